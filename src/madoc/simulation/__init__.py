@@ -1,0 +1,1 @@
+"""Simulators: parameters bound to a system, systems stepped over two batch axes."""

@@ -1,0 +1,76 @@
+"""What a task is: a model, and pure batched functions between state, observation, reward and end."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import mujoco
+from jaxtyping import PRNGKeyArray
+
+from madoc.errors import MadocError
+from madoc.parameters import ParameterSpace
+
+Batch = Any
+"""A NumPy or JAX array with any leading axes; task functions work on both, so every backend shares them."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A robot and what is asked of it, without any truth about the target.
+
+    The state is (qpos, qvel), float64, last axis `state_size`. Functions are pure and batched over leading axes.
+
+    Attributes:
+        name: `hopper`, ...
+        physics: `legacy` (mujoco-py: D4RL, NeoRL, the paper) or `modern` (MuJoCo >= 2.1.1).
+        spec: Builds the MuJoCo spec, at its nominal parameters.
+        frame_skip: Physics steps per control step.
+        observation_size: Values per observation.
+        observe: state -> observation.
+        reward: (state, action, next_state) -> reward.
+        terminated: next_state -> whether the task has ended there (a fall).
+        reset_noise: (key, count) -> offsets (count, state_size) added to the model's initial state.
+        parameters: What can be calibrated, with the paper's normal ranges.
+        ranges: Other boxes by level (`easy`, `normal`, `hard`).
+        groups: How many groups the paper forms for this robot.
+        max_episode_steps: Time limit in control steps; reaching it truncates.
+        reference_returns: Returns of (random, expert) for the normalized score, from D4RL.
+        state_from_observation: observation -> state; None where the observation does not determine the state.
+        rebuildable: observation -> whether `state_from_observation` is exact for that row.
+    """
+
+    name: str
+    physics: str
+    spec: Callable[[], mujoco.MjSpec]
+    frame_skip: int
+    observation_size: int
+    observe: Callable[[Batch], Batch]
+    reward: Callable[[Batch, Batch, Batch], Batch]
+    terminated: Callable[[Batch], Batch]
+    reset_noise: Callable[[PRNGKeyArray, int], jax.Array]
+    parameters: ParameterSpace
+    ranges: dict[str, ParameterSpace]
+    groups: int
+    max_episode_steps: int
+    reference_returns: tuple[float, float]
+    state_from_observation: Callable[[Batch], Batch] | None = None
+    rebuildable: Callable[[Batch], Batch] | None = None
+
+    def compile(self) -> mujoco.MjModel:
+        """A fresh model at nominal parameters."""
+        return self.spec().compile()
+
+    def with_level(self, level: str) -> "Task":
+        """The same task searched in its `easy`, `normal` or `hard` ranges (the paper's appendix D).
+
+        Raises:
+            MadocError: No such level.
+        """
+        if level not in self.ranges:
+            raise MadocError(f"no range level {level!r} for {self.name}; there are: {', '.join(self.ranges)}")
+        return replace(self, parameters=self.ranges[level])
+
+    def with_parameters(self, names: list[str]) -> "Task":
+        """The same task with only the named parameters calibratable."""
+        return replace(self, parameters=self.parameters.select(names))
