@@ -1,0 +1,1 @@
+"""Calibrators: from logged data to parameters. One file a method."""

@@ -1,0 +1,124 @@
+"""What a calibrator is given, what it must offer, and what it returns."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from madoc.data import Dataset, logged_states
+from madoc.errors import MadocError
+from madoc.learning.dynamics_ratio import Scaling
+from madoc.simulation.base import Simulator
+from madoc.types import Metrics
+
+State = Any
+
+
+@dataclass(frozen=True)
+class CalibrationProblem:
+    """Find the parameters under which the simulator moves as the data does.
+
+    The data's true parameters, where it carries any, are dropped here: no method can read them.
+
+    Raises:
+        MadocError: The data belongs to another task.
+    """
+
+    dataset: Dataset
+    simulator: Simulator
+
+    def __post_init__(self) -> None:
+        if self.dataset.task_name != self.simulator.task.name:
+            raise MadocError(
+                f"the data was recorded from {self.dataset.task_name}, the simulator is {self.simulator.task.name}"
+            )
+        object.__setattr__(self, "dataset", replace(self.dataset, true_parameters=None))
+
+    @cached_property
+    def logged_states(self) -> Float[np.ndarray, "rows state"]:
+        """States rebuilt from logged observations, where that is exact."""
+        return logged_states(self.dataset, self.simulator.task)[0]
+
+    @cached_property
+    def logged_actions(self) -> Float[np.ndarray, "rows action"]:
+        """The actions taken at `logged_states`."""
+        rows = logged_states(self.dataset, self.simulator.task)[1]
+        return np.asarray(self.dataset.transitions.action)[rows]
+
+    @cached_property
+    def pairs(self) -> tuple[Float[Array, "rows observation"], Float[Array, "rows action"]]:
+        """Logged observations and actions on the device, float32."""
+        logged = self.dataset.transitions
+        return jnp.asarray(logged.observation, jnp.float32), jnp.asarray(logged.action, jnp.float32)
+
+    @cached_property
+    def scalings(self) -> dict[str, Scaling]:
+        """The two ways to describe (s, a, s') to a network, by name."""
+        logged = self.dataset.transitions
+        return {"standardised": Scaling.standardised(logged), "raw": Scaling.raw(logged)}
+
+    @cached_property
+    def standardised_features(self) -> tuple[Array, Array]:
+        """Standardised features of the logged rows, on the device."""
+        return self._features("standardised")
+
+    @cached_property
+    def raw_features(self) -> tuple[Array, Array]:
+        """Raw features of the logged rows, on the device."""
+        return self._features("raw")
+
+    def _features(self, name: str) -> tuple[Array, Array]:
+        pair, following = self.scalings[name].features(self.dataset.transitions)
+        return jnp.asarray(pair), jnp.asarray(following)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a calibrator believes, in physical units.
+
+    Attributes:
+        mean: Value of each parameter, shape (d,).
+        std: Its spread under the calibration distribution, shape (d,).
+        groups: Parameters calibrated together, as indices; one group of all where a method has none.
+        warnings: What a user should know about it, one sentence each.
+    """
+
+    mean: Float[np.ndarray, " d"]
+    std: Float[np.ndarray, " d"]
+    groups: tuple[tuple[int, ...], ...]
+    warnings: tuple[str, ...] = field(default=())
+
+
+class Calibrator(Protocol):
+    """A method. It holds hyperparameters only; what it carries is in its state."""
+
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> State:
+        """A cheap start: networks, buffers, the random key."""
+        ...
+
+    def step(self, problem: CalibrationProblem, state: State) -> tuple[State, Metrics]:
+        """One epoch."""
+        ...
+
+    def estimate(self, problem: CalibrationProblem, state: State) -> Estimate:
+        """The best estimate so far."""
+        ...
+
+    def control_steps(self, state: State) -> int:
+        """Simulated control steps spent, of any kind."""
+        ...
+
+    def stage(self, state: State) -> str:
+        """A word for what it is doing."""
+        ...
+
+    def progress(self, state: State, budget: int) -> float:
+        """Share of all its stages done, in [0, 1]."""
+        ...
+
+    def converged(self, state: State) -> str | None:
+        """A sentence once it has stopped by itself."""
+        ...

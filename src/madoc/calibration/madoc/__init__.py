@@ -1,0 +1,1 @@
+"""Madoc: Multi-Agent Domain Calibration (Jiang et al. 2024)."""

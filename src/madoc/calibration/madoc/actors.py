@@ -1,0 +1,67 @@
+"""Calibration actors: one tanh-Gaussian a group, over its own parameters.
+
+Groups are disjoint and every Gaussian is diagonal, so all actors together are one mean and one log std a parameter.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from madoc.learning.tanh_gaussian import sample
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Actors:
+    """Means and log stds before squashing, both of shape (d,)."""
+
+    mean: Float[Array, " d"]
+    log_std: Float[Array, " d"]
+
+
+def initial_actors(count: int) -> Actors:
+    """N(0, 1) before squashing: also the prior's start (appendix C)."""
+    return Actors(jnp.zeros(count), jnp.zeros(count))
+
+
+def draw_parameters(
+    actors: Actors, key: PRNGKeyArray, count: int
+) -> tuple[Float[Array, "count d"], Float[Array, " count"]]:
+    """Draws of all parameters in [-1, 1], and their log densities summed over groups."""
+    shape = (count, len(actors.mean))
+    mean, log_std = (jnp.broadcast_to(part, shape) for part in (actors.mean, actors.log_std))
+    return sample(mean, log_std, key)
+
+
+def divergence(actors: Actors, prior: Actors) -> Float[Array, " d"]:
+    """KL(q || p) of each parameter, in closed form: squashing both by the same map leaves it as it is."""
+    variance_ratio = jnp.exp(2.0 * (actors.log_std - prior.log_std))
+    shift = ((actors.mean - prior.mean) * jnp.exp(-prior.log_std)) ** 2
+    return 0.5 * (variance_ratio + shift - 1.0) - actors.log_std + prior.log_std
+
+
+def prior_weight(updates: Float[Array, ""], *, time_constant: float, largest: float) -> Float[Array, ""]:
+    """λ_t = min(largest, exp(t / time_constant)) (appendix C: 10 and 2e5)."""
+    return jnp.minimum(largest, jnp.exp(updates / time_constant))
+
+
+def actor_loss(
+    value: Float[Array, " rows"],
+    log_density: Float[Array, " rows"],
+    kl: Float[Array, ""],
+    *,
+    entropy_weight: float,
+    prior_weight: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Eq. (13) summed over groups: α log q - v + λ KL(q || p), averaged over draws.
+
+    Args:
+        value: Σ_g v_g(ξ^g) of each draw.
+        log_density: Σ_g log q_g(ξ^g) of each draw.
+        kl: Σ_g KL(q_g || p_g).
+        entropy_weight: α.
+        prior_weight: λ.
+    """
+    return (entropy_weight * log_density - value).mean() + prior_weight * kl

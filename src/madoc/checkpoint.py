@@ -1,0 +1,215 @@
+"""Save a method's state to one `.npz` file and get the same bits back. No pickle."""
+
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from madoc.errors import MadocError
+from madoc.files import json_text, replacing
+
+State = TypeVar("State")
+
+FORMAT = 1
+"""Version of the file's layout: one `.npy` member a leaf, and `checkpoint.json` for all the rest."""
+
+_VALUES: dict[str, tuple[type, Callable[[str], Any]]] = {
+    "bool": (bool, lambda text: text == "True"),
+    "int": (int, int),
+    "float": (float, float),
+    "str": (str, str),
+}
+"""Python values a state may hold, and how to read them back from `str(value)`; exact for all four."""
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """What a leaf of a state is, without its numbers.
+
+    Attributes:
+        kind: "jax", "numpy" or "scalar" (a NumPy scalar): an array; "key": random key; "value": Python value;
+            "static": a function, never saved.
+        dtype: Its dtype, the name of a key's generator, or the Python type of a value.
+        shape: Its shape.
+        weak: Whether a JAX array is weakly typed; losing that would change promotions, and so bits.
+    """
+
+    kind: str
+    dtype: str = ""
+    shape: tuple[int, ...] = ()
+    weak: bool = False
+
+    def __str__(self) -> str:
+        shape = f" of shape {self.shape}" if self.kind in ("jax", "numpy", "key") else ""
+        return {"key": "random key ", "static": "function"}.get(self.kind, "") + self.dtype + shape
+
+    def fits(self, other: "Leaf") -> bool:
+        """Whether one may take the other's place: the same but for where an array lives."""
+        arrays = ("jax", "numpy", "scalar")
+        same_kind = self.kind == other.kind or (self.kind in arrays and other.kind in arrays)
+        return same_kind and self.dtype == other.dtype and self.shape == other.shape
+
+
+Layout = dict[str, Leaf]
+"""The leaves of a state by path, for example `state.actor.layers[0].weight`."""
+
+
+def layout(state: Any) -> Layout:
+    """What the leaves of a state are.
+
+    Raises:
+        MadocError: A leaf is of a type that cannot be saved.
+    """
+    return {path: _describe(path, leaf) for path, leaf in _leaves(state)}
+
+
+def difference(got: Layout, expected: Layout) -> str | None:
+    """The first place where two layouts do not fit, in words; None if they fit."""
+    for path in [*expected, *got]:
+        if path not in got:
+            return f"expected {path} ({expected[path]}), which is missing"
+        if path not in expected:
+            return f"got {path} ({got[path]}), which is not expected"
+        if not got[path].fits(expected[path]):
+            return f"expected {path} to be {expected[path]}, got {got[path]}"
+    return None
+
+
+def first_non_finite(state: Any) -> str | None:
+    """The path of the first leaf that holds a NaN or an infinity; None if there is none."""
+    for path, leaf in _leaves(state):
+        if _is_inexact(leaf) and not np.isfinite(np.asarray(leaf)).all():
+            return path
+    return None
+
+
+def save(path: Path, state: Any, extra: dict[str, Any]) -> None:
+    """Write a state, and a small JSON dictionary beside it, whole or not at all.
+
+    Leaves go to the disk one after the other, so a large replay buffer is never copied as a whole. Equal
+    states and extras give equal files.
+
+    Raises:
+        MadocError: A leaf is of a type that cannot be saved, `extra` is not strict JSON, or the disk refuses.
+    """
+    leaves = layout(state)
+    values = {name: str(leaf) for name, leaf in _leaves(state) if leaves[name].kind == "value"}
+    about = {
+        "format": FORMAT,
+        "leaves": {name: asdict(leaf) for name, leaf in leaves.items() if leaf.kind != "static"},
+        "values": values,
+        "extra": extra,
+    }
+    text = json_text(about, what=path.name)
+    with replacing(path) as stream, zipfile.ZipFile(stream, "w") as archive:
+        archive.writestr(zipfile.ZipInfo("checkpoint.json"), text)
+        for name, leaf in _leaves(state):
+            if leaves[name].kind not in ("value", "static"):
+                # A ZipInfo of our own carries no clock time.
+                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                    np.lib.format.write_array(member, _to_numpy(leaf), allow_pickle=False)
+
+
+def load(path: Path, like: State) -> tuple[State, dict[str, Any]]:
+    """The state and the extra dictionary that `save` wrote.
+
+    Args:
+        path: The file.
+        like: A state of the same structure, from the method's `init`; gives the structure and the functions.
+
+    Raises:
+        MadocError: The file is missing or damaged, or holds the state of another method, setting or version.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            about = json.loads(archive.read("checkpoint.json"))
+            if about["format"] != FORMAT:
+                raise MadocError(
+                    f"{path} has format {about['format']}, expected {FORMAT}; written by another madoc"
+                )
+            saved = {
+                name: Leaf(**leaf | {"shape": tuple(leaf["shape"])}) for name, leaf in about["leaves"].items()
+            }
+            wanted = {name: leaf for name, leaf in layout(like).items() if leaf.kind != "static"}
+            problem = difference(saved, wanted)
+            if problem:
+                raise MadocError(
+                    f"{path} does not fit this method: {problem}; different settings or another version?"
+                )
+            leaves = [
+                _restore(archive, name, saved[name], about["values"]) if name in saved else leaf
+                for name, leaf in _leaves(like)
+            ]
+    except MadocError:
+        raise
+    except FileNotFoundError as error:
+        raise MadocError(f"there is no checkpoint {path}") from error
+    except Exception as error:  # damage shows as any of a dozen types, from BadZipFile to MemoryError
+        raise MadocError(f"{path} is damaged ({error}); restore it from a copy or start a new run") from error
+    return jax.tree.unflatten(jax.tree.structure(like), leaves), about["extra"]
+
+
+def _leaves(state: Any) -> list[tuple[str, Any]]:
+    flat, _ = jax.tree_util.tree_flatten_with_path(state)
+    return [("state" + jax.tree_util.keystr(path), leaf) for path, leaf in flat]
+
+
+def _is_inexact(leaf: Any) -> bool:
+    if isinstance(leaf, np.ndarray | np.generic | jax.Array):
+        return bool(jnp.issubdtype(leaf.dtype, jnp.inexact))
+    return isinstance(leaf, float)
+
+
+def _describe(path: str, leaf: Any) -> Leaf:
+    if isinstance(leaf, jax.Array):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return Leaf("key", str(jax.random.key_impl(leaf)), leaf.shape)
+        return Leaf("jax", leaf.dtype.name, leaf.shape, bool(leaf.aval.weak_type))  # type: ignore[attr-defined]
+    if isinstance(leaf, np.ndarray | np.generic):
+        if leaf.dtype.hasobject or leaf.dtype.names or np.dtype(leaf.dtype.name) != leaf.dtype:
+            raise MadocError(f"cannot save {path}: NumPy dtype {leaf.dtype!r}; expected plain native numbers")
+        return Leaf("numpy" if isinstance(leaf, np.ndarray) else "scalar", leaf.dtype.name, leaf.shape)
+    if type(leaf).__name__ in _VALUES and type(leaf) is _VALUES[type(leaf).__name__][0]:
+        return Leaf("value", type(leaf).__name__)
+    if callable(leaf):
+        return Leaf("static")
+    raise MadocError(
+        f"cannot save {path}: a {type(leaf).__name__};"
+        " expected an array, a random key, a number, a string or a function"
+    )
+
+
+def _to_numpy(leaf: Any) -> np.ndarray:
+    """The numbers of a leaf in a dtype that the npy format knows."""
+    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    array = np.asarray(leaf)
+    foreign = np.dtype(array.dtype.str) != array.dtype  # bfloat16 and its kin: npy would forget what they are
+    return array.view(f"u{array.dtype.itemsize}") if foreign else array
+
+
+def _restore(archive: zipfile.ZipFile, name: str, leaf: Leaf, values: dict[str, str]) -> Any:
+    if leaf.kind == "value":
+        return _VALUES[leaf.dtype][1](values[name])
+    with archive.open(f"{name}.npy") as member:
+        array = np.lib.format.read_array(member, allow_pickle=False)
+    if leaf.kind == "key":
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=leaf.dtype)
+    dtype = np.dtype(leaf.dtype)
+    array = array.view(dtype) if array.dtype != dtype else array
+    if array.shape != leaf.shape:
+        raise ValueError(f"{name} has shape {array.shape}, recorded as {leaf.shape}")
+    if leaf.kind == "numpy":
+        return array
+    if leaf.kind == "scalar":
+        return array[()]
+    if leaf.weak:
+        weak = jnp.full(leaf.shape, dtype.type(0).item())
+        return weak.at[...].set(array) if weak.dtype == dtype else jnp.asarray(array)
+    return jnp.asarray(array)

@@ -1,0 +1,146 @@
+"""D4RL's HDF5 layout, v0 to v2 (Fu et al. 2020): one file, rows of all episodes in a row."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+from jaxtyping import Bool, Float
+
+from madoc.data.dataset import Dataset, close_episodes, starts_after
+from madoc.data.validation import (
+    NAMES,
+    as_flags,
+    as_matrix,
+    as_vector,
+    check_lengths,
+    require_arrays,
+    require_file,
+    validate,
+)
+from madoc.errors import MadocError
+from madoc.tasks import Task
+from madoc.types import Transitions
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+REQUIRED = ("observations", "actions", "rewards", "terminals")
+OPTIONAL = ("next_observations", "timeouts")
+# D4RL's Ant: 27 values of state, then contact forces of 14 bodies that mujoco-py 2.x left at zero.
+ANT_WIDTH, ANT_STATE_WIDTH = 111, 27
+
+
+def recognises(path: Path) -> bool:
+    """Whether the file begins like HDF5."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(SIGNATURE)) == SIGNATURE
+
+
+def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
+    """Read a D4RL file. `terminals` terminate, `timeouts` truncate.
+
+    Without `next_observations` (v0) the next row's observation takes their place, and the last row of every
+    episode is dropped: its successor was not recorded. (D4RL's own `qlearning_dataset` keeps terminal rows,
+    with the next episode's first observation as successor; that pair never happened.) The row before then
+    ends its episode as truncated. Without any timeout, every `task.max_episode_steps` rows since the last end
+    are one, as in `qlearning_dataset`. An Ant of 111 values keeps the first 27; the other 84 must be 0.
+    Physics is legacy for names that end in -v0, -v1 or -v2, as D4RL's do, else unknown.
+
+    Raises:
+        MadocError: Missing, damaged, not this layout, or refused by `validate`.
+    """
+    arrays = _read_arrays(path)
+    check_lengths(arrays)
+    observation = _observation(arrays["observations"], "observations", task)
+    terminated = as_flags(arrays["terminals"], "terminals")
+    timeouts = np.zeros_like(terminated)
+    if "timeouts" in arrays:
+        timeouts = as_flags(arrays["timeouts"], "timeouts")
+    if not timeouts.any():
+        timeouts = count_time_limits(terminated, task.max_episode_steps)
+    has_next = "next_observations" in arrays
+    next_observation = np.roll(observation, -1, axis=0)
+    if has_next:
+        next_observation = _observation(arrays["next_observations"], "next_observations", task)
+    transitions = Transitions(
+        observation=observation,
+        action=as_matrix(arrays["actions"], "actions"),
+        reward=as_vector(arrays["rewards"], "rewards"),
+        next_observation=next_observation,
+        terminated=terminated,
+        truncated=timeouts,
+    )
+    dataset = _dataset(transitions, terminated | timeouts, path, task)
+    names = {**NAMES, "observation": "observations", "action": "actions", "reward": "rewards"}
+    names |= {
+        "next_observation": "next_observations" if has_next else "observations",
+        "terminated": "terminals",
+    }
+    dataset = validate(dataset, task, names, clip_actions=clip_actions)
+    return dataset if has_next else _without_last_rows(dataset)
+
+
+def count_time_limits(ends: Bool[np.ndarray, " rows"], limit: int) -> Bool[np.ndarray, " rows"]:
+    """Rows that reach a time limit of `limit` rows since the last end (or time limit)."""
+    rows = np.arange(len(ends))
+    starts = starts_after(ends) if len(ends) else rows
+    age = rows - starts[np.searchsorted(starts, rows, side="right") - 1] + 1
+    return (age % limit == 0) & ~ends
+
+
+def _dataset(transitions: Transitions, ends: np.ndarray, path: Path, task: Task) -> Dataset:
+    starts = starts_after(ends)
+    physics = "legacy" if re.search(r"-v[012]$", path.stem) else "unknown"
+    if len(ends):
+        transitions = close_episodes(transitions, starts)
+    return Dataset(transitions, starts, task_name=task.name, physics=physics, origin=str(path))
+
+
+def _without_last_rows(dataset: Dataset) -> Dataset:
+    """Drop the last row of every episode; episodes of one row vanish."""
+    keep = np.ones(len(dataset), dtype=bool)
+    keep[dataset.episode_ends - 1] = False
+    episode = np.repeat(
+        np.arange(len(dataset.episode_starts)), dataset.episode_ends - dataset.episode_starts
+    )[keep]
+    if not len(episode):
+        raise MadocError(
+            f"expected episodes of two rows or more, got {len(dataset)} of one row in {dataset.origin}; "
+            "without next_observations they hold no transition, so record longer ones"
+        )
+    starts = starts_after(np.append(np.diff(episode) > 0, True))
+    transitions = close_episodes(dataset.transitions.take(keep), starts)
+    return replace(dataset, transitions=transitions, episode_starts=starts)
+
+
+def _observation(values: np.ndarray, name: str, task: Task) -> Float[np.ndarray, "rows observation"]:
+    observation = as_matrix(values, name)
+    if task.name != "ant" or observation.shape[1] != ANT_WIDTH:
+        return observation
+    forces = observation[:, ANT_STATE_WIDTH:]
+    if (forces != 0).any():
+        row, column = np.argwhere(forces != 0)[0]
+        raise MadocError(
+            f"expected zeros after the first 27 values of an Ant of 111, got {forces[row, column]:g} in "
+            f"row {row}, column {ANT_STATE_WIDTH + column} of {name}; contact forces are not part of this "
+            "task, cut them off"
+        )
+    return np.ascontiguousarray(observation[:, :ANT_STATE_WIDTH])
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    require_file(path)
+    try:
+        with h5py.File(path, "r") as file:
+            present = [name for name in REQUIRED + OPTIONAL if isinstance(file.get(name), h5py.Dataset)]
+            require_arrays(present, REQUIRED, path, "if it is a Minari file, pass its directory instead")
+            return {name: np.atleast_1d(file[name][()]) for name in present}
+    except MadocError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise MadocError(
+            f"cannot read {path} as HDF5 ({error}); it is damaged, was cut short or has another format, "
+            "copy or download it again"
+        ) from error

@@ -1,0 +1,106 @@
+"""A dataset: logged transitions, where their episodes begin, and where they come from."""
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
+
+from madoc.errors import MadocError
+from madoc.tasks import Task
+from madoc.types import Transitions
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Logged transitions of one robot.
+
+    Attributes:
+        transitions: NumPy, float64 and bool; actions in [-1, 1]. The last row of every episode is terminated
+            or truncated. No row pairs observations of two episodes.
+        episode_starts: Rows where an episode begins, ascending; the first is 0.
+        task_name: The task it was recorded for.
+        physics: `legacy`, `modern`, or `unknown` where the file does not say.
+        origin: The file, or a description.
+        true_parameters: The target's physical values by parameter name, if known. Only evaluation reads them.
+    """
+
+    transitions: Transitions
+    episode_starts: Int[np.ndarray, " episodes"]
+    task_name: str
+    physics: str
+    origin: str
+    true_parameters: dict[str, float] | None = None
+
+    def __len__(self) -> int:
+        return len(self.transitions)
+
+    @property
+    def episode_ends(self) -> Int[np.ndarray, " episodes"]:
+        """One past the last row of every episode."""
+        return np.append(self.episode_starts[1:], len(self))
+
+
+def starts_after(ends: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, " episodes"]:
+    """Rows where an episode begins, from whether a row ends one."""
+    return np.flatnonzero(np.append(True, ends[:-1]))
+
+
+def close_episodes(transitions: Transitions, episode_starts: Int[np.ndarray, " episodes"]) -> Transitions:
+    """Mark the last row of every episode truncated unless it is terminated: the record ends there."""
+    last = np.append(episode_starts[1:], len(transitions)) - 1
+    truncated = np.array(transitions.truncated)
+    truncated[last] |= ~np.asarray(transitions.terminated)[last]
+    return replace(transitions, truncated=truncated)
+
+
+def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Dataset:
+    """At most `max_transitions` transitions: whole episodes in a random order, the last one cut short.
+
+    The rule looks at episodes only, so it is the same for every format, and a smaller draw with the same key
+    is a prefix of a larger one. A dataset that is small enough comes back as it is.
+
+    Raises:
+        MadocError: `max_transitions` is not positive.
+    """
+    if max_transitions < 1:
+        raise MadocError(f"expected max_transitions of at least 1, got {max_transitions}")
+    if max_transitions >= len(dataset):
+        return dataset
+    starts, ends = dataset.episode_starts, dataset.episode_ends
+    order = np.asarray(jax.random.permutation(key, len(starts)))
+    filled = np.cumsum((ends - starts)[order])
+    episodes = int(np.searchsorted(filled, max_transitions)) + 1
+    chosen = order[:episodes]
+    rows = np.concatenate([np.arange(starts[episode], ends[episode]) for episode in chosen])[:max_transitions]
+    new_starts = np.append(0, filled[: episodes - 1])
+    transitions = close_episodes(dataset.transitions.take(rows), new_starts)
+    return replace(dataset, transitions=transitions, episode_starts=new_starts)
+
+
+def logged_states(
+    dataset: Dataset, task: Task
+) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
+    """Simulator states of the rows whose observation determines them, and which rows those are.
+
+    Root positions that never enter the dynamics are 0.
+
+    Raises:
+        MadocError: The task's observation does not determine its state, or no row can be rebuilt.
+    """
+    if task.state_from_observation is None:
+        raise MadocError(
+            f"an observation of {task.name} does not determine its state, so nothing can start at logged "
+            "states; give the task a state_from_observation, or start rollouts from its reset"
+        )
+    observation = np.asarray(dataset.transitions.observation, dtype=np.float64)
+    rows = np.arange(len(observation))
+    if task.rebuildable is not None:
+        rows = np.flatnonzero(task.rebuildable(observation))
+    if not len(rows):
+        raise MadocError(
+            f"none of the {len(observation)} logged states of {task.name} can be rebuilt from its "
+            f"observation (every row has a clipped value) in {dataset.origin}; start rollouts from the "
+            "task's reset"
+        )
+    return np.asarray(task.state_from_observation(observation[rows]), dtype=np.float64), rows

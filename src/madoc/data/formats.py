@@ -1,0 +1,92 @@
+"""Which reader reads which file. A new format is one module and one line of `FORMATS`."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtyping import PRNGKeyArray
+
+from madoc.data import d4rl, minari_reader, native, neorl
+from madoc.data.dataset import Dataset, subsample
+from madoc.data.validation import require_file
+from madoc.errors import MadocError
+from madoc.tasks import Task
+
+
+@dataclass(frozen=True)
+class Format:
+    """A layout of logged data.
+
+    Attributes:
+        read: (path, task, clip_actions=...) -> validated dataset.
+        recognises: path -> whether it is this layout, judged by a glance at its content.
+        description: What it looks like, for lists.
+    """
+
+    read: Callable[..., Dataset]
+    recognises: Callable[[Path], bool]
+    description: str
+
+
+FORMATS: dict[str, Format] = {
+    "d4rl": Format(d4rl.read, d4rl.recognises, "HDF5 with observations, actions, rewards, terminals"),
+    "neorl": Format(neorl.read, neorl.recognises, "npz with obs, next_obs, action, reward, done, index"),
+    "minari": Format(minari_reader.read, minari_reader.recognises, "a Minari directory or id"),
+    "madoc": Format(native.read, native.recognises, "npz that madoc wrote"),
+}
+
+
+def load(
+    path: str | os.PathLike,
+    task: Task,
+    *,
+    format: str | None = None,
+    max_transitions: int | None = None,
+    key: PRNGKeyArray | None = None,
+    clip_actions: bool = False,
+    download: bool = False,
+) -> Dataset:
+    """Read logged data of a robot, in whatever format it is.
+
+    Args:
+        path: A file, a Minari directory, or a Minari id.
+        task: The robot.
+        format: A name in `FORMATS`, instead of a glance at the content.
+        max_transitions: Keep at most so many (see `subsample`); needs a key.
+        key: Which episodes to keep.
+        clip_actions: Clip actions outside [-1, 1] instead of refusing them.
+        download: Fetch a Minari id that is not on this machine. Without it nothing touches the network.
+
+    Raises:
+        MadocError: Missing, unreadable, of no known format, or not data of this task.
+    """
+    source = Path(path).expanduser()
+    if format is not None and format not in FORMATS:
+        raise MadocError(f"unknown format {format!r}; there are: {', '.join(FORMATS)}")
+    if max_transitions is not None and key is None:
+        raise MadocError("max_transitions draws episodes at random and needs a key, got none; pass key=")
+    name = format or recognise(source)
+    if download:
+        if name != "minari":
+            raise MadocError(f"only Minari ids can be downloaded, got {source} of format {name}")
+        if not source.exists():
+            minari_reader.download(source.as_posix())
+    dataset = FORMATS[name].read(source, task, clip_actions=clip_actions)
+    if max_transitions is None or key is None:
+        return dataset
+    return subsample(dataset, max_transitions, key)
+
+
+def recognise(path: Path) -> str:
+    """The name of a file's format, from its content.
+
+    Raises:
+        MadocError: Missing, empty, damaged beyond recognition, or of no known format.
+    """
+    for name, candidate in FORMATS.items():
+        if candidate.recognises(path):
+            return name
+    require_file(path)
+    known = "; ".join(f"{name} ({candidate.description})" for name, candidate in FORMATS.items())
+    raise MadocError(f"cannot tell the format of {path}; pass --format with one of: {known}")

@@ -1,0 +1,170 @@
+"""Minari datasets (Younis et al. 2024): a directory of episodes, or the id of one on this machine."""
+
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from madoc.data.dataset import Dataset, close_episodes
+from madoc.data.validation import as_flags, as_matrix, as_vector, check_lengths, validate
+from madoc.errors import MadocError
+from madoc.tasks import Task
+from madoc.types import Transitions
+
+ID = re.compile(r"[\w-]+(/[\w-]+)*-v\d+")
+# Ant-v5: 27 values of state, then 78 contact forces, which the state determines.
+ANT_V5_WIDTH, ANT_STATE_WIDTH = 105, 27
+NAMES_HERE = {
+    "observation": "observations",
+    "action": "actions",
+    "reward": "rewards",
+    "next_observation": "observations",
+    "terminated": "terminations",
+    "truncated": "truncations",
+}
+
+
+def recognises(path: Path) -> bool:
+    """Whether the path is a Minari directory, or no path but an id such as `mujoco/hopper/expert-v0`."""
+    if path.exists():
+        return _data_directory(path) is not None
+    return ID.fullmatch(path.as_posix()) is not None
+
+
+def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
+    """Read a Minari dataset, by its directory or by its id. Never touches the network.
+
+    An Ant of 105 values keeps the first 27, and the rewards keep the contact cost they were recorded with.
+    Physics is modern for environments v4 and later, legacy before, unknown without an environment. Rows are
+    counted over all episodes joined.
+
+    Raises:
+        MadocError: `minari` is not installed, no such dataset here, damaged, not arrays, or refused by
+            `validate`.
+    """
+    directory = _local_directory(path)
+    episodes, environment = _read_episodes(directory)
+    if not episodes:
+        raise MadocError(f"expected at least one episode for {task.name}, got none in {path}")
+    lengths = [len(episode.rewards) for episode in episodes]
+    observations = [_observation(episode, task) for episode in episodes]
+    starts = np.append(0, np.cumsum(lengths)[:-1])
+    transitions = Transitions(
+        observation=_join([values[:-1] for values in observations], "observations"),
+        action=_join([as_matrix(episode.actions, "actions") for episode in episodes], "actions"),
+        reward=np.concatenate([as_vector(episode.rewards, "rewards") for episode in episodes]),
+        next_observation=_join([values[1:] for values in observations], "observations"),
+        terminated=np.concatenate([as_flags(episode.terminations, "terminations") for episode in episodes]),
+        truncated=np.concatenate([as_flags(episode.truncations, "truncations") for episode in episodes]),
+    )
+    transitions = close_episodes(transitions, starts)
+    dataset = Dataset(transitions, starts, task.name, _physics(environment), origin=str(path))
+    return validate(dataset, task, NAMES_HERE, clip_actions=clip_actions)
+
+
+def download(dataset_id: str) -> None:
+    """Fetch a Minari dataset from its public host, unless it is here. Nothing else needs a network.
+
+    Raises:
+        MadocError: `minari` is not installed, or the download failed.
+    """
+    minari = _import_minari()
+    try:
+        minari.load_dataset(dataset_id, download=True)
+    except Exception as error:  # whatever the host's client raises is one thing to the user: it did not come
+        raise MadocError(
+            f"cannot download Minari dataset {dataset_id!r} ({error}); check its id and the network"
+        ) from error
+
+
+def _import_minari() -> Any:
+    try:
+        import minari
+    except ImportError as error:
+        raise MadocError(f'Minari datasets need the library: pip install "minari[hdf5]" ({error})') from error
+    return minari
+
+
+def _data_directory(path: Path) -> Path | None:
+    """The folder with the metadata: the path itself or its `data`."""
+    found = [folder for folder in (path / "data", path) if (folder / "metadata.json").is_file()]
+    return found[0] if found else None
+
+
+def _local_directory(path: Path) -> Path:
+    directory = _data_directory(path)
+    if directory is not None:
+        return directory
+    if path.exists():
+        raise MadocError(
+            f"{path} is no Minari dataset: there is no metadata.json in it or in its data folder"
+        )
+    if ID.fullmatch(path.as_posix()) is None:
+        raise MadocError(f"no file or directory at {path}; check the path")
+    _import_minari()
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    directory = _data_directory(get_dataset_path(path.as_posix()))
+    if directory is None:
+        raise MadocError(
+            f"no file, and no Minari dataset on this machine, is called {path.as_posix()}; check the name, "
+            f"or fetch it with `minari download {path.as_posix()}` (download=True)"
+        )
+    return directory
+
+
+def _read_episodes(directory: Path) -> tuple[list[Any], str]:
+    """All episodes, and the id of their environment (empty if not recorded)."""
+    minari = _import_minari()
+    try:
+        with warnings.catch_warnings():
+            # Minari warns about packages its environment would need; the environment is never made here.
+            warnings.simplefilter("ignore")
+            dataset = minari.MinariDataset(directory)
+            environment = dataset.spec.env_spec
+            return list(dataset.iterate_episodes()), "" if environment is None else environment.id
+    except Exception as error:  # its storages raise anything from AssertionError to OSError on a damaged file
+        raise MadocError(
+            f"cannot read the Minari dataset in {directory} ({type(error).__name__}: {error}); it is damaged "
+            "or was cut short, download or record it again"
+        ) from error
+
+
+def _join(parts: list[np.ndarray], name: str) -> np.ndarray:
+    widths = [part.shape[1] for part in parts]
+    for episode, width in enumerate(widths):
+        if width != widths[0]:
+            raise MadocError(
+                f"expected {widths[0]} values per row of {name} in every episode, got {width} in "
+                f"episode {episode}; record them again from one robot"
+            )
+    return np.concatenate(parts)
+
+
+def _observation(episode: Any, task: Task) -> np.ndarray:
+    if isinstance(episode.observations, dict | tuple):
+        raise MadocError(
+            f"expected observations of {task.name} as one array, got a {type(episode.observations).__name__} "
+            f"in episode {episode.id}; is this dataset of {task.name}?"
+        )
+    observation = as_matrix(episode.observations, "observations")
+    steps = len(episode.rewards)
+    if steps == 0 or len(observation) != steps + 1:
+        raise MadocError(
+            f"expected one more observation than rewards, and a reward, got {len(observation)} and {steps} "
+            f"in episode {episode.id}; record it again"
+        )
+    check_lengths({"rewards": episode.rewards, "actions": episode.actions})
+    check_lengths({"terminations": episode.terminations, "truncations": episode.truncations})
+    if task.name == "ant" and observation.shape[1] == ANT_V5_WIDTH:
+        return observation[:, :ANT_STATE_WIDTH]
+    return observation
+
+
+def _physics(environment: str) -> str:
+    version = re.search(r"-v(\d+)$", environment)
+    if version is None:
+        return "unknown"
+    return "modern" if int(version[1]) >= 4 else "legacy"

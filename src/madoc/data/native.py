@@ -1,0 +1,132 @@
+"""Madoc's own file: an npz of the arrays and one JSON string. Written whole or not at all; never a pickle."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+
+from madoc.data.dataset import Dataset
+from madoc.data.npz import array_names, is_npz, read_arrays
+from madoc.data.validation import (
+    NAMES,
+    as_flags,
+    as_matrix,
+    as_vector,
+    require_arrays,
+    validate,
+)
+from madoc.errors import MadocError
+from madoc.files import json_text, replacing
+from madoc.parameters import FIELDS
+from madoc.tasks import Task
+from madoc.types import Transitions
+
+VERSION = 1
+REQUIRED = (*NAMES, "episode_starts", "metadata")
+
+
+def recognises(path: Path) -> bool:
+    """Whether the file is an npz with our metadata."""
+    return is_npz(path) and {"metadata", "episode_starts"} <= array_names(path)
+
+
+def save(dataset: Dataset, path: str | os.PathLike) -> None:
+    """Write a dataset whole or not at all: a failure leaves `path` as it was.
+
+    Raises:
+        MadocError: The folder does not exist, `path` is a directory, or the disk refuses.
+    """
+    target = Path(path).expanduser()
+    if target.is_dir():
+        raise MadocError(f"expected a file to write to, got the directory {target}; add a file name")
+    if not target.parent.is_dir():
+        raise MadocError(f"no folder {target.parent} to write {target.name} into; make it first")
+    arrays = _arrays(dataset)
+    with replacing(target) as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
+
+
+def load(path: str | os.PathLike) -> Dataset:
+    """Read what `save` wrote, bit for bit.
+
+    Raises:
+        MadocError: Missing, damaged, not ours, or of another version.
+    """
+    source = Path(path).expanduser()
+    arrays = read_arrays(source)
+    require_arrays(arrays, REQUIRED, source, "it is not a file of Madoc, pass the --format it has")
+    metadata = _metadata(arrays["metadata"], source)
+    transitions = Transitions(
+        observation=as_matrix(arrays["observation"], "observation"),
+        action=as_matrix(arrays["action"], "action"),
+        reward=as_vector(arrays["reward"], "reward"),
+        next_observation=as_matrix(arrays["next_observation"], "next_observation"),
+        terminated=as_flags(arrays["terminated"], "terminated"),
+        truncated=as_flags(arrays["truncated"], "truncated"),
+    )
+    return Dataset(
+        transitions,
+        _row_numbers(arrays["episode_starts"], source),
+        task_name=metadata["task_name"],
+        physics=metadata["physics"],
+        origin=metadata["origin"],
+        true_parameters=metadata["true_parameters"],
+    )
+
+
+def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
+    """`load`, checked against a task.
+
+    Raises:
+        MadocError: As `load`, or refused by `validate`.
+    """
+    return validate(load(path), task, clip_actions=clip_actions)
+
+
+def _arrays(dataset: Dataset) -> dict[str, np.ndarray]:
+    truth = dataset.true_parameters
+    metadata = {
+        "version": VERSION,
+        "task_name": dataset.task_name,
+        "physics": dataset.physics,
+        "origin": dataset.origin,
+        "true_parameters": None if truth is None else {name: float(value) for name, value in truth.items()},
+        "parameter_units": {name: _unit(name) for name in truth or {}},
+    }
+    arrays = {name: np.asarray(getattr(dataset.transitions, name)) for name in NAMES}
+    starts = np.asarray(dataset.episode_starts)
+    return {**arrays, "episode_starts": starts, "metadata": np.array(json_text(metadata, what="metadata"))}
+
+
+def _unit(parameter_name: str) -> str:
+    """The unit of `field.element`; empty for a field unknown here. For whoever opens the file by hand."""
+    field = FIELDS.get(parameter_name.split(".")[0])
+    return "" if field is None else field.unit
+
+
+def _row_numbers(values: np.ndarray, path: Path) -> np.ndarray:
+    if values.ndim != 1 or values.dtype.kind not in "iu":
+        raise MadocError(
+            f"expected row numbers in episode_starts of {path}, got shape {values.shape} of {values.dtype}; "
+            "the file is damaged, make it again"
+        )
+    return values.astype(np.int64)
+
+
+def _metadata(text: np.ndarray, path: Path) -> dict:
+    try:
+        metadata = json.loads(str(text))
+        version = metadata["version"]
+    except (ValueError, TypeError, KeyError) as error:
+        raise MadocError(
+            f"metadata of {path} cannot be read ({error}); the file is damaged, make it again"
+        ) from error
+    if version != VERSION:
+        raise MadocError(
+            f"expected file version {VERSION}, got {version} in {path}; use the Madoc that wrote it"
+        )
+    missing = {"task_name", "physics", "origin", "true_parameters"} - set(metadata)
+    if missing:
+        raise MadocError(f"no {min(missing)!r} in the metadata of {path}; the file is damaged, make it again")
+    return metadata

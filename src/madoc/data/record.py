@@ -1,0 +1,101 @@
+"""Recording: a policy acts in a target, and what it sees becomes a dataset."""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from madoc.data.dataset import Dataset, close_episodes, starts_after
+from madoc.errors import MadocError
+from madoc.simulation.base import Simulator
+from madoc.simulation.rollout import begin, reset_states, roll
+from madoc.types import Policy, Transitions
+
+WALKERS = 100
+"""Episodes recorded at a time."""
+_BLOCK = 100
+
+
+def record(
+    policy: Policy,
+    simulator: Simulator,
+    true_parameters: dict[str, float],
+    *,
+    transitions: int,
+    key: PRNGKeyArray,
+    origin: str,
+    advance: Callable[[int], None] = lambda rows: None,
+) -> Dataset:
+    """Sample a policy in the target for that many transitions.
+
+    Episodes run from the task's reset to a fall or its time limit; what is cut by the end of the recording is
+    truncated there.
+
+    Args:
+        policy: Who acts; its actions are sampled.
+        simulator: The robot. Its model is bound to `true_parameters`.
+        true_parameters: The target's physical values by name; they travel with the data.
+        transitions: Rows wanted.
+        key: Randomness.
+        origin: What the dataset should say of itself.
+        advance: Told how many rows have come.
+
+    Raises:
+        MadocError: The target explodes, or `transitions` is not positive.
+    """
+    if transitions < 1:
+        raise MadocError(f"expected at least 1 transition to record, got {transitions}")
+    truth = simulator.parameters.vector(true_parameters)
+    system = simulator.bind(truth[None])
+    starts = reset_states(simulator)
+    rows = min(WALKERS, max(1, transitions // simulator.task.max_episode_steps))
+    length = -(-transitions // rows)
+    of_start, of_action, of_restart = jax.random.split(key, 3)
+    walkers = begin(starts, of_start, systems=1, rows=rows)
+    blocks = []
+    for block in range(0, length, _BLOCK):
+        rollout, walkers = roll(
+            system,
+            simulator.task,
+            policy,
+            walkers,
+            steps=min(_BLOCK, length - block),
+            starts=starts,
+            key=jax.random.fold_in(of_action, block),
+            restart_key=jax.random.fold_in(of_restart, block),
+        )
+        if rollout.failures:
+            raise MadocError(
+                f"the target {simulator.task.name} explodes under its true parameters ({rollout.failures} rows); "
+                "check the values"
+            )
+        blocks.append(rollout.transitions)
+        advance(rollout.valid.size)
+    seen = jax.tree.map(lambda *columns: _one_walker_after_another(columns), *blocks)
+    ends = np.asarray(seen.terminated | seen.truncated).copy()
+    ends[length - 1 :: length] = True
+    starts_at = starts_after(ends[:transitions])
+    kept = close_episodes(seen.take(slice(transitions)), starts_at)
+    return Dataset(
+        kept, starts_at, simulator.task.name, simulator.task.physics, origin, dict(true_parameters)
+    )
+
+
+def join(datasets: list[Dataset], origin: str) -> Dataset:
+    """Datasets of one target, one after another."""
+    first = datasets[0]
+    offsets = np.cumsum([0, *(len(dataset) for dataset in datasets[:-1])])
+    starts = [dataset.episode_starts + offset for dataset, offset in zip(datasets, offsets, strict=True)]
+    joined: Transitions = jax.tree.map(
+        lambda *columns: np.concatenate(columns), *(dataset.transitions for dataset in datasets)
+    )
+    return Dataset(
+        joined, np.concatenate(starts), first.task_name, first.physics, origin, first.true_parameters
+    )
+
+
+def _one_walker_after_another(columns: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Blocks of (steps, 1, rows, ...) as (rows * all steps, ...)."""
+    column = np.concatenate(columns)[:, 0]
+    return np.swapaxes(column, 0, 1).reshape(-1, *column.shape[2:])

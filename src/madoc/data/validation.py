@@ -1,0 +1,190 @@
+"""What every reader checks, so that a bad file is refused with one sentence before any budget is spent."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from madoc.data.dataset import Dataset
+from madoc.errors import MadocError
+from madoc.tasks import Task
+
+# An action of exactly ±1 may leave that range when a recorder rounds it to float32 or rescales it.
+ACTION_TOLERANCE = 1e-5
+FLOATS = ("observation", "action", "reward", "next_observation")
+NAMES = {name: name for name in (*FLOATS, "terminated", "truncated")}
+
+
+def require_file(path: Path) -> None:
+    """Refuse a path that is no readable, non-empty file.
+
+    Raises:
+        MadocError: Missing, a directory, or empty.
+    """
+    if path.is_dir():
+        raise MadocError(f"expected a file, got the directory {path}; name one of the files in it")
+    if not path.is_file():
+        raise MadocError(f"no file at {path}; check the path")
+    if path.stat().st_size == 0:
+        raise MadocError(f"{path} is empty; copy or download it again")
+
+
+def require_arrays(arrays: Iterable[str], wanted: Iterable[str], path: Path, hint: str) -> None:
+    """Refuse a file that lacks an array of its layout.
+
+    Raises:
+        MadocError: Names the first one missing and what is there.
+    """
+    present = sorted(arrays)
+    missing = [name for name in wanted if name not in present]
+    if missing:
+        there = ", ".join(present) or "none of the layout's arrays"
+        raise MadocError(f"no array {missing[0]!r} in {path}, there is: {there}; {hint}")
+
+
+def check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
+    """Refuse arrays that disagree in their number of rows.
+
+    Raises:
+        MadocError: Names two arrays and their rows.
+    """
+    (first, values), *others = arrays.items()
+    for name, other in others:
+        if len(other) != len(values):
+            raise MadocError(
+                f"expected as many rows in {name} as in {first}, got {len(other)} and {len(values)}; "
+                "the file is damaged or was written in part, make it again"
+            )
+
+
+def as_matrix(values: np.ndarray, name: str) -> Float[np.ndarray, "rows values"]:
+    """Values as float64 rows.
+
+    Raises:
+        MadocError: Not numbers, or not two axes.
+    """
+    numbers = _as_numbers(values, name)
+    if numbers.ndim != 2:
+        raise MadocError(f"expected {name} of shape (rows, values), got shape {numbers.shape}")
+    return numbers
+
+
+def as_vector(values: np.ndarray, name: str) -> Float[np.ndarray, " rows"]:
+    """Values as float64, one a row; a second axis of one value is dropped.
+
+    Raises:
+        MadocError: Not numbers, or more than one value a row.
+    """
+    numbers = _as_numbers(values, name)
+    if numbers.ndim == 2 and numbers.shape[1] == 1:
+        numbers = numbers[:, 0]
+    if numbers.ndim != 1:
+        raise MadocError(f"expected one value per row in {name}, got shape {numbers.shape}")
+    return numbers
+
+
+def as_flags(values: np.ndarray, name: str) -> Bool[np.ndarray, " rows"]:
+    """Values as bool, one a row.
+
+    Raises:
+        MadocError: A value is neither 0 nor 1.
+    """
+    numbers = as_vector(values, name)
+    odd = np.flatnonzero((numbers != 0) & (numbers != 1))
+    if len(odd):
+        raise MadocError(f"expected 0 or 1, got {numbers[odd[0]]:g} in row {odd[0]} of {name}")
+    return numbers.astype(bool)
+
+
+def validate(
+    dataset: Dataset, task: Task, names: Mapping[str, str] = NAMES, *, clip_actions: bool = False
+) -> Dataset:
+    """The dataset, if it can be one of the task. Actions within rounding of [-1, 1] are clipped.
+
+    Args:
+        dataset: What a reader made of a file, row for row.
+        task: The robot it should be of.
+        names: What the file calls each field of `Transitions`, for the sentences.
+        clip_actions: Clip all actions to [-1, 1], as the motors do with what is asked of them.
+
+    Raises:
+        MadocError: Another task, no rows, lengths that disagree, a wrong width, a value that is not finite,
+            an action outside [-1, 1], or episode starts that are not ascending rows from 0.
+    """
+    transitions = dataset.transitions
+    if dataset.task_name != task.name:
+        raise MadocError(f"expected data of {task.name}, got data of {dataset.task_name} in {dataset.origin}")
+    check_lengths({names[field]: getattr(transitions, field) for field in NAMES})
+    if not len(dataset):
+        raise MadocError(f"expected at least one transition for {task.name}, got none in {dataset.origin}")
+    columns = {field: np.asarray(getattr(transitions, field)) for field in FLOATS}
+    for field in ("observation", "next_observation"):
+        _check_observation_width(columns[field], task, names[field])
+    _check_action_width(columns["action"], task, names["action"])
+    for field, values in columns.items():
+        _check_finite(values, names[field])
+    _check_episode_starts(dataset)
+    if not clip_actions:
+        _check_actions(columns["action"], names["action"])
+    action = np.clip(columns["action"], -1.0, 1.0)
+    return replace(dataset, transitions=replace(transitions, action=action))
+
+
+def _as_numbers(values: np.ndarray, name: str) -> np.ndarray:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiub":
+        raise MadocError(f"expected numbers in {name}, got dtype {array.dtype}")
+    return array.astype(np.float64)
+
+
+def _check_observation_width(values: np.ndarray, task: Task, name: str) -> None:
+    expected, got = task.observation_size, values.shape[-1]
+    if got != expected:
+        neorl = got == expected + 1
+        hint = "a NeoRL file? pass --format neorl" if neorl else f"is this file of {task.name}?"
+        raise MadocError(
+            f"expected {expected} values per observation for {task.name}, got {got} in row 0 of {name}; "
+            f"{hint}"
+        )
+
+
+def _check_action_width(values: np.ndarray, task: Task, name: str) -> None:
+    expected, got = task.compile().nu, values.shape[-1]
+    if got != expected:
+        raise MadocError(
+            f"expected {expected} values per action for {task.name}, got {got} in row 0 of {name}; "
+            f"is this file of {task.name}?"
+        )
+
+
+def _check_finite(values: np.ndarray, name: str) -> None:
+    places = np.argwhere(~np.isfinite(values))
+    if len(places):
+        rows = np.unique(places[:, 0])
+        raise MadocError(
+            f"expected finite values, got {values[tuple(places[0])]} in row {rows[0]} of {name} "
+            f"({len(rows)} such rows); drop those rows where the file is made"
+        )
+
+
+def _check_actions(action: np.ndarray, name: str) -> None:
+    size = np.abs(action).max(axis=1)
+    rows = np.flatnonzero(size > 1.0 + ACTION_TOLERANCE)
+    if len(rows):
+        raise MadocError(
+            f"expected actions in [-1, 1], got one of size {size[rows[0]]:.6g} in row {rows[0]} of {name} "
+            f"({len(rows)} such rows); if the recording simulator clipped them at the motors, as Gymnasium's "
+            "does, pass --clip-actions (clip_actions=True), else rescale them"
+        )
+
+
+def _check_episode_starts(dataset: Dataset) -> None:
+    starts = dataset.episode_starts
+    if len(starts) and starts[0] == 0 and (np.diff(starts) > 0).all() and starts[-1] < len(dataset):
+        return
+    raise MadocError(
+        f"expected ascending episode starts from 0 to below {len(dataset)}, got {starts[:5]} in "
+        f"{dataset.origin}; make the file again"
+    )

@@ -1,0 +1,92 @@
+"""Judging: returns in a system, the normalized score, the calibration error. Only here is truth read."""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from madoc.parameters import ParameterSpace
+from madoc.simulation.base import Simulator
+from madoc.simulation.rollout import act, reset_states
+from madoc.tasks.base import Task
+from madoc.types import Policy
+
+
+@dataclass(frozen=True)
+class Returns:
+    """Undiscounted returns of episodes, and what they come to on D4RL's scale.
+
+    Attributes:
+        returns: One return an episode.
+        lengths: Control steps each lasted.
+        normalized: 100 (return - random) / (expert - random), per episode.
+    """
+
+    returns: Float[np.ndarray, " episodes"]
+    lengths: Float[np.ndarray, " episodes"]
+    normalized: Float[np.ndarray, " episodes"]
+
+    def summary(self) -> dict[str, float]:
+        """Means and the spread, for JSON."""
+        return {
+            "return": float(self.returns.mean()),
+            "return_std": float(self.returns.std()),
+            "normalized": float(self.normalized.mean()),
+            "length": float(self.lengths.mean()),
+            "episodes": len(self.returns),
+        }
+
+
+def evaluate(
+    policy: Policy,
+    simulator: Simulator,
+    parameters: Float[np.ndarray, " parameters"],
+    *,
+    key: PRNGKeyArray,
+    episodes: int = 10,
+    deterministic: bool = True,
+) -> Returns:
+    """Returns of whole episodes in one system, all episodes at a time; an episode that explodes ends there."""
+    task = simulator.task
+    of_start, of_action = jax.random.split(key)
+    system = simulator.bind(np.asarray(parameters)[None])
+    state = reset_states(simulator)(of_start, episodes)[None]
+    alive = np.ones((1, episodes), dtype=bool)
+    total, length = np.zeros((1, episodes)), np.zeros((1, episodes))
+    for step in range(task.max_episode_steps):
+        stream = None if deterministic else of_action
+        action = np.asarray(act(policy, task.observe(state), stream, np.int32(step)), dtype=np.float64)
+        next_state = system.step(state, action)
+        alive &= np.isfinite(next_state).all(-1)
+        next_state = np.where(alive[..., None], next_state, state)
+        total += np.where(alive, task.reward(state, action, next_state), 0.0)
+        length += alive
+        alive &= ~task.terminated(next_state)
+        state = next_state
+        if not alive.any():
+            break
+    return Returns(total[0], length[0], normalized_score(total[0], task))
+
+
+def normalized_score(returns: Float[np.ndarray, " episodes"], task: Task) -> Float[np.ndarray, " episodes"]:
+    """100 (return - random) / (expert - random), D4RL (Fu et al. 2020)."""
+    random, expert = task.reference_returns
+    return 100.0 * (returns - random) / (expert - random)
+
+
+def calibration_error(
+    estimate: Float[np.ndarray, " parameters"], truth: Float[np.ndarray, " parameters"], space: ParameterSpace
+) -> dict[str, object]:
+    """How far an estimate is from the truth.
+
+    Returns:
+        `mean_absolute` in raw units, as the paper's Table 10 has it (gravity dominates), `mean_percent_of_range`,
+        and `per_parameter`: the absolute error of each, in its unit.
+    """
+    absolute = np.abs(np.asarray(estimate) - np.asarray(truth))
+    return {
+        "mean_absolute": float(absolute.mean()),
+        "mean_percent_of_range": float((100.0 * absolute / (space.high - space.low)).mean()),
+        "per_parameter": dict(zip(space.names, absolute.tolist(), strict=True)),
+    }

@@ -1,0 +1,109 @@
+"""Files written whole or not at all, and strict JSON."""
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from madoc.errors import MadocError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A binary stream; what it got becomes the file `path` if the block ends well, else nothing changes.
+
+    After the block the content is on the disk, not in a cache: a power cut leaves the old or the new file.
+
+    Raises:
+        MadocError: The file cannot be written (no permission, disk full).
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        raise MadocError(
+            f"could not write {path}: {error.strerror or error}; what it held before is untouched"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what killed writers left half-written in a folder that no other process writes to."""
+    for leftover in folder.glob(".*.tmp"):
+        leftover.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `value` as readable strict JSON, whole or not at all.
+
+    Raises:
+        MadocError: `value` holds something JSON has no word for (NaN, an object), or the disk refuses.
+    """
+    content = json_text(value, what=path.name, indent=2) + "\n"
+    with replacing(path) as stream:
+        stream.write(content.encode())
+
+
+def json_text(value: Any, *, what: str, indent: int | None = None) -> str:
+    """Strict JSON on one line, or indented.
+
+    Raises:
+        MadocError: `value` holds something JSON has no word for; the sentence names the place inside `what`.
+    """
+    try:
+        return json.dumps(value, allow_nan=False, indent=indent, ensure_ascii=False)
+    except (TypeError, ValueError) as error:
+        place = _unwritable(value, what) or f"{what}: {error}"
+        raise MadocError(f"cannot write as JSON: {place}") from error
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        MadocError: The file is missing, unreadable or not JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MadocError(f"could not read {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise MadocError(f"{path} is not valid JSON ({error}); restore it or delete it") from error
+
+
+def _unwritable(value: Any, place: str) -> str | None:
+    """Where in a nested value, and what, JSON cannot express."""
+    if value is None or isinstance(value, bool | int | str):
+        return None
+    if isinstance(value, float):
+        return None if math.isfinite(value) else f"{place} is {value}, expected a finite number"
+    if isinstance(value, Mapping):
+        keys = [key for key in value if not isinstance(key, str)]
+        if keys:
+            return f"{place} has the key {keys[0]!r}, expected a string"
+        inner = (_unwritable(child, f"{place}.{key}") for key, child in value.items())
+    elif isinstance(value, list | tuple):
+        inner = (_unwritable(child, f"{place}[{index}]") for index, child in enumerate(value))
+    else:
+        return f"{place} is a {type(value).__name__}, expected a number, string, list, dict or null"
+    return next((found for found in inner if found), None)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put a renamed entry of a folder on the disk; Windows has no such call and needs none."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

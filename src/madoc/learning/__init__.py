@@ -1,0 +1,1 @@
+"""Blocks that algorithms share: networks, distributions, replay, losses."""

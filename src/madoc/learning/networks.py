@@ -1,0 +1,77 @@
+"""Networks and the scan that trains them."""
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+Carry = TypeVar("Carry")
+
+
+class Network(eqx.Module):
+    """A ReLU multilayer perceptron on a batch, with optional dropout between layers."""
+
+    layers: list[eqx.nn.Linear]
+    dropout: float = eqx.field(static=True)
+
+    def __init__(
+        self, inputs: int, outputs: int, hidden: Sequence[int], *, key: PRNGKeyArray, dropout: float = 0.0
+    ) -> None:
+        sizes = (inputs, *hidden, outputs)
+        keys = jax.random.split(key, len(sizes) - 1)
+        self.layers = [
+            eqx.nn.Linear(size, following, key=layer_key)
+            for size, following, layer_key in zip(sizes[:-1], sizes[1:], keys, strict=True)
+        ]
+        self.dropout = dropout
+
+    def __call__(
+        self, rows: Float[Array, "*rows inputs"], key: PRNGKeyArray | None = None
+    ) -> Float[Array, "*rows outputs"]:
+        """Outputs for a batch; dropout acts only where a key is given."""
+        for index, layer in enumerate(self.layers):
+            assert layer.bias is not None
+            rows = rows @ layer.weight.T + layer.bias
+            if index + 1 < len(self.layers):
+                rows = jax.nn.relu(rows)
+                if self.dropout and key is not None:
+                    keep = jax.random.bernoulli(jax.random.fold_in(key, index), 1 - self.dropout, rows.shape)
+                    rows = jnp.where(keep, rows / (1 - self.dropout), 0.0)
+        return rows
+
+
+def scan_updates(
+    update: Callable[[Carry, PRNGKeyArray], tuple[Carry, dict[str, Array]]],
+    carry: Carry,
+    key: PRNGKeyArray,
+    count: int,
+) -> tuple[Carry, dict[str, Array]]:
+    """Run `count` updates in one `lax.scan`; returns the last carry and the mean of each metric."""
+    arrays, static = eqx.partition(carry, eqx.is_array)
+
+    def body(arrays: PyTree, key: PRNGKeyArray) -> tuple[PyTree, dict[str, Array]]:
+        following, metrics = update(eqx.combine(arrays, static), key)
+        return eqx.filter(following, eqx.is_array), metrics
+
+    arrays, metrics = jax.lax.scan(body, arrays, jax.random.split(key, count))
+    return eqx.combine(arrays, static), jax.tree.map(jnp.mean, metrics)
+
+
+def descend(
+    optimiser, gradients: PyTree, optimiser_state: PyTree, parameters: Carry
+) -> tuple[Carry, PyTree]:
+    """One step of an Optax optimiser on the arrays of a module."""
+    updates, optimiser_state = optimiser.update(gradients, optimiser_state)
+    return eqx.apply_updates(parameters, updates), optimiser_state
+
+
+def moving_average(slow: Carry, fast: Carry, rate: float) -> Carry:
+    """Polyak averaging: slow + rate (fast - slow), leaf by leaf."""
+
+    def blend(old: Array, new: Array) -> Array:
+        return old + rate * (new - old) if eqx.is_inexact_array(old) else old
+
+    return jax.tree.map(blend, slow, fast)

@@ -1,0 +1,61 @@
+"""A ring of rows on the device, filled by jitted writes and sampled inside jitted updates."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Replay:
+    """The last `capacity` rows of any pytree, float32 on the device.
+
+    Attributes:
+        rows: Columns of shape (capacity, ...).
+        written: How many rows were ever written.
+    """
+
+    rows: PyTree
+    written: Int[Array, ""]
+
+    @property
+    def capacity(self) -> int:
+        """Rows it can hold."""
+        return jax.tree.leaves(self.rows)[0].shape[0]
+
+
+def empty(capacity: int, **columns: tuple[int, ...]) -> Replay:
+    """A replay of named columns, each given by the shape of one row; () is a scalar."""
+    rows = {name: jnp.zeros((capacity, *shape), jnp.float32) for name, shape in columns.items()}
+    return Replay(rows, jnp.zeros((), jnp.int32))
+
+
+@partial(jax.jit, donate_argnums=0)
+def add(replay: Replay, rows: PyTree, valid: Bool[Array, " batch"]) -> Replay:
+    """Write the valid rows of a batch over the oldest ones. The replay given is consumed."""
+    position = replay.written + jnp.cumsum(valid) - 1
+    index = jnp.where(valid, position % replay.capacity, replay.capacity)
+    written = jax.tree.map(lambda ring, new: ring.at[index].set(new, mode="drop"), replay.rows, rows)
+    return Replay(written, replay.written + valid.sum(dtype=jnp.int32))
+
+
+def clear(replay: Replay) -> Replay:
+    """The same ring with nothing in it."""
+    return Replay(replay.rows, jnp.zeros((), jnp.int32))
+
+
+def sample(replay: Replay, key: PRNGKeyArray, batch: int) -> Any:
+    """`batch` rows drawn uniformly with replacement."""
+    size = jnp.minimum(replay.written, replay.capacity)
+    index = jax.random.randint(key, (batch,), 0, size)
+    return jax.tree.map(lambda ring: ring[index], replay.rows)
+
+
+def flatten_rows(column: np.ndarray, leading: int) -> np.ndarray:
+    """Merge the first `leading` axes of a float column; for replay, in float32."""
+    return np.asarray(column.reshape(-1, *column.shape[leading:]), dtype=np.float32)

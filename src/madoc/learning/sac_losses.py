@@ -1,0 +1,77 @@
+"""The losses of soft actor-critic (Haarnoja et al. 2018, arXiv 1812.05905), one function an equation."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from madoc.learning.networks import Network
+from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
+
+
+class TwinCritic(eqx.Module):
+    """Two independent action values."""
+
+    first: Network
+    second: Network
+
+    def __init__(self, inputs: int, hidden: tuple[int, ...], *, key: PRNGKeyArray) -> None:
+        first, second = jax.random.split(key)
+        self.first = Network(inputs, 1, hidden, key=first)
+        self.second = Network(inputs, 1, hidden, key=second)
+
+    def __call__(
+        self, observation: Float[Array, "rows observation"], action: Float[Array, "rows action"]
+    ) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
+        """Both values of every row."""
+        pair = jnp.concatenate([observation, action], axis=-1)
+        return self.first(pair)[..., 0], self.second(pair)[..., 0]
+
+
+def soft_target(
+    reward: Float[Array, " rows"],
+    terminated: Float[Array, " rows"],
+    next_value: Float[Array, " rows"],
+    next_log_density: Float[Array, " rows"],
+    *,
+    temperature: Float[Array, ""],
+    discount: float,
+) -> Float[Array, " rows"]:
+    """Eq. (2) and (3): r + γ (1 - terminated) (min Q(s', a') - α log π(a'|s'))."""
+    return reward + discount * (1.0 - terminated) * (next_value - temperature * next_log_density)
+
+
+def critic_loss(
+    critic: TwinCritic, observation: Array, action: Array, target: Float[Array, " rows"]
+) -> Float[Array, ""]:
+    """Eq. (5): half the mean squared Bellman error, summed over the twins."""
+    first, second = critic(observation, action)
+    return 0.5 * (jnp.mean((first - target) ** 2) + jnp.mean((second - target) ** 2))
+
+
+def actor_loss(
+    policy: TanhGaussianPolicy,
+    critic: TwinCritic,
+    observation: Array,
+    *,
+    temperature: Float[Array, ""],
+    key: PRNGKeyArray,
+) -> tuple[Float[Array, ""], tuple[Float[Array, " rows"], Float[Array, " rows"]]]:
+    """Eq. (7): mean of α log π(a|s) - min Q(s, a). Also returns the values and log densities, per row."""
+    action, density = sample(*policy.distribution(observation), key)
+    value = jnp.minimum(*critic(observation, action))
+    return jnp.mean(temperature * density - value), (value, density)
+
+
+def temperature_loss(
+    log_temperature: Float[Array, ""], log_density: Float[Array, " rows"], target_entropy: float
+) -> Float[Array, ""]:
+    """Eq. (18), on log α: -log α (log π + target entropy), averaged."""
+    return -jnp.mean(log_temperature * jax.lax.stop_gradient(log_density + target_entropy))
+
+
+def cloning_error(
+    policy: TanhGaussianPolicy, observation: Array, action: Float[Array, "rows action"]
+) -> Float[Array, ""]:
+    """Mean squared distance of the deterministic action to the data's (TD3+BC, Fujimoto & Gu 2021, Eq. 3)."""
+    return jnp.mean((policy(observation) - action) ** 2)

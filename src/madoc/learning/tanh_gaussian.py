@@ -1,0 +1,73 @@
+"""Tanh-squashed Gaussians: sampling, densities, and the policy made of one."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from madoc.learning.networks import Network
+
+LOG_STD_RANGE = (-5.0, 2.0)
+_EDGE = 1.0 - 1e-5
+"""Actions recorded at ±1 are read as this: the density of a squashed Gaussian ends there."""
+
+
+def sample(
+    mean: Float[Array, "*rows n"], log_std: Float[Array, "*rows n"], key: PRNGKeyArray
+) -> tuple[Float[Array, "*rows n"], Float[Array, "*rows"]]:
+    """A reparameterised draw in (-1, 1) and its log density."""
+    raw = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+    return jnp.tanh(raw), _log_density(raw, mean, log_std)
+
+
+def log_density(
+    value: Float[Array, "*rows n"], mean: Float[Array, "*rows n"], log_std: Float[Array, "*rows n"]
+) -> Float[Array, "*rows"]:
+    """Log density of values in [-1, 1]."""
+    return _log_density(jnp.arctanh(jnp.clip(value, -_EDGE, _EDGE)), mean, log_std)
+
+
+def _log_density(raw: Array, mean: Array, log_std: Array) -> Array:
+    """log N(raw; mean, std) - log |d tanh(raw) / d raw|, summed over the last axis (SAC, appendix C)."""
+    standard = (raw - mean) * jnp.exp(-log_std)
+    normal = -0.5 * standard**2 - log_std - 0.5 * np.log(2 * np.pi)
+    log_slope = 2.0 * (np.log(2.0) - raw - jax.nn.softplus(-2.0 * raw))
+    return (normal - log_slope).sum(-1)
+
+
+class TanhGaussianPolicy(eqx.Module):
+    """A policy: standardised observation -> mean and log std of a squashed Gaussian."""
+
+    network: Network
+    offset: Float[Array, " observation"]
+    scale: Float[Array, " observation"]
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        hidden: tuple[int, ...],
+        *,
+        key: PRNGKeyArray,
+        offset: np.ndarray | None = None,
+        scale: np.ndarray | None = None,
+    ) -> None:
+        self.network = Network(observation_size, 2 * action_size, hidden, key=key)
+        self.offset = jnp.zeros(observation_size) if offset is None else jnp.asarray(offset, jnp.float32)
+        self.scale = jnp.ones(observation_size) if scale is None else jnp.asarray(scale, jnp.float32)
+
+    def distribution(
+        self, observation: Float[Array, "*rows observation"]
+    ) -> tuple[Float[Array, "*rows action"], Float[Array, "*rows action"]]:
+        """Mean and log std before squashing."""
+        offset, scale = jax.lax.stop_gradient((self.offset, self.scale))
+        mean, log_std = jnp.split(self.network((observation - offset) / scale), 2, axis=-1)
+        return mean, jnp.clip(log_std, *LOG_STD_RANGE)
+
+    def __call__(
+        self, observation: Float[Array, "*rows observation"], key: PRNGKeyArray | None = None
+    ) -> Float[Array, "*rows action"]:
+        """A sampled action with a key, tanh of the mean without."""
+        mean, log_std = self.distribution(jnp.asarray(observation, jnp.float32))
+        return jnp.tanh(mean) if key is None else sample(mean, log_std, key)[0]

@@ -1,0 +1,1 @@
+"""Policy learners: from a calibrated simulator to a policy. One file a learner."""

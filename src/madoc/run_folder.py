@@ -1,0 +1,246 @@
+"""The folder of one run: what was asked, what was measured, where to go on. It has one writer."""
+
+import os
+import platform
+import warnings
+from contextlib import ExitStack
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import filelock
+import numpy as np
+
+from madoc.errors import MadocError
+from madoc.files import json_text, read_json, remove_leftovers, write_json
+from madoc.types import Metrics
+
+_FREE = ("budget", "versions")
+"""Keys of a spec that may differ when a run is resumed."""
+
+
+class RunFolder:
+    """A locked run folder; a context manager that unlocks it.
+
+    Files: `spec.json` (what was asked, with versions), `metrics.jsonl` (one line an epoch), `tensorboard/`,
+    `checkpoint.npz` (all that is needed to go on), `result.json` (when the run has ended), `diverged.npz`
+    (the bad state, if there was one). All are written whole or not at all, but for the logs, which grow.
+    """
+
+    def __init__(self, path: Path, spec: dict[str, Any], lock: filelock.BaseFileLock) -> None:
+        """Use `create` or `open`."""
+        self.path = path
+        self.spec = spec
+        self._lock = lock
+
+    @classmethod
+    def create(cls, path: str | Path, spec: dict[str, Any]) -> "RunFolder":
+        """Make the folder of a new run.
+
+        Args:
+            path: The folder; made if missing.
+            spec: What was asked, as JSON: method, hyperparameters, data, seed, budget. Versions are added.
+
+        Raises:
+            MadocError: The folder already holds a run, is locked, or cannot be written.
+        """
+        path = Path(path)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise MadocError(f"could not make the folder {path}: {error.strerror or error}") from error
+        with ExitStack() as on_refusal:
+            lock = _lock(path)
+            on_refusal.callback(lock.release)
+            if (path / "spec.json").exists():
+                raise MadocError(
+                    f"{path} already holds a run; pass --resume to go on or choose another --out"
+                )
+            folder = cls(path, spec | {"versions": versions()}, lock)
+            folder.write_json("spec.json", folder.spec)
+            on_refusal.pop_all()
+        return folder
+
+    @classmethod
+    def open(cls, path: str | Path, spec: dict[str, Any] | None = None) -> "RunFolder":
+        """Lock the folder of an earlier run, to go on with it or to add to it.
+
+        Args:
+            path: The folder.
+            spec: What is asked now; must equal what was asked then, but for `budget`. None to not compare.
+
+        Raises:
+            MadocError: The folder is missing, holds no run, is locked, or holds a run with another spec.
+        """
+        path = Path(path)
+        if not (path / "spec.json").exists():
+            what = "holds no run" if path.is_dir() else "does not exist"
+            raise MadocError(
+                f"cannot resume: the folder {path} {what}; check the path, or leave out --resume"
+            )
+        with ExitStack() as on_refusal:
+            lock = _lock(path)
+            on_refusal.callback(lock.release)
+            folder = cls(path, read_json(path / "spec.json"), lock)
+            if spec is not None:
+                folder._agree_on(spec)
+            on_refusal.pop_all()
+        return folder
+
+    def __enter__(self) -> "RunFolder":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Unlock the folder."""
+        self._lock.release()
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where the last good state is."""
+        return self.path / "checkpoint.npz"
+
+    @property
+    def diverged(self) -> Path:
+        """Where the state goes that made a run stop on a NaN."""
+        return self.path / "diverged.npz"
+
+    @property
+    def result(self) -> Path:
+        """How the run ended; missing while it has not."""
+        return self.path / "result.json"
+
+    def write_json(self, name: str, value: Any) -> None:
+        """Write a JSON file of this folder, whole or not at all."""
+        write_json(self.path / name, value)
+
+    def log(self, offset: int, control_steps: int) -> "RunLog":
+        """The logs, cut back to a checkpoint's `offset` (bytes) and `control_steps`; 0, 0 for a new run."""
+        return RunLog(self.path, offset, control_steps)
+
+    def _agree_on(self, spec: dict[str, Any]) -> None:
+        """Refuse another spec; note other versions; take the new budget."""
+        then = _flat({key: value for key, value in self.spec.items() if key not in _FREE})
+        now = _flat({key: value for key, value in spec.items() if key not in _FREE})
+        for key in [*then, *now]:
+            if key not in then or key not in now or then[key] != now[key]:
+                raise MadocError(
+                    f"cannot resume {self.path}: {key} was {then.get(key, 'not given')}, is now"
+                    f" {now.get(key, 'not given')}; resume with the same settings or choose another --out"
+                )
+        changed = [
+            f"{name} {self.spec.get('versions', {}).get(name)} (now {version})"
+            for name, version in versions().items()
+            if self.spec.get("versions", {}).get(name) != version
+        ]
+        if changed:
+            warnings.warn(
+                f"{self.path} was started with {', '.join(changed)}; the result may differ in its last bits",
+                stacklevel=3,
+            )
+        if "budget" in spec and spec["budget"] != self.spec.get("budget"):
+            self.spec = self.spec | {"budget": spec["budget"]}
+            self.write_json("spec.json", self.spec)
+
+
+class RunLog:
+    """The growing logs of a run, `metrics.jsonl` and TensorBoard events; closed at the end of its block."""
+
+    def __init__(self, path: Path, offset: int, control_steps: int) -> None:
+        """Use `RunFolder.log`."""
+        from tensorboardX import SummaryWriter  # slow to import, and only runs with a folder need it
+
+        self._lines = _cut(path / "metrics.jsonl", offset).open("ab")
+        events = path / "tensorboard"
+        events.mkdir(exist_ok=True)
+        self._events = SummaryWriter(
+            str(events),
+            purge_step=control_steps + 1,
+            # Two writers in one second would share, and so overwrite, a file.
+            filename_suffix=f".{len(list(events.iterdir()))}",
+        )
+
+    def __enter__(self) -> "RunLog":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._lines.close()
+        self._events.close()
+
+    def append(self, metrics: Metrics, *, stage: str, control_steps: int, seconds: float) -> None:
+        """Add one epoch. A NaN or infinite metric is logged as null."""
+        finite = {name: value if np.isfinite(value) else None for name, value in metrics.items()}
+        line = {
+            "control_steps": control_steps,
+            "seconds": round(seconds, 3),
+            "stage": stage,
+            "metrics": finite,
+        }
+        self._lines.write(json_text(line, what="metrics.jsonl").encode() + b"\n")
+        self._lines.flush()
+        for name, value in finite.items():
+            if value is not None:
+                self._events.add_scalar(f"{stage}/{name}", value, control_steps)
+
+    def sync(self) -> int:
+        """Put all lines on the disk; the length of `metrics.jsonl` in bytes, for the checkpoint."""
+        self._lines.flush()
+        os.fsync(self._lines.fileno())
+        self._events.flush()
+        return self._lines.tell()
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides a run's bits, by name."""
+    found = {"python": platform.python_version()}
+    for name, package in {"madoc": "madoc-calibration", "jax": "jax", "mujoco": "mujoco"}.items():
+        try:
+            found[name] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def _lock(path: Path) -> filelock.BaseFileLock:
+    """Lock a folder and clear it of what a killed writer left."""
+    lock = filelock.FileLock(path / ".lock", timeout=0, thread_local=False)
+    try:
+        lock.acquire()
+    except filelock.Timeout as error:
+        raise MadocError(
+            f"{path} is in use by another process; wait until it ends, or choose another --out"
+        ) from error
+    except OSError as error:
+        raise MadocError(f"could not lock {path}: {error.strerror or error}") from error
+    remove_leftovers(path)
+    return lock
+
+
+def _cut(path: Path, offset: int) -> Path:
+    """Drop the lines after a checkpoint: the resumed run writes them again."""
+    size = path.stat().st_size if path.exists() else 0
+    if size < offset:
+        raise MadocError(
+            f"{path} has {size} bytes, its checkpoint says {offset}; restore it or start a new run"
+        )
+    if size > offset:
+        os.truncate(path, offset)
+    return path
+
+
+def _flat(spec: Any, prefix: str = "") -> dict[str, str]:
+    """Nested dictionaries as one, with dotted keys and JSON values."""
+    if isinstance(spec, dict) and spec:
+        return {
+            key: value
+            for name, child in spec.items()
+            for key, value in _flat(child, f"{prefix}.{name}" if prefix else name).items()
+        }
+    return {prefix: json_text(spec, what=prefix)}

@@ -1,0 +1,161 @@
+"""Closed-loop rollouts: a policy acts in systems, rows that end start again, failed rows are dropped and counted."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from madoc.simulation.base import Simulator, System
+from madoc.tasks.base import Task
+from madoc.types import Policy, Transitions
+
+Starts = Callable[[PRNGKeyArray, int], Float[np.ndarray, "count state"]]
+"""Draws that many states to start rows at."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Walkers:
+    """Rows under way: their states, and how many control steps each has lived since its start."""
+
+    state: Float[np.ndarray, "systems rows state"]
+    age: Int[np.ndarray, "systems rows"]
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What a rollout saw, time first. Rows whose simulation failed are not `valid`."""
+
+    transitions: Transitions
+    valid: Bool[np.ndarray, "steps systems rows"]
+
+    @property
+    def failures(self) -> int:
+        """Rows that exploded."""
+        return int((~self.valid).sum())
+
+
+def reset_states(simulator: Simulator) -> Starts:
+    """Starts as the task's own reset draws them."""
+
+    def draw(key: PRNGKeyArray, count: int) -> np.ndarray:
+        noise = _reset_noise(simulator.task.reset_noise, key, count)
+        return simulator.initial_state + np.asarray(noise, dtype=np.float64)
+
+    return draw
+
+
+def chosen_states(states: Float[np.ndarray, "logged state"]) -> Starts:
+    """Starts drawn uniformly from given states."""
+
+    def draw(key: PRNGKeyArray, count: int) -> np.ndarray:
+        return states[np.asarray(jax.random.randint(key, (count,), 0, len(states)))]
+
+    return draw
+
+
+def begin(starts: Starts, key: PRNGKeyArray, *, systems: int, rows: int) -> Walkers:
+    """Rows at fresh starts."""
+    state = starts(key, systems * rows).reshape(systems, rows, -1)
+    return Walkers(state, np.zeros((systems, rows), dtype=np.int64))
+
+
+def roll(
+    system: System,
+    task: Task,
+    policy: Policy,
+    walkers: Walkers,
+    *,
+    steps: int,
+    starts: Starts,
+    key: PRNGKeyArray | None,
+    restart_key: PRNGKeyArray,
+) -> tuple[Rollout, Walkers]:
+    """Act for `steps` control steps in every row.
+
+    A row that terminates, fails, or reaches the task's time limit starts again at a state from `starts`.
+
+    Args:
+        system: Where to act.
+        task: The robot's functions of state.
+        policy: Who acts; sampled with `key`, deterministic where `key` is None.
+        walkers: Where the rows stand.
+        steps: Control steps per row.
+        starts: Where ended rows start again.
+        key: Randomness of the actions.
+        restart_key: Randomness of the restarts.
+
+    Returns:
+        Transitions with axes (steps, systems, rows), and where the rows stand now.
+    """
+    state, age = walkers.state, walkers.age
+    frames = []
+    for step in range(steps):
+        observation = task.observe(state)
+        action = np.asarray(act(policy, observation, key, np.int32(step)), dtype=np.float64)
+        next_state = system.step(state, action)
+        valid = np.isfinite(next_state).all(-1)
+        safe = np.where(valid[..., None], next_state, state)
+        terminated = task.terminated(safe) & valid
+        truncated = (age + 1 >= task.max_episode_steps) & ~terminated & valid
+        frame = (
+            observation,
+            action,
+            task.reward(state, action, safe),
+            task.observe(safe),
+            terminated,
+            truncated,
+        )
+        frames.append((*frame, valid))
+        state, age = safe, age + 1
+        ended = terminated | truncated | ~valid
+        if ended.any():
+            fresh = starts(jax.random.fold_in(restart_key, step), ended.size)
+            state = np.where(ended[..., None], fresh.reshape(state.shape), state)
+            age = np.where(ended, 0, age)
+    *columns, valid = (np.stack(column) for column in zip(*frames, strict=True))
+    return Rollout(Transitions(*columns), valid), Walkers(state, age)
+
+
+@eqx.filter_jit
+def act(
+    policy: Policy, observation: Float[Array, "*rows observation"], key: PRNGKeyArray | None, step: Array
+) -> Array:
+    """Actions of a policy, jitted; step `step` of the stream `key`, deterministic without a key."""
+    return policy(observation, None if key is None else jax.random.fold_in(key, step))
+
+
+@partial(jax.jit, static_argnums=(0, 2))
+def _reset_noise(noise: Callable, key: PRNGKeyArray, count: int) -> Array:
+    return noise(key, count)
+
+
+def replay_actions(
+    system: System,
+    task: Task,
+    states: Float[np.ndarray, "logged state"],
+    actions: Float[np.ndarray, "logged action"],
+    *,
+    rows: int,
+    key: PRNGKeyArray,
+) -> Rollout:
+    """One control step from logged states under the actions logged there, `rows` of them drawn for each system."""
+    chosen = np.asarray(jax.random.randint(key, (system.count, rows), 0, len(states)))
+    state, action = states[chosen], actions[chosen]
+    next_state = system.step(state, action)
+    valid = np.isfinite(next_state).all(-1)
+    safe = np.where(valid[..., None], next_state, state)
+    terminated = task.terminated(safe) & valid
+    seen = Transitions(
+        task.observe(state),
+        action,
+        task.reward(state, action, safe),
+        task.observe(safe),
+        terminated,
+        np.zeros_like(terminated),
+    )
+    return Rollout(jax.tree.map(lambda column: column[None], seen), valid[None])
