@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -12,6 +13,7 @@ from madoc.data import Dataset, logged_states
 from madoc.errors import MadocError
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.simulation.base import Simulator
+from madoc.simulation.rollout import reset_states
 from madoc.types import Metrics
 
 State = Any
@@ -47,6 +49,15 @@ class CalibrationProblem:
         """The actions taken at `logged_states`."""
         rows = logged_states(self.dataset, self.simulator.task)[1]
         return np.asarray(self.dataset.transitions.action)[rows]
+
+    @cached_property
+    def probe(self) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
+        """States and actions at which every parameter must matter: logged ones where states can be rebuilt."""
+        task = self.simulator.task
+        if task.state_from_observation is not None:
+            return self.logged_states, self.logged_actions
+        states = reset_states(self.simulator)(jax.random.key(0), 64)
+        return states, np.asarray(self.dataset.transitions.action)[np.arange(64) % len(self.dataset)]
 
     @cached_property
     def pairs(self) -> tuple[Float[Array, "rows observation"], Float[Array, "rows action"]]:
@@ -94,6 +105,16 @@ class Estimate:
 
 class Calibrator(Protocol):
     """A method. It holds hyperparameters only; what it carries is in its state."""
+
+    @property
+    def name(self) -> str:
+        """As `madoc methods` lists it."""
+        ...
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Metrics worth a place beside the progress bar."""
+        ...
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> State:
         """A cheap start: networks, buffers, the random key."""

@@ -1,1 +1,45 @@
-"""Policy learners: from a calibrated simulator to a policy. One file a learner."""
+"""Policy learners: from a calibrated simulator to a policy. One file a learner; `LEARNERS` finds them by name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from madoc.policies.base import PolicyLearner, PolicyProblem
+from madoc.policies.files import load_policy, save_policy
+from madoc.policies.learn import LearnedPolicy, learn_policy
+from madoc.policies.sac import SAC
+
+
+@dataclass(frozen=True)
+class LearnerEntry:
+    """A line of `madoc methods`. `make` takes the learner's hyperparameters as keywords."""
+
+    make: Callable[..., PolicyLearner]
+    summary: str
+    paper: str
+    year: int
+
+
+LEARNERS: dict[str, LearnerEntry] = {
+    "sac": LearnerEntry(
+        SAC, "soft actor-critic in the calibrated simulator", "Haarnoja et al., Soft Actor-Critic", 2018
+    ),
+    "sac-bc": LearnerEntry(
+        partial(SAC, cloning=2.5),
+        "the same with a cloning term to the data's actions",
+        "Jiang et al., Multi-Agent Domain Calibration with a Handful of Offline Data",
+        2024,
+    ),
+}
+
+__all__ = [
+    "LEARNERS",
+    "SAC",
+    "LearnedPolicy",
+    "LearnerEntry",
+    "PolicyLearner",
+    "PolicyProblem",
+    "learn_policy",
+    "load_policy",
+    "save_policy",
+]

@@ -80,6 +80,16 @@ class SAC:
     replay_capacity: int = 1_000_000
     cloning: float | None = None
 
+    @property
+    def name(self) -> str:
+        """`sac`, or `sac-bc` where it clones."""
+        return "sac" if self.cloning is None else "sac-bc"
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Metrics beside the progress bar."""
+        return ("return_in_simulator", "temperature")
+
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> SACState:
         """Fresh networks, an empty replay, rows at reset states.
 

@@ -61,6 +61,7 @@ class Agents:
     critic_optimiser: PyTree
     actor_optimiser: PyTree
     updates: Int[Array, ""]
+    log_noise: Float[Array, ""]
 
 
 @jax.tree_util.register_dataclass
@@ -143,7 +144,12 @@ class Madoc:
     prior_rate: float = 1e-3
     prior_every: int = 10
     average_rate: float = 1e-3
-    replay_capacity: int = 1_000_000
+    replay_capacity: int = 50_000
+    noise_rate: float = 3e-3
+    reward_size: float = 1.0
+    actor_batch: int = 64
+    actor_learning_rate: float = 3e-3
+    critic_learning_rate: float = 1e-3
 
     @classmethod
     def paper(cls, **changes) -> "Madoc":
@@ -285,9 +291,10 @@ class Madoc:
             prior=initial_actors(count),
             average=initial_actors(count),
             discriminator_optimiser=self._discriminator_optimiser.init(eqx.filter(discriminators, eqx.is_array)),
-            critic_optimiser=self._optimiser.init(eqx.filter(critics, eqx.is_array)),
-            actor_optimiser=self._optimiser.init(initial_actors(count)),
+            critic_optimiser=optax.adam(self.critic_learning_rate).init(eqx.filter(critics, eqx.is_array)),
+            actor_optimiser=optax.adam(self.actor_learning_rate).init(initial_actors(count)),
             updates=jnp.zeros((), jnp.int32),
+            log_noise=jnp.zeros(()),
         )
 
     def _empty_replay(self, problem: CalibrationProblem) -> replay.Replay:
@@ -435,12 +442,19 @@ class Madoc:
         count: int,
     ) -> tuple[Agents, dict[str, Array]]:
         def update(agents: Agents, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
-            of_logged, of_simulated, of_dropout, of_actors = jax.random.split(key, 4)
+            of_logged, of_simulated, of_dropout, of_actors, of_noise = jax.random.split(key, 5)
             rows = jax.random.randint(of_logged, (self.batch,), 0, len(logged[0]))
             real = (logged[0][rows], logged[1][rows])
             drawn = replay.sample(simulated, of_simulated, self.batch)
+            n1, n2 = jax.random.normal(of_noise, (2, *real[1].shape)) * jnp.exp(agents.log_noise)
+            real = (real[0], real[1] + n1)
+            drawn = drawn | {"following": drawn["following"] + n2}
             agents, metrics = self._update_discriminators(agents, real, drawn, of_dropout)
             reward = log_dynamics_ratio(agents.discriminators, drawn["pair"], drawn["following"])
+            size = jnp.abs(reward).mean()
+            if self.noise_rate:
+                agents = replace(agents, log_noise=jnp.maximum(agents.log_noise + self.noise_rate * jnp.clip(size - self.reward_size,-1,1), -9.0))
+            metrics = metrics | {"noise": jnp.exp(agents.log_noise), "size": size}
             agents, value_metrics = self._update_critics(agents, drawn["parameters"], reward, members)
             agents, actor_metrics = self._update_actors(agents, members, of_actors)
             return agents, metrics | value_metrics | actor_metrics
@@ -466,7 +480,7 @@ class Madoc:
             return value_loss(values, critics.weight, critics.bias, reward, self.mixing)
 
         loss, gradients = eqx.filter_value_and_grad(loss_of)(agents.critics)
-        critics, optimiser = descend(self._optimiser, gradients, agents.critic_optimiser, agents.critics)
+        critics, optimiser = descend(optax.adam(self.critic_learning_rate), gradients, agents.critic_optimiser, agents.critics)
         at_bound = (jnp.abs(reward) > 0.95 * 2 * self.bound).mean()
         metrics = {"value_loss": loss, "reward": reward.mean(), "reward_at_bound": at_bound}
         return replace(agents, critics=critics, critic_optimiser=optimiser), metrics
@@ -477,7 +491,7 @@ class Madoc:
         weight = prior_weight(agents.updates, time_constant=self.prior_time, largest=self.prior_largest)
 
         def loss_of(actors: Actors) -> Array:
-            draws, density = draw_parameters(actors, key, self.batch)
+            draws, density = draw_parameters(actors, key, self.actor_batch)
             return actor_loss(
                 agents.critics.values(draws, members).sum(-1),
                 density,
@@ -487,7 +501,7 @@ class Madoc:
             )
 
         loss, gradients = jax.value_and_grad(loss_of)(agents.actors)
-        actors, optimiser = descend(self._optimiser, gradients, agents.actor_optimiser, agents.actors)
+        actors, optimiser = descend(optax.adam(self.actor_learning_rate), gradients, agents.actor_optimiser, agents.actors)
         due = (agents.updates + 1) % self.prior_every == 0
         prior = moving_average(agents.prior, actors, jnp.where(due, self.prior_rate, 0.0))
         following = replace(

@@ -1,0 +1,87 @@
+"""Run a calibrator on a problem: refuse what cannot work, spend the budget, say what came out."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+from jaxtyping import PRNGKeyArray
+
+from madoc import loop
+from madoc.calibration.base import CalibrationProblem, Calibrator
+from madoc.calibration.result import CalibrationResult, ParameterEstimate
+from madoc.evaluation import calibration_error
+from madoc.run_folder import RunFolder
+from madoc.simulation.sensitivity import refuse_insensitive
+
+
+def calibrate(
+    method: Calibrator,
+    problem: CalibrationProblem,
+    *,
+    key: PRNGKeyArray,
+    budget: int,
+    truth: Mapping[str, float] | None = None,
+    folder: RunFolder | None = None,
+    resume: bool = False,
+    quiet: bool = True,
+    checkpoint_every: float = 30.0,
+) -> CalibrationResult:
+    """Calibrate, and judge the estimate against the truth where that is given.
+
+    Args:
+        method: What to run.
+        problem: Data and simulator.
+        key: The only source of randomness.
+        budget: Simulated control steps, of any kind.
+        truth: The target's physical values by name; only the finished estimate is compared with them.
+        folder: Where to keep logs, checkpoints and `result.json`.
+        resume: Go on from the folder's checkpoint.
+        quiet: Show no progress.
+        checkpoint_every: Seconds between checkpoints.
+
+    Raises:
+        MadocError: The method refuses the problem, a parameter changes no next state, or `loop.run` refuses.
+    """
+    space = problem.simulator.parameters
+    known = None if truth is None else space.vector(dict(truth))
+    refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0))
+    finished = loop.run(
+        method,
+        problem,
+        key=key,
+        budget=budget,
+        folder=folder,
+        resume=resume,
+        quiet=quiet,
+        description=f"{method.name} on {problem.simulator.task.name}",
+        shown=method.shown,
+        checkpoint_every=checkpoint_every,
+    )
+    estimate = method.estimate(problem, finished.state)
+    result = CalibrationResult(
+        method=method.name,
+        task=problem.simulator.task.name,
+        status=finished.status,
+        sentence=finished.sentence,
+        control_steps=finished.control_steps,
+        seconds=round(finished.seconds, 3),
+        seed=seed_of(key),
+        groups=[[space.names[index] for index in group] for group in estimate.groups],
+        parameters={
+            parameter.name: ParameterEstimate(
+                float(mean), float(std), parameter.low, parameter.high, parameter.unit
+            )
+            for parameter, mean, std in zip(space.parameters, estimate.mean, estimate.std, strict=True)
+        },
+        warnings=list(estimate.warnings),
+        error=None if known is None else calibration_error(estimate.mean, known, space),
+    )
+    if folder is not None:
+        folder.write_json("result.json", result.to_json())
+    return result
+
+
+def seed_of(key: PRNGKeyArray) -> int:
+    """The seed that `jax.random.key` was given (its low word)."""
+    data: Any = jax.random.key_data(key)
+    return int(data[-1])

@@ -1,0 +1,125 @@
+"""What a calibration returns: an estimate with its doubts, as a table, as JSON."""
+
+import io
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from madoc.errors import MadocError
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """One parameter: `estimate` ± `std` within [`low`, `high`], in `unit`."""
+
+    estimate: float
+    std: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """A finished calibration; `result.json` holds exactly its fields. Printing it shows a table.
+
+    Attributes:
+        method: Name of the method, as `madoc methods` lists it.
+        task: Name of the task.
+        status: `finished` (budget spent), `converged`, `interrupted` or `diverged`.
+        sentence: The status in words.
+        control_steps: Simulated control steps spent, of any kind.
+        seconds: Wall-clock time.
+        seed: Of the random key.
+        groups: Names of parameters calibrated together.
+        parameters: By name.
+        warnings: What to know before trusting it, one sentence each.
+        error: Only where the truth was given: `mean_absolute`, `mean_percent_of_range`, `per_parameter`.
+    """
+
+    method: str
+    task: str
+    status: str
+    sentence: str
+    control_steps: int
+    seconds: float
+    seed: int
+    groups: list[list[str]]
+    parameters: dict[str, ParameterEstimate]
+    warnings: list[str] = field(default_factory=list)
+    error: dict[str, Any] | None = None
+
+    @property
+    def mean(self) -> np.ndarray:
+        """The estimate as a vector (d,), physical units, in the task's order."""
+        return np.array([parameter.estimate for parameter in self.parameters.values()])
+
+    @property
+    def std(self) -> np.ndarray:
+        """Its spread (d,)."""
+        return np.array([parameter.std for parameter in self.parameters.values()])
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON; `error` is left out where no truth was given."""
+        fields = asdict(self)
+        if self.error is None:
+            del fields["error"]
+        return fields
+
+    @classmethod
+    def from_json(cls, fields: dict[str, Any]) -> "CalibrationResult":
+        """What `to_json` wrote.
+
+        Raises:
+            MadocError: A field is missing or unknown.
+        """
+        try:
+            parameters = {name: ParameterEstimate(**row) for name, row in fields["parameters"].items()}
+            return cls(**{**fields, "parameters": parameters})
+        except (KeyError, TypeError, AttributeError) as error:
+            raise MadocError(f"this is not the result of a calibration: {error}") from error
+
+    def table(self) -> Table:
+        """The parameters as a rich table: name, unit, estimate ± std, range, group, and the error if known."""
+        table = Table(title=f"{self.method} on {self.task}", title_justify="left")
+        group_of = {name: index for index, names in enumerate(self.groups, 1) for name in names}
+        for heading in ("parameter", "unit"):
+            table.add_column(heading)
+        for heading in ("estimate", "± std", "range", "group"):
+            table.add_column(heading, justify="right")
+        errors = self.error["per_parameter"] if self.error else {}
+        if errors:
+            table.add_column("|error|", justify="right")
+        for name, row in self.parameters.items():
+            cells = [
+                name,
+                row.unit,
+                f"{row.estimate:.4g}",
+                f"{row.std:.2g}",
+                f"[{row.low:g}, {row.high:g}]",
+                str(group_of.get(name, "")),
+            ]
+            table.add_row(*cells, *([f"{errors[name]:.2g}"] if errors else []))
+        return table
+
+    def summary(self) -> str:
+        """Status, cost, error and warnings, a line each."""
+        lines = [
+            f"{self.status}: {self.sentence}",
+            f"{self.control_steps:,} control steps, {self.seconds:.0f} s, seed {self.seed}",
+        ]
+        if self.error:
+            lines.append(
+                f"mean absolute error {self.error['mean_absolute']:.4g}, "
+                f"{self.error['mean_percent_of_range']:.2f} % of range"
+            )
+        return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
+
+    def __str__(self) -> str:
+        stream = io.StringIO()
+        console = Console(file=stream, width=100)
+        console.print(self.table())
+        return stream.getvalue() + self.summary()
