@@ -49,9 +49,7 @@ def main() -> None:
             kept += 1
             policy = learner.policy(state)
             returns = evaluate(policy, simulator, truth, key=jax.random.key(kept), episodes=10)
-            sampled = evaluate(
-                policy, simulator, truth, key=jax.random.key(kept), episodes=10, deterministic=False
-            )
+            sampled = evaluate(policy, simulator, truth, key=jax.random.key(kept), episodes=10, deterministic=False)
             leaves = jax.tree.leaves(eqx.filter(policy, eqx.is_array))
             np.savez(folder / f"{kept:04d}.npz", *[np.asarray(leaf) for leaf in leaves])
             row = {

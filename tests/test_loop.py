@@ -153,9 +153,7 @@ def test_a_nan_stops_the_run_and_leaves_good_and_bad_state(tmp_path, place):
     assert dump.epoch == 21
     assert json.loads((tmp_path / "run/result.json").read_text())["status"] == "diverged"
     if place == "metric":
-        assert finished.sentence.startswith(
-            "stopped at 180 control steps: metric mean became nan while learning"
-        )
+        assert finished.sentence.startswith("stopped at 180 control steps: metric mean became nan while learning")
         assert bits(last) == good
         assert lines(tmp_path / "run")[-1]["metrics"] == {"mean": None, "epoch": 21.0}
     else:
@@ -233,9 +231,7 @@ def test_the_first_interrupt_ends_the_step_and_the_second_breaks_it_off(tmp_path
 
 def test_runs_outside_the_main_thread():
     results = []
-    thread = threading.Thread(
-        target=lambda: results.append(run(Wander(), None, key=KEY, budget=20, quiet=True))
-    )
+    thread = threading.Thread(target=lambda: results.append(run(Wander(), None, key=KEY, budget=20, quiet=True)))
     thread.start()
     thread.join()
     assert results[0].status == "finished"

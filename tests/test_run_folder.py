@@ -29,9 +29,7 @@ def test_a_spec_is_kept_with_versions(tmp_path):
 def test_a_folder_with_a_run_is_refused_without_resume(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     RunFolder.create(tmp_path, SPEC).close()
-    with pytest.raises(
-        MadocError, match="already holds a run; pass --resume to go on or choose another --out"
-    ):
+    with pytest.raises(MadocError, match="already holds a run; pass --resume to go on or choose another --out"):
         RunFolder.create(tmp_path, SPEC)
     RunFolder.open(tmp_path).close()  # the refusal left no lock
 

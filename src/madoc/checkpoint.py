@@ -130,18 +130,12 @@ def load(path: Path, like: State) -> tuple[State, dict[str, Any]]:
         with zipfile.ZipFile(path) as archive:
             about = json.loads(archive.read("checkpoint.json"))
             if about["format"] != FORMAT:
-                raise MadocError(
-                    f"{path} has format {about['format']}, expected {FORMAT}; written by another madoc"
-                )
-            saved = {
-                name: Leaf(**leaf | {"shape": tuple(leaf["shape"])}) for name, leaf in about["leaves"].items()
-            }
+                raise MadocError(f"{path} has format {about['format']}, expected {FORMAT}; written by another madoc")
+            saved = {name: Leaf(**leaf | {"shape": tuple(leaf["shape"])}) for name, leaf in about["leaves"].items()}
             wanted = {name: leaf for name, leaf in layout(like).items() if leaf.kind != "static"}
             problem = difference(saved, wanted)
             if problem:
-                raise MadocError(
-                    f"{path} does not fit this method: {problem}; different settings or another version?"
-                )
+                raise MadocError(f"{path} does not fit this method: {problem}; different settings or another version?")
             leaves = [
                 _restore(archive, name, saved[name], about["values"]) if name in saved else leaf
                 for name, leaf in _leaves(like)

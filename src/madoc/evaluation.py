@@ -1,5 +1,6 @@
 """Judging: returns in a system, the normalized score, the calibration error. Only here is truth read."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -46,8 +47,12 @@ def evaluate(
     key: PRNGKeyArray,
     episodes: int = 10,
     deterministic: bool = True,
+    advance: Callable[[int], None] = lambda steps: None,
 ) -> Returns:
-    """Returns of whole episodes in one system, all episodes at a time; an episode that explodes ends there."""
+    """Returns of whole episodes in one system, all episodes at a time; an episode that explodes ends there.
+
+    `advance` is told how many of the task's `max_episode_steps` have passed.
+    """
     task = simulator.task
     of_start, of_action = jax.random.split(key)
     system = simulator.bind(np.asarray(parameters)[None])
@@ -65,7 +70,9 @@ def evaluate(
         alive &= ~task.terminated(next_state)
         state = next_state
         if not alive.any():
+            advance(task.max_episode_steps - step)
             break
+        advance(1)
     return Returns(total[0], length[0], normalized_score(total[0], task))
 
 

@@ -213,9 +213,7 @@ class _Session(Generic[State]):
             elif self._folder and self._log:
                 problem = checkpoint.difference(checkpoint.layout(self.state), self._layout)
                 if problem:
-                    raise MadocError(
-                        f"{type(self._method).__name__} changed the layout of its state: {problem}"
-                    )
+                    raise MadocError(f"{type(self._method).__name__} changed the layout of its state: {problem}")
                 extra = self._extra() | {"metrics_bytes": self._log.sync()}
                 checkpoint.save(self._folder.checkpoint, self.state, extra)
 

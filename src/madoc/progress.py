@@ -67,7 +67,7 @@ def bar(description: str, *, total: int, unit: str, quiet: bool = False) -> Iter
         def advance(count: int = 1) -> None:
             nonlocal done
             done += count
-            show(Moment(done / total if total else 1.0, done))
+            show(Moment(min(done / total, 1.0) if total else 1.0, done))
 
         yield advance
 

@@ -54,9 +54,7 @@ class RunFolder:
             lock = _lock(path)
             on_refusal.callback(lock.release)
             if (path / "spec.json").exists():
-                raise MadocError(
-                    f"{path} already holds a run; pass --resume to go on or choose another --out"
-                )
+                raise MadocError(f"{path} already holds a run; pass --resume to go on or choose another --out")
             folder = cls(path, spec | {"versions": versions()}, lock)
             folder.write_json("spec.json", folder.spec)
             on_refusal.pop_all()
@@ -76,9 +74,7 @@ class RunFolder:
         path = Path(path)
         if not (path / "spec.json").exists():
             what = "holds no run" if path.is_dir() else "does not exist"
-            raise MadocError(
-                f"cannot resume: the folder {path} {what}; check the path, or leave out --resume"
-            )
+            raise MadocError(f"cannot resume: the folder {path} {what}; check the path, or leave out --resume")
         with ExitStack() as on_refusal:
             lock = _lock(path)
             on_refusal.callback(lock.release)
@@ -214,9 +210,7 @@ def _lock(path: Path) -> filelock.BaseFileLock:
     try:
         lock.acquire()
     except filelock.Timeout as error:
-        raise MadocError(
-            f"{path} is in use by another process; wait until it ends, or choose another --out"
-        ) from error
+        raise MadocError(f"{path} is in use by another process; wait until it ends, or choose another --out") from error
     except OSError as error:
         raise MadocError(f"could not lock {path}: {error.strerror or error}") from error
     remove_leftovers(path)
@@ -227,9 +221,7 @@ def _cut(path: Path, offset: int) -> Path:
     """Drop the lines after a checkpoint: the resumed run writes them again."""
     size = path.stat().st_size if path.exists() else 0
     if size < offset:
-        raise MadocError(
-            f"{path} has {size} bytes, its checkpoint says {offset}; restore it or start a new run"
-        )
+        raise MadocError(f"{path} has {size} bytes, its checkpoint says {offset}; restore it or start a new run")
     if size > offset:
         os.truncate(path, offset)
     return path

@@ -78,9 +78,7 @@ def test_ant_of_111_values_keeps_the_state(ant, tmp_path):
     np.testing.assert_array_equal(loaded.transitions.observation, dataset.transitions.observation)
     np.testing.assert_array_equal(loaded.transitions.next_observation, dataset.transitions.next_observation)
     arrays["observations"][5, 40] = 0.25
-    with pytest.raises(
-        MadocError, match=r"zeros .* Ant of 111, got 0.25 in row 5, column 40 of observations"
-    ):
+    with pytest.raises(MadocError, match=r"zeros .* Ant of 111, got 0.25 in row 5, column 40 of observations"):
         load(write_hdf5(tmp_path / "forces.hdf5", arrays), ant)
 
 

@@ -91,7 +91,5 @@ def test_logged_states_refuse_what_cannot_be_rebuilt(hopper):
     with pytest.raises(MadocError, match="an observation of hopper does not determine its state"):
         logged_states(dataset, replace(hopper, state_from_observation=None))
     clipped = with_fields(dataset, observation=np.full_like(dataset.transitions.observation, 10.0))
-    with pytest.raises(
-        MadocError, match=r"none of the 14 logged states of hopper can be rebuilt .* made by a"
-    ):
+    with pytest.raises(MadocError, match=r"none of the 14 logged states of hopper can be rebuilt .* made by a"):
         logged_states(clipped, hopper)

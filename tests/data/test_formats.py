@@ -30,9 +30,7 @@ def test_no_format_pairs_observations_of_two_episodes(hopper, tmp_path, form):
     loaded = load(write(form, tmp_path, make_dataset(hopper)), hopper)
     rows = loaded.transitions
     for start, end in zip(loaded.episode_starts, loaded.episode_ends, strict=True):
-        np.testing.assert_array_equal(
-            rows.next_observation[start : end - 1], rows.observation[start + 1 : end]
-        )
+        np.testing.assert_array_equal(rows.next_observation[start : end - 1], rows.observation[start + 1 : end])
         assert (rows.terminated | rows.truncated)[start:end].nonzero()[0].tolist() == [end - start - 1]
 
 

@@ -54,9 +54,7 @@ def test_nothing_is_fetched_unless_asked(hopper, monkeypatch):
         raise ConnectionError("no network here")
 
     monkeypatch.setattr(minari.storage.hosting, "download_dataset", refuse)
-    with pytest.raises(
-        MadocError, match=r"no Minari dataset on this machine, is called mujoco/hopper/none-v0"
-    ):
+    with pytest.raises(MadocError, match=r"no Minari dataset on this machine, is called mujoco/hopper/none-v0"):
         load("mujoco/hopper/none-v0", hopper)
     with pytest.raises(MadocError, match=r"cannot download .*'mujoco/hopper/none-v0' \(no network here\)"):
         load("mujoco/hopper/none-v0", hopper, download=True)
@@ -78,9 +76,7 @@ def test_a_missing_library_names_its_install_command(hopper, tmp_path, monkeypat
 def test_refusals(hopper, ant, tmp_path):
     dataset = make_dataset(hopper)
     folder = write_minari(tmp_path / "made", dataset)
-    with pytest.raises(
-        MadocError, match="27 values per observation for ant, got 11 in row 0 of observations"
-    ):
+    with pytest.raises(MadocError, match="27 values per observation for ant, got 11 in row 0 of observations"):
         load(folder, ant)
     with pytest.raises(MadocError, match="got 12 in row 0 of observations"):
         load(write_minari(tmp_path / "wide", dataset, widen=1), hopper)

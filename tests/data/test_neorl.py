@@ -46,9 +46,7 @@ def test_refusals(hopper, tmp_path):
     nan[3, 0] = 0.0
     nan[3, 4] = np.inf
     cases = {
-        r"expected 12 values .* hopper \(NeoRL keeps .* got 11 in row 0 of next_obs": {
-            "next_obs": np.zeros((14, 11))
-        },
+        r"expected 12 values .* hopper \(NeoRL keeps .* got 11 in row 0 of next_obs": {"next_obs": np.zeros((14, 11))},
         "got 13 in row 0 of obs; is this file of hopper": {"obs": np.zeros((14, 13))},
         "got inf in row 3 of next_obs": {"next_obs": nan},
         "3 values per action for hopper, got 6 in row 0 of action": {"action": np.zeros((14, 6))},

@@ -71,9 +71,7 @@ def test_actions_within_rounding_are_clipped_and_others_refused(hopper):
     rounded = with_fields(dataset, action=changed(dataset.transitions.action, (4, 0), 1.000001))
     assert validate(rounded, hopper).transitions.action[4, 0] == 1.0
     beyond = with_fields(dataset, action=changed(dataset.transitions.action, (4, 0), -1.5))
-    with pytest.raises(
-        MadocError, match=r"actions in \[-1, 1\], got one of size 1.5 in row 4 of action .*clip"
-    ):
+    with pytest.raises(MadocError, match=r"actions in \[-1, 1\], got one of size 1.5 in row 4 of action .*clip"):
         validate(beyond, hopper)
     assert validate(beyond, hopper, clip_actions=True).transitions.action[4, 0] == -1.0
 

@@ -24,18 +24,12 @@ class CalibratorEntry:
 
 CALIBRATORS: dict[str, CalibratorEntry] = {
     "madoc": CalibratorEntry(Madoc, "one agent a group of like parameters, credit by DOP", _PAPER, 2024),
-    "madoc-s": CalibratorEntry(
-        partial(Madoc, groups="one"), "one agent for all parameters", _PAPER, 2024
-    ),
-    "madoc-vdn": CalibratorEntry(
-        partial(Madoc, mixing="sum"), "credit by a plain sum (VDN)", _PAPER, 2024
-    ),
+    "madoc-s": CalibratorEntry(partial(Madoc, groups="one"), "one agent for all parameters", _PAPER, 2024),
+    "madoc-vdn": CalibratorEntry(partial(Madoc, mixing="sum"), "credit by a plain sum (VDN)", _PAPER, 2024),
     "madoc-isac": CalibratorEntry(
         partial(Madoc, mixing="independent"), "every agent learns from the shared reward alone", _PAPER, 2024
     ),
-    "madoc-ungrouped": CalibratorEntry(
-        partial(Madoc, groups="each"), "one agent a parameter", _PAPER, 2024
-    ),
+    "madoc-ungrouped": CalibratorEntry(partial(Madoc, groups="each"), "one agent a parameter", _PAPER, 2024),
     "madoc-paper": CalibratorEntry(Madoc.paper, "Madoc with the paper's own constants", _PAPER, 2024),
 }
 

@@ -68,9 +68,7 @@ def calibrate(
         seed=seed_of(key),
         groups=[[space.names[index] for index in group] for group in estimate.groups],
         parameters={
-            parameter.name: ParameterEstimate(
-                float(mean), float(std), parameter.low, parameter.high, parameter.unit
-            )
+            parameter.name: ParameterEstimate(float(mean), float(std), parameter.low, parameter.high, parameter.unit)
             for parameter, mean, std in zip(space.parameters, estimate.mean, estimate.std, strict=True)
         },
         warnings=list(estimate.warnings),

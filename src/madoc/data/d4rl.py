@@ -102,9 +102,7 @@ def _without_last_rows(dataset: Dataset) -> Dataset:
     """Drop the last row of every episode; episodes of one row vanish."""
     keep = np.ones(len(dataset), dtype=bool)
     keep[dataset.episode_ends - 1] = False
-    episode = np.repeat(
-        np.arange(len(dataset.episode_starts)), dataset.episode_ends - dataset.episode_starts
-    )[keep]
+    episode = np.repeat(np.arange(len(dataset.episode_starts)), dataset.episode_ends - dataset.episode_starts)[keep]
     if not len(episode):
         raise MadocError(
             f"expected episodes of two rows or more, got {len(dataset)} of one row in {dataset.origin}; "

@@ -78,9 +78,7 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
     return replace(dataset, transitions=transitions, episode_starts=new_starts)
 
 
-def logged_states(
-    dataset: Dataset, task: Task
-) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
+def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
     """Simulator states of the rows whose observation determines them, and which rows those are.
 
     Root positions that never enter the dynamics are 0.

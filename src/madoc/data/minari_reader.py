@@ -98,9 +98,7 @@ def _local_directory(path: Path) -> Path:
     if directory is not None:
         return directory
     if path.exists():
-        raise MadocError(
-            f"{path} is no Minari dataset: there is no metadata.json in it or in its data folder"
-        )
+        raise MadocError(f"{path} is no Minari dataset: there is no metadata.json in it or in its data folder")
     if ID.fullmatch(path.as_posix()) is None:
         raise MadocError(f"no file or directory at {path}; check the path")
     _import_minari()

@@ -119,13 +119,9 @@ def _metadata(text: np.ndarray, path: Path) -> dict:
         metadata = json.loads(str(text))
         version = metadata["version"]
     except (ValueError, TypeError, KeyError) as error:
-        raise MadocError(
-            f"metadata of {path} cannot be read ({error}); the file is damaged, make it again"
-        ) from error
+        raise MadocError(f"metadata of {path} cannot be read ({error}); the file is damaged, make it again") from error
     if version != VERSION:
-        raise MadocError(
-            f"expected file version {VERSION}, got {version} in {path}; use the Madoc that wrote it"
-        )
+        raise MadocError(f"expected file version {VERSION}, got {version} in {path}; use the Madoc that wrote it")
     missing = {"task_name", "physics", "origin", "true_parameters"} - set(metadata)
     if missing:
         raise MadocError(f"no {min(missing)!r} in the metadata of {path}; the file is damaged, make it again")

@@ -77,9 +77,7 @@ def record(
     ends[length - 1 :: length] = True
     starts_at = starts_after(ends[:transitions])
     kept = close_episodes(seen.take(slice(transitions)), starts_at)
-    return Dataset(
-        kept, starts_at, simulator.task.name, simulator.task.physics, origin, dict(true_parameters)
-    )
+    return Dataset(kept, starts_at, simulator.task.name, simulator.task.physics, origin, dict(true_parameters))
 
 
 def join(datasets: list[Dataset], origin: str) -> Dataset:
@@ -90,9 +88,7 @@ def join(datasets: list[Dataset], origin: str) -> Dataset:
     joined: Transitions = jax.tree.map(
         lambda *columns: np.concatenate(columns), *(dataset.transitions for dataset in datasets)
     )
-    return Dataset(
-        joined, np.concatenate(starts), first.task_name, first.physics, origin, first.true_parameters
-    )
+    return Dataset(joined, np.concatenate(starts), first.task_name, first.physics, origin, first.true_parameters)
 
 
 def _one_walker_after_another(columns: tuple[np.ndarray, ...]) -> np.ndarray:

@@ -98,9 +98,7 @@ def as_flags(values: np.ndarray, name: str) -> Bool[np.ndarray, " rows"]:
     return numbers.astype(bool)
 
 
-def validate(
-    dataset: Dataset, task: Task, names: Mapping[str, str] = NAMES, *, clip_actions: bool = False
-) -> Dataset:
+def validate(dataset: Dataset, task: Task, names: Mapping[str, str] = NAMES, *, clip_actions: bool = False) -> Dataset:
     """The dataset, if it can be one of the task. Actions within rounding of [-1, 1] are clipped.
 
     Args:
@@ -145,8 +143,7 @@ def _check_observation_width(values: np.ndarray, task: Task, name: str) -> None:
         neorl = got == expected + 1
         hint = "a NeoRL file? pass --format neorl" if neorl else f"is this file of {task.name}?"
         raise MadocError(
-            f"expected {expected} values per observation for {task.name}, got {got} in row 0 of {name}; "
-            f"{hint}"
+            f"expected {expected} values per observation for {task.name}, got {got} in row 0 of {name}; {hint}"
         )
 
 

@@ -139,6 +139,20 @@ def log_dynamics_ratio(discriminators: Discriminators, pair: Array, following: A
     As f_sa enters both softmaxes, this is f_sas(target) - f_sas(source): within ±2 `bound`.
     """
     log_pair, log_triple = discriminators(pair, following)
-    return (
-        log_triple[:, TARGET] - log_triple[:, SOURCE] - log_pair[:, TARGET] + log_pair[:, SOURCE]
+    return log_triple[:, TARGET] - log_triple[:, SOURCE] - log_pair[:, TARGET] + log_pair[:, SOURCE]
+
+
+def blur(
+    following: tuple[Array, Array], scale: Float[Array, ""] | float, key: PRNGKeyArray
+) -> tuple[Float[Array, "rows observation"], Float[Array, "rows observation"]]:
+    """Add the same kind of normal noise to logged and simulated s' features.
+
+    Not in the paper. Noise-free simulators have disjoint s', so discriminators soon are sure of every row and
+    the reward stands at its bound, without a slope. Blurred by `scale`, the log ratio is about
+    -|difference|² / (2 scale²): a slope towards the target from anywhere (instance noise, Sønderby et al. 2017).
+    """
+    keys = jax.random.split(key)
+    target, source = (
+        rows + scale * jax.random.normal(key, rows.shape) for rows, key in zip(following, keys, strict=True)
     )
+    return target, source

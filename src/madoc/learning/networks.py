@@ -34,7 +34,8 @@ class Network(eqx.Module):
         """Outputs for a batch; dropout acts only where a key is given."""
         for index, layer in enumerate(self.layers):
             assert layer.bias is not None
-            rows = rows @ layer.weight.T + layer.bias
+            rows = rows @ layer.weight.T
+            rows = rows + jnp.broadcast_to(layer.bias, rows.shape)
             if index + 1 < len(self.layers):
                 rows = jax.nn.relu(rows)
                 if self.dropout and key is not None:
@@ -60,9 +61,7 @@ def scan_updates(
     return eqx.combine(arrays, static), jax.tree.map(jnp.mean, metrics)
 
 
-def descend(
-    optimiser, gradients: PyTree, optimiser_state: PyTree, parameters: Carry
-) -> tuple[Carry, PyTree]:
+def descend(optimiser, gradients: PyTree, optimiser_state: PyTree, parameters: Carry) -> tuple[Carry, PyTree]:
     """One step of an Optax optimiser on the arrays of a module."""
     updates, optimiser_state = optimiser.update(gradients, optimiser_state)
     return eqx.apply_updates(parameters, updates), optimiser_state

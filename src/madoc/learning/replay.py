@@ -39,9 +39,12 @@ def empty(capacity: int, **columns: tuple[int, ...]) -> Replay:
 def add(replay: Replay, rows: PyTree, valid: Bool[Array, " batch"]) -> Replay:
     """Write the valid rows of a batch over the oldest ones. The replay given is consumed."""
     position = replay.written + jnp.cumsum(valid) - 1
-    index = jnp.where(valid, position % replay.capacity, replay.capacity)
-    written = jax.tree.map(lambda ring, new: ring.at[index].set(new, mode="drop"), replay.rows, rows)
-    return Replay(written, replay.written + valid.sum(dtype=jnp.int32))
+    written = replay.written + valid.sum(dtype=jnp.int32)
+    # Of rows that would land on one place only the last is written: a scatter's order is undefined.
+    kept = valid & (position >= written - replay.capacity)
+    index = jnp.where(kept, position % replay.capacity, replay.capacity)
+    ring = jax.tree.map(lambda column, new: column.at[index].set(new, mode="drop"), replay.rows, rows)
+    return Replay(ring, written)
 
 
 def clear(replay: Replay) -> Replay:

@@ -29,7 +29,7 @@ def log_density(
 
 
 def _log_density(raw: Array, mean: Array, log_std: Array) -> Array:
-    """log N(raw; mean, std) - log |d tanh(raw) / d raw|, summed over the last axis (SAC, appendix C)."""
+    """Log N(raw; mean, std) - log |d tanh(raw) / d raw|, summed over the last axis (SAC, appendix C)."""
     standard = (raw - mean) * jnp.exp(-log_std)
     normal = -0.5 * standard**2 - log_std - 0.5 * np.log(2 * np.pi)
     log_slope = 2.0 * (np.log(2.0) - raw - jax.nn.softplus(-2.0 * raw))
@@ -61,7 +61,9 @@ class TanhGaussianPolicy(eqx.Module):
         self, observation: Float[Array, "*rows observation"]
     ) -> tuple[Float[Array, "*rows action"], Float[Array, "*rows action"]]:
         """Mean and log std before squashing."""
-        offset, scale = jax.lax.stop_gradient((self.offset, self.scale))
+        offset, scale = (
+            jnp.broadcast_to(jax.lax.stop_gradient(part), observation.shape) for part in (self.offset, self.scale)
+        )
         mean, log_std = jnp.split(self.network((observation - offset) / scale), 2, axis=-1)
         return mean, jnp.clip(log_std, *LOG_STD_RANGE)
 

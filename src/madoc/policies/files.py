@@ -45,9 +45,7 @@ def load_policy(path: str | Path) -> TanhGaussianPolicy:
 def policy_of(saved: NumpyPolicy) -> TanhGaussianPolicy:
     """A JAX policy with the weights of a saved one."""
     sizes = [weight.shape[1] for weight in saved.weights]
-    policy = TanhGaussianPolicy(
-        len(saved.offset), sizes[-1] // 2, tuple(sizes[:-1]), key=jax.random.key(0)
-    )
+    policy = TanhGaussianPolicy(len(saved.offset), sizes[-1] // 2, tuple(sizes[:-1]), key=jax.random.key(0))
     layers = [
         eqx.tree_at(
             lambda linear: (linear.weight, linear.bias),

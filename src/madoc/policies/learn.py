@@ -63,6 +63,4 @@ def learn_policy(
     policy = method.policy(finished.state)
     if folder is not None:
         save_policy(policy, folder.path / "policy.npz", task_name=problem.simulator.task.name)
-    return LearnedPolicy(
-        policy, finished.status, finished.sentence, finished.control_steps, round(finished.seconds, 3)
-    )
+    return LearnedPolicy(policy, finished.status, finished.sentence, finished.control_steps, round(finished.seconds, 3))

@@ -241,9 +241,7 @@ class SAC:
             return weight * loss + sac_losses.cloning_error(policy, *cloned), (loss, density)
 
         (_, (loss, density)), gradients = eqx.filter_value_and_grad(loss_of, has_aux=True)(learner.policy)
-        policy, policy_optimiser = descend(
-            self._optimiser, gradients, learner.policy_optimiser, learner.policy
-        )
+        policy, policy_optimiser = descend(self._optimiser, gradients, learner.policy_optimiser, learner.policy)
         slope = jax.grad(sac_losses.temperature_loss)(
             learner.log_temperature, density, -float(policy.network.layers[-1].out_features // 2)
         )
@@ -260,7 +258,11 @@ class SAC:
             learner,
             (policy, policy_optimiser, log_temperature, temperature_optimiser),
         )
-        return learner, {"actor_loss": loss, "entropy": -density.mean(), "temperature": jnp.exp(log_temperature)}
+        return learner, {
+            "actor_loss": loss,
+            "entropy": -density.mean(),
+            "temperature": jnp.exp(log_temperature),
+        }
 
 
 class UniformPolicy(eqx.Module):
@@ -296,9 +298,7 @@ def _episode_returns(rollout: Rollout, running: np.ndarray) -> tuple[np.ndarray,
     """Returns of the episodes that ended in a rollout, and the running sums of those that did not."""
     finished = []
     seen = rollout.transitions
-    for reward, ended, valid in zip(
-        seen.reward, seen.terminated | seen.truncated, rollout.valid, strict=True
-    ):
+    for reward, ended, valid in zip(seen.reward, seen.terminated | seen.truncated, rollout.valid, strict=True):
         running = running + np.where(valid, reward, 0.0)
         finished.append(running[ended])
         running = np.where(ended | ~valid, 0.0, running)

@@ -2,6 +2,8 @@
 
 import copy
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import mujoco
 import mujoco.rollout
@@ -9,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.errors import MadocError
-from madoc.parameters import ParameterSpace
+from madoc.parameters import FIELDS, ParameterSpace
 from madoc.simulation.write import find_element, write_parameters
 from madoc.tasks.base import Task
 
@@ -21,7 +23,11 @@ _ROWS_FOR_ALL_THREADS = 8
 
 
 class CpuSimulator:
-    """A task's MuJoCo model with calibratable parameters, on `threads` cores (default: all this process may use).
+    """A task's MuJoCo model with calibratable parameters.
+
+    Args:
+        task: The robot.
+        threads: How many cores step it; all that this process may use by default.
 
     Raises:
         MadocError: A parameter names an element that the model does not have.
@@ -62,13 +68,20 @@ class CpuSimulator:
         """Copy the model once per row of physical values and write them.
 
         Raises:
-            MadocError: Values are not finite, or not one per parameter.
+            MadocError: Values are not finite, not one per parameter, or below a physical bound.
         """
         values = np.asarray(parameters, dtype=np.float64)
         if values.ndim != 2 or values.shape[1] != len(self.parameters):
             raise MadocError(f"expected parameters of shape (systems, {len(self.parameters)}), got {values.shape}")
         if not np.isfinite(values).all():
             raise MadocError("expected finite parameters, got NaN or infinity")
+        for parameter, column in zip(self.parameters.parameters, values.T, strict=True):
+            minimum = FIELDS[parameter.field].minimum
+            if (column < minimum).any():
+                raise MadocError(
+                    f"expected {parameter.name} of at least {minimum} {parameter.unit}, "
+                    f"got {column.min()} in system {column.argmin()}"
+                )
         models = []
         for row in values:
             model = copy.copy(self._model)
@@ -82,8 +95,10 @@ class CpuSimulator:
 
 
 class CpuSystem:
-    """Systems at fixed parameters. States are (qpos, qvel); the solver's warm start is always 0, so a step is a
-    function of state, action and parameters alone, whatever the number of threads.
+    """Systems at fixed parameters; states are (qpos, qvel).
+
+    The solver's warm start is always 0, so a step is a function of state, action and parameters alone,
+    whatever the number of threads.
     """
 
     def __init__(self, simulator: CpuSimulator, models: list[mujoco.MjModel]) -> None:
@@ -99,7 +114,12 @@ class CpuSystem:
     def step(
         self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
     ) -> Float[np.ndarray, "systems rows state"]:
-        """One control step of `frame_skip` physics steps; a row that explodes comes back as NaN."""
+        """One control step of `frame_skip` physics steps; a row that explodes comes back as NaN.
+
+        Raises:
+            MadocError: States or actions do not have the shape of these systems.
+        """
+        self._check_shapes(state.shape, action.shape)
         self._allocate(state.shape[1])
         simulator = self._simulator
         self._start[:, 1:] = state.reshape(self._start.shape[0], -1)
@@ -108,21 +128,31 @@ class CpuSystem:
         if bad.any():
             self._start[bad, 1:] = simulator.initial_state
         data = simulator._data if len(self._start) >= _ROWS_FOR_ALL_THREADS else simulator._data[:1]
-        simulator._pool.rollout(
-            self._repeated,
-            data,
-            self._start,
-            self._control,
-            skip_checks=True,
-            nstep=simulator.task.frame_skip,
-            state=self._trajectory,
-            sensordata=self._sensors,
-        )
+        with _quiet():
+            simulator._pool.rollout(
+                self._repeated,
+                data,
+                self._start,
+                self._control,
+                skip_checks=True,
+                nstep=simulator.task.frame_skip,
+                state=self._trajectory,
+                sensordata=self._sensors,
+            )
         end = self._trajectory[:, -1]
-        failed = bad | (abs(end[:, 0] - self._end) > 1e-9) | ~np.isfinite(end).all(1)
+        failed = bad | (abs(end[:, 0] - self._end) > 1e-9) | ~(abs(end) <= mujoco.mjMAXVAL).all(1)
         next_state = end[:, 1:].copy()
         next_state[failed] = np.nan
         return next_state.reshape(state.shape)
+
+    def _check_shapes(self, state: tuple[int, ...], action: tuple[int, ...]) -> None:
+        model = self.models[0]
+        rows = state[1] if len(state) == 3 else 0
+        if state != (self.count, rows, model.nq + model.nv) or action != (self.count, rows, model.nu):
+            raise MadocError(
+                f"expected states of shape ({self.count}, rows, {model.nq + model.nv}) and actions of shape "
+                f"({self.count}, rows, {model.nu}) for {self._simulator.task.name}, got {state} and {action}"
+            )
 
     def _allocate(self, rows: int) -> None:
         if rows == self._rows:
@@ -136,3 +166,21 @@ class CpuSystem:
         self._control = np.zeros((total, steps, model.nu))
         self._trajectory = np.zeros((total, steps, size))
         self._sensors = np.zeros((total, steps, model.nsensordata))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep MuJoCo's word on an exploding row (stderr, MUJOCO_LOG.TXT in the working directory) to itself.
+
+    Such rows come back as NaN and are counted.
+    """
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_ignore)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _ignore(_: str) -> None:
+    pass

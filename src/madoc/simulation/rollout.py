@@ -1,4 +1,4 @@
-"""Closed-loop rollouts: a policy acts in systems, rows that end start again, failed rows are dropped and counted."""
+"""Closed-loop rollouts: a policy acts in systems, rows that end start again, failed rows are counted."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -123,7 +123,7 @@ def roll(
 
 @eqx.filter_jit
 def act(
-    policy: Policy, observation: Float[Array, "*rows observation"], key: PRNGKeyArray | None, step: Array
+    policy: Policy, observation: Float[Array, "*rows observation"], key: PRNGKeyArray | None, step: np.int32
 ) -> Array:
     """Actions of a policy, jitted; step `step` of the stream `key`, deterministic without a key."""
     return policy(observation, None if key is None else jax.random.fold_in(key, step))
@@ -143,7 +143,7 @@ def replay_actions(
     rows: int,
     key: PRNGKeyArray,
 ) -> Rollout:
-    """One control step from logged states under the actions logged there, `rows` of them drawn for each system."""
+    """One control step from logged states under the actions logged there, `rows` drawn for each system."""
     chosen = np.asarray(jax.random.randint(key, (system.count, rows), 0, len(states)))
     state, action = states[chosen], actions[chosen]
     next_state = system.step(state, action)

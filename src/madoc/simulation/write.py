@@ -26,7 +26,7 @@ def write_parameters(
     """Write physical values (d,) into a model in place, then recompute what depends on them (`mj_setConst`).
 
     Raises:
-        MadocError: A parameter names an element that the model does not have.
+        MadocError: A parameter names an element that the model does not have, or scales a mass of 0.
     """
     for parameter, value in zip(parameters, values, strict=True):
         _WRITERS[parameter.field](model, find_element(model, parameter), float(value))
@@ -51,9 +51,7 @@ def find_element(model: mujoco.MjModel, parameter: Parameter) -> int:
     if index < 0:
         names = element_names(model, kind)
         near = get_close_matches(parameter.element, names, n=3, cutoff=0.4) or names[:8]
-        raise MadocError(
-            f"{parameter.name}: the model has no {kind} {parameter.element!r}; nearest: {', '.join(near)}"
-        )
+        raise MadocError(f"{parameter.name}: the model has no {kind} {parameter.element!r}; nearest: {', '.join(near)}")
     return index
 
 
@@ -80,6 +78,9 @@ def _body_mass(model: mujoco.MjModel, body: int, value: float) -> None:
 
 def _body_mass_and_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
     mass = max(value, MASS_FLOOR)
+    if model.body_mass[body] == 0.0:
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body)
+        raise MadocError(f"body_mass_and_inertia: body {name!r} has no mass to scale; use body_mass instead")
     model.body_inertia[body] *= mass / model.body_mass[body]
     model.body_mass[body] = mass
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from madoc.errors import MadocError
+from madoc.errors import unknown_name
 from madoc.tasks.ant import ant
 from madoc.tasks.base import Task
 from madoc.tasks.half_cheetah import half_cheetah
@@ -24,7 +24,7 @@ def make(name: str, physics: str = "legacy") -> Task:
         MadocError: No task has that name, or `physics` is neither `legacy` nor `modern`.
     """
     if name not in TASKS:
-        raise MadocError(f"unknown task {name!r}; there are: {', '.join(TASKS)}")
+        raise unknown_name("task", name, TASKS)
     return TASKS[name](physics)
 
 

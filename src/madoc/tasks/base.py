@@ -19,7 +19,7 @@ Batch = Any
 class Task:
     """A robot and what is asked of it, without any truth about the target.
 
-    The state is (qpos, qvel), float64, last axis `state_size`. Functions are pure and batched over leading axes.
+    The state is (qpos, qvel), float64, on the last axis. Functions are pure and batched over leading axes.
 
     Attributes:
         name: `hopper`, ...

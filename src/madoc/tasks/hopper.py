@@ -80,5 +80,3 @@ def terminated(next_state: Batch) -> Batch:
 def reset_noise(key: PRNGKeyArray, count: int) -> jax.Array:
     """Uniform ±0.005 on positions and velocities."""
     return uniform_noise(key, count, size=12, scale=5e-3)
-
-

@@ -64,7 +64,7 @@ def _use_legacy_inertia(spec: mujoco.MjSpec) -> None:
             continue
         mass = sum(part[0] for part in parts)
         centre = sum(part[0] * part[1] for part in parts) / mass
-        inertia = sum(part[2] + part[0] * _parallel_axis(part[1] - centre) for part in parts)
+        inertia = np.sum([part[2] + part[0] * _parallel_axis(part[1] - centre) for part in parts], axis=0)
         body.explicitinertial = True
         body.mass = mass
         body.ipos = centre

@@ -10,7 +10,7 @@ VELOCITY_CLIP = 10.0
 
 
 def observe_clipped(state: Batch) -> Batch:
-    """Hopper and Walker2d: every position but x, then velocities clipped to ±10. (..., 2n) -> (..., 2n - 1)."""
+    """Hopper, Walker2d: every position but x, then velocities clipped to ±10. (..., 2n) -> (..., 2n - 1)."""
     namespace = state.__array_namespace__()
     size = state.shape[-1] // 2
     velocity = namespace.clip(state[..., size:], -VELOCITY_CLIP, VELOCITY_CLIP)

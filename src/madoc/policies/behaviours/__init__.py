@@ -48,9 +48,7 @@ def ladder(task_name: str) -> tuple[list[Rung], dict[str, list[int]]]:
         about = json.loads(str(arrays["about"]))
         layers = range(about["layers"])
         rungs = []
-        for index, (steps, mean_return) in enumerate(
-            zip(about["control_steps"], about["returns"], strict=True)
-        ):
+        for index, (steps, mean_return) in enumerate(zip(about["control_steps"], about["returns"], strict=True)):
             weights = tuple(arrays[f"weight_{layer}"][index].astype(np.float32) for layer in layers)
             biases = tuple(arrays[f"bias_{layer}"][index].astype(np.float32) for layer in layers)
             size = weights[0].shape[0]

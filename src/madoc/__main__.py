@@ -1,0 +1,8 @@
+"""`python -m madoc` is the command `madoc`."""
+
+import sys
+
+from madoc.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

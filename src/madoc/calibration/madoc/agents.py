@@ -1,0 +1,239 @@
+"""What calibration updates: discriminators, group critics, actors, their prior; and the update itself."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+
+from madoc.calibration.madoc.actors import (
+    Actors,
+    actor_loss,
+    divergence,
+    draw_parameters,
+    initial_actors,
+    prior_weight,
+)
+from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
+from madoc.learning import replay
+from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio
+from madoc.learning.networks import descend, moving_average, scan_updates
+
+AT_BOUND = 0.95
+"""A reward past this share of its bound is counted as saturated."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Agents:
+    """What updates change.
+
+    Attributes:
+        discriminators: The reward.
+        critics: One a group.
+        actors: The calibration distribution.
+        prior: Its moving average, the p of Eq. (13).
+        average: A moving average of the actors for reading the estimate.
+        log_blur: Log of the noise on s' features that both discriminators see.
+        updates: How many there were.
+    """
+
+    discriminators: Discriminators
+    critics: GroupCritics
+    actors: Actors
+    prior: Actors
+    average: Actors
+    log_blur: Float[Array, ""]
+    updates: Int[Array, ""]
+    discriminator_optimiser: PyTree
+    critic_optimiser: PyTree
+    actor_optimiser: PyTree
+
+
+@dataclass(frozen=True)
+class AgentSettings:
+    """How the agents learn.
+
+    Attributes:
+        hidden: Units per layer of the discriminators.
+        critic_hidden: Units per layer of each group's critic.
+        bound: Discriminator logits are this many tanh.
+        dropout: In the discriminators.
+        batch: Logged rows, and simulated rows, an update.
+        actor_batch: Draws an update of the actors.
+        discriminator_rate: Adam's learning rate.
+        critic_rate: Adam's learning rate.
+        actor_rate: Adam's learning rate.
+        entropy_weight: α of Eq. (13).
+        prior_time: Updates in which λ of Eq. (13) grows by e.
+        prior_largest: Where λ stops growing.
+        prior_rate: Of the prior's moving average.
+        prior_every: Updates between two moves of the prior.
+        average_rate: Of the estimate's moving average.
+        reward_size: Mean |reward| that the blur is steered to; 0 for no blur, as in the paper.
+        blur_rate: How fast it is steered.
+    """
+
+    hidden: tuple[int, ...] = (128, 128)
+    critic_hidden: tuple[int, ...] = (64, 64)
+    bound: float = 2.0
+    dropout: float = 0.0
+    batch: int = 256
+    actor_batch: int = 64
+    discriminator_rate: float = 1e-3
+    critic_rate: float = 1e-3
+    actor_rate: float = 3e-3
+    entropy_weight: float = 0.05
+    prior_time: float = 2e5
+    prior_largest: float = 10.0
+    prior_rate: float = 0.1
+    prior_every: int = 10
+    average_rate: float = 1e-3
+    reward_size: float = 1.0
+    blur_rate: float = 3e-3
+
+    def init(self, *, observation: int, action: int, parameters: int, groups: int, key: PRNGKeyArray) -> Agents:
+        """Fresh networks; actors and prior at N(0, 1)."""
+        of_discriminators, of_critics = jax.random.split(key)
+        discriminators = Discriminators(
+            observation,
+            action,
+            self.hidden,
+            key=of_discriminators,
+            bound=self.bound,
+            dropout=self.dropout,
+        )
+        critics = GroupCritics(groups, parameters, self.critic_hidden, key=of_critics)
+        actors = initial_actors(parameters)
+        return Agents(
+            discriminators=discriminators,
+            critics=critics,
+            actors=actors,
+            prior=initial_actors(parameters),
+            average=initial_actors(parameters),
+            log_blur=jnp.zeros(()),
+            updates=jnp.zeros((), jnp.int32),
+            discriminator_optimiser=self._discriminator_adam.init(eqx.filter(discriminators, eqx.is_array)),
+            critic_optimiser=self._critic_adam.init(eqx.filter(critics, eqx.is_array)),
+            actor_optimiser=self._actor_adam.init(actors),
+        )
+
+    @eqx.filter_jit
+    def update(
+        self,
+        agents: Agents,
+        simulated: replay.Replay,
+        logged: tuple[Float[Array, "rows pair"], Float[Array, "rows observation"]],
+        members: Bool[Array, "groups d"],
+        key: PRNGKeyArray,
+        *,
+        mixing: Mixing,
+        count: int,
+    ) -> tuple[Agents, dict[str, Array]]:
+        """`count` updates, one scan: Algorithm 1, lines 13 to 19.
+
+        Args:
+            agents: What to update.
+            simulated: Rows with `pair`, `following` and `parameters` (in [-1, 1]).
+            logged: Features of the target's rows.
+            members: Which parameters belong to which group.
+            key: Randomness.
+            mixing: How credit is given.
+            count: Updates.
+        """
+
+        def update(agents: Agents, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
+            of_logged, of_simulated, of_blur, of_dropout, of_actors = jax.random.split(key, 5)
+            rows = jax.random.randint(of_logged, (self.batch,), 0, len(logged[0]))
+            drawn = replay.sample(simulated, of_simulated, self.batch)
+            scale = jnp.exp(agents.log_blur) if self.reward_size else 0.0
+            target, source = blur((logged[1][rows], drawn["following"]), scale, of_blur)
+            agents, metrics = self._update_discriminators(
+                agents, (logged[0][rows], target), (drawn["pair"], source), of_dropout
+            )
+            reward = log_dynamics_ratio(agents.discriminators, drawn["pair"], source)
+            agents = self._steer_blur(agents, reward)
+            agents, value_metrics = self._update_critics(agents, drawn["parameters"], reward, members, mixing)
+            agents, actor_metrics = self._update_actors(agents, members, of_actors)
+            return agents, metrics | value_metrics | actor_metrics | {"blur": jnp.exp(agents.log_blur)}
+
+        return scan_updates(update, agents, key, count)
+
+    @cached_property
+    def _discriminator_adam(self) -> optax.GradientTransformation:
+        return optax.adam(self.discriminator_rate)
+
+    @cached_property
+    def _critic_adam(self) -> optax.GradientTransformation:
+        return optax.adam(self.critic_rate)
+
+    @cached_property
+    def _actor_adam(self) -> optax.GradientTransformation:
+        return optax.adam(self.actor_rate)
+
+    def _update_discriminators(
+        self, agents: Agents, target: tuple[Array, Array], source: tuple[Array, Array], key: PRNGKeyArray
+    ) -> tuple[Agents, dict[str, Array]]:
+        (_, metrics), gradients = eqx.filter_value_and_grad(discriminator_loss, has_aux=True)(
+            agents.discriminators, target, source, key
+        )
+        discriminators, optimiser = descend(
+            self._discriminator_adam, gradients, agents.discriminator_optimiser, agents.discriminators
+        )
+        return replace(agents, discriminators=discriminators, discriminator_optimiser=optimiser), metrics
+
+    def _steer_blur(self, agents: Agents, reward: Float[Array, " rows"]) -> Agents:
+        """More blur where the discriminators are too sure, less where they cannot tell."""
+        surplus = jnp.clip(jnp.abs(reward).mean() - self.reward_size, -1.0, 1.0)
+        log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *LOG_BLUR_RANGE)
+        return replace(agents, log_blur=log_blur)
+
+    def _update_critics(
+        self, agents: Agents, parameters: Array, reward: Array, members: Array, mixing: Mixing
+    ) -> tuple[Agents, dict[str, Array]]:
+        def loss_of(critics: GroupCritics) -> Array:
+            values = critics.values(parameters, members)
+            return value_loss(values, critics.weight, critics.bias, reward, mixing)
+
+        loss, gradients = eqx.filter_value_and_grad(loss_of)(agents.critics)
+        critics, optimiser = descend(self._critic_adam, gradients, agents.critic_optimiser, agents.critics)
+        metrics = {
+            "value_loss": loss,
+            "reward": reward.mean(),
+            "reward_size": jnp.abs(reward).mean(),
+            "reward_at_bound": (jnp.abs(reward) > AT_BOUND * 2 * self.bound).mean(),
+        }
+        return replace(agents, critics=critics, critic_optimiser=optimiser), metrics
+
+    def _update_actors(self, agents: Agents, members: Array, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
+        weight = prior_weight(agents.updates, time_constant=self.prior_time, largest=self.prior_largest)
+
+        def loss_of(actors: Actors) -> Array:
+            draws, density = draw_parameters(actors, key, self.actor_batch)
+            return actor_loss(
+                agents.critics.values(draws, members).sum(-1),
+                density,
+                divergence(actors, agents.prior).sum(),
+                entropy_weight=self.entropy_weight,
+                prior_weight=weight,
+            )
+
+        loss, gradients = jax.value_and_grad(loss_of)(agents.actors)
+        actors, optimiser = descend(self._actor_adam, gradients, agents.actor_optimiser, agents.actors)
+        due = (agents.updates + 1) % self.prior_every == 0
+        following = replace(
+            agents,
+            actors=actors,
+            prior=moving_average(agents.prior, actors, jnp.where(due, self.prior_rate, 0.0)),
+            average=moving_average(agents.average, actors, self.average_rate),
+            actor_optimiser=optimiser,
+            updates=agents.updates + 1,
+        )
+        return following, {"actor_loss": loss, "actor_std": jnp.exp(actors.log_std).mean()}
+
+
+LOG_BLUR_RANGE = (-9.0, 2.0)
+"""Logs of a share of a step's spread: 1e-4 to 7."""

@@ -1,0 +1,93 @@
+"""Madoc watches itself: is the reward saturated, is it still getting closer, which estimate was best. No truth."""
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+
+from madoc.calibration.madoc.actors import Actors
+from madoc.types import Metrics
+
+SMOOTHING = 0.1
+"""Share of an epoch in the running averages."""
+PROGRESS = 0.02
+"""A mismatch smaller by this share is progress."""
+SATURATED = 0.5
+"""Share of rows at the reward's bound past which a user is warned."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Watch:
+    """Running averages over epochs, and the best estimate so far.
+
+    Attributes:
+        epochs: Calibration epochs watched.
+        mismatch: How far simulated rows are from logged ones: the blur at which the discriminators are as
+            unsure as they are steered to be, or the mean |reward| where there is no blur.
+        at_bound: Share of rows whose reward stands at its bound.
+        best_mismatch: The lowest `mismatch` since the start.
+        best_epoch: When that was.
+        best: The actors' moving average then.
+    """
+
+    epochs: int
+    mismatch: float
+    at_bound: float
+    best_mismatch: float
+    best_epoch: int
+    best: Actors
+
+
+def begin_watch(actors: Actors) -> Watch:
+    """Before the first epoch."""
+    return Watch(0, 0.0, 0.0, 0.0, 0, actors)
+
+
+def observe(watch: Watch, metrics: Metrics, average: Actors, *, blurred: bool) -> Watch:
+    """Take in one epoch; keep its estimate if the mismatch has never been lower."""
+    mismatch, at_bound = metrics["blur" if blurred else "reward_size"], metrics["reward_at_bound"]
+    if watch.epochs:
+        mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
+        at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
+    watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, at_bound=at_bound)
+    if watch.epochs == 1 or mismatch < watch.best_mismatch:
+        progress = watch.epochs == 1 or mismatch < (1.0 - PROGRESS) * watch.best_mismatch
+        return replace(
+            watch,
+            best=average,
+            best_mismatch=mismatch,
+            best_epoch=watch.epochs if progress else watch.best_epoch,
+        )
+    return watch
+
+
+def stalled(watch: Watch, patience: int) -> str | None:
+    """A sentence once the mismatch has not become smaller for `patience` epochs."""
+    waited = watch.epochs - watch.best_epoch
+    if waited < patience:
+        return None
+    return f"the reward has nothing left to say: no smaller mismatch than {watch.best_mismatch:.3g} in {waited} epochs"
+
+
+def warnings(
+    watch: Watch, unit: np.ndarray, names: tuple[str, ...], *, failures: int, control_steps: int
+) -> tuple[str, ...]:
+    """What a user should know of the estimate `unit` (d,) in [-1, 1], one sentence each."""
+    found = []
+    if watch.epochs == 0:
+        found.append("the budget was spent before calibration began; the estimate is mid-range")
+    if watch.at_bound > SATURATED:
+        found.append(
+            f"the discriminators are sure of {watch.at_bound:.0%} of the simulated rows (reward at its bound), "
+            "so the reward has no slope; start rollouts at logged states, or narrow the ranges"
+        )
+    at_end = [name for name, value in zip(names, unit, strict=True) if abs(value) > 0.98]
+    if at_end:
+        found.append(f"at the end of its range: {', '.join(at_end)}; widen the range or doubt the model")
+    if failures:
+        found.append(
+            f"{failures} of {control_steps:,} simulated rows exploded and were left out; "
+            "the ranges may hold impossible parameters"
+        )
+    return tuple(found)

@@ -1,0 +1,85 @@
+"""Parameters that change nothing: found from logged rows before any budget is spent on them."""
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from madoc.errors import MadocError
+from madoc.simulation.base import Simulator
+
+
+def insensitive(
+    simulator: Simulator,
+    states: Float[np.ndarray, "logged state"],
+    actions: Float[np.ndarray, "logged action"],
+    *,
+    key: PRNGKeyArray,
+    rows: int = 64,
+) -> tuple[list[str], int]:
+    """Which parameters change no next state, bit for bit, when they go to either end of their range.
+
+    All others stay at mid-range. A row counts only where both simulations succeeded.
+
+    Args:
+        simulator: Whose parameters.
+        states: States to step from, typically logged ones.
+        actions: The actions taken there.
+        key: Draws the rows.
+        rows: How many rows are drawn, without repetition, if there are that many.
+
+    Returns:
+        The names, in the order of the parameters, and the control steps spent: rows · (2 d + 1).
+
+    Raises:
+        MadocError: There are no rows, or every one fails at mid-range.
+    """
+    if not len(states) or len(states) != len(actions):
+        raise MadocError(f"expected as many states as actions, at least one, got {len(states)} and {len(actions)}")
+    count = min(rows, len(states))
+    chosen = np.asarray(jax.random.choice(key, len(states), (count,), replace=False))
+    ends = _ends(simulator)
+    shape = (len(ends), count, -1)
+    next_states = simulator.bind(ends).step(
+        np.broadcast_to(states[chosen], (len(ends), *states[chosen].shape)).reshape(shape),
+        np.broadcast_to(actions[chosen], (len(ends), *actions[chosen].shape)).reshape(shape),
+    )
+    middle, moved = next_states[0], next_states[1:]
+    if not np.isfinite(middle).all(-1).any():
+        raise MadocError(
+            f"{simulator.task.name}: the simulation fails in all {count} rows at mid-range parameters; "
+            "check the ranges and the states"
+        )
+    comparable = np.isfinite(moved).all(-1) & np.isfinite(middle).all(-1)
+    changed = ((moved != middle).any(-1) & comparable).any(-1).reshape(-1, 2).any(-1)
+    names = [name for name, felt in zip(simulator.parameters.names, changed, strict=True) if not felt]
+    return names, len(ends) * count
+
+
+def refuse_insensitive(
+    simulator: Simulator,
+    states: Float[np.ndarray, "logged state"],
+    actions: Float[np.ndarray, "logged action"],
+    *,
+    key: PRNGKeyArray,
+    rows: int = 64,
+) -> int:
+    """Control steps spent on finding that every parameter changes some next state.
+
+    Raises:
+        MadocError: Some parameter changes none: no method could calibrate it.
+    """
+    names, control_steps = insensitive(simulator, states, actions, key=key, rows=rows)
+    if names:
+        what = f"parameter {names[0]} changes" if len(names) == 1 else f"parameters {', '.join(names)} change"
+        remedy = "remove it or widen its range" if len(names) == 1 else "remove them or widen their ranges"
+        raise MadocError(f"{what} no next state in {min(rows, len(states))} logged rows; {remedy}")
+    return control_steps
+
+
+def _ends(simulator: Simulator) -> Float[np.ndarray, "systems parameters"]:
+    """Mid-range, then each parameter in turn at its low and at its high end."""
+    space = simulator.parameters
+    unit = np.zeros((1 + 2 * len(space), len(space)))
+    for column in range(len(space)):
+        unit[1 + 2 * column : 3 + 2 * column, column] = -1.0, 1.0
+    return space.to_physical(unit)

@@ -1,0 +1,144 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from madoc.calibration.madoc.value_decomposition import GroupCritics, total_value, value_loss
+
+VALUES = jnp.array([[1.0, 2.0], [3.0, -1.0]])
+REWARD = jnp.array([2.0, 0.0])
+MEMBERS = jnp.array([[True, False, True, False], [False, True, False, False], [False, False, False, True]])
+
+
+def critics(hidden=(16, 16)):
+    return GroupCritics(3, 4, hidden, key=jax.random.key(0))
+
+
+def parameters(count=20):
+    return jax.random.uniform(jax.random.key(1), (count, 4), minval=-1.0)
+
+
+def test_weights_start_at_one_and_the_bias_at_zero():
+    made = critics()
+    np.testing.assert_array_equal(made.weight, np.ones(3))
+    assert made.bias == 0
+    assert not np.allclose(made.networks.layers[0].weight[0], made.networks.layers[0].weight[1])
+
+
+def test_total_value_by_hand(compiled):
+    # 0.5·1 + 2·2 + 0.25 = 4.75, 0.5·3 + 2·(-1) + 0.25 = -0.25
+    total = compiled(total_value)(VALUES, jnp.array([0.5, 2.0]), jnp.asarray(0.25))
+    np.testing.assert_allclose(total, [4.75, -0.25])
+
+
+def test_a_negative_k_counts_as_its_absolute_value(compiled):
+    total = compiled(total_value)(VALUES, jnp.array([-0.5, -2.0]), jnp.asarray(0.25))
+    np.testing.assert_allclose(total, [4.75, -0.25])
+
+
+def test_total_value_never_falls_where_a_groups_value_rises():
+    slope = jax.grad(lambda values: total_value(values, jnp.array([-3.0, 0.2]), jnp.zeros(())).sum())(VALUES)
+    np.testing.assert_allclose(slope, [[3.0, 0.2], [3.0, 0.2]])
+
+
+@pytest.mark.parametrize(
+    ("mixing", "expected"),
+    [
+        # totals (4.75, -0.25) as above, errors (2.75, -0.25): ½ (7.5625 + 0.0625) / 2
+        ("dop", 1.90625),
+        # plain sums (3, 2), errors (1, 2): ½ (1 + 4) / 2
+        ("sum", 1.25),
+        # errors of the first critic (-1, 3), of the second (0, -1): ½ (1 + 9) / 2 + ½ (0 + 1) / 2
+        ("independent", 2.75),
+    ],
+)
+def test_value_loss_by_hand(mixing, expected, compiled):
+    loss = compiled(value_loss)(VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, mixing)
+    assert loss == pytest.approx(expected)
+
+
+def test_value_loss_slopes_by_hand():
+    # dL/dV = (2.75, -0.25) / 2; dL/dk = sign(k) Σ dL/dV v, dL/db = Σ dL/dV
+    slope = jax.grad(value_loss, argnums=(0, 1, 2))
+    values, weight, bias = slope(VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, "dop")
+    np.testing.assert_allclose(values, [[0.6875, 2.75], [-0.0625, -0.25]])  # 1.375·(0.5, 2), -0.125·(0.5, 2)
+    np.testing.assert_allclose(weight, [-1.0, 2.875])  # -(1.375·1 - 0.125·3), 1.375·2 + 0.125·1
+    assert bias == pytest.approx(1.25)
+
+
+@pytest.mark.parametrize("mixing", ["sum", "independent"])
+def test_only_dop_has_k_and_b(mixing):
+    loss = value_loss(VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, mixing)
+    assert loss == value_loss(VALUES, jnp.array([7.0, 0.0]), jnp.asarray(-9.0), REWARD, mixing)
+    weight, bias = jax.grad(value_loss, argnums=(1, 2))(VALUES, jnp.ones(2), jnp.zeros(()), REWARD, mixing)
+    np.testing.assert_array_equal(weight, np.zeros(2))
+    assert bias == 0
+
+
+def test_dop_at_its_start_is_vdn():
+    start = value_loss(VALUES, jnp.ones(2), jnp.zeros(()), REWARD, "dop")
+    assert start == pytest.approx(value_loss(VALUES, jnp.ones(2), jnp.zeros(()), REWARD, "sum"))
+
+
+def test_independent_critics_regress_the_reward_each_on_its_own():
+    slope = jax.grad(value_loss)
+    none = jnp.ones(2), jnp.zeros(())
+    before = slope(VALUES, *none, REWARD, "independent")
+    np.testing.assert_allclose(before, (VALUES - REWARD[:, None]) / 2)
+    after = slope(VALUES.at[:, 1].add(100.0), *none, REWARD, "independent")
+    np.testing.assert_array_equal(after[:, 0], before[:, 0])
+    # the others' slopes do depend on every critic: they share one error
+    assert not np.array_equal(slope(VALUES, *none, REWARD, "sum"), slope(VALUES + 1.0, *none, REWARD, "sum"))
+
+
+def test_values_are_each_groups_network_on_its_own_parameters(compiled):
+    made = eqx.tree_at(
+        lambda made: (made.networks.layers[0].weight, made.networks.layers[0].bias),
+        critics(hidden=()),
+        (jnp.array([[[1.0, 2, 3, 4]], [[5, 6, 7, 8]], [[-1, -1, -1, -2]]]), jnp.array([[0.0], [10], [100]])),
+    )
+    # group 0 has parameters 0 and 2: 1·1 + 3·0.5 = 2.5; group 1 has 1: 6·(-1) + 10 = 4; group 2 has 3: -2·0.25 + 100
+    values = compiled(made.values)(jnp.array([[1.0, -1.0, 0.5, 0.25]]), MEMBERS)
+    np.testing.assert_allclose(values, [[2.5, 4.0, 99.5]])
+
+
+@pytest.mark.parametrize("parameter", range(4))
+def test_a_critic_sees_only_its_own_groups_parameters(parameter, compiled):
+    made, drawn = critics(), parameters()
+    values = compiled(made.values)
+    before = np.asarray(values(drawn, MEMBERS))
+    after = np.asarray(values(drawn.at[:, parameter].set(-drawn[:, parameter] + 0.1), MEMBERS))
+    own = np.asarray(MEMBERS)[:, parameter]
+    np.testing.assert_array_equal(after[:, ~own], before[:, ~own])
+    assert (after[:, own] != before[:, own]).all()
+
+
+def test_nothing_flows_back_to_another_groups_parameters():
+    jacobian = jax.jacobian(lambda row: critics().values(row[None], MEMBERS)[0])(parameters()[0])
+    assert ((np.asarray(jacobian) != 0) == np.asarray(MEMBERS)).all()
+
+
+def test_a_critic_learns_what_its_parameters_earn():
+    # R = ξ_0 ξ_2 + ξ_1² - ξ_3 is a sum over the groups; VDN's sum can fit it, and credits parameter 3 as it should
+    import optax
+
+    from madoc.learning.networks import descend
+
+    optimiser, drawn = optax.adam(1e-2), parameters(512)
+    reward = drawn[:, 0] * drawn[:, 2] + drawn[:, 1] ** 2 - drawn[:, 3]
+
+    def loss_of(made):
+        return value_loss(made.values(drawn, MEMBERS), made.weight, made.bias, reward, "sum")
+
+    @eqx.filter_jit
+    def update(made, state):
+        return descend(optimiser, eqx.filter_grad(loss_of)(made), state, made)
+
+    made = critics()
+    state = optimiser.init(eqx.filter(made, eqx.is_array))
+    for _ in range(300):
+        made, state = update(made, state)
+    assert loss_of(made) < 0.005
+    credit = np.asarray(made.values(drawn, MEMBERS))[:, 2]
+    assert np.corrcoef(credit, drawn[:, 3])[0, 1] < -0.99

@@ -1,0 +1,34 @@
+"""Strictness for the whole suite, and what tests of equations share."""
+
+import os
+
+import equinox as eqx
+import jax
+import jax.monitoring
+import pytest
+
+os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"  # for the processes that tests start
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+_TRACE_EVENT = "/jax/core/compile/jaxpr_trace_duration"
+_traces: list[str] = []
+
+
+def _listen(event: str, duration: float, **_: object) -> None:
+    if event == _TRACE_EVENT:
+        _traces.append(event)
+
+
+jax.monitoring.register_event_duration_secs_listener(_listen)
+
+
+@pytest.fixture(params=["eager", "jitted"])
+def compiled(request):
+    """Wraps a function under test: as it is, or jitted."""
+    return eqx.filter_jit if request.param == "jitted" else lambda function: function
+
+
+@pytest.fixture
+def traced():
+    """How many functions JAX has traced so far: unchanged over calls that reuse what was traced."""
+    return lambda: len(_traces)

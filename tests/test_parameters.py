@@ -1,0 +1,128 @@
+"""Parameters: the map between [-1, 1] and physical values, and what is refused."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from madoc.errors import MadocError
+from madoc.parameters import FIELDS, Parameter, ParameterSpace
+
+SPACE = ParameterSpace(
+    (
+        Parameter("gravity", "", -30.0, 0.0),
+        Parameter("body_mass", "torso", 3.0, 5.0),
+        Parameter("dof_damping", "foot_joint", 0.0, 3.0),
+    )
+)
+
+
+def test_name_and_unit():
+    assert SPACE.names == ("gravity", "body_mass.torso", "dof_damping.foot_joint")
+    assert [parameter.unit for parameter in SPACE.parameters] == ["m/s²", "kg", "N·m·s/rad"]
+    assert len(SPACE) == 3
+
+
+def test_physical_values_worked_by_hand():
+    np.testing.assert_array_equal(SPACE.to_physical([0.5, -0.5, 0.0]), [-7.5, 3.5, 1.5])
+    np.testing.assert_array_equal(SPACE.to_unit([-7.5, 3.5, 1.5]), [0.5, -0.5, 0.0])
+    np.testing.assert_array_equal(SPACE.middle, [-15.0, 4.0, 1.5])
+
+
+def test_corners_are_the_ranges_exactly():
+    np.testing.assert_array_equal(SPACE.to_physical(-np.ones(3)), SPACE.low)
+    np.testing.assert_array_equal(SPACE.to_physical(np.ones(3)), SPACE.high)
+
+
+@pytest.mark.parametrize("shape", [(3,), (7, 3), (2, 5, 3)])
+def test_to_unit_inverts_to_physical_over_any_leading_axes(shape):
+    unit = np.random.default_rng(0).uniform(-1.0, 1.0, shape)
+    physical = SPACE.to_physical(unit)
+    assert physical.shape == shape
+    assert physical.dtype == np.float64
+    assert ((physical >= SPACE.low) & (physical <= SPACE.high)).all()
+    np.testing.assert_allclose(SPACE.to_unit(physical), unit, atol=1e-14)
+
+
+def test_float32_becomes_float64():
+    assert SPACE.to_physical(np.zeros(3, dtype=np.float32)).dtype == np.float64
+    assert SPACE.to_unit(np.zeros(3, dtype=np.float32)).dtype == np.float64
+
+
+def test_permuting_parameters_permutes_the_map():
+    order = [2, 0, 1]
+    permuted = SPACE.select([SPACE.names[index] for index in order])
+    unit = np.array([0.1, -0.7, 0.9])
+    np.testing.assert_array_equal(permuted.to_physical(unit[order]), SPACE.to_physical(unit)[order])
+
+
+def test_select_keeps_the_order_given():
+    assert SPACE.select(["dof_damping.foot_joint", "gravity"]).names == ("dof_damping.foot_joint", "gravity")
+
+
+def test_select_refuses_a_name_that_is_not_there():
+    with pytest.raises(MadocError, match=r"no parameter 'body_mass.head' here; there are: gravity, body_mass"):
+        SPACE.select(["gravity", "body_mass.head"])
+
+
+def test_vector_by_name_whatever_the_order():
+    values = {"dof_damping.foot_joint": 1.0, "gravity": -9.81, "body_mass.torso": 4}
+    np.testing.assert_array_equal(SPACE.vector(values), [-9.81, 4.0, 1.0])
+
+
+def test_vector_refuses_a_missing_and_an_unknown_name():
+    with pytest.raises(MadocError, match=r"no value for 'body_mass.torso'; expected values for exactly: gravity"):
+        SPACE.vector({"gravity": -9.81})
+    values = {"gravity": -9.81, "body_mass.torso": 4.0, "dof_damping.foot_joint": 1.0, "wind": 1.0}
+    with pytest.raises(MadocError, match=r"unknown parameter 'wind'; expected values for exactly: gravity"):
+        SPACE.vector(values)
+
+
+def test_an_unknown_field_is_refused():
+    with pytest.raises(MadocError, match=r"unknown parameter field 'mass'; expected one of gravity, body_mass"):
+        Parameter("mass", "torso", 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("field", "element", "sentence"),
+    [
+        ("gravity", "torso", "parameter field 'gravity' takes no element, got 'torso'"),
+        ("body_mass", "", "parameter field 'body_mass' takes the name of a body, got ''"),
+        ("geom_friction", "", "parameter field 'geom_friction' takes the name of a geom, got ''"),
+    ],
+)
+def test_an_element_where_none_belongs_and_the_reverse(field, element, sentence):
+    with pytest.raises(MadocError, match=sentence):
+        Parameter(field, element, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(1.0, 1.0), (2.0, 1.0), (np.nan, 1.0), (0.0, np.nan), (0.0, np.inf), (-np.inf, 0.0)]
+)
+def test_a_range_must_be_finite_and_ordered(low, high):
+    with pytest.raises(MadocError, match=r"range of gravity must be finite with low < high, got \["):
+        Parameter("gravity", "", low, high)
+
+
+@pytest.mark.parametrize("field", [name for name, field in FIELDS.items() if field.minimum == 0.0])
+def test_a_range_below_the_physical_bound_is_refused(field):
+    with pytest.raises(MadocError, match=rf"range of {field}.x starts at -0.1 .*, below its physical bound 0.0"):
+        Parameter(field, "x", -0.1, 1.0)
+
+
+@pytest.mark.parametrize("field", ["gravity", "actuator_gain"])
+def test_only_gravity_and_gain_may_be_negative(field):
+    assert FIELDS[field].minimum == -np.inf
+    assert [name for name, kind in FIELDS.items() if kind.minimum == -np.inf] == ["gravity", "actuator_gain"]
+
+
+def test_an_empty_space_and_a_repeated_name_are_refused():
+    with pytest.raises(MadocError, match="needs at least one parameter, got none"):
+        ParameterSpace(())
+    with pytest.raises(MadocError, match="parameters named twice: gravity"):
+        ParameterSpace((SPACE.parameters[0], SPACE.parameters[0]))
+
+
+def test_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        SPACE.parameters[0].low = 0.0  # type: ignore[misc]
