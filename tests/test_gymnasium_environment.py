@@ -139,7 +139,7 @@ def test_an_explosion_truncates_at_the_last_good_state():
 
 
 def test_mistakes_are_refused_in_one_sentence(hopper):
-    with pytest.raises(MadocError, match="unknown parameter 'body_mass.head'; expected values for exactly"):
+    with pytest.raises(MadocError, match=r"unknown parameter 'body_mass.head'; expected values for exactly"):
         values = dict.fromkeys(hopper.unwrapped.task.parameters.names, 1.0)
         gymnasium.make("madoc/Hopper", parameters={**values, "body_mass.head": 1.0})
     with pytest.raises(MadocError, match="no value for 'gravity'"):

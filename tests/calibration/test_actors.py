@@ -16,7 +16,9 @@ from madoc.learning.tanh_gaussian import log_density
 
 
 def gaussian(mean, std):
-    return Actors(jnp.atleast_1d(jnp.asarray(mean, jnp.float32)), jnp.log(jnp.atleast_1d(jnp.asarray(std, jnp.float32))))
+    return Actors(
+        jnp.atleast_1d(jnp.asarray(mean, jnp.float32)), jnp.log(jnp.atleast_1d(jnp.asarray(std, jnp.float32)))
+    )
 
 
 def test_actors_start_as_the_standard_normal():

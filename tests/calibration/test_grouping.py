@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from affine import affine
 
+from affine import affine
 from madoc.calibration.madoc import grouping
 from madoc.calibration.madoc.grouping import LATENT, GroupingVAE
 from madoc.learning import replay
@@ -37,7 +37,7 @@ def simulated_rows(affects, count=4000, seed=0):
 @pytest.mark.parametrize("affects", [(0, 0, 1, 1), (0, 1, 0, 1), (1, 0, 0, 0)])
 def test_parameters_of_one_effect_become_one_group(affects):
     vae, state = untrained()
-    vae, _, metrics = grouping.train(
+    vae, _, _ = grouping.train(
         vae, state, simulated_rows(affects), jax.random.key(1), optimiser=OPTIMISER, batch=256, count=800
     )
     expected = [0 if channel == affects[0] else 1 for channel in affects]

@@ -2,9 +2,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from madoc.calibration.madoc.value_decomposition import GroupCritics, total_value, value_loss
+from madoc.learning.networks import descend
 
 VALUES = jnp.array([[1.0, 2.0], [3.0, -1.0]])
 REWARD = jnp.array([2.0, 0.0])
@@ -121,10 +123,6 @@ def test_nothing_flows_back_to_another_groups_parameters():
 
 def test_a_critic_learns_what_its_parameters_earn():
     # R = ξ_0 ξ_2 + ξ_1² - ξ_3 is a sum over the groups; VDN's sum can fit it, and credits parameter 3 as it should
-    import optax
-
-    from madoc.learning.networks import descend
-
     optimiser, drawn = optax.adam(1e-2), parameters(512)
     reward = drawn[:, 0] * drawn[:, 2] + drawn[:, 1] ** 2 - drawn[:, 3]
 

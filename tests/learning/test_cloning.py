@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from affine import affine
 
+from affine import affine
 from madoc.learning.cloning import clone, cloning_loss
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 

@@ -3,8 +3,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from affine import affine
 
+from affine import affine
 from madoc.learning.dynamics_ratio import Discriminators, Scaling, discriminator_loss, log_dynamics_ratio
 from madoc.types import Transitions
 
@@ -126,9 +126,7 @@ def test_dropout_acts_in_the_loss_with_a_key_and_never_in_the_ratio():
     undropped = random_discriminators(dropout=0.0)
     assert plain == discriminator_loss(undropped, features, features)[0]
     assert plain != dropped
-    np.testing.assert_array_equal(
-        log_dynamics_ratio(parts, *features), log_dynamics_ratio(undropped, *features)
-    )
+    np.testing.assert_array_equal(log_dynamics_ratio(parts, *features), log_dynamics_ratio(undropped, *features))
 
 
 def test_standardised_scaling_by_hand():

@@ -3,9 +3,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from affine import affine
 from scipy import stats
 
+from affine import affine
 from madoc.learning import sac_losses
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy

@@ -1,0 +1,34 @@
+# Everything happens in .venv, made on first use from the locked versions. Python 3.11 or later, pip and make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+
+.PHONY: demo test test-slow check lock clean
+
+demo: $(STAMP)  ## the main job on Hopper, small: record, calibrate, learn, evaluate
+	$(BIN)/madoc run hopper-medium --preset demo --out runs/demo --fresh
+
+test: $(STAMP)  ## every test that takes seconds
+	$(BIN)/python -m pytest -n 2
+
+test-slow: $(STAMP)  ## the others
+	$(BIN)/python -m pytest -n 2 -m slow
+
+check: $(STAMP)  ## format, lint, types, layers
+	$(BIN)/ruff format --check src tests benchmarks examples
+	$(BIN)/ruff check src tests benchmarks examples
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+lock: $(STAMP)  ## write the installed versions down, without addresses
+	$(BIN)/python -m pip freeze --exclude-editable > requirements.lock
+
+$(STAMP): pyproject.toml requirements.lock
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	touch $(STAMP)
+
+clean:  ## remove the environment, not your runs
+	rm -rf $(VENV)

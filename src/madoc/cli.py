@@ -1,0 +1,130 @@
+"""The command `madoc`: arguments in, words out. What the commands do is in `madoc.commands`."""
+
+import contextlib
+import io
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Annotated, Any, TextIO
+
+import tyro
+from tyro.conf import subcommand
+
+from madoc.commands.answer import EXIT_CODES, Answer, Command
+from madoc.commands.calibrate import Calibrate
+from madoc.commands.evaluate import Evaluate
+from madoc.commands.learn import Learn
+from madoc.commands.lists import Methods, Tasks
+from madoc.commands.record import Record
+from madoc.commands.run import Run
+from madoc.errors import MadocError
+from madoc.files import json_text
+
+REFUSED = 2
+"""Exit code of a user's mistake."""
+INTERRUPTED = EXIT_CODES["interrupted"]
+WIDTH = 110
+"""Columns of a table where standard output is no terminal."""
+
+Commands = (
+    Annotated[Run, subcommand("run")]
+    | Annotated[Record, subcommand("record")]
+    | Annotated[Calibrate, subcommand("calibrate")]
+    | Annotated[Learn, subcommand("learn")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Tasks, subcommand("tasks")]
+    | Annotated[Methods, subcommand("methods")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line; its exit code. A user's mistake is one sentence on standard error and code 2."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        command = _parse(given)
+        with _calm(), contextlib.redirect_stdout(sys.stderr):
+            answer = command.run()
+    except MadocError as error:
+        print(f"madoc: {error}", file=sys.stderr)
+        return REFUSED
+    except KeyboardInterrupt:
+        print("madoc: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    try:
+        _say(answer, as_json=command.output.json)
+    except BrokenPipeError:  # the reader of a pipe has seen enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return EXIT_CODES[answer.status]
+
+
+def _parse(arguments: Sequence[str]) -> Command:
+    """The command and its options.
+
+    Raises:
+        MadocError: They cannot be understood.
+    """
+    heard = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(heard):
+            return tyro.cli(
+                Commands,  # type: ignore[arg-type]
+                prog="madoc",
+                description="Calibrate a simulator to logged robot data, learn a policy there, and show that it "
+                "works in the target.",
+                args=arguments,
+                config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone),
+            )
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise MadocError(_one_sentence(heard.getvalue())) from None
+
+
+def _one_sentence(box: str) -> str:
+    """What tyro draws as a box: its first paragraph, a suggestion if there is one, and where to read on."""
+    lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:-1]]
+    paragraphs = [" ".join(text.split()) for text in "\n".join(lines).split("─" * 10) if text.strip("─\n ")]
+    paragraphs = [text.strip("─ ") for text in paragraphs]
+    if not paragraphs:
+        return " ".join(box.split())
+    told = [paragraphs[0].rstrip(".")]
+    told += [text for text in paragraphs[1:-1] if text.startswith(("Perhaps", "Available"))][:1]
+    read_on = paragraphs[-1] if paragraphs[-1].startswith("For full") else ""
+    read_on = read_on[read_on.find("madoc") :]
+    return "; ".join([*told, f"see {read_on}"] if read_on else told)
+
+
+@contextlib.contextmanager
+def _calm() -> Any:
+    """Warnings as one line each."""
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        print(f"madoc: warning: {message}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+def _say(answer: Answer, *, as_json: bool) -> None:
+    """Print an answer on standard output."""
+    if as_json:
+        print(json_text(dict(answer.json), what="the answer"), flush=True)
+        return
+    from rich.console import Console
+
+    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    for part in answer.text:
+        console.print(part, markup=False, highlight=False, soft_wrap=isinstance(part, str))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,86 @@
+"""What a command returns, and the options all commands share."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from rich.console import RenderableType
+from rich.table import Table
+
+EXIT_CODES: Mapping[str, int] = {"finished": 0, "converged": 0, "diverged": 1, "interrupted": 130}
+"""Exit codes by how a run ended; 2 is a refusal."""
+
+PLACE_NAMES: Mapping[str, str] = {
+    "calibrated": "at the calibrated parameters",
+    "midrange": "at mid-range (yardstick)",
+    "truth": "at the truth (yardstick)",
+}
+"""What a policy is called in a table, by where it was learnt."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The outcome of a command.
+
+    Attributes:
+        json: What `--json` prints.
+        text: What is printed without it, one after another.
+        status: A key of `EXIT_CODES`.
+    """
+
+    json: Mapping[str, Any]
+    text: tuple[RenderableType, ...]
+    status: str = "finished"
+
+
+@dataclass(frozen=True)
+class Output:
+    """What is shown."""
+
+    quiet: bool = False
+    """Show no progress."""
+    json: bool = False
+    """Print exactly one JSON object on standard output."""
+
+
+class Command(Protocol):
+    """A command with its options."""
+
+    @property
+    def output(self) -> Output:
+        """What is shown."""
+        ...
+
+    def run(self) -> Answer:
+        """Do it."""
+        ...
+
+
+def evaluation_table(evaluation: Mapping[str, Any]) -> Table:
+    """Returns in the target, a row a policy."""
+    episodes = evaluation["episodes"]
+    table = Table(title=f"{evaluation['task']}: returns in the target, {episodes} episodes", title_justify="left")
+    table.add_column("policy learnt")
+    for heading in ("return ± std", "normalized", "length"):
+        table.add_column(heading, justify="right")
+    for name, row in evaluation["policies"].items():
+        table.add_row(
+            PLACE_NAMES.get(name, name),
+            f"{row['return']:,.1f} ± {row['return_std']:,.1f}",
+            f"{row['normalized']:.1f}",
+            f"{row['length']:.0f}",
+        )
+    return table
+
+
+def evaluation_text(evaluation: Mapping[str, Any]) -> tuple[RenderableType, ...]:
+    """The table, and how near the calibrated policy comes to that of the truth."""
+    share = evaluation.get("calibrated_percent_of_truth")
+    line = () if share is None else (f"calibrated: {share:.1f} % of the return of the policy learnt at the truth",)
+    return (evaluation_table(evaluation), *line)
+
+
+def left_behind(path: Path, what: str) -> str:
+    """A line on what was left where."""
+    return f"{what}: {path}"

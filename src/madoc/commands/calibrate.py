@@ -1,0 +1,91 @@
+"""`madoc calibrate`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
+
+from madoc.commands.answer import Answer, Output, left_behind
+from madoc.errors import MadocError
+
+Settings = UseAppendAction[tuple[tuple[str, ...], ...]]
+"""`--set a=1 b=2 --set c=3`."""
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Find the parameters under which the simulator moves as the data does.
+
+    Leaves a run folder: result.json, spec.json, metrics.jsonl, TensorBoard events and a checkpoint.
+    """
+
+    task: Annotated[Positional[str], arg(metavar="TASK")]
+    """The robot, as `madoc tasks` lists it."""
+    data: str
+    """The log: a D4RL, NeoRL or Minari file, one of `madoc record`, or a Minari id."""
+    format: str | None = None
+    """Format of the log: d4rl, neorl, minari or madoc. Default: look at its content."""
+    clip_actions: bool = False
+    """Clip actions outside [-1, 1] instead of refusing them."""
+    max_transitions: int = 200_000
+    """Keep at most so many rows, drawn as whole episodes."""
+    physics: Literal["legacy", "modern"] | None = None
+    """Physics to calibrate in. Default: the data's; legacy where it does not say."""
+    level: str = "normal"
+    """Ranges to search: easy, normal or hard."""
+    parameters: tuple[str, ...] = ()
+    """Calibrate only these. Default: all of the robot's."""
+    method: str = "madoc"
+    """A calibrator, as `madoc methods` lists it."""
+    starts: Literal["policy", "logged", "replay"] | None = None
+    """Where rollouts start: free running from resets, short ones from logged states, or one step of the log."""
+    set: Settings = ()
+    """Hyperparameters of the method as name=value."""
+    budget: int = 300_000
+    """Simulated control steps."""
+    seed: int = 0
+    """Of all randomness."""
+    truth: Path | None = None
+    """JSON file {parameter: value} to judge the result by; no method ever sees it."""
+    out: Path | None = None
+    """Run folder. Default: runs/TASK-METHOD-SEED."""
+    resume: bool = False
+    """Go on with the run in the folder."""
+    output: OmitArgPrefixes[Output] = field(default_factory=Output)
+
+    def run(self) -> Answer:
+        """Calibrate, and leave the run folder."""
+        from madoc.pipeline import CalibrationOrder, Source, calibrate_in, split_name
+        from madoc.pipeline.data_stage import read_truth
+
+        if split_name(self.task)[1]:
+            raise MadocError(f"expected the name of a robot, got {self.task!r}; the data is given with --data")
+        order = CalibrationOrder(
+            task=self.task,
+            source=Source(self.data, self.format, self.clip_actions, self.max_transitions),
+            physics=self.physics,
+            level=self.level,
+            parameters=self.parameters,
+            method=self.method,
+            changes=changes_of(self.set, self.starts),
+            budget=self.budget,
+            seed=self.seed,
+            truth=None if self.truth is None else read_truth(self.truth),
+        )
+        out = self.out or Path("runs") / f"{self.task}-{self.method}-{self.seed}"
+        result = calibrate_in(out, order, resume=self.resume, quiet=self.output.quiet)
+        lines = (result.table(), result.summary(), left_behind(out, "run folder"))
+        return Answer(result.to_json(), lines, result.status)
+
+
+def changes_of(settings: tuple[tuple[str, ...], ...], starts: str | None = None) -> dict[str, str]:
+    """Hyperparameters as given on the command line."""
+    from madoc.pipeline.methods import parse_settings
+
+    changes = parse_settings([setting for group in settings for setting in group])
+    if starts is None:
+        return changes
+    if "starts" in changes:
+        raise MadocError(f"starts is given twice: --starts {starts} and --set starts={changes['starts']}")
+    return changes | {"starts": starts}

@@ -1,0 +1,23 @@
+"""The stages of the main job with their files, and `run_all`, which does them one after another."""
+
+from madoc.pipeline.calibration_stage import CalibrationOrder, calibrate_in, read_calibration
+from madoc.pipeline.data_stage import Source, fingerprint, load_source, record_named, split_name
+from madoc.pipeline.evaluation_stage import evaluate_folder
+from madoc.pipeline.learning_stage import PolicyOrder, learn_in
+from madoc.pipeline.whole import Plan, run_all
+
+__all__ = [
+    "CalibrationOrder",
+    "Plan",
+    "PolicyOrder",
+    "Source",
+    "calibrate_in",
+    "evaluate_folder",
+    "fingerprint",
+    "learn_in",
+    "load_source",
+    "read_calibration",
+    "record_named",
+    "run_all",
+    "split_name",
+]

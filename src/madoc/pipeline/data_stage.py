@@ -1,0 +1,143 @@
+"""The data of a run: recorded, or read from a file."""
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from madoc import data, simulation, tasks
+from madoc.data import Dataset
+from madoc.errors import MadocError, unknown_name
+from madoc.files import read_json
+from madoc.pipeline.keys import stage_key
+from madoc.policies.behaviours import QUALITIES, record_quality
+from madoc.progress import bar
+from madoc.simulation import CpuSimulator
+from madoc.tasks import TASKS, Task
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where logged data is and how to read it.
+
+    Attributes:
+        path: A file, a Minari directory or a Minari id.
+        format: A name in `data.FORMATS`; None looks at the content.
+        clip_actions: Clip actions outside [-1, 1] instead of refusing them.
+        max_transitions: Keep at most so many, drawn as whole episodes; None keeps all.
+    """
+
+    path: str
+    format: str | None = None
+    clip_actions: bool = False
+    max_transitions: int | None = 200_000
+
+
+def absolute_source(path: str, format: str | None, clip_actions: bool) -> Source:
+    """A source that means the same from any working directory; a Minari id stays what it is."""
+    file = Path(path).expanduser()
+    return Source(str(file.resolve()) if file.exists() else path, format, clip_actions)
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a policy is for: the simulator at the true parameters."""
+
+    simulator: CpuSimulator
+    parameters: np.ndarray
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """`hopper-medium-replay` as (`hopper`, `medium-replay`); the quality of a bare `hopper` is empty.
+
+    Raises:
+        MadocError: No such task, or no such quality.
+    """
+    task_name, _, quality = name.partition("-")
+    if task_name not in TASKS:
+        raise unknown_name("task", task_name, TASKS)
+    if quality and quality not in QUALITIES:
+        raise unknown_name("quality", quality, QUALITIES)
+    return task_name, quality
+
+
+def record_named(name: str, *, transitions: int, physics: str, seed: int, quiet: bool = True) -> Dataset:
+    """Record `TASK-QUALITY` in the target with the paper's truth.
+
+    Raises:
+        MadocError: The name is no TASK-QUALITY, or `record_quality` refuses.
+    """
+    task_name, quality = split_name(name)
+    if not quality:
+        raise MadocError(
+            f"expected TASK-QUALITY, got {name!r}; for example {task_name}-medium, of: {', '.join(QUALITIES)}"
+        )
+    if transitions < 1:
+        raise MadocError(f"expected at least 1 transition to record, got {transitions}")
+    key = stage_key(seed, "recording")
+    simulator = simulation.make(tasks.make(task_name, physics))
+    with bar(f"recording {name}", total=transitions, unit="transitions", quiet=quiet) as advance:
+        return record_quality(simulator, quality, transitions=transitions, key=key, advance=advance)
+
+
+def load_source(source: Source, task: Task, *, seed: int) -> Dataset:
+    """Read logged data of a robot.
+
+    Raises:
+        MadocError: As `data.load`.
+    """
+    return data.load(
+        source.path,
+        task,
+        format=source.format,
+        max_transitions=source.max_transitions,
+        key=stage_key(seed, "subsampling"),
+        clip_actions=source.clip_actions,
+    )
+
+
+def fingerprint(dataset: Dataset) -> str:
+    """A checksum of the transitions: a run is only resumed on the data it was started with."""
+    logged, total = dataset.transitions, 0
+    for column in (logged.observation, logged.action, logged.next_observation, logged.terminated):
+        total = zlib.crc32(np.ascontiguousarray(column).tobytes(), total)
+    return f"{total:08x}"
+
+
+def read_truth(path: Path) -> dict[str, float]:
+    """True parameters from a JSON file `{name: value}`.
+
+    Raises:
+        MadocError: Missing, no JSON, or not numbers by name.
+    """
+    values = read_json(path)
+    if not isinstance(values, dict) or not values:
+        raise MadocError(f'expected {{"parameter": value, ...}} in {path}, got {type(values).__name__}')
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise MadocError(f"expected a finite number for {name} in {path}, got {value!r}")
+    return {name: float(value) for name, value in values.items()}
+
+
+def check_truth(truth: Mapping[str, float], task: Task, *, physics: str) -> None:
+    """Refuse a truth that does not say every calibrated parameter, or says one the robot does not have.
+
+    Raises:
+        MadocError: Names the parameter.
+    """
+    known = tasks.make(task.name, physics).parameters.names
+    for name in truth:
+        if name not in known:
+            raise unknown_name(f"parameter of {task.name} in the truth", name, known)
+    missing = [name for name in task.parameters.names if name not in truth]
+    if missing:
+        raise MadocError(f"the truth has no value for {missing[0]}; add it, or leave it out of --parameters")
+
+
+def make_target(task_name: str, physics: str, truth: Mapping[str, float]) -> Target:
+    """The target: all true parameters are bound, also those that were not calibrated."""
+    whole = tasks.make(task_name, physics)
+    simulator = simulation.make(replace(whole, parameters=whole.parameters.select(list(truth))))
+    return Target(simulator, simulator.parameters.vector(dict(truth)))

@@ -1,0 +1,115 @@
+"""Policy learning as a stage: in a calibrated simulator, or at one of the two yardsticks."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from madoc import simulation
+from madoc.errors import MadocError, unknown_name
+from madoc.pipeline.calibration_stage import Calibrated
+from madoc.pipeline.data_stage import check_truth, load_source, make_target
+from madoc.pipeline.folders import working_folder
+from madoc.pipeline.keys import stage_key
+from madoc.pipeline.methods import hyperparameters, make_method
+from madoc.policies import LEARNERS, LearnedPolicy, PolicyProblem, learn_policy
+from madoc.simulation import CpuSimulator
+
+PLACES = ("calibrated", "midrange", "truth")
+"""Where a policy may be learnt: at the estimate, in the uncalibrated simulator, in the target itself."""
+
+
+@dataclass(frozen=True)
+class PolicyOrder:
+    """What a policy learner is asked.
+
+    Attributes:
+        at: One of `PLACES`.
+        method: A name in `LEARNERS`.
+        changes: Hyperparameters that differ from the method's own.
+        budget: Simulated control steps.
+        seed: Of all randomness.
+    """
+
+    at: str = "calibrated"
+    method: str = "sac"
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    budget: int = 300_000
+    seed: int = 0
+
+
+def learn_in(
+    out: Path,
+    calibrated: Calibrated,
+    order: PolicyOrder,
+    *,
+    truth: Mapping[str, float] | None = None,
+    resume: bool = False,
+    quiet: bool = True,
+) -> LearnedPolicy:
+    """Learn a policy, and leave a run folder with `policy.npz`.
+
+    Args:
+        out: The folder.
+        calibrated: The calibration.
+        order: What to learn, and where.
+        truth: The target's values by name; None takes those the calibration remembers.
+        resume: Go on with the run in the folder.
+        quiet: Show no progress.
+
+    Raises:
+        MadocError: The order cannot be carried out; a new folder is then not left behind.
+    """
+    if order.budget < 1:
+        raise MadocError(f"expected a budget of at least 1 control step, got {order.budget}")
+    key = stage_key(order.seed, "learning")
+    method = make_method(LEARNERS, order.method, order.changes)
+    known = calibrated.truth if truth is None else dict(truth)
+    simulator, parameters = _system(calibrated, order.at, known)
+    dataset = None
+    if getattr(method, "cloning", None) is not None:
+        if calibrated.source is None:
+            raise MadocError(
+                f"{order.method} clones the data's actions, and a bare result names no data; "
+                "give it the run folder of the calibration"
+            )
+        dataset = load_source(calibrated.source, calibrated.task, seed=calibrated.seed)
+    spec = {
+        "command": "learn",
+        "task": calibrated.task.name,
+        "physics": calibrated.task.physics,
+        "at": order.at,
+        "parameters": dict(zip(simulator.parameters.names, parameters.tolist(), strict=True)),
+        "method": order.method,
+        "hyperparameters": hyperparameters(method),
+        "seed": order.seed,
+        "budget": order.budget,
+        "truth": known,
+    }
+    with working_folder(out, spec, resume=resume) as folder:
+        # One that an interrupted run left would be taken for the finished policy after a kill.
+        (out / "policy.npz").unlink(missing_ok=True)
+        problem = PolicyProblem(simulator, parameters, dataset)
+        return learn_policy(method, problem, key=key, budget=order.budget, folder=folder, resume=resume, quiet=quiet)
+
+
+def policy_folder_name(at: str, method: str) -> str:
+    """`policy-calibrated`, with the method behind it where that is not SAC."""
+    return f"policy-{at}" if method == "sac" else f"policy-{at}-{method}"
+
+
+def _system(calibrated: Calibrated, at: str, truth: Mapping[str, float] | None) -> tuple[CpuSimulator, np.ndarray]:
+    """The simulator to learn in, and its physical values."""
+    if at not in PLACES:
+        raise unknown_name("place to learn at", at, PLACES)
+    if truth is not None:
+        check_truth(truth, calibrated.task, physics=calibrated.task.physics)
+    if at == "truth":
+        if truth is None:
+            raise MadocError("the true parameters are not known here; pass --truth FILE.json")
+        target = make_target(calibrated.task.name, calibrated.task.physics, truth)
+        return target.simulator, target.parameters
+    simulator = simulation.make(calibrated.task)
+    return simulator, calibrated.result.mean if at == "calibrated" else simulator.parameters.middle
