@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 
 from affine import affine
-from madoc.learning.dynamics_ratio import Discriminators, Scaling, discriminator_loss, log_dynamics_ratio
+from madoc.learning.dynamics_ratio import (
+    Discriminators,
+    Scaling,
+    blur,
+    discriminator_loss,
+    log_dynamics_ratio,
+)
 from madoc.types import Transitions
 
 
@@ -127,6 +133,24 @@ def test_dropout_acts_in_the_loss_with_a_key_and_never_in_the_ratio():
     assert plain == discriminator_loss(undropped, features, features)[0]
     assert plain != dropped
     np.testing.assert_array_equal(log_dynamics_ratio(parts, *features), log_dynamics_ratio(undropped, *features))
+
+
+def test_blur_adds_normal_noise_of_one_scale_to_both(compiled):
+    logged, simulated = jnp.zeros((20_000, 2)), jnp.full((20_000, 2), 3.0)
+    noisy = [np.asarray(rows) for rows in compiled(blur)((logged, simulated), 0.5, jax.random.key(0))]
+    for rows, mean in zip(noisy, (0.0, 3.0), strict=True):
+        # the mean of 20 000 has std 0.5 / 141 = 0.0035
+        np.testing.assert_allclose(rows.mean(0), mean, atol=0.02)
+        np.testing.assert_allclose(rows.std(0), 0.5, rtol=0.03)
+    # drawn apart: neither the two nor their channels share noise
+    together = np.concatenate([noisy[0], noisy[1] - 3.0], axis=-1)
+    np.testing.assert_allclose(np.corrcoef(together.T), np.eye(4), atol=0.04)
+
+
+def test_no_blur_leaves_features_as_they_are():
+    rows = random_features()[1]
+    for unblurred in blur((rows, rows), 0.0, jax.random.key(0)):
+        np.testing.assert_array_equal(unblurred, rows)
 
 
 def test_standardised_scaling_by_hand():

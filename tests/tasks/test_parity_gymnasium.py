@@ -61,7 +61,7 @@ def test_observation_reward_and_termination_along_random_episodes(robot, nominal
             if terminated:
                 falls += 1
                 break
-    assert falls == {"hopper": 5, "walker2d": 5}.get(task.name, 0)
+    assert falls == (0 if task.name == "halfcheetah" else 5)
 
 
 def test_health_agrees_far_from_where_random_episodes_go(robot):
@@ -104,11 +104,11 @@ def test_models_agree_in_everything_that_moves_them(robot):
 def test_resets_are_spread_as_gymnasiums(robot):
     task, environment = robot
     bare = environment.unwrapped
-    ours = np.asarray(task.reset_noise(jax.random.key(0), 200), dtype=np.float64)
+    ours = np.asarray(task.reset_noise(jax.random.key(0), 2000), dtype=np.float64)
     theirs = []
-    for seed in range(200):
+    for seed in range(60):
         environment.reset(seed=seed)
         theirs.append(bare.state_vector() - np.concatenate([bare.init_qpos, bare.init_qvel]))
     for part in (slice(None, bare.model.nq), slice(bare.model.nq, None)):
-        assert ours[:, part].std() == pytest.approx(np.std(np.array(theirs)[:, part]), rel=0.05)
+        assert ours[:, part].std() == pytest.approx(np.std(np.array(theirs)[:, part]), rel=0.1)
         assert abs(ours[:, part].mean()) < 0.1 * ours[:, part].std()

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields, is_dataclass, replace
 from typing import Any, NoReturn, Protocol, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
@@ -26,7 +26,7 @@ def make_method(entries: Mapping[str, Entry], name: str, changes: Mapping[str, A
     Args:
         entries: `CALIBRATORS` or `LEARNERS`.
         name: One of its keys.
-        changes: Hyperparameters by name. Text that is JSON (`3`, `[256, 256]`, `null`) is read as such.
+        changes: Hyperparameters by name, those of a part of it as `agents.batch`. Text that is JSON (`3`, `[256, 256]`, `null`) is read as such.
 
     Raises:
         MadocError: No such method, no such hyperparameter, or a value of another type.
@@ -34,18 +34,33 @@ def make_method(entries: Mapping[str, Entry], name: str, changes: Mapping[str, A
     if name not in entries:
         raise unknown_name("method", name, entries)
     make = entries[name].make
-    kind = type(make())
-    types = get_type_hints(kind)
-    known = [field.name for field in fields(kind) if field.init]
-    for changed in changes:
-        if changed not in known:
-            raise unknown_name(f"hyperparameter of {name}", changed, known)
-    return make(**{key: _typed(key, value, types[key], name) for key, value in changes.items()})
+    default = make()
+    types = _types(type(default))
+    new: dict[str, Any] = {}
+    for changed, value in changes.items():
+        if changed not in types:
+            raise unknown_name(f"hyperparameter of {name}", changed, types)
+        typed = _typed(changed, value, types[changed], name)
+        whole, _, part = changed.partition(".")
+        new[whole] = replace(new.get(whole, getattr(default, whole)), **{part: typed}) if part else typed
+    return make(**new)
 
 
 def hyperparameters(method: Any) -> dict[str, Any]:
     """Every hyperparameter of a method by name."""
-    return {field.name: getattr(method, field.name) for field in fields(method) if field.init}
+    return asdict(method)
+
+
+def _types(kind: type, prefix: str = "") -> dict[str, Any]:
+    """The type of each hyperparameter; those of a part of the method are named `part.name`."""
+    hints, found = get_type_hints(kind), {}
+    for row in fields(kind):
+        hint = hints[row.name]
+        if is_dataclass(hint) and not prefix:
+            found |= _types(hint, f"{row.name}.")
+        else:
+            found[prefix + row.name] = hint
+    return found
 
 
 def parse_settings(settings: Iterable[str]) -> dict[str, str]:

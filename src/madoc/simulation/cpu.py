@@ -43,6 +43,7 @@ class CpuSimulator:
             find_element(self._model, parameter)
         self._data = [mujoco.MjData(self._model) for _ in range(self.threads)]
         self._pool = mujoco.rollout.Rollout(nthread=self.threads if self.threads > 1 else 0)
+        self._alone = mujoco.rollout.Rollout(nthread=0)
 
     @property
     def parameters(self) -> ParameterSpace:
@@ -127,11 +128,12 @@ class CpuSystem:
         bad = ~np.isfinite(self._start).all(1)
         if bad.any():
             self._start[bad, 1:] = simulator.initial_state
-        data = simulator._data if len(self._start) >= _ROWS_FOR_ALL_THREADS else simulator._data[:1]
+        many = len(self._start) >= _ROWS_FOR_ALL_THREADS
+        pool = simulator._pool if many else simulator._alone
         with _quiet():
-            simulator._pool.rollout(
+            pool.rollout(
                 self._repeated,
-                data,
+                simulator._data if many else simulator._data[:1],
                 self._start,
                 self._control,
                 skip_checks=True,

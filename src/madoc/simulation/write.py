@@ -50,7 +50,7 @@ def find_element(model: mujoco.MjModel, parameter: Parameter) -> int:
         index = int(model.jnt_bodyid[joint]) if joint >= 0 else -1
     if index < 0:
         names = element_names(model, kind)
-        near = get_close_matches(parameter.element, names, n=3, cutoff=0.4) or names[:8]
+        near = _nearest(parameter.element, names) or names[:8]
         raise MadocError(f"{parameter.name}: the model has no {kind} {parameter.element!r}; nearest: {', '.join(near)}")
     return index
 
@@ -62,10 +62,15 @@ def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
     return [name for name in names if name]
 
 
+def _nearest(wanted: str, names: list[str]) -> list[str]:
+    """At most three: names that hold the wanted one first, then those spelled like it."""
+    close = get_close_matches(wanted, names, n=3, cutoff=0.4)
+    return list(dict.fromkeys([*(name for name in names if wanted in name), *close]))[:3]
+
+
 def _dofs(model: mujoco.MjModel, joint: int) -> slice:
-    sizes = {mujoco.mjtJoint.mjJNT_FREE: 6, mujoco.mjtJoint.mjJNT_BALL: 3}
-    start = model.jnt_dofadr[joint]
-    return slice(start, start + sizes.get(model.jnt_type[joint], 1))
+    """The degrees of freedom of a joint: 6 of a free one, 3 of a ball, 1 of any other."""
+    return slice(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + len(model.joint(joint).damping))
 
 
 def _gravity(model: mujoco.MjModel, _: int, value: float) -> None:

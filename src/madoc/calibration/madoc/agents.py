@@ -24,6 +24,8 @@ from madoc.learning.networks import descend, moving_average, scan_updates
 
 AT_BOUND = 0.95
 """A reward past this share of its bound is counted as saturated."""
+LOG_BLUR_RANGE = (-9.0, 2.0)
+"""Logs of a share of a step's spread: 1e-4 to 7."""
 
 
 @jax.tree_util.register_dataclass
@@ -141,7 +143,7 @@ class AgentSettings:
             logged: Features of the target's rows.
             members: Which parameters belong to which group.
             key: Randomness.
-            mixing: How credit is given.
+            mixing: How credit is given. The reward is read at the unblurred s', where it is the least noisy.
             count: Updates.
         """
 
@@ -154,7 +156,7 @@ class AgentSettings:
             agents, metrics = self._update_discriminators(
                 agents, (logged[0][rows], target), (drawn["pair"], source), of_dropout
             )
-            reward = log_dynamics_ratio(agents.discriminators, drawn["pair"], source)
+            reward = log_dynamics_ratio(agents.discriminators, drawn["pair"], drawn["following"])
             agents = self._steer_blur(agents, reward)
             agents, value_metrics = self._update_critics(agents, drawn["parameters"], reward, members, mixing)
             agents, actor_metrics = self._update_actors(agents, members, of_actors)
@@ -233,7 +235,3 @@ class AgentSettings:
             updates=agents.updates + 1,
         )
         return following, {"actor_loss": loss, "actor_std": jnp.exp(actors.log_std).mean()}
-
-
-LOG_BLUR_RANGE = (-9.0, 2.0)
-"""Logs of a share of a step's spread: 1e-4 to 7."""

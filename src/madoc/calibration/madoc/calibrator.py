@@ -342,7 +342,7 @@ class Madoc:
             count=self.updates,
         )
         metrics = _scalars(device_metrics)
-        watched = watch.observe(state.watch, metrics, agents.average, blurred=self.agents.reward_size > 0)
+        watched = watch.observe(state.watch, metrics, agents.average, steered_to=self.agents.reward_size)
         following = replace(
             state,
             agents=agents,

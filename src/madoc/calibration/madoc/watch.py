@@ -12,6 +12,8 @@ SMOOTHING = 0.1
 """Share of an epoch in the running averages."""
 PROGRESS = 0.02
 """A mismatch smaller by this share is progress."""
+TELLING = 0.7
+"""Share of the steered reward size below which a blur is still being found, or can no longer be."""
 SATURATED = 0.5
 """Share of rows at the reward's bound past which a user is warned."""
 
@@ -27,7 +29,7 @@ class Watch:
             unsure as they are steered to be, or the mean |reward| where there is no blur.
         at_bound: Share of rows whose reward stands at its bound.
         best_mismatch: The lowest `mismatch` since the start.
-        best_epoch: When that was.
+        best_epoch: When it last fell by a share worth the name; 0 before there was any.
         best: The actors' moving average then.
     """
 
@@ -44,15 +46,23 @@ def begin_watch(actors: Actors) -> Watch:
     return Watch(0, 0.0, 0.0, 0.0, 0, actors)
 
 
-def observe(watch: Watch, metrics: Metrics, average: Actors, *, blurred: bool) -> Watch:
-    """Take in one epoch; keep its estimate if the mismatch has never been lower."""
-    mismatch, at_bound = metrics["blur" if blurred else "reward_size"], metrics["reward_at_bound"]
+def observe(watch: Watch, metrics: Metrics, average: Actors, *, steered_to: float) -> Watch:
+    """Take in one epoch; keep its estimate if the mismatch has never been lower.
+
+    A blur says something only while the discriminators can tell at it: while the mean |reward| is near the size
+    it is `steered_to` (0 where there is no blur).
+    """
+    telling = metrics["reward_size"] >= TELLING * steered_to
+    mismatch, at_bound = metrics["blur" if steered_to else "reward_size"], metrics["reward_at_bound"]
     if watch.epochs:
         mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
     watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, at_bound=at_bound)
-    if watch.epochs == 1 or mismatch < watch.best_mismatch:
-        progress = watch.epochs == 1 or mismatch < (1.0 - PROGRESS) * watch.best_mismatch
+    if not steered_to:  # no measure of its own: the latest is taken, as in the paper
+        return replace(watch, best=average, best_mismatch=mismatch, best_epoch=watch.epochs)
+    first = watch.best_epoch == 0
+    if telling and (first or mismatch < watch.best_mismatch):
+        progress = first or mismatch < (1.0 - PROGRESS) * watch.best_mismatch
         return replace(
             watch,
             best=average,
@@ -75,8 +85,8 @@ def warnings(
 ) -> tuple[str, ...]:
     """What a user should know of the estimate `unit` (d,) in [-1, 1], one sentence each."""
     found = []
-    if watch.epochs == 0:
-        found.append("the budget was spent before calibration began; the estimate is mid-range")
+    if watch.best_epoch == 0:
+        found.append("the budget was spent before the discriminators could tell anything; the estimate is mid-range")
     if watch.at_bound > SATURATED:
         found.append(
             f"the discriminators are sure of {watch.at_bound:.0%} of the simulated rows (reward at its bound), "

@@ -1,0 +1,213 @@
+"""bind and step: two batch axes, the same bits however they are stepped, failures isolated."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+import madoc.tasks
+from madoc.errors import MadocError
+from madoc.parameters import Parameter
+from madoc.simulation.cpu import CpuSimulator
+
+
+@pytest.mark.parametrize("name", madoc.tasks.TASKS)
+def test_two_axes_equal_one_by_one_bit_for_bit(name, make_batch):
+    simulator = CpuSimulator(madoc.tasks.make(name), threads=1)
+    parameters, state, action = make_batch(simulator, 3, 5)
+    together = simulator.bind(parameters).step(state, action)
+    assert np.isfinite(together).all()
+    assert (together != state).any(-1).all()
+    for system in range(3):
+        alone = simulator.bind(parameters[system : system + 1])
+        for row in range(5):
+            one = alone.step(state[system, row][None, None], action[system, row][None, None])
+            np.testing.assert_array_equal(one[0, 0], together[system, row])
+
+
+@pytest.mark.parametrize("name", madoc.tasks.TASKS)
+def test_threads_give_the_same_bits(name, make_batch):
+    ends = []
+    for threads in (1, 2, 3):
+        simulator = CpuSimulator(madoc.tasks.make(name), threads=threads)
+        parameters, state, action = make_batch(simulator, 4, 8)
+        system = simulator.bind(parameters)
+        for _ in range(3):
+            state = system.step(state, action)
+        ends.append(state)
+    np.testing.assert_array_equal(ends[0], ends[1])
+    np.testing.assert_array_equal(ends[0], ends[2])
+
+
+def test_a_step_does_not_depend_on_the_steps_before(hopper, make_batch):
+    parameters, state, action = make_batch(hopper, 2, 6)
+    system = hopper.bind(parameters)
+    first = system.step(state, action)
+    system.step(first, action)
+    np.testing.assert_array_equal(system.step(state, action), first)
+    other_rows = system.step(state[:, :2], action[:, :2])
+    np.testing.assert_array_equal(other_rows, first[:, :2])
+
+
+def test_a_step_is_mujocos(spring_task):
+    task = spring_task()
+    simulator = CpuSimulator(task, threads=1)
+    model = simulator.model(np.array([4.0, 0.5, 2.0]))
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel, data.ctrl = 0.3, -0.2, 0.7
+    mujoco.mj_step(model, data, nstep=task.frame_skip)
+    end = simulator.bind(np.array([[4.0, 0.5, 2.0]])).step(np.array([[[0.3, -0.2]]]), np.array([[[0.7]]]))
+    np.testing.assert_array_equal(end[0, 0], [data.qpos[0], data.qvel[0]])
+
+
+def test_one_step_worked_by_hand(spring_task):
+    # Semi-implicit Euler with implicit damping, twice 0.01 s:
+    # v += 0.01 (u - k x - d v) / (m + 0.01 d); x += 0.01 v, with k = 4, d = 0.5, m = 2, u = 1 from x = 0.5, v = 0.
+    position, velocity = 0.5, 0.0
+    for _ in range(2):
+        velocity += 0.01 * (1.0 - 4.0 * position - 0.5 * velocity) / (2.0 + 0.01 * 0.5)
+        position += 0.01 * velocity
+    simulator = CpuSimulator(spring_task(), threads=1)
+    end = simulator.bind(np.array([[4.0, 0.5, 2.0]])).step(np.array([[[0.5, 0.0]]]), np.ones((1, 1, 1)))
+    np.testing.assert_allclose(end[0, 0], [position, velocity], atol=1e-15)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_exploding_row_is_nan_and_the_others_keep_their_bits(threads, make_batch, capfd, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    simulator = CpuSimulator(madoc.tasks.make("hopper"), threads=threads)
+    parameters, state, action = make_batch(simulator, 3, 6)
+    system = simulator.bind(parameters)
+    good = system.step(state, action)
+    bad_state, bad_action = state.copy(), action.copy()
+    bad_state[0, 2, 7] = 1e11  # faster than MuJoCo takes
+    bad_state[1, 4, 8] = 1e8  # explodes on the way
+    bad_state[2, 0, 3] = np.nan
+    bad_state[2, 5, -1] = np.inf
+    bad_action[0, 0, 1] = np.nan
+    end = system.step(bad_state, bad_action)
+    failed = np.zeros((3, 6), dtype=bool)
+    failed[[0, 1, 2, 2, 0], [2, 4, 0, 5, 0]] = True
+    assert np.isnan(end[failed]).all()
+    np.testing.assert_array_equal(end[~failed], good[~failed])
+    np.testing.assert_array_equal(system.step(state, action), good)
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_exploding_system_fails_alone(hopper, make_batch):
+    parameters, state, action = make_batch(hopper, 3, 4)
+    good = hopper.bind(parameters).step(state, action)
+    wild = parameters.copy()
+    wild[1, 0] = -1e12
+    end = hopper.bind(wild).step(state, action)
+    assert np.isnan(end[1]).all()
+    np.testing.assert_array_equal(end[[0, 2]], good[[0, 2]])
+
+
+def test_a_huge_but_finite_end_is_a_failure_too(spring_task):
+    # 1.5e9 m/s for 0.02 s is a state MuJoCo takes; a force of 1e15 N leaves one that it does not.
+    simulator = CpuSimulator(spring_task(Parameter("actuator_gain", "push", 1.0, 1e15)), threads=1)
+    system = simulator.bind(np.array([[1.0], [1e13]]))
+    end = system.step(np.zeros((2, 1, 2)), np.ones((2, 1, 1)))
+    assert np.isfinite(end[0]).all()
+    assert np.isnan(end[1]).all()
+
+
+def test_the_users_own_warning_handler_comes_back(hopper, make_batch):
+    def handler(_: str) -> None: ...
+
+    mujoco.set_mju_user_warning(handler)
+    try:
+        parameters, state, action = make_batch(hopper, 1, 1)
+        hopper.bind(parameters).step(state * 1e12, action)
+        assert mujoco.get_mju_user_warning() is handler
+    finally:
+        mujoco.set_mju_user_warning(None)
+
+
+def test_inputs_are_not_written_to(hopper, make_batch):
+    given = make_batch(hopper, 2, 9)
+    copies = [array.copy() for array in given]
+    given[1][0, 0, 0] = copies[1][0, 0, 0] = np.nan
+    hopper.bind(given[0]).step(given[1], given[2])
+    for array, copy in zip(given, copies, strict=True):
+        np.testing.assert_array_equal(array, copy)
+
+
+def test_binding_leaves_the_base_model_as_it_was(hopper, make_batch):
+    before = hopper.task.compile()
+    parameters, _, _ = make_batch(hopper, 2, 1)
+    models = [*hopper.bind(parameters).models, hopper.model(parameters[0])]
+    for field in ("body_mass", "dof_damping", "body_inertia", "body_subtreemass", "dof_invweight0"):
+        np.testing.assert_array_equal(getattr(hopper._model, field), getattr(before, field), err_msg=field)
+    assert hopper._model.opt.gravity[2] == before.opt.gravity[2]
+    assert models[0].opt.gravity[2] == models[2].opt.gravity[2] == parameters[0, 0]
+    assert models[1].opt.gravity[2] == parameters[1, 0]
+
+
+def test_initial_state_and_sizes(hopper):
+    np.testing.assert_array_equal(hopper.initial_state, [0, 1.25, *10 * [0]])
+    assert hopper.action_size == 3
+    assert hopper.control_step == pytest.approx(0.008)
+    assert hopper.bind(np.stack([hopper.parameters.middle] * 4)).count == 4
+
+
+@pytest.mark.parametrize("shape", [(8,), (2, 7), (1, 2, 8)])
+def test_parameters_of_a_wrong_shape_are_refused(hopper, shape):
+    with pytest.raises(MadocError, match=r"expected parameters of shape \(systems, 8\), got \("):
+        hopper.bind(np.ones(shape))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_parameters_that_are_not_finite_are_refused(hopper, value):
+    parameters = np.stack([hopper.parameters.middle] * 2)
+    parameters[1, 3] = value
+    with pytest.raises(MadocError, match="expected finite parameters, got NaN or infinity"):
+        hopper.bind(parameters)
+
+
+def test_parameters_below_their_physical_bound_are_refused(hopper):
+    parameters = np.stack([hopper.parameters.middle] * 3)
+    parameters[2, -1] = -0.5
+    sentence = r"expected dof_damping.foot_joint of at least 0.0 N·m·s/rad, got -0.5 in system 2"
+    with pytest.raises(MadocError, match=sentence):
+        hopper.bind(parameters)
+
+
+@pytest.mark.parametrize(
+    ("state", "action"),
+    [
+        ((2, 3, 11), (2, 3, 3)),
+        ((2, 3, 12), (2, 3, 4)),
+        ((2, 3, 12), (2, 3, 1)),
+        ((2, 3, 12), (2, 2, 3)),
+        ((3, 3, 12), (3, 3, 3)),
+        ((6, 12), (6, 3)),
+    ],
+)
+def test_states_and_actions_of_a_wrong_shape_are_refused(hopper, state, action):
+    system = hopper.bind(np.stack([hopper.parameters.middle] * 2))
+    with pytest.raises(
+        MadocError, match=r"expected states of shape \(2, rows, 12\) and actions of shape \(2, rows, 3\)"
+    ):
+        system.step(np.zeros(state), np.zeros(action))
+
+
+def test_models_with_activations_are_refused(spring_task):
+    task = spring_task()
+    spec = task.spec
+
+    def with_activation() -> mujoco.MjSpec:
+        robot = spec()
+        robot.actuators[0].dyntype = mujoco.mjtDyn.mjDYN_INTEGRATOR
+        return robot
+
+    with pytest.raises(MadocError, match="spring: models with actuator activations or mocap bodies are not supported"):
+        CpuSimulator(replace(task, spec=with_activation))
+
+
+def test_a_parameter_of_an_element_that_is_not_there_is_refused_at_once(spring_task):
+    with pytest.raises(MadocError, match=r"dof_damping.slid: the model has no joint 'slid'; nearest: slide"):
+        CpuSimulator(spring_task(Parameter("dof_damping", "slid", 0.0, 1.0)))

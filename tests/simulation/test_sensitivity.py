@@ -1,0 +1,100 @@
+"""Parameters that change no next state are named and refused, and the control steps it took are counted."""
+
+import jax
+import numpy as np
+import pytest
+
+from madoc.errors import MadocError
+from madoc.parameters import Parameter
+from madoc.simulation.cpu import CpuSimulator
+from madoc.simulation.sensitivity import insensitive, refuse_insensitive
+
+KEY = jax.random.key(0)
+STIFFNESS = Parameter("jnt_stiffness", "slide", 1.0, 9.0)
+GRAVITY = Parameter("gravity", "", -20.0, -5.0)
+FRICTION = Parameter("geom_friction", "box", 0.5, 1.5)
+DAMPING = Parameter("dof_damping", "slide", 0.0, 2.0)
+
+
+def logged(count=100):
+    """States and actions of a spring, moving."""
+    randomness = np.random.default_rng(0)
+    return randomness.normal(size=(count, 2)), randomness.uniform(-1, 1, (count, 1))
+
+
+def test_gravity_across_a_slide_and_friction_in_the_air_change_nothing(spring_task):
+    simulator = CpuSimulator(spring_task(STIFFNESS, GRAVITY, DAMPING, FRICTION), threads=1)
+    names, control_steps = insensitive(simulator, *logged(), key=KEY, rows=16)
+    assert names == ["gravity", "geom_friction.box"]
+    assert control_steps == 16 * 9
+
+
+def test_the_refusal_names_one(spring_task):
+    simulator = CpuSimulator(spring_task(GRAVITY, STIFFNESS), threads=1)
+    sentence = "^parameter gravity changes no next state in 64 logged rows; remove it or widen its range$"
+    with pytest.raises(MadocError, match=sentence):
+        refuse_insensitive(simulator, *logged(), key=KEY)
+
+
+def test_the_refusal_names_several_and_the_rows_there_were(spring_task):
+    simulator = CpuSimulator(spring_task(GRAVITY, STIFFNESS, FRICTION), threads=1)
+    sentence = r"^parameters gravity, geom_friction.box change no next state in 5 logged rows; remove them or widen"
+    with pytest.raises(MadocError, match=sentence):
+        refuse_insensitive(simulator, *logged(5), key=KEY)
+
+
+def test_nothing_to_refuse_gives_the_control_steps(spring_task):
+    simulator = CpuSimulator(spring_task(STIFFNESS, DAMPING), threads=1)
+    assert refuse_insensitive(simulator, *logged(), key=KEY) == 64 * 5
+    assert refuse_insensitive(simulator, *logged(10), key=KEY) == 10 * 5
+
+
+def test_damping_is_not_felt_at_rest(spring_task):
+    # v = 0 stays 0 at x = 0 without a force, so neither damping nor stiffness shows.
+    simulator = CpuSimulator(spring_task(STIFFNESS, DAMPING), threads=1)
+    names, _ = insensitive(simulator, np.zeros((3, 2)), np.zeros((3, 1)), key=KEY)
+    assert names == ["jnt_stiffness.slide", "dof_damping.slide"]
+
+
+def test_all_parameters_of_hopper_are_felt_where_it_moves(hopper, make_batch):
+    _, state, action = make_batch(hopper, 1, 50)
+    assert insensitive(hopper, state[0], action[0], key=KEY) == ([], 50 * 17)
+
+
+def test_rows_that_fail_do_not_count_as_change(spring_task):
+    simulator = CpuSimulator(spring_task(STIFFNESS, Parameter("geom_friction", "box", 0.5, 1.5)), threads=1)
+    states, actions = logged(8)
+    states[::2] = 1e12
+    assert insensitive(simulator, states, actions, key=KEY)[0] == ["geom_friction.box"]
+
+
+def test_an_end_that_always_fails_is_no_change(spring_task):
+    simulator = CpuSimulator(spring_task(STIFFNESS, Parameter("actuator_gain", "push", -1e16, 1e16)), threads=1)
+    states, actions = logged(8)
+    assert insensitive(simulator, states, actions, key=KEY)[0] == ["actuator_gain.push"]
+
+
+def test_when_mid_range_always_fails_that_is_the_sentence(spring_task):
+    simulator = CpuSimulator(spring_task(), threads=1)
+    with pytest.raises(MadocError, match="spring: the simulation fails in all 4 rows at mid-range parameters; check"):
+        insensitive(simulator, np.full((4, 2), 1e12), np.zeros((4, 1)), key=KEY)
+
+
+@pytest.mark.parametrize(("states", "actions"), [(0, 0), (3, 2)])
+def test_no_rows_or_rows_that_do_not_pair_are_refused(spring_task, states, actions):
+    simulator = CpuSimulator(spring_task(), threads=1)
+    sentence = f"expected as many states as actions, at least one, got {states} and {actions}"
+    with pytest.raises(MadocError, match=sentence):
+        insensitive(simulator, np.zeros((states, 2)), np.zeros((actions, 1)), key=KEY)
+
+
+def test_same_key_same_rows(spring_task):
+    simulator = CpuSimulator(spring_task(STIFFNESS), threads=1)
+    states, actions = logged(200)
+    states[:-1], actions[:-1] = 0.0, 0.0  # one row in 200 shows the stiffness
+    found = [insensitive(simulator, states, actions, key=jax.random.key(seed), rows=64)[0] for seed in range(10)]
+    assert found == [
+        insensitive(simulator, states, actions, key=jax.random.key(seed), rows=64)[0] for seed in range(10)
+    ]
+    assert [] in found
+    assert ["jnt_stiffness.slide"] in found

@@ -1,0 +1,157 @@
+"""Parameters into a model: found by name, written, and everything derived from them recomputed."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import madoc.tasks
+from madoc.errors import MadocError
+from madoc.parameters import FIELDS, Parameter
+from madoc.simulation.cpu import CpuSimulator
+from madoc.simulation.write import MASS_FLOOR, element_names, find_element, write_parameters
+
+WRITTEN = {
+    "gravity": lambda model, _: model.opt.gravity[2],
+    "body_mass": lambda model, body: model.body_mass[body],
+    "body_mass_and_inertia": lambda model, body: model.body_mass[body],
+    "dof_damping": lambda model, joint: model.dof_damping[model.jnt_dofadr[joint]],
+    "dof_armature": lambda model, joint: model.dof_armature[model.jnt_dofadr[joint]],
+    "dof_frictionloss": lambda model, joint: model.dof_frictionloss[model.jnt_dofadr[joint]],
+    "jnt_stiffness": lambda model, joint: model.jnt_stiffness[joint],
+    "geom_friction": lambda model, geom: model.geom_friction[geom, 0],
+    "actuator_gain": lambda model, actuator: model.actuator_gainprm[actuator, 0],
+}
+"""Where each field's value stands in a model."""
+
+
+def written(model, parameter, value):
+    """The model with one value written."""
+    write_parameters(model, mujoco.MjData(model), [parameter], np.array([value]))
+    return model
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_every_field_is_written_where_it_belongs_and_moves_the_robot(everything, field):
+    name = next(name for name in everything.parameters.names if name.split(".")[0] == field)
+    simulator = CpuSimulator(everything.with_parameters([name]), threads=1)
+    (parameter,) = simulator.parameters.parameters
+    ends = []
+    # Standing on the floor and moving in every joint, so that friction, damping and stiffness have a say.
+    state = simulator.initial_state
+    state[1:6] += [-0.05, 0.05, -0.1, 0.05, 0.0]
+    state[6:] = [1.0, -0.5, 0.5, -1.0, 1.0, -2.0]
+    for value in (parameter.low, parameter.high):
+        system = simulator.bind(np.array([[value]]))
+        assert WRITTEN[field](system.models[0], find_element(system.models[0], parameter)) == max(
+            value, MASS_FLOOR if "mass" in field else -np.inf
+        )
+        ends.append(system.step(state[None, None], np.full((1, 1, 3), 0.5)))
+    assert np.isfinite(ends).all()
+    assert (ends[0] != ends[1]).any()
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_only_the_named_element_changes(everything, field):
+    parameter = next(parameter for parameter in everything.parameters.parameters if parameter.field == field)
+    before, model = everything.compile(), written(everything.compile(), parameter, parameter.high)
+    arrays = {
+        "body_mass": "body_mass",
+        "body_mass_and_inertia": "body_mass",
+        "geom_friction": "geom_friction",
+        "actuator_gain": "actuator_gainprm",
+    }
+    if field == "gravity":
+        np.testing.assert_array_equal(model.opt.gravity, [0.0, 0.0, parameter.high])
+    else:
+        changed = np.argwhere(getattr(model, arrays.get(field, field)) != getattr(before, arrays.get(field, field)))
+        assert len(changed) == 1
+
+
+def test_body_mass_leaves_the_inertia_and_its_sibling_scales_it():
+    task = madoc.tasks.make("hopper")
+    before = task.compile()
+    alone = written(task.compile(), Parameter("body_mass", "thigh", 1.0, 9.0), 2 * before.body("thigh").mass[0])
+    both = written(
+        task.compile(), Parameter("body_mass_and_inertia", "thigh", 1.0, 9.0), 2 * before.body("thigh").mass[0]
+    )
+    np.testing.assert_array_equal(alone.body_inertia, before.body_inertia)
+    np.testing.assert_allclose(both.body("thigh").inertia, 2 * before.body("thigh").inertia)
+    np.testing.assert_array_equal(both.body("torso").inertia, before.body("torso").inertia)
+    assert alone.body("thigh").mass == both.body("thigh").mass
+
+
+def test_derived_constants_follow_the_mass():
+    model = written(madoc.tasks.make("hopper").compile(), Parameter("body_mass", "foot", 1.0, 99.0), 50.0)
+    assert model.body_subtreemass[0] == pytest.approx(model.body_mass.sum())
+    assert model.body("foot").subtreemass[0] == 50.0
+    fresh = madoc.tasks.make("hopper").spec()
+    fresh.body("foot").mass = 50.0
+    np.testing.assert_allclose(model.dof_invweight0, fresh.compile().dof_invweight0)
+    np.testing.assert_allclose(model.body_invweight0, fresh.compile().body_invweight0)
+
+
+@pytest.mark.parametrize("field", ["body_mass", "body_mass_and_inertia"])
+def test_a_mass_has_a_floor(field):
+    model = written(madoc.tasks.make("hopper").compile(), Parameter(field, "thigh", 0.0, 1.0), 0.0)
+    assert model.body("thigh").mass[0] == MASS_FLOOR
+    assert (model.body("thigh").inertia > 0).all()
+
+
+def test_half_cheetah_at_the_low_end_of_every_mass_does_not_explode():
+    simulator = CpuSimulator(madoc.tasks.make("halfcheetah"), threads=1)
+    system = simulator.bind(simulator.parameters.low[None])
+    assert np.isfinite(system.step(simulator.initial_state[None, None], np.zeros((1, 1, 6)))).all()
+
+
+def test_a_body_may_be_named_by_its_joint():
+    model = madoc.tasks.make("ant").compile()
+    body = find_element(model, Parameter("body_mass", "ankle_1", 0.0, 1.0))
+    assert mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) in (None, "")
+    assert body == model.jnt_bodyid[model.joint("ankle_1").id] == 4
+    assert written(model, Parameter("body_mass", "ankle_1", 0.0, 1.0), 0.5).body_mass[4] == 0.5
+
+
+def test_the_paper_counts_bodies_and_joints_as_we_name_them():
+    # Tables 6, 7 and 9, Jiang et al. 2024: body_mass 1, 2, ... and dof_damping 3, 4, ... (Ant 6, 7, 8, 9).
+    first_dof = {"hopper": 3, "halfcheetah": 3, "walker2d": 3, "ant": 6}
+    for name, dof in first_dof.items():
+        task = madoc.tasks.make(name)
+        model = task.compile()
+        found = {"gravity": [], "body_mass": [], "dof_damping": []}
+        for parameter in task.parameters.parameters:
+            found[parameter.field].append(find_element(model, parameter))
+        assert found["gravity"] == [-1]
+        assert found["body_mass"] == list(range(1, 1 + len(found["body_mass"])))
+        dofs = [model.jnt_dofadr[joint] for joint in found["dof_damping"]]
+        assert dofs == list(range(dof, dof + len(dofs)))
+
+
+@pytest.mark.parametrize(
+    ("parameter", "sentence"),
+    [
+        (("body_mass", "tigh"), r"body_mass.tigh: the model has no body 'tigh'; nearest: thigh"),
+        (("dof_damping", "foot"), r"dof_damping.foot: the model has no joint 'foot'; nearest: foot_joint"),
+        (("geom_friction", "xyz"), r"geom_friction.xyz: the model has no geom 'xyz'; nearest: floor, torso_geom"),
+    ],
+)
+def test_an_unknown_element_names_the_nearest(parameter, sentence):
+    with pytest.raises(MadocError, match=sentence):
+        find_element(madoc.tasks.make("hopper").compile(), Parameter(*parameter, 0.0, 1.0))
+
+
+def test_element_names():
+    model = madoc.tasks.make("hopper").compile()
+    assert element_names(model, "body") == ["world", "torso", "thigh", "leg", "foot"]
+    assert element_names(model, "joint")[3:] == ["thigh_joint", "leg_joint", "foot_joint"]
+
+
+def test_a_free_joint_is_damped_in_all_its_degrees():
+    model = written(madoc.tasks.make("ant").compile(), Parameter("dof_damping", "root", 0.0, 1.0), 0.25)
+    np.testing.assert_array_equal(model.dof_damping[:6], 0.25)
+    np.testing.assert_array_equal(model.dof_damping[6:], 1.0)
+
+
+def test_a_massless_body_cannot_be_scaled():
+    model = madoc.tasks.make("hopper").compile()
+    with pytest.raises(MadocError, match="body_mass_and_inertia: body 'world' has no mass to scale; use body_mass"):
+        written(model, Parameter("body_mass_and_inertia", "world", 0.0, 1.0), 1.0)
