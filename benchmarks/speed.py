@@ -39,9 +39,7 @@ def main() -> None:
         name: round(calibration_update(method) * 1e3, 3)
         for name, method in {"paper": Madoc.paper(), "default": Madoc()}.items()
     }
-    rows["sac_updates_per_second"] = {
-        f"{width}x2": round(1.0 / sac_update(width), 1) for width in (256, 128)
-    }
+    rows["sac_updates_per_second"] = {f"{width}x2": round(1.0 / sac_update(width), 1) for width in (256, 128)}
     rows["sac_update_floor_ms"] = round(sac_flops(256, 17, 6) / rows["gflops"] / 1e6, 3)
     rows["control_steps"] = {robot: stepping(robot) for robot in tasks.TASKS}
     text = json.dumps(rows, indent=1)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from madoc import calibration, data, policies, simulation, tasks
-    from madoc.calibration import CalibrationProblem, CalibrationResult, Madoc, calibrate
+    from madoc.calibration import CalibrationProblem, CalibrationResult, Madoc
+    from madoc.calibration.calibrate import calibrate
     from madoc.data import Dataset
     from madoc.errors import MadocError
     from madoc.evaluation import evaluate

@@ -1,11 +1,14 @@
 """What every room exchanges: transitions, policies, metrics."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+Method = TypeVar("Method", covariant=True)
 
 Metrics = dict[str, float]
 """Scalars worth looking at, by name. Never needed by the next step."""
@@ -42,3 +45,13 @@ class Policy(Protocol):
     ) -> Float[Array, "*rows action"]:
         """Actions in [-1, 1] for a batch of observations."""
         ...
+
+
+@dataclass(frozen=True)
+class MethodEntry(Generic[Method]):
+    """A line of `madoc methods`: `make` takes the method's hyperparameters as keywords."""
+
+    make: Callable[..., Method]
+    summary: str
+    paper: str
+    year: int

@@ -10,13 +10,13 @@ from madoc.learning.networks import Network, descend, moving_average, scan_updat
 
 
 def test_network_is_affine_relu_affine(compiled):
-    network = layered(([[1, 2], [-1, 0]], [0.5, 0.25]), ([[3, 5]], [-1]))
-    # row (1, 1):  hidden (3.5, -0.75) -> relu (3.5, 0)     -> 10.5 + 0 - 1    = 9.5
-    # row (-2, 0): hidden (-1.5, 2.25) -> relu (0, 2.25)    -> 0 + 11.25 - 1   = 10.25
-    # row (0, 0):  hidden (0.5, 0.25)                       -> 1.5 + 1.25 - 1  = 1.75
+    network = layered(([[1, 2], [-1, 0]], [0.5, 0.25]), ([[3, 5]], [-4]))
+    # row (1, 1):  hidden (3.5, -0.75) -> relu (3.5, 0)     -> 10.5 + 0 - 4    = 6.5
+    # row (-2, 0): hidden (-1.5, 2.25) -> relu (0, 2.25)    -> 0 + 11.25 - 4   = 7.25
+    # row (0, 0):  hidden (0.5, 0.25)                       -> 1.5 + 1.25 - 4  = -1.25, no ReLU at the end
     rows = jnp.array([[1.0, 1.0], [-2.0, 0.0], [0.0, 0.0]])
     outputs = compiled(network)(rows)
-    np.testing.assert_allclose(outputs, [[9.5], [10.25], [1.75]], rtol=1e-6)
+    np.testing.assert_allclose(outputs, [[6.5], [7.25], [-1.25]], rtol=1e-6)
 
 
 def test_network_takes_any_leading_axes():

@@ -44,7 +44,7 @@ def calibrate(
     """
     space = problem.simulator.parameters
     known = None if truth is None else space.vector(dict(truth))
-    refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0))
+    probing = refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0))
     finished = loop.run(
         method,
         problem,
@@ -63,7 +63,7 @@ def calibrate(
         task=problem.simulator.task.name,
         status=finished.status,
         sentence=finished.sentence,
-        control_steps=finished.control_steps,
+        control_steps=finished.control_steps + probing,
         seconds=round(finished.seconds, 3),
         seed=seed_of(key),
         groups=[[space.names[index] for index in group] for group in estimate.groups],

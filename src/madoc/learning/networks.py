@@ -67,7 +67,7 @@ def descend(optimiser, gradients: PyTree, optimiser_state: PyTree, parameters: C
     return eqx.apply_updates(parameters, updates), optimiser_state
 
 
-def moving_average(slow: Carry, fast: Carry, rate: float) -> Carry:
+def moving_average(slow: Carry, fast: Carry, rate: float | Array) -> Carry:
     """Polyak averaging: slow + rate (fast - slow), leaf by leaf."""
 
     def blend(old: Array, new: Array) -> Array:

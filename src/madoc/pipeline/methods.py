@@ -26,7 +26,8 @@ def make_method(entries: Mapping[str, Entry], name: str, changes: Mapping[str, A
     Args:
         entries: `CALIBRATORS` or `LEARNERS`.
         name: One of its keys.
-        changes: Hyperparameters by name, those of a part of it as `agents.batch`. Text that is JSON (`3`, `[256, 256]`, `null`) is read as such.
+        changes: Hyperparameters by name, those of a part of it as `agents.batch`. Text that is JSON (`3`,
+            `[256, 256]`, `null`) is read as such.
 
     Raises:
         MadocError: No such method, no such hyperparameter, or a value of another type.
@@ -51,12 +52,13 @@ def hyperparameters(method: Any) -> dict[str, Any]:
     return asdict(method)
 
 
-def _types(kind: type, prefix: str = "") -> dict[str, Any]:
+def _types(kind: Any, prefix: str = "") -> dict[str, Any]:
     """The type of each hyperparameter; those of a part of the method are named `part.name`."""
-    hints, found = get_type_hints(kind), {}
+    hints: dict[str, Any] = get_type_hints(kind)
+    found: dict[str, Any] = {}
     for row in fields(kind):
         hint = hints[row.name]
-        if is_dataclass(hint) and not prefix:
+        if isinstance(hint, type) and is_dataclass(hint) and not prefix:
             found |= _types(hint, f"{row.name}.")
         else:
             found[prefix + row.name] = hint

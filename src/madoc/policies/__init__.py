@@ -1,30 +1,18 @@
 """Policy learners: from a calibrated simulator to a policy. One file a learner; `LEARNERS` finds them by name."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 from madoc.policies.base import PolicyLearner, PolicyProblem
 from madoc.policies.files import load_policy, save_policy
 from madoc.policies.learn import LearnedPolicy, learn_policy
 from madoc.policies.sac import SAC
+from madoc.types import MethodEntry
 
-
-@dataclass(frozen=True)
-class LearnerEntry:
-    """A line of `madoc methods`. `make` takes the learner's hyperparameters as keywords."""
-
-    make: Callable[..., PolicyLearner]
-    summary: str
-    paper: str
-    year: int
-
-
-LEARNERS: dict[str, LearnerEntry] = {
-    "sac": LearnerEntry(
+LEARNERS: dict[str, MethodEntry[PolicyLearner]] = {
+    "sac": MethodEntry(
         SAC, "soft actor-critic in the calibrated simulator", "Haarnoja et al., Soft Actor-Critic", 2018
     ),
-    "sac-bc": LearnerEntry(
+    "sac-bc": MethodEntry(
         partial(SAC, cloning=2.5),
         "the same with a cloning term to the data's actions",
         "Jiang et al., Multi-Agent Domain Calibration with a Handful of Offline Data",
@@ -36,7 +24,6 @@ __all__ = [
     "LEARNERS",
     "SAC",
     "LearnedPolicy",
-    "LearnerEntry",
     "PolicyLearner",
     "PolicyProblem",
     "learn_policy",

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,17 +18,17 @@ from madoc.numpy_policy import NumpyPolicy
 def save_policy(policy: TanhGaussianPolicy, path: str | Path, *, task_name: str) -> None:
     """Write a policy, whole or not at all."""
     with replacing(Path(path)) as stream:
-        np.savez(stream, **policy_arrays(policy, task_name, np.float32))
+        np.savez(stream, allow_pickle=False, **_arrays(policy, task_name))
 
 
-def policy_arrays(policy: TanhGaussianPolicy, task_name: str, dtype: type) -> dict[str, np.ndarray]:
-    """A policy as named arrays."""
+def _arrays(policy: TanhGaussianPolicy, task_name: str) -> dict[str, Any]:
+    """A policy as named arrays, float32, matrices (inputs, outputs)."""
     layers = policy.network.layers
-    arrays = {"about": np.array(json.dumps({"task": task_name, "layers": len(layers)}))}
+    arrays: dict[str, Any] = {"about": np.array(json.dumps({"task": task_name, "layers": len(layers)}))}
     for index, layer in enumerate(layers):
-        arrays[f"weight_{index}"] = np.asarray(layer.weight.T, dtype)
-        arrays[f"bias_{index}"] = np.asarray(layer.bias, dtype)
-    return arrays | {"offset": np.asarray(policy.offset, dtype), "scale": np.asarray(policy.scale, dtype)}
+        arrays[f"weight_{index}"] = np.asarray(layer.weight.T)
+        arrays[f"bias_{index}"] = np.asarray(layer.bias)
+    return arrays | {"offset": np.asarray(policy.offset), "scale": np.asarray(policy.scale)}
 
 
 def load_policy(path: str | Path) -> TanhGaussianPolicy:

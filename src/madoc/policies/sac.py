@@ -145,7 +145,8 @@ class SAC:
         filled = replay.add(state.replay, *_replay_rows(rollout))
         finished, episode_return = _episode_returns(rollout, state.episode_return)
         steps = state.control_steps + rollout.valid.size
-        learner, metrics = state.learner, {}
+        learner: Learner = state.learner
+        metrics: dict[str, Array] = {}
         if steps >= self.warmup_steps:
             logged = _logged_pairs(problem) if self.cloning is not None else None
             count = round(self.updates_per_step * rollout.valid.size)
@@ -242,9 +243,8 @@ class SAC:
 
         (_, (loss, density)), gradients = eqx.filter_value_and_grad(loss_of, has_aux=True)(learner.policy)
         policy, policy_optimiser = descend(self._optimiser, gradients, learner.policy_optimiser, learner.policy)
-        slope = jax.grad(sac_losses.temperature_loss)(
-            learner.log_temperature, density, -float(policy.network.layers[-1].out_features // 2)
-        )
+        target_entropy = -float(len(policy.network.layers[-1].weight) // 2)
+        slope = jax.grad(sac_losses.temperature_loss)(learner.log_temperature, density, target_entropy)
         log_temperature, temperature_optimiser = descend(
             self._optimiser, slope, learner.temperature_optimiser, learner.log_temperature
         )

@@ -5,8 +5,7 @@ from functools import partial
 import jax
 from jaxtyping import PRNGKeyArray
 
-from madoc.parameters import Parameter, ParameterSpace
-from madoc.tasks.base import Batch, Task
+from madoc.tasks.base import Batch, Task, healthy_reward, paper_space
 from madoc.tasks.physics import load_robot
 from madoc.tasks.planar import always_rebuildable, uniform_and_normal_noise
 
@@ -26,7 +25,14 @@ RANGES = {
 
 def ant(physics: str = "legacy") -> Task:
     """The Ant of D4RL without its always-zero contact forces: 27 observations, 8 motors, 12 parameters."""
-    spaces = {level: _space(*ranges) for level, ranges in RANGES.items()}
+    spaces = {
+        level: paper_space(
+            gravity,
+            {body: torso if body == "torso" else legs for body in BODIES},
+            dict.fromkeys(JOINTS, damping),
+        )
+        for level, (gravity, torso, legs, damping) in RANGES.items()
+    }
     return Task(
         name="ant",
         physics=physics,
@@ -47,16 +53,6 @@ def ant(physics: str = "legacy") -> Task:
     )
 
 
-def _space(gravity: tuple, torso: tuple, legs: tuple, damping: tuple) -> ParameterSpace:
-    return ParameterSpace(
-        (
-            Parameter("gravity", "", *gravity),
-            *(Parameter("body_mass", body, *(torso if body == "torso" else legs)) for body in BODIES),
-            *(Parameter("dof_damping", joint, *damping) for joint in JOINTS),
-        )
-    )
-
-
 def observe(state: Batch) -> Batch:
     """Every position but x and y, then the velocities. (..., 29) -> (..., 27)."""
     return state[..., 2:]
@@ -73,9 +69,7 @@ def reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
 
     Gymnasium's without the contact cost, which mujoco-py 2.x (D4RL) always had as zero.
     """
-    speed = (next_state[..., 0] - state[..., 0]) / CONTROL_STEP
-    healthy = ~terminated(next_state)
-    return speed + healthy - 0.5 * (action**2).sum(-1)
+    return healthy_reward(state, action, next_state, ~terminated(next_state), dt=CONTROL_STEP, cost=0.5)
 
 
 def terminated(next_state: Batch) -> Batch:

@@ -9,10 +9,30 @@ import mujoco
 from jaxtyping import PRNGKeyArray
 
 from madoc.errors import MadocError
-from madoc.parameters import ParameterSpace
+from madoc.parameters import Parameter, ParameterSpace
 
 Batch = Any
 """A NumPy or JAX array with any leading axes; task functions work on both, so every backend shares them."""
+
+
+def healthy_reward(state: Batch, action: Batch, next_state: Batch, healthy: Batch, *, dt: float, cost: float) -> Batch:
+    """Speed along the first coordinate (m/s), 1 where healthy, less `cost` times the squared action."""
+    speed = (next_state[..., 0] - state[..., 0]) / dt
+    return speed + healthy - cost * (action**2).sum(-1)
+
+
+Span = tuple[float, float]
+
+
+def paper_space(gravity: Span, masses: dict[str, Span], dampings: dict[str, Span]) -> ParameterSpace:
+    """The paper's kind of box: gravity, masses of bodies (kg), damping of joints (N·m·s/rad), in this order."""
+    return ParameterSpace(
+        (
+            Parameter("gravity", "", *gravity),
+            *(Parameter("body_mass", body, *span) for body, span in masses.items()),
+            *(Parameter("dof_damping", joint, *span) for joint, span in dampings.items()),
+        )
+    )
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,7 @@ from functools import partial
 import jax
 from jaxtyping import PRNGKeyArray
 
-from madoc.parameters import Parameter, ParameterSpace
-from madoc.tasks.base import Batch, Task
+from madoc.tasks.base import Batch, Task, paper_space
 from madoc.tasks.physics import load_robot
 from madoc.tasks.planar import (
     always_rebuildable,
@@ -34,7 +33,10 @@ RANGES = {
 
 def half_cheetah(physics: str = "legacy") -> Task:
     """The HalfCheetah of D4RL and Gymnasium: 17 observations, 6 motors, 14 parameters."""
-    spaces = {level: _space(*ranges) for level, ranges in RANGES.items()}
+    spaces = {
+        level: paper_space(gravity, dict(zip(BODIES, masses, strict=True)), dict(zip(JOINTS, dampings, strict=True)))
+        for level, (gravity, masses, dampings) in RANGES.items()
+    }
     return Task(
         name="halfcheetah",
         physics=physics,
@@ -52,16 +54,6 @@ def half_cheetah(physics: str = "legacy") -> Task:
         reference_returns=(-280.178953, 12135.0),
         state_from_observation=planar_state_from_observation,
         rebuildable=always_rebuildable,
-    )
-
-
-def _space(gravity: tuple, masses: tuple, dampings: tuple) -> ParameterSpace:
-    return ParameterSpace(
-        (
-            Parameter("gravity", "", *gravity),
-            *(Parameter("body_mass", body, *span) for body, span in zip(BODIES, masses, strict=True)),
-            *(Parameter("dof_damping", joint, *span) for joint, span in zip(JOINTS, dampings, strict=True)),
-        )
     )
 
 

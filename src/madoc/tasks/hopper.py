@@ -5,8 +5,7 @@ from functools import partial
 import jax
 from jaxtyping import PRNGKeyArray
 
-from madoc.parameters import Parameter, ParameterSpace
-from madoc.tasks.base import Batch, Task
+from madoc.tasks.base import Batch, Task, healthy_reward, paper_space
 from madoc.tasks.physics import load_robot
 from madoc.tasks.planar import (
     observe_clipped,
@@ -32,7 +31,10 @@ RANGES = {
 
 def hopper(physics: str = "legacy") -> Task:
     """The Hopper of D4RL and Gymnasium: 11 observations, 3 motors, 8 parameters."""
-    spaces = {level: _space(*ranges) for level, ranges in RANGES.items()}
+    spaces = {
+        level: paper_space(gravity, dict(zip(BODIES, masses, strict=True)), dict.fromkeys(JOINTS, damping))
+        for level, (gravity, masses, damping) in RANGES.items()
+    }
     return Task(
         name="hopper",
         physics=physics,
@@ -53,21 +55,9 @@ def hopper(physics: str = "legacy") -> Task:
     )
 
 
-def _space(gravity: tuple, masses: tuple, damping: tuple) -> ParameterSpace:
-    return ParameterSpace(
-        (
-            Parameter("gravity", "", *gravity),
-            *(Parameter("body_mass", body, *span) for body, span in zip(BODIES, masses, strict=True)),
-            *(Parameter("dof_damping", joint, *damping) for joint in JOINTS),
-        )
-    )
-
-
 def reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
     """Forward speed (m/s), 1 for being healthy, less 0.001 of the squared action (Gymnasium v5)."""
-    speed = (next_state[..., 0] - state[..., 0]) / CONTROL_STEP
-    healthy = ~terminated(next_state)
-    return speed + healthy - 1e-3 * (action**2).sum(-1)
+    return healthy_reward(state, action, next_state, ~terminated(next_state), dt=CONTROL_STEP, cost=1e-3)
 
 
 def terminated(next_state: Batch) -> Batch:

@@ -5,8 +5,7 @@ from functools import partial
 import jax
 from jaxtyping import PRNGKeyArray
 
-from madoc.parameters import Parameter, ParameterSpace
-from madoc.tasks.base import Batch, Task
+from madoc.tasks.base import Batch, Task, healthy_reward, paper_space
 from madoc.tasks.physics import load_robot
 from madoc.tasks.planar import (
     observe_clipped,
@@ -33,7 +32,14 @@ RANGES = {
 
 def walker2d(physics: str = "legacy") -> Task:
     """The Walker2d of D4RL and Gymnasium v2 to v4: 17 observations, 6 motors, 14 parameters."""
-    spaces = {level: _space(*ranges) for level, ranges in RANGES.items()}
+    spaces = {
+        level: paper_space(
+            gravity,
+            {body: heavy if body in HEAVY else light for body in BODIES},
+            dict.fromkeys(JOINTS, damping),
+        )
+        for level, (gravity, heavy, light, damping) in RANGES.items()
+    }
     return Task(
         name="walker2d",
         physics=physics,
@@ -54,21 +60,9 @@ def walker2d(physics: str = "legacy") -> Task:
     )
 
 
-def _space(gravity: tuple, heavy: tuple, light: tuple, damping: tuple) -> ParameterSpace:
-    return ParameterSpace(
-        (
-            Parameter("gravity", "", *gravity),
-            *(Parameter("body_mass", body, *(heavy if body in HEAVY else light)) for body in BODIES),
-            *(Parameter("dof_damping", joint, *damping) for joint in JOINTS),
-        )
-    )
-
-
 def reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
     """Forward speed (m/s), 1 for being healthy, less 0.001 of the squared action (Gymnasium v5)."""
-    speed = (next_state[..., 0] - state[..., 0]) / CONTROL_STEP
-    healthy = ~terminated(next_state)
-    return speed + healthy - 1e-3 * (action**2).sum(-1)
+    return healthy_reward(state, action, next_state, ~terminated(next_state), dt=CONTROL_STEP, cost=1e-3)
 
 
 def terminated(next_state: Batch) -> Batch:
