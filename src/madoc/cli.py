@@ -122,8 +122,10 @@ def _say(answer: Answer, *, as_json: bool) -> None:
     from rich.console import Console
 
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
-    for part in answer.text:
-        console.print(part, markup=False, highlight=False, soft_wrap=isinstance(part, str))
+    with console.capture() as capture:  # printed by hand: Rich would exit at a closed pipe
+        for part in answer.text:
+            console.print(part, markup=False, highlight=False, soft_wrap=isinstance(part, str))
+    print(capture.get(), end="", flush=True)
 
 
 if __name__ == "__main__":

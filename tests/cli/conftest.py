@@ -1,0 +1,18 @@
+import pytest
+from command_line import WHOLE
+
+from madoc.cli import main
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory):
+    """The folder of one `madoc run`, shared by all tests: only read it, or copy it."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    assert main([*WHOLE, "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def recorded(whole):
+    """A thousand recorded transitions of Hopper."""
+    return whole / "data.npz"

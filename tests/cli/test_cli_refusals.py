@@ -1,0 +1,138 @@
+import json
+
+import numpy as np
+import pytest
+from command_line import arguments
+
+from madoc.cli import main
+
+CALIBRATE = "calibrate hopper --data {data} --out {out} "
+
+
+@pytest.fixture
+def places(recorded, whole, tmp_path):
+    """Files to be refused, by name."""
+    corrupt, narrow = tmp_path / "corrupt.npz", tmp_path / "narrow.npz"
+    corrupt.write_bytes(recorded.read_bytes()[:5000])
+    with np.load(recorded) as arrays:
+        columns = dict(arrays)
+    for name in ("observation", "next_observation"):
+        columns[name] = columns[name][:, :10]
+    np.savez(narrow, **columns)
+    truths = {
+        "words": "not JSON",
+        "list": "[1, 2]",
+        "text": '{"gravity": "down"}',
+        "nan": '{"gravity": NaN}',
+        "strange": '{"gravty": -9.81}',
+        "part": '{"gravity": -9.81}',
+    }
+    for name, text in truths.items():
+        (tmp_path / f"{name}.json").write_text(text)
+    names = {name: tmp_path / f"{name}.json" for name in truths}
+    out = tmp_path / "out"
+    return names | {"data": recorded, "corrupt": corrupt, "narrow": narrow, "used": whole, "out": out}
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("", "Expected one of"),
+        ("calibrat hopper", "Unrecognized options: calibrat"),
+        (CALIBRATE + "--budgt 3", "--budget"),
+        (CALIBRATE + "--budget many", "--budget"),
+        ("calibrate hopper", "--data"),
+        ("record hoper-medium --out {out}", "did you mean hopper?"),
+        ("record hopper-medum --out {out}", "did you mean medium?"),
+        ("record hopper --out {out}", "expected TASK-QUALITY"),
+        ("record hopper-medium --out {out} --transitions 0", "at least 1 transition"),
+        ("record hopper-medium --out {out} --seed -1", "seed"),
+        ("record hopper-medium --out {out}/log.npz", "no folder"),
+        ("run hoper-medium --out {out}", "did you mean hopper?"),
+        ("run hopper --out {out}", "--data FILE"),
+        ("run hopper-medium --out {out} --budget -5", "budget"),
+        ("run hopper-medium --out {out} --policy-budget 0", "policy budget"),
+        ("run hopper-medium --out {out} --episodes 0", "episode"),
+        ("run hopper-medium --out {out} --transitions -1", "transition"),
+        ("run hopper-medium --out {out} --set colour=1", "unknown hyperparameter of madoc 'colour'"),
+        ("run hopper-medium --out {out} --learner sacc", "did you mean sac?"),
+        ("run hopper --data {corrupt} --out {out}", "corrupt.npz"),
+        ("run hopper-medium --out {used}", "already holds a run"),
+        ("run hopper-medium --out {out} --resume", "cannot resume"),
+        ("run hopper-medium --out {used} --seed 1 --resume", "cannot resume"),
+        ("calibrate hoper --data {data} --out {out}", "did you mean hopper?"),
+        ("calibrate hopper --data {out}.npz --out {out}", "no file"),
+        ("calibrate hopper --data {corrupt} --out {out}", "corrupt.npz"),
+        ("calibrate hopper --data {narrow} --out {out}", "expected 11 values"),
+        ("calibrate walker2d --data {data} --out {out}", "hopper"),
+        (CALIBRATE + "--format tape", "unknown format"),
+        (CALIBRATE + "--max-transitions 0", "max_transitions"),
+        (CALIBRATE + "--level harder", "harder"),
+        (CALIBRATE + "--budget -1", "budget"),
+        (CALIBRATE + "--seed -1", "seed"),
+        (CALIBRATE + "--method madok", "did you mean madoc?"),
+        (CALIBRATE + "--parameters torso", "did you mean body_mass.torso?"),
+        (CALIBRATE + "--set updats=2", "did you mean updates?"),
+        (CALIBRATE + "--set bound=2", "did you mean agents.bound?"),
+        (CALIBRATE + "--set updates=few", "hyperparameter updates of madoc is int, got 'few'"),
+        (CALIBRATE + "--set learning_rate=NaN", "learning_rate"),
+        (CALIBRATE + "--set updates", "name=value"),
+        (CALIBRATE + "--set updates=1 updates=2", "twice"),
+        (CALIBRATE + "--starts replay --set starts=logged", "twice"),
+        (CALIBRATE + "--resume", "cannot resume"),
+        ("calibrate hopper --data {data} --out {used}/calibration", "already holds a run"),
+        (CALIBRATE + "--truth {out}.json", "could not read"),
+        (CALIBRATE + "--truth {words}", "not valid JSON"),
+        (CALIBRATE + "--truth {list}", "list"),
+        (CALIBRATE + "--truth {text}", "finite number for gravity"),
+        (CALIBRATE + "--truth {nan}", "finite number for gravity"),
+        (CALIBRATE + "--truth {strange}", "did you mean gravity?"),
+        (CALIBRATE + "--truth {part}", "no value for body_mass.torso"),
+        ("learn {out}", "there is no calibration"),
+        ("learn {used} --out {out} --method ppo", "unknown method 'ppo'"),
+        ("learn {used} --out {out} --budget 0", "budget"),
+        ("learn {used}", "already holds a run"),
+        ("learn {used} --out {out} --set cloning=[1]", "cloning"),
+        ("learn {used} --out {out} --resume", "cannot resume"),
+        ("evaluate {out}", "no run folder"),
+        ("evaluate {used}/calibration", "no learnt policy"),
+        ("evaluate {used} --episodes 0", "episode"),
+        ("evaluate {used} --seed -2", "seed"),
+        ("evaluate {used} --truth {strange}", "did you mean gravity?"),
+    ],
+)
+def test_a_mistake_is_one_sentence(line, sentence, places, capsys):
+    assert main(arguments(line, **places)) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("madoc: ")
+    assert told.err.count("\n") == 1
+    assert sentence in told.err
+    assert not places["out"].exists()
+
+
+def test_a_refused_calibration_leaves_the_folder_as_it_was(places, capsys):
+    out = places["out"]
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    assert main(arguments(CALIBRATE + "--method madoc-s --set group_count=[1]", **places)) == 2
+    assert [file.name for file in out.iterdir()] == ["notes.txt"]
+
+
+def test_an_unfinished_calibration_is_not_learnt_from(places, tmp_path, capsys):
+    out = places["out"]
+    out.mkdir()
+    (out / "spec.json").write_text(json.dumps({"command": "calibrate"}))
+    (out / "result.json").write_text(json.dumps({"status": "finished"}))
+    assert main(["learn", str(out)]) == 2
+    assert "has not ended" in capsys.readouterr().err
+
+
+def test_a_policy_without_a_known_target_is_not_evaluated(whole, tmp_path, capsys):
+    out = tmp_path / "policy"
+    out.mkdir()
+    (out / "policy.npz").write_bytes((whole / "policy-truth" / "policy.npz").read_bytes())
+    spec = json.loads((whole / "policy-truth" / "spec.json").read_text())
+    (out / "spec.json").write_text(json.dumps(spec | {"truth": None}))
+    assert main(["evaluate", str(out)]) == 2
+    assert "pass --truth" in capsys.readouterr().err

@@ -1,0 +1,102 @@
+import json
+import warnings
+
+import pytest
+
+from madoc import tasks
+from madoc.calibration import CALIBRATORS
+from madoc.errors import MadocError
+from madoc.pipeline import fingerprint, split_name
+from madoc.pipeline.data_stage import check_truth, make_target
+from madoc.pipeline.folders import ended, restored_path, stored_path, working_folder
+from madoc.pipeline.keys import seed_key, stage_key
+from madoc.pipeline.methods import hyperparameters, make_method, parse_settings
+from madoc.simulation import make
+
+
+def test_a_name_is_a_task_and_a_quality():
+    assert split_name("hopper-medium-replay") == ("hopper", "medium-replay")
+    assert split_name("hopper") == ("hopper", "")
+
+
+def test_hyperparameters_are_read_as_what_they_are():
+    changes = parse_settings(["updates=3e2", "hidden=[64, 32]", "mixing=sum", "group-count=null", "agents.bound=3"])
+    method = make_method(CALIBRATORS, "madoc", changes)
+    assert (method.updates, method.hidden, method.mixing, method.group_count) == (300, (64, 32), "sum", None)
+    assert method.agents.bound == 3.0
+    assert hyperparameters(method)["agents"]["bound"] == 3.0
+
+
+def test_a_preset_keeps_its_own_values():
+    paper, changed = (make_method(CALIBRATORS, "madoc-paper", {**change}) for change in ({}, {"updates": 7}))
+    assert changed.updates == 7
+    assert changed.starts == paper.starts == "policy"
+
+
+def test_stages_have_streams_of_their_own():
+    keys = [seed_key(0), stage_key(0, "recording"), stage_key(0, "learning"), stage_key(1, "recording")]
+    assert len({str(key) for key in keys}) == 4
+    assert stage_key(0, "learning") == stage_key(0, "learning")
+
+
+def test_a_target_binds_what_was_not_calibrated():
+    truth = {"gravity": -5.0, "body_mass.torso": 3.3}
+    task = tasks.hopper().with_parameters(["gravity"])
+    check_truth(truth, task, physics="legacy")
+    target = make_target("hopper", "legacy", truth)
+    model = target.simulator.model(target.parameters)
+    assert model.body("torso").mass[0] == 3.3
+    assert model.opt.gravity[2] == -5.0
+
+
+def test_paths_beside_the_folder_move_with_it(tmp_path):
+    folder = tmp_path / "run" / "calibration"
+    assert stored_path(tmp_path / "run" / "data.npz", folder) == "../data.npz"
+    assert restored_path("../data.npz", folder).resolve() == tmp_path / "run" / "data.npz"
+    elsewhere = tmp_path / "data.npz"
+    assert restored_path(stored_path(elsewhere, folder), folder) == elsewhere
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_new_folder_is_taken_away_unless_it_holds_something(tmp_path, kept):
+    path = tmp_path / "run"
+    with pytest.raises(MadocError, match="no"), working_folder(path, {"seed": 0}, resume=False):
+        if kept:
+            (path / "checkpoint.npz").touch()
+        raise MadocError("no")
+    assert path.exists() == kept
+
+
+def test_a_stage_has_ended_when_its_last_file_is_there(tmp_path):
+    assert not ended(tmp_path)
+    (tmp_path / "result.json").write_text(json.dumps({"status": "interrupted"}))
+    assert not ended(tmp_path)
+    (tmp_path / "result.json").write_text(json.dumps({"status": "converged"}))
+    assert ended(tmp_path)
+    assert not ended(tmp_path, "policy.npz")
+
+
+def test_physics_is_the_datas_unless_asked_otherwise(recorded):
+    from madoc.pipeline.calibration_stage import CalibrationOrder, _prepare
+    from madoc.pipeline.data_stage import Source
+
+    source = Source(str(recorded))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dataset, task = _prepare(CalibrationOrder("hopper", source))
+    assert task.physics == dataset.physics == "legacy"
+    with pytest.warns(UserWarning, match="recorded in legacy physics"):
+        assert _prepare(CalibrationOrder("hopper", source, physics="modern"))[1].physics == "modern"
+    assert fingerprint(dataset) == fingerprint(_prepare(CalibrationOrder("hopper", source))[0])
+
+
+def test_few_rows_step_like_many():
+    """Below eight rows one thread steps them."""
+    import numpy as np
+
+    simulator = make(tasks.hopper(), threads=2)
+    system = simulator.bind(simulator.parameters.middle[None])
+    state = np.repeat(simulator.initial_state[None, None], 16, axis=1)
+    action = np.random.default_rng(0).uniform(-1, 1, (1, 16, 3))
+    many = system.step(state, action)
+    assert (system.step(state[:, :3], action[:, :3]) == many[:, :3]).all()
