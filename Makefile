@@ -7,7 +7,9 @@ STAMP := $(VENV)/installed
 .PHONY: demo test test-slow check lock clean
 
 demo: $(STAMP)  ## the main job on Hopper, small: record, calibrate, learn, evaluate
-	$(BIN)/madoc run hopper-medium --preset demo --out runs/demo --fresh
+	rm -rf runs/demo
+	$(BIN)/madoc run hopper-medium --out runs/demo --transitions 50000 --budget 80000 --policy-budget 20000 \
+	  --policy-set "hidden=[128, 128]" --episodes 10
 
 test: $(STAMP)  ## every test that takes seconds
 	$(BIN)/python -m pytest -n 2
