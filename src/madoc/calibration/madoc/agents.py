@@ -6,6 +6,7 @@ from functools import cached_property
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
@@ -24,8 +25,8 @@ from madoc.learning.networks import descend, moving_average, scan_updates
 
 AT_BOUND = 0.95
 """A reward past this share of its bound is counted as saturated."""
-LOG_BLUR_RANGE = (-9.0, 2.0)
-"""Logs of a share of a step's spread: 1e-4 to 7."""
+BLUR_RANGE = (1e-4, 0.3)
+"""Shares of a step's spread; it starts at the largest. Rows far off the data need little: their (s, a) tell already."""
 
 
 @jax.tree_util.register_dataclass
@@ -116,7 +117,7 @@ class AgentSettings:
             actors=actors,
             prior=initial_actors(parameters),
             average=initial_actors(parameters),
-            log_blur=jnp.zeros(()),
+            log_blur=jnp.full((), np.log(BLUR_RANGE[1]), jnp.float32),
             updates=jnp.zeros((), jnp.int32),
             discriminator_optimiser=self._discriminator_adam.init(eqx.filter(discriminators, eqx.is_array)),
             critic_optimiser=self._critic_adam.init(eqx.filter(critics, eqx.is_array)),
@@ -190,7 +191,7 @@ class AgentSettings:
     def _steer_blur(self, agents: Agents, reward: Float[Array, " rows"]) -> Agents:
         """More blur where the discriminators are too sure, less where they cannot tell."""
         surplus = jnp.clip(jnp.abs(reward).mean() - self.reward_size, -1.0, 1.0)
-        log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *LOG_BLUR_RANGE)
+        log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *np.log(BLUR_RANGE))
         return replace(agents, log_blur=log_blur)
 
     def _update_critics(
