@@ -25,8 +25,9 @@ class Watch:
 
     Attributes:
         epochs: Calibration epochs watched.
-        mismatch: How far simulated rows are from logged ones: the blur at which the discriminators are as
-            unsure as they are steered to be, or the mean |reward| where there is no blur.
+        mismatch: How far simulated rows are from logged ones: the blur at which the discriminators would be as
+            unsure as they are steered to be (its size times the surplus of |reward| where it is at an end of
+            its range), or the mean |reward| where there is no blur.
         at_bound: Share of rows whose reward stands at its bound.
         best_mismatch: The lowest `mismatch` since the start.
         best_epoch: When it last fell by a share worth the name; 0 before there was any.
@@ -52,8 +53,9 @@ def observe(watch: Watch, metrics: Metrics, average: Actors, *, steered_to: floa
     A blur says something only while the discriminators can tell at it: while the mean |reward| is near the size
     it is `steered_to` (0 where there is no blur).
     """
-    telling = metrics["reward_size"] >= TELLING * steered_to
-    mismatch, at_bound = metrics["blur" if steered_to else "reward_size"], metrics["reward_at_bound"]
+    size, at_bound = metrics["reward_size"], metrics["reward_at_bound"]
+    telling = size >= TELLING * steered_to
+    mismatch = metrics["blur"] * size / steered_to if steered_to else size
     if watch.epochs:
         mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
