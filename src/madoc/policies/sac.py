@@ -10,7 +10,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, check_at_least
 from madoc.learning import replay, sac_losses
 from madoc.learning.networks import descend, moving_average, scan_updates
 from madoc.learning.sac_losses import TwinCritic
@@ -71,7 +71,7 @@ class SAC:
     hidden: tuple[int, ...] = (256, 256)
     environments: int = 20
     epoch_steps: int = 1000
-    updates_per_step: float = 0.5
+    updates_per_step: float = 1.0
     warmup_steps: int = 5000
     batch: int = 256
     discount: float = 0.99
@@ -79,6 +79,11 @@ class SAC:
     learning_rate: float = 3e-4
     replay_capacity: int = 1_000_000
     cloning: float | None = None
+
+    def __post_init__(self) -> None:
+        check_at_least(self, hidden=1, environments=1, batch=1, replay_capacity=1, warmup_steps=0, cloning=0.0)
+        check_at_least(self, epoch_steps=self.environments, updates_per_step=0.0, discount=0.0)
+        check_at_least(self, target_rate=0.0, learning_rate=0.0)
 
     @property
     def name(self) -> str:

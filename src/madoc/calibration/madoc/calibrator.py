@@ -22,6 +22,7 @@ from madoc.calibration.madoc.collection import Features, StartMode, collect, emp
 from madoc.calibration.madoc.grouping import GroupingVAE
 from madoc.calibration.madoc.value_decomposition import Mixing
 from madoc.calibration.madoc.watch import Watch
+from madoc.errors import MadocError, check_at_least
 from madoc.learning import replay
 from madoc.learning.cloning import clone
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
@@ -104,6 +105,13 @@ class Madoc:
     replay_capacity: int = 50_000
     patience: int = 80
     agents: AgentSettings = field(default_factory=AgentSettings)
+
+    def __post_init__(self) -> None:
+        counts = ("group_count", "hidden", "grouping_epochs", "epoch_steps", "updates", "draws", "horizon", "batch")
+        check_at_least(self, **dict.fromkeys((*counts, "cloning_updates", "grouping_updates", "replay_capacity"), 1))
+        check_at_least(self, cloning_epochs=0, learning_rate=0.0, patience=0)
+        if self.starts == "replay" and self.horizon not in (None, 1):
+            raise MadocError(f"starts=replay replays single steps: expected horizon 1 or none, got {self.horizon}")
 
     @classmethod
     def paper(cls, **changes: Any) -> "Madoc":

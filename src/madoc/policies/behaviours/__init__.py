@@ -17,8 +17,7 @@ from jaxtyping import PRNGKeyArray
 from madoc.data import Dataset
 from madoc.data.record import join, record
 from madoc.data.targets import paper_truth
-from madoc.errors import MadocError
-from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.errors import MadocError, unknown_name
 from madoc.numpy_policy import NumpyPolicy
 from madoc.policies.files import policy_of
 from madoc.simulation.base import Simulator
@@ -27,16 +26,24 @@ QUALITIES = ("medium", "medium-replay", "medium-expert", "neorl-low", "neorl-med
 
 
 @dataclass(frozen=True)
-class Rung:
-    """One policy of a ladder, and what it returned in the target while it was trained."""
+class Ladder:
+    """The shipped policies of a robot, weakest training first.
 
-    policy: TanhGaussianPolicy
-    control_steps: int
-    mean_return: float
+    Attributes:
+        saved: The policies.
+        control_steps: How long each was trained.
+        returns: Mean sampled return of each in the target.
+        qualities: Which of them make which quality, in equal shares.
+    """
+
+    saved: tuple[NumpyPolicy, ...]
+    control_steps: tuple[int, ...]
+    returns: tuple[float, ...]
+    qualities: dict[str, list[int]]
 
 
-def ladder(task_name: str) -> tuple[list[Rung], dict[str, list[int]]]:
-    """All shipped policies of a robot, and which of them make which quality.
+def ladder(task_name: str) -> Ladder:
+    """All shipped policies of a robot.
 
     Raises:
         MadocError: Nothing is shipped for that robot.
@@ -46,15 +53,20 @@ def ladder(task_name: str) -> tuple[list[Rung], dict[str, list[int]]]:
         raise MadocError(f"no behaviour policies are shipped for {task_name!r}")
     with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
         about = json.loads(str(arrays["about"]))
-        layers = range(about["layers"])
-        rungs = []
-        for index, (steps, mean_return) in enumerate(zip(about["control_steps"], about["returns"], strict=True)):
-            weights = tuple(arrays[f"weight_{layer}"][index].astype(np.float32) for layer in layers)
-            biases = tuple(arrays[f"bias_{layer}"][index].astype(np.float32) for layer in layers)
-            size = weights[0].shape[0]
-            saved = NumpyPolicy(task_name, weights, biases, np.zeros(size), np.ones(size))
-            rungs.append(Rung(policy_of(saved), steps, mean_return))
-    return rungs, about["qualities"]
+        weights = [arrays[f"weight_{layer}"].astype(np.float32) for layer in range(about["layers"])]
+        biases = [arrays[f"bias_{layer}"].astype(np.float32) for layer in range(about["layers"])]
+    size = weights[0].shape[1]
+    saved = (
+        NumpyPolicy(
+            task_name,
+            tuple(layer[index] for layer in weights),
+            tuple(layer[index] for layer in biases),
+            np.zeros(size),
+            np.ones(size),
+        )
+        for index in range(len(weights[0]))
+    )
+    return Ladder(tuple(saved), tuple(about["control_steps"]), tuple(about["returns"]), about["qualities"])
 
 
 def record_quality(
@@ -79,14 +91,14 @@ def record_quality(
     """
     task = simulator.task
     if quality not in QUALITIES:
-        raise MadocError(f"unknown quality {quality!r}; there are: {', '.join(QUALITIES)}")
-    rungs, qualities = ladder(task.name)
-    chosen = qualities[quality]
+        raise unknown_name("quality", quality, QUALITIES)
+    rungs = ladder(task.name)
+    chosen = rungs.qualities[quality]
     origin = f"madoc record {task.name}-{quality} ({task.physics} physics)"
     counts = np.diff(np.linspace(0, transitions, len(chosen) + 1).astype(int))
     parts = [
         record(
-            rungs[index].policy,
+            policy_of(rungs.saved[index]),
             simulator,
             paper_truth(task.name),
             transitions=int(count),
