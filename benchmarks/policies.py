@@ -11,9 +11,9 @@ import json
 from pathlib import Path
 
 import jax
+
 from calibration import RESULTS as CALIBRATIONS
 from calibration import commit
-
 from madoc import tasks
 from madoc.calibration import CalibrationResult
 from madoc.data.targets import paper_truth

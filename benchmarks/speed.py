@@ -91,7 +91,14 @@ def calibration_update(method: Madoc) -> float:
     def run() -> object:
         return jax.block_until_ready(
             method.agents.update(
-                state.agents, state.rows, features, members, jax.random.key(1), mixing="dop", count=count
+                state.agents,
+                state.rows,
+                features,
+                members,
+                jax.random.key(1),
+                mixing="dop",
+                reward_size=1.0,
+                count=count,
             )[1]
         )
 

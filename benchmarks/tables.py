@@ -1,6 +1,6 @@
 """Medians of what was measured, as Markdown, beside the paper's figures where it prints them.
 
-    python benchmarks/tables.py            # prints, and writes results/README.md
+python benchmarks/tables.py            # prints, and writes results/README.md
 """
 
 import json

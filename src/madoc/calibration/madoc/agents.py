@@ -76,7 +76,8 @@ class AgentSettings:
         prior_rate: Of the prior's moving average.
         prior_every: Updates between two moves of the prior.
         average_rate: Of the estimate's moving average.
-        reward_size: Mean |reward| that the blur is steered to; 0 for no blur, as in the paper.
+        reward_size: Mean |reward| that the blur is steered to; 0 for no blur, as in the paper. None leaves it to
+            the caller of `update`.
         blur_rate: How fast it is steered.
     """
 
@@ -95,7 +96,7 @@ class AgentSettings:
     prior_rate: float = 0.1
     prior_every: int = 10
     average_rate: float = 1e-3
-    reward_size: float = 1.0
+    reward_size: float | None = None
     blur_rate: float = 3e-3
 
     def init(self, *, observation: int, action: int, parameters: int, groups: int, key: PRNGKeyArray) -> Agents:
@@ -134,6 +135,7 @@ class AgentSettings:
         key: PRNGKeyArray,
         *,
         mixing: Mixing,
+        reward_size: float,
         count: int,
     ) -> tuple[Agents, dict[str, Array]]:
         """`count` updates, one scan: Algorithm 1, lines 13 to 19.
@@ -145,6 +147,7 @@ class AgentSettings:
             members: Which parameters belong to which group.
             key: Randomness.
             mixing: How credit is given. The reward is read at the unblurred s', where it is the least noisy.
+            reward_size: Mean |reward| that the blur is steered to, 0 for no blur.
             count: Updates.
         """
 
@@ -152,13 +155,13 @@ class AgentSettings:
             of_logged, of_simulated, of_blur, of_dropout, of_actors = jax.random.split(key, 5)
             rows = jax.random.randint(of_logged, (self.batch,), 0, len(logged[0]))
             drawn = replay.sample(simulated, of_simulated, self.batch)
-            scale = jnp.exp(agents.log_blur) if self.reward_size else 0.0
+            scale = jnp.exp(agents.log_blur) if reward_size else 0.0
             target, source = blur((logged[1][rows], drawn["following"]), scale, of_blur)
             agents, metrics = self._update_discriminators(
                 agents, (logged[0][rows], target), (drawn["pair"], source), of_dropout
             )
             reward = log_dynamics_ratio(agents.discriminators, drawn["pair"], drawn["following"])
-            agents = self._steer_blur(agents, reward)
+            agents = self._steer_blur(agents, reward, reward_size)
             agents, value_metrics = self._update_critics(agents, drawn["parameters"], reward, members, mixing)
             agents, actor_metrics = self._update_actors(agents, members, of_actors)
             return agents, metrics | value_metrics | actor_metrics | {"blur": jnp.exp(agents.log_blur)}
@@ -188,9 +191,9 @@ class AgentSettings:
         )
         return replace(agents, discriminators=discriminators, discriminator_optimiser=optimiser), metrics
 
-    def _steer_blur(self, agents: Agents, reward: Float[Array, " rows"]) -> Agents:
+    def _steer_blur(self, agents: Agents, reward: Float[Array, " rows"], reward_size: float) -> Agents:
         """More blur where the discriminators are too sure, less where they cannot tell."""
-        surplus = jnp.clip(jnp.abs(reward).mean() - self.reward_size, -1.0, 1.0)
+        surplus = jnp.clip(jnp.abs(reward).mean() - reward_size, -1.0, 1.0)
         log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *np.log(BLUR_RANGE))
         return replace(agents, log_blur=log_blur)
 

@@ -32,6 +32,8 @@ from madoc.types import Metrics
 Grouping = Literal["learned", "one", "each"]
 GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
 """Parameter draws an epoch, and control steps a row lives under one draw, by start mode."""
+REWARD_SIZE = {"policy": 2.0, "logged": 1.0, "replay": 1.0}
+"""Mean |reward| that the blur is steered to. Free-running rows are told by their (s, a) too, and that part stays."""
 _NAMES = {("learned", "sum"): "madoc-vdn", ("learned", "independent"): "madoc-isac"}
 
 
@@ -256,6 +258,11 @@ class Madoc:
         draws, horizon = GEOMETRY[self.starts]
         return self.draws or draws, self.horizon or horizon
 
+    @property
+    def _reward_size(self) -> float:
+        chosen = self.agents.reward_size
+        return REWARD_SIZE[self.starts] if chosen is None else chosen
+
     @cached_property
     def _adam(self) -> optax.GradientTransformation:
         return optax.adam(self.learning_rate)
@@ -347,10 +354,11 @@ class Madoc:
             jnp.asarray(grouping.members(state.labels, self._group_count(problem))),
             of_updates,
             mixing=self.mixing,
+            reward_size=self._reward_size,
             count=self.updates,
         )
         metrics = _scalars(device_metrics)
-        watched = watch.observe(state.watch, metrics, agents.average, steered_to=self.agents.reward_size)
+        watched = watch.observe(state.watch, metrics, agents.average, steered_to=self._reward_size)
         following = replace(
             state,
             agents=agents,
