@@ -42,9 +42,10 @@ def calibration() -> str:
     if not cells:
         return ""
     lines = [
-        "## Calibration\n\n`python benchmarks/calibration.py` (see its options). Recorded legacy data, 200 000 rows; mean "
-        "absolute error in raw units, median (lowest to highest) over seeds; the paper's figures took 1e6 control steps.\n",
-        "| robot | data | method | starts | control steps | seeds | error | % of range | paper's error | seconds | commit |",
+        "## Calibration\n\n`python benchmarks/calibration.py` (see its options). Recorded legacy data, 200 000 rows. "
+        "Mean absolute error in raw units, median (lowest to highest) over seeds; the paper's took 1e6 control steps. "
+        "Seconds are of one core.\n",
+        "| robot | data | method | starts | control steps | seeds | error | % of range | paper | seconds | commit |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for (robot, quality, method, starts, _), rows in sorted(cells.items()):
@@ -70,7 +71,7 @@ def policies() -> str:
     if not cells:
         return ""
     lines = [
-        "## Policies\n\n`python benchmarks/policies.py` (see its options). Deterministic SAC policy, return in the target.\n",
+        "## Policies\n\n`python benchmarks/policies.py` (see its options). Deterministic policy, return in the target.\n",
         "| robot | learnt at | control steps | hidden | updates a step | seeds | return | normalized | seconds | commit |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
