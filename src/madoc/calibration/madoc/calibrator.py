@@ -17,7 +17,7 @@ from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.madoc import grouping, watch
 from madoc.calibration.madoc.actors import draw_parameters
-from madoc.calibration.madoc.agents import Agents, AgentSettings
+from madoc.calibration.madoc.agents import BLUR_RANGE, Agents, AgentSettings
 from madoc.calibration.madoc.collection import Features, StartMode, collect, empty_rows, remember, starts_of
 from madoc.calibration.madoc.grouping import GroupingVAE
 from madoc.calibration.madoc.value_decomposition import Mixing
@@ -105,7 +105,7 @@ class Madoc:
     batch: int = 256
     learning_rate: float = 1e-3
     replay_capacity: int = 50_000
-    patience: int = 80
+    patience: int = 100
     agents: AgentSettings = field(default_factory=AgentSettings)
 
     def __post_init__(self) -> None:
@@ -358,7 +358,9 @@ class Madoc:
             count=self.updates,
         )
         metrics = _scalars(device_metrics)
-        watched = watch.observe(state.watch, metrics, agents.average, steered_to=self._reward_size)
+        watched = watch.observe(
+            state.watch, metrics, agents.average, steered_to=self._reward_size, largest_blur=BLUR_RANGE[1]
+        )
         following = replace(
             state,
             agents=agents,

@@ -12,6 +12,8 @@ SMOOTHING = 0.1
 """Share of an epoch in the running averages."""
 PROGRESS = 0.02
 """A mismatch smaller by this share is progress."""
+SETTLING = 30
+"""Epochs in which discriminators and blur find each other."""
 TELLING = 0.7
 """Share of the steered reward size below which a blur is still being found, or can no longer be."""
 SATURATED = 0.5
@@ -29,8 +31,8 @@ class Watch:
             unsure as they are steered to be (its size times the surplus of |reward| where it is at an end of
             its range), or the mean |reward| where there is no blur.
         at_bound: Share of rows whose reward stands at its bound.
-        best_mismatch: The lowest `mismatch` since the start.
-        best_epoch: When it last fell by a share worth the name; 0 before there was any.
+        best_mismatch: The lowest `mismatch` since it could be told.
+        best_epoch: When it last fell by a share worth the name.
         best: The actors' moving average then.
     """
 
@@ -47,31 +49,26 @@ def begin_watch(actors: Actors) -> Watch:
     return Watch(0, 0.0, 0.0, 0.0, 0, actors)
 
 
-def observe(watch: Watch, metrics: Metrics, average: Actors, *, steered_to: float) -> Watch:
+def observe(watch: Watch, metrics: Metrics, average: Actors, *, steered_to: float, largest_blur: float) -> Watch:
     """Take in one epoch; keep its estimate if the mismatch has never been lower.
 
-    A blur says something only while the discriminators can tell at it: while the mean |reward| is near the size
-    it is `steered_to` (0 where there is no blur).
+    A blur says something only once the discriminators have settled, while it is below its largest, and while
+    they can tell at it: while the mean |reward| is near the size it is `steered_to` (0 where there is no blur).
+    Before that, and without a blur, the latest estimate is the best.
     """
-    size, at_bound = metrics["reward_size"], metrics["reward_at_bound"]
-    telling = size >= TELLING * steered_to
-    mismatch = metrics["blur"] * size / steered_to if steered_to else size
+    blur, size, at_bound = metrics["blur"], metrics["reward_size"], metrics["reward_at_bound"]
+    mismatch = blur * size / steered_to if steered_to else size
     if watch.epochs:
         mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
     watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, at_bound=at_bound)
-    if not steered_to:  # no measure of its own: the latest is taken, as in the paper
+    if not steered_to or watch.epochs <= SETTLING or blur > 0.99 * largest_blur:
         return replace(watch, best=average, best_mismatch=mismatch, best_epoch=watch.epochs)
-    first = watch.best_epoch == 0
-    if telling and (first or mismatch < watch.best_mismatch):
-        progress = first or mismatch < (1.0 - PROGRESS) * watch.best_mismatch
-        return replace(
-            watch,
-            best=average,
-            best_mismatch=mismatch,
-            best_epoch=watch.epochs if progress else watch.best_epoch,
-        )
-    return watch
+    if size < TELLING * steered_to or mismatch >= watch.best_mismatch:
+        return watch
+    progress = mismatch < (1.0 - PROGRESS) * watch.best_mismatch
+    best_epoch = watch.epochs if progress else watch.best_epoch
+    return replace(watch, best=average, best_mismatch=mismatch, best_epoch=best_epoch)
 
 
 def stalled(watch: Watch, patience: int) -> str | None:
@@ -87,8 +84,11 @@ def warnings(
 ) -> tuple[str, ...]:
     """What a user should know of the estimate `unit` (d,) in [-1, 1], one sentence each."""
     found = []
-    if watch.best_epoch == 0:
-        found.append("the budget was spent before the discriminators could tell anything; the estimate is mid-range")
+    if watch.epochs < SETTLING:
+        found.append(
+            f"only {watch.epochs} epochs of calibration, fewer than the {SETTLING} in which the discriminators settle; "
+            "give it a larger budget"
+        )
     if watch.at_bound > SATURATED:
         found.append(
             f"the discriminators are sure of {watch.at_bound:.0%} of the simulated rows (reward at its bound), "

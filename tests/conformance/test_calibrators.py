@@ -1,0 +1,271 @@
+"""What every calibrator must keep to. A method that is not in the dictionary here fails."""
+
+import json
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+import madoc.data.targets
+from madoc import checkpoint, simulation
+from madoc.calibration import CALIBRATORS, CalibrationProblem, CalibrationResult, calibrate
+from madoc.data import Dataset
+from madoc.errors import MadocError
+from madoc.parameters import Parameter
+from madoc.run_folder import RunFolder
+from robots import ARM_TRUTH, recorded, two_link_arm
+
+KEY = jax.random.key(0)
+BUDGET = 400
+PROBING = 64 * 11  # rows x (2 d + 1): what finding parameters that change nothing costs
+
+
+def small(name, **changes):
+    """A Madoc whose epochs take milliseconds."""
+    method = CALIBRATORS[name].make()
+    agents = replace(method.agents, hidden=(8,), critic_hidden=(8,), batch=16, actor_batch=8)
+    tiny = {"hidden": (8,), "cloning_epochs": 2, "cloning_updates": 3, "grouping_epochs": 2, "grouping_updates": 3}
+    tiny |= {"epoch_steps": 80, "updates": 3, "draws": 4, "batch": 16, "replay_capacity": 300, "agents": agents}
+    return replace(method, **(tiny | changes))
+
+
+METHODS = {
+    **{name: small(name) for name in CALIBRATORS if name.startswith("madoc")},
+    "madoc, free running": small("madoc", starts="policy", horizon=5),
+    "madoc, replaying": small("madoc", starts="replay"),
+}
+
+
+@pytest.fixture(scope="module")
+def task():
+    return two_link_arm()
+
+
+@pytest.fixture(scope="module")
+def dataset(task):
+    return recorded(task, ARM_TRUTH, 200, jax.random.key(100))
+
+
+class Counting:
+    """A simulator that counts the rows it steps."""
+
+    def __init__(self, simulator):
+        self._simulator = simulator
+        self.rows = 0
+
+    def __getattr__(self, name):
+        return getattr(self._simulator, name)
+
+    def bind(self, parameters):
+        return CountingSystem(self, self._simulator.bind(parameters))
+
+
+class CountingSystem:
+    def __init__(self, simulator, system):
+        self._simulator = simulator
+        self._system = system
+
+    @property
+    def count(self):
+        return self._system.count
+
+    def step(self, state, action):
+        self._simulator.rows += state.shape[0] * state.shape[1]
+        return self._system.step(state, action)
+
+
+@pytest.fixture
+def simulator(task):
+    return Counting(simulation.make(task, threads=1))
+
+
+@pytest.fixture
+def problem(dataset, simulator):
+    return CalibrationProblem(dataset, simulator)
+
+
+@pytest.fixture(params=METHODS)
+def method(request):
+    return METHODS[request.param]
+
+
+def without_seconds(result):
+    return {name: value for name, value in result.to_json().items() if name != "seconds"}
+
+
+def through_all_stages(method, problem, *, key=KEY):
+    """Every state, and the stage that made it, until the second epoch of calibration is done."""
+    state = method.init(problem, key)
+    yield "init", state
+    calibrated = 0
+    while calibrated < 2:
+        stage = method.stage(state)
+        calibrated += stage == "calibrating"
+        state, _ = method.step(problem, state)
+        yield stage, state
+
+
+def test_no_calibrator_is_forgotten():
+    assert set(CALIBRATORS) <= set(METHODS), "add the new calibrator to METHODS"
+
+
+@pytest.mark.parametrize("name", CALIBRATORS)
+def test_a_method_knows_the_name_it_is_listed_under(name):
+    assert CALIBRATORS[name].make().name in CALIBRATORS
+    assert CALIBRATORS[name].summary
+    assert CALIBRATORS[name].paper
+    assert 1900 < CALIBRATORS[name].year < 2100
+
+
+def test_the_result_is_sound_and_the_budget_kept(method, problem, simulator, task):
+    result = calibrate(method, problem, key=KEY, budget=BUDGET, truth=ARM_TRUTH)
+    space = task.parameters
+    assert result.status in ("finished", "converged")
+    assert result.control_steps == simulator.rows
+    spent = [method.control_steps(state) for _, state in through_all_stages(method, problem)]
+    assert BUDGET <= result.control_steps - PROBING < BUDGET + max(np.diff(spent))
+    assert np.isfinite(result.mean).all()
+    assert (space.low <= result.mean).all()
+    assert (result.mean <= space.high).all()
+    assert (result.std >= 0).all()
+    assert np.isfinite(result.std).all()
+    assert sorted(name for names in result.groups for name in names) == sorted(space.names)
+    assert list(result.parameters) == list(space.names)
+    assert result.method == method.name
+    assert result.error["per_parameter"].keys() == ARM_TRUTH.keys()
+    assert str(result)
+    told = result.to_json()
+    assert CalibrationResult.from_json(json.loads(json.dumps(told))).to_json() == told
+
+
+def test_same_seed_same_bits_and_another_seed_others(method, problem):
+    first, again, other = (calibrate(method, problem, key=jax.random.key(seed), budget=BUDGET) for seed in (0, 0, 1))
+    assert without_seconds(first) == without_seconds(again)
+    assert (first.mean != other.mean).any()
+    assert (first.seed, other.seed) == (0, 1)
+
+
+def test_stopped_and_resumed_equals_uninterrupted(method, problem, tmp_path):
+    whole = calibrate(method, problem, key=KEY, budget=BUDGET)
+    with RunFolder.create(tmp_path / "run", {"seed": 0}) as folder:
+        part = calibrate(method, problem, key=KEY, budget=BUDGET // 2, folder=folder)
+        assert part.control_steps < whole.control_steps
+        resumed = calibrate(method, problem, key=KEY, budget=BUDGET, folder=folder, resume=True)
+        assert without_seconds(resumed) == without_seconds(whole)
+        again = calibrate(method, problem, key=KEY, budget=BUDGET, folder=folder, resume=True)
+        assert again == resumed
+        assert json.loads(folder.result.read_text()) == resumed.to_json()
+
+
+def test_the_layout_of_the_state_never_changes(method, problem):
+    states = dict(through_all_stages(method, problem))
+    expected = checkpoint.layout(states["init"])
+    assert {stage: checkpoint.difference(checkpoint.layout(state), expected) for stage, state in states.items()} == (
+        dict.fromkeys(states)
+    )
+    assert not any(checkpoint.first_non_finite(state) for state in states.values())
+
+
+def test_metrics_are_finite_numbers_and_progress_grows(method, problem):
+    state = method.init(problem, KEY)
+    done = [method.progress(state, BUDGET)]
+    while method.control_steps(state) < BUDGET:
+        state, metrics = method.step(problem, state)
+        assert all(np.isfinite(value) for value in metrics.values())
+        done.append(method.progress(state, BUDGET))
+    assert done == sorted(done)
+    assert done[0] >= 0.0
+    assert done[-1] == 1.0
+    assert set(method.shown) & metrics.keys()
+
+
+class Poison:
+    """Raises whatever is done with it."""
+
+    def _refuse(self, *_):
+        raise AssertionError("the truth was read")
+
+    __getattr__ = __getitem__ = __iter__ = __len__ = __call__ = __eq__ = __bool__ = __contains__ = _refuse
+    __hash__ = None
+
+
+def test_the_truth_is_never_read(method, dataset, simulator, monkeypatch):
+    poisoned = replace(dataset, true_parameters=Poison())
+    monkeypatch.setattr(madoc.data.targets, "PAPER_TRUTH", Poison())
+    monkeypatch.setattr(madoc.data.targets, "paper_truth", Poison())
+    monkeypatch.setattr("madoc.evaluation.calibration_error", Poison())
+    problem = CalibrationProblem(poisoned, simulator)
+    assert problem.dataset.true_parameters is None
+    calibrate(method, problem, key=KEY, budget=BUDGET)
+
+
+def test_the_result_is_the_same_whatever_the_truth(method, problem, dataset, simulator):
+    lying = replace(dataset, true_parameters=dict.fromkeys(ARM_TRUTH, 0.3))
+    told = [
+        calibrate(method, CalibrationProblem(rows, simulator), key=KEY, budget=BUDGET).parameters
+        for rows in (dataset, lying)
+    ]
+    assert told[0] == told[1]
+
+
+def test_nothing_is_traced_again(method, problem, traced):
+    for _, following in through_all_stages(method, problem):
+        state = following
+    assert method.stage(state) == "calibrating"
+    before = traced()
+    for _ in range(10):
+        state, _ = method.step(problem, state)
+    assert traced() == before
+
+
+def test_a_state_is_not_changed_by_what_is_done_with_it(method, problem):
+    """But for the replay buffer, which a step may consume."""
+    result = [calibrate(method, problem, key=KEY, budget=BUDGET).mean for _ in range(2)]
+    assert (result[0] == result[1]).all()
+
+
+def test_data_of_another_robot_is_refused(dataset, simulator):
+    with pytest.raises(MadocError, match="recorded from hopper, the simulator is two_link_arm"):
+        CalibrationProblem(replace(dataset, task_name="hopper"), simulator)
+
+
+@pytest.mark.parametrize("starts", ["logged", "replay"])
+def test_logged_starts_without_states_are_refused(method, dataset, starts):
+    blind = replace(two_link_arm(), state_from_observation=None)
+    problem = CalibrationProblem(dataset, simulation.make(blind, threads=1))
+    with pytest.raises(MadocError, match="does not determine its state, so nothing can start at logged states"):
+        calibrate(replace(method, starts=starts), problem, key=KEY, budget=BUDGET)
+
+
+def test_free_running_needs_no_states(method, dataset):
+    blind = replace(two_link_arm(), state_from_observation=None)
+    problem = CalibrationProblem(dataset, simulation.make(blind, threads=1))
+    assert calibrate(replace(method, starts="policy"), problem, key=KEY, budget=1).status == "finished"
+
+
+def test_a_parameter_that_changes_nothing_is_refused_before_any_budget_is_spent(method, dataset: Dataset, monkeypatch):
+    # Contacts are off, so friction is never felt.
+    task = two_link_arm(Parameter("body_mass", "fore", 0.2, 1.0), Parameter("geom_friction", "fore", 0.5, 2.0))
+    problem = CalibrationProblem(dataset, simulation.make(task, threads=1))
+    monkeypatch.setattr(type(method), "step", Poison())
+    with pytest.raises(MadocError, match=r"geom_friction\.fore changes no next state in 64 logged rows; remove it"):
+        calibrate(method, problem, key=KEY, budget=BUDGET)
+
+
+@pytest.mark.parametrize("truth", [{"gravity": -9.81}, ARM_TRUTH | {"body_mass.tail": 1.0}])
+def test_a_truth_of_other_parameters_is_refused(method, problem, truth):
+    with pytest.raises(MadocError, match="expected values for exactly"):
+        calibrate(method, problem, key=KEY, budget=BUDGET, truth=truth)
+
+
+def test_no_budget_is_refused(method, problem):
+    with pytest.raises(MadocError, match="budget of at least 1 control step, got 0"):
+        calibrate(method, problem, key=KEY, budget=0)
+
+
+def test_one_parameter_can_be_calibrated_alone(method, dataset):
+    task = two_link_arm().with_parameters(["dof_damping.elbow"])
+    problem = CalibrationProblem(replace(dataset, true_parameters=None), simulation.make(task, threads=1))
+    result = calibrate(method, problem, key=KEY, budget=BUDGET)
+    assert result.groups == [["dof_damping.elbow"]]
