@@ -71,8 +71,8 @@ def policies() -> str:
     if not cells:
         return ""
     lines = [
-        "## Policies\n\n`python benchmarks/policies.py` (see its options). Deterministic policy, return in the target.\n",
-        "| robot | learnt at | control steps | hidden | updates a step | seeds | return | normalized | seconds | commit |",
+        "## Policies\n\n`python benchmarks/policies.py` (see its options). Deterministic, return in the target.\n",
+        "| robot | learnt at | control steps | hidden | updates | seeds | return | normalized | seconds | commit |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for (robot, at, budget, hidden, updates), rows in sorted(cells.items()):
