@@ -51,11 +51,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("madoc: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except BrokenPipeError:  # the reader of the help has seen enough, as `head` does
+        return _hang_up()
     try:
         _say(answer, as_json=command.output.json)
-    except BrokenPipeError:  # the reader of a pipe has seen enough, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:
+        _hang_up()
     return EXIT_CODES[answer.status]
+
+
+def _hang_up() -> int:
+    """Write no more to a closed pipe, not even at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
 
 
 def _parse(arguments: Sequence[str]) -> Command:

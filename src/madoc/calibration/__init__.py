@@ -8,16 +8,14 @@ from madoc.calibration.madoc.calibrator import Madoc
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.types import MethodEntry
 
-_PAPER = "Jiang et al., Multi-Agent Domain Calibration with a Handful of Offline Data"
+_PAPER = "Jiang et al., Madoc"
 
 
 CALIBRATORS: dict[str, MethodEntry[Calibrator]] = {
-    "madoc": MethodEntry(Madoc, "one agent a group of like parameters, credit by DOP", _PAPER, 2024),
+    "madoc": MethodEntry(Madoc, "one agent a group of parameters, DOP", _PAPER, 2024),
     "madoc-s": MethodEntry(partial(Madoc, groups="one"), "one agent for all parameters", _PAPER, 2024),
     "madoc-vdn": MethodEntry(partial(Madoc, mixing="sum"), "credit by a plain sum (VDN)", _PAPER, 2024),
-    "madoc-isac": MethodEntry(
-        partial(Madoc, mixing="independent"), "every agent learns from the shared reward alone", _PAPER, 2024
-    ),
+    "madoc-isac": MethodEntry(partial(Madoc, mixing="independent"), "agents share one reward, no credit", _PAPER, 2024),
     "madoc-ungrouped": MethodEntry(partial(Madoc, groups="each"), "one agent a parameter", _PAPER, 2024),
     "madoc-paper": MethodEntry(Madoc.paper, "Madoc with the paper's own constants", _PAPER, 2024),
 }

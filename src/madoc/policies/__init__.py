@@ -9,13 +9,11 @@ from madoc.policies.sac import SAC
 from madoc.types import MethodEntry
 
 LEARNERS: dict[str, MethodEntry[PolicyLearner]] = {
-    "sac": MethodEntry(
-        SAC, "soft actor-critic in the calibrated simulator", "Haarnoja et al., Soft Actor-Critic", 2018
-    ),
+    "sac": MethodEntry(SAC, "SAC in the calibrated simulator", "Haarnoja et al., SAC", 2018),
     "sac-bc": MethodEntry(
         partial(SAC, cloning=2.5),
-        "the same with a cloning term to the data's actions",
-        "Jiang et al., Multi-Agent Domain Calibration with a Handful of Offline Data",
+        "SAC, cloning the data's actions too",
+        "Jiang et al., Madoc",
         2024,
     ),
 }
