@@ -36,6 +36,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("runs/benchmark-data"))
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
+    revision = commit()
     arguments.results.mkdir(parents=True, exist_ok=True)
     for robot in arguments.robots:
         simulator = CpuSimulator(tasks.make(robot, "legacy"), threads=arguments.threads)
@@ -57,7 +58,7 @@ def main() -> None:
                         truth=dataset.true_parameters,
                     )
                     row = result.to_json() | {
-                        "commit": commit(),
+                        "commit": revision,
                         "starts": starts,
                         "quality": arguments.quality,
                         "transitions": len(dataset),
@@ -77,10 +78,13 @@ def recorded(simulator: CpuSimulator, quality: str, transitions: int, folder: Pa
 
 
 def commit() -> str:
-    """The revision measured, with a + if the tree had changes."""
-    return subprocess.run(
-        ["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, check=True
-    ).stdout.strip()
+    """The revision measured, with a + if tracked files had changes."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], capture_output=True, text=True, check=True).stdout.strip()
+
+    sources = ("src", "benchmarks/*.py")
+    return git("rev-parse", "--short", "HEAD") + "+" * bool(git("status", "--porcelain", "-uno", "--", *sources))
 
 
 if __name__ == "__main__":

@@ -121,3 +121,25 @@ def recorded(task: Task, truth: dict[str, float], rows: int, key):
     of_policy, of_rollout = jax.random.split(key)
     policy = TanhGaussianPolicy(task.observation_size, simulator.action_size, (16,), key=of_policy)
     return record(policy, simulator, truth, transitions=rows, key=of_rollout, origin="a random policy")
+
+
+class CountingSimulator:
+    """A simulator that counts the rows its systems step."""
+
+    def __init__(self, simulator):
+        self._simulator = simulator
+        self.rows = 0
+
+    def __getattr__(self, name):
+        return getattr(self._simulator, name)
+
+    def bind(self, parameters):
+        system = self._simulator.bind(parameters)
+        step = system.step
+
+        def counted(state, action):
+            self.rows += state.shape[0] * state.shape[1]
+            return step(state, action)
+
+        system.step = counted
+        return system

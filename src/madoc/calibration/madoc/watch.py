@@ -32,7 +32,8 @@ class Watch:
             its range), or the mean |reward| where there is no blur.
         at_bound: Share of rows whose reward stands at its bound.
         best_mismatch: The lowest `mismatch` since it could be told.
-        best_epoch: When it last fell by a share worth the name.
+        milestone: The mismatch when it last fell by a share worth the name, ...
+        milestone_epoch: ... and when that was.
         best: The actors' moving average then.
     """
 
@@ -40,13 +41,14 @@ class Watch:
     mismatch: float
     at_bound: float
     best_mismatch: float
-    best_epoch: int
+    milestone: float
+    milestone_epoch: int
     best: Actors
 
 
 def begin_watch(actors: Actors) -> Watch:
     """Before the first epoch."""
-    return Watch(0, 0.0, 0.0, 0.0, 0, actors)
+    return Watch(0, 0.0, 0.0, 0.0, 0.0, 0, actors)
 
 
 def observe(watch: Watch, metrics: Metrics, average: Actors, *, steered_to: float, largest_blur: float) -> Watch:
@@ -63,20 +65,25 @@ def observe(watch: Watch, metrics: Metrics, average: Actors, *, steered_to: floa
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
     watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, at_bound=at_bound)
     if not steered_to or watch.epochs <= SETTLING or blur > 0.99 * largest_blur:
-        return replace(watch, best=average, best_mismatch=mismatch, best_epoch=watch.epochs)
+        return _mark(replace(watch, best=average, best_mismatch=mismatch))
     if size < TELLING * steered_to or mismatch >= watch.best_mismatch:
         return watch
-    progress = mismatch < (1.0 - PROGRESS) * watch.best_mismatch
-    best_epoch = watch.epochs if progress else watch.best_epoch
-    return replace(watch, best=average, best_mismatch=mismatch, best_epoch=best_epoch)
+    watch = replace(watch, best=average, best_mismatch=mismatch)
+    return _mark(watch) if mismatch < (1.0 - PROGRESS) * watch.milestone else watch
+
+
+def _mark(watch: Watch) -> Watch:
+    return replace(watch, milestone=watch.mismatch, milestone_epoch=watch.epochs)
 
 
 def stalled(watch: Watch, patience: int) -> str | None:
     """A sentence once the mismatch has not become smaller for `patience` epochs."""
-    waited = watch.epochs - watch.best_epoch
+    waited = watch.epochs - watch.milestone_epoch
     if waited < patience:
         return None
-    return f"the reward has nothing left to say: no smaller mismatch than {watch.best_mismatch:.3g} in {waited} epochs"
+    return (
+        f"the reward has nothing left to say: the mismatch has stayed at {watch.best_mismatch:.3g} for {waited} epochs"
+    )
 
 
 def warnings(

@@ -1,0 +1,130 @@
+"""Madoc's watch, on metrics made by hand."""
+
+import numpy as np
+import pytest
+
+from madoc.calibration.madoc.actors import Actors, initial_actors
+from madoc.calibration.madoc.watch import SATURATED, SETTLING, SMOOTHING, begin_watch, observe, stalled, warnings
+
+LARGEST = 0.3
+
+
+def actors(value):
+    return Actors(np.full(2, value, np.float32), np.zeros(2, np.float32))
+
+
+def watched(watch, epochs, *, blur, size=1.0, at_bound=0.0, estimate=0.0, steered_to=1.0):
+    metrics = {"blur": blur, "reward_size": size, "reward_at_bound": at_bound}
+    for _ in range(epochs):
+        watch = observe(watch, metrics, actors(estimate), steered_to=steered_to, largest_blur=LARGEST)
+    return watch
+
+
+def begun():
+    return begin_watch(initial_actors(2))
+
+
+def settled(**metrics):
+    return watched(begun(), SETTLING, **metrics)
+
+
+def test_the_mismatch_is_a_running_average_that_begins_at_the_first_epoch():
+    first = watched(begun(), 1, blur=0.2, at_bound=0.4)
+    assert (first.mismatch, first.at_bound, first.epochs) == (0.2, 0.4, 1)
+    second = watched(first, 1, blur=0.1, at_bound=0.0)
+    assert second.mismatch == pytest.approx(0.2 + SMOOTHING * (0.1 - 0.2))
+    assert second.at_bound == pytest.approx(0.4 * (1 - SMOOTHING))
+
+
+def test_a_blur_at_which_discriminators_are_surer_than_wanted_stands_for_a_larger_mismatch():
+    assert watched(begun(), 1, blur=0.1, size=3.0, steered_to=2.0).mismatch == pytest.approx(0.15)
+
+
+def test_until_the_discriminators_have_settled_the_latest_estimate_is_the_best():
+    watch = settled(blur=0.01, estimate=0.1)  # mismatches that will never be as low again
+    assert float(watch.best.mean[0]) == pytest.approx(0.1)
+    assert watch.best_epoch == SETTLING
+
+
+def test_the_estimate_of_the_lowest_mismatch_is_kept():
+    watch = settled(blur=0.2, estimate=0.1)
+    better = watched(watch, 40, blur=0.1, estimate=0.5)
+    worse = watched(better, 40, blur=0.25, estimate=0.9)
+    assert float(worse.best.mean[0]) == pytest.approx(0.5)
+    assert worse.best_mismatch == better.best_mismatch
+    assert SETTLING < worse.best_epoch <= SETTLING + 40
+
+
+def test_a_blur_at_its_largest_says_nothing_yet():
+    watch = watched(settled(blur=LARGEST), 10, blur=LARGEST, estimate=0.7)
+    assert float(watch.best.mean[0]) == pytest.approx(0.7)
+    assert watch.best_epoch == watch.epochs
+
+
+def test_a_blur_at_which_nothing_can_be_told_does_not_count():
+    watch = settled(blur=0.2, estimate=0.1)
+    assert watched(watch, 20, blur=0.05, size=0.1, estimate=0.7).best is watch.best
+
+
+def test_a_crumb_is_better_but_no_progress():
+    watch = settled(blur=0.2, estimate=0.1)
+    crumb = watched(watch, 1, blur=0.199, estimate=0.3)
+    assert float(crumb.best.mean[0]) == pytest.approx(0.3)
+    assert crumb.best_epoch == watch.best_epoch
+
+
+def test_without_a_blur_the_latest_estimate_is_taken_and_it_never_stalls():
+    watch = watched(begun(), 3 * SETTLING, blur=0.0, size=2.0, steered_to=0.0)
+    watch = watched(watch, 1, blur=0.0, size=3.0, steered_to=0.0, estimate=0.6)
+    assert float(watch.best.mean[0]) == pytest.approx(0.6)
+    assert stalled(watch, 1) is None
+
+
+def test_it_stops_after_so_many_epochs_without_progress():
+    watch = settled(blur=0.2)
+    assert stalled(watched(watch, 19, blur=0.2), 20) is None
+    assert stalled(watched(watch, 20, blur=0.2), 20) == (
+        "the reward has nothing left to say: no smaller mismatch than 0.2 in 20 epochs"
+    )
+    assert stalled(watched(watch, 20, blur=0.05), 20) is None
+
+
+def told(watch=None, unit=(0.0, 0.0), failures=0):
+    return warnings(
+        watch or settled(blur=0.1), np.array(unit), ("mass", "damping"), failures=failures, control_steps=12_000
+    )
+
+
+def test_a_healthy_run_is_not_warned_of():
+    assert told(unit=(-0.97, 0.97)) == ()
+
+
+def test_a_parameter_at_the_end_of_its_range_is_named():
+    (warning,) = told(unit=(0.5, -0.99))
+    assert warning == "at the end of its range: damping; widen the range or doubt the model"
+    assert "mass, damping" in told(unit=(1.0, -0.99))[0]
+
+
+def test_a_saturated_reward_is_told():
+    (warning,) = told(settled(blur=0.1, at_bound=0.75))
+    assert "sure of 75% of the simulated rows (reward at its bound)" in warning
+    assert told(settled(blur=0.1, at_bound=SATURATED - 0.01)) == ()
+
+
+def test_saturation_long_past_is_forgotten():
+    assert told(watched(settled(blur=0.1, at_bound=1.0), 30, blur=0.1)) == ()
+
+
+def test_rows_that_exploded_are_counted():
+    assert told(failures=7) == (
+        "7 of 12,000 simulated rows exploded and were left out; the ranges may hold impossible parameters",
+    )
+
+
+def test_too_few_epochs_are_told():
+    (warning,) = told(watched(begun(), 3, blur=0.1))
+    assert warning.startswith("only 3 epochs of calibration")
+
+
+def test_warnings_add_up():
+    assert len(told(watched(begun(), 3, blur=0.1, at_bound=1.0), unit=(1.0, 0.0), failures=1)) == 4
