@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -84,11 +85,11 @@ class CalibrationResult:
 
     def table(self) -> Table:
         """The parameters as a rich table: name, unit, estimate ± std, range, group, and the error if known."""
-        table = Table(title=f"{self.method} on {self.task}", title_justify="left")
+        table = Table(title=f"{self.method} on {self.task}", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
         group_of = {name: index for index, names in enumerate(self.groups, 1) for name in names}
-        for heading in ("parameter", "unit"):
-            table.add_column(heading)
-        for heading in ("estimate", "± std", "range", "group"):
+        table.add_column("parameter", min_width=max(map(len, self.parameters)))
+        table.add_column("unit")
+        for heading in ("estimate ± std", "range", "group"):
             table.add_column(heading, justify="right")
         errors = self.error["per_parameter"] if self.error else {}
         if errors:
@@ -97,8 +98,7 @@ class CalibrationResult:
             cells = [
                 name,
                 row.unit,
-                f"{row.estimate:.4g}",
-                f"{row.std:.2g}",
+                f"{row.estimate:.4g} ± {row.std:.2g}",
                 f"[{row.low:g}, {row.high:g}]",
                 str(group_of.get(name, "")),
             ]

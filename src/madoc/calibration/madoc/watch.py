@@ -93,7 +93,7 @@ def warnings(
     found = []
     if watch.epochs < SETTLING:
         found.append(
-            f"only {watch.epochs} epochs of calibration, fewer than the {SETTLING} in which the discriminators settle; "
+            f"{watch.epochs} epochs of calibration are fewer than the {SETTLING} in which the discriminators settle; "
             "give it a larger budget"
         )
     if watch.at_bound > SATURATED:
