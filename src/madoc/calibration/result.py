@@ -85,7 +85,13 @@ class CalibrationResult:
 
     def table(self) -> Table:
         """The parameters as a rich table: name, unit, estimate ± std, range, group, and the error if known."""
-        table = Table(title=f"{self.method} on {self.task}", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+        table = Table(
+            title=f"{self.method} on {self.task}",
+            title_justify="left",
+            box=box.SIMPLE_HEAD,
+            padding=(0, 0),
+            pad_edge=False,
+        )
         group_of = {name: index for index, names in enumerate(self.groups, 1) for name in names}
         table.add_column("parameter", min_width=max(map(len, self.parameters)))
         table.add_column("unit")
@@ -93,7 +99,7 @@ class CalibrationResult:
             table.add_column(heading, justify="right")
         errors = self.error["per_parameter"] if self.error else {}
         if errors:
-            table.add_column("|error|", justify="right")
+            table.add_column("error", justify="right")
         for name, row in self.parameters.items():
             cells = [
                 name,

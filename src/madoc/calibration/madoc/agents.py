@@ -140,13 +140,15 @@ class AgentSettings:
     ) -> tuple[Agents, dict[str, Array]]:
         """`count` updates, one scan: Algorithm 1, lines 13 to 19.
 
+        The discriminators learn from blurred s'; the reward is read at the unblurred ones, where it is least noisy.
+
         Args:
             agents: What to update.
             simulated: Rows with `pair`, `following` and `parameters` (in [-1, 1]).
             logged: Features of the target's rows.
             members: Which parameters belong to which group.
             key: Randomness.
-            mixing: How credit is given. The reward is read at the unblurred s', where it is the least noisy.
+            mixing: How credit is given.
             reward_size: Mean |reward| that the blur is steered to, 0 for no blur.
             count: Updates.
         """
