@@ -5,6 +5,7 @@ python benchmarks/tables.py            # prints, and writes results/README.md
 
 import json
 from collections import defaultdict
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ PAPER_ERROR = {
 
 def main() -> None:
     parts = ["# Measured\n\nMade by `python benchmarks/tables.py` from the files beside it.\n"]
-    parts += [calibration(), policies(), speed()]
+    parts += [calibration(), policies(), speed(), not_run()]
     text = "\n".join(part for part in parts if part)
     (RESULTS / "README.md").write_text(text)
     print(text)
@@ -93,6 +94,26 @@ def speed() -> str:
     if not path.exists():
         return ""
     return f"## Speed\n\n`python benchmarks/speed.py`\n\n```json\n{path.read_text()}```\n"
+
+
+def not_run() -> str:
+    """What the tables should hold and do not, each with the command that runs it."""
+    lines = []
+    for robot, starts in product(("hopper", "halfcheetah", "walker2d", "ant"), ("logged", "policy")):
+        for method in ("madoc", "madoc-s") if robot == "halfcheetah" else ("madoc",):
+            wanted = range(5 if robot == "halfcheetah" else 3)
+            name = f"{robot}-medium-{method}-{starts}-300000"
+            seeds = [seed for seed in wanted if not (RESULTS / "calibration" / f"{name}-{seed}.json").exists()]
+            if seeds:
+                lines.append(
+                    f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --starts {starts} "
+                    f"--seeds {' '.join(map(str, seeds))}`"
+                )
+    if len(list((RESULTS / "policies").glob("*.json"))) < 18:
+        lines.append("- `python benchmarks/policies.py --robots hopper halfcheetah --seeds 0 1 2`")
+    if not (RESULTS / "speed.json").exists():
+        lines.append("- `python benchmarks/speed.py`")
+    return "\n".join(["## Not run yet\n", *lines]) + "\n" if lines else ""
 
 
 if __name__ == "__main__":
