@@ -57,7 +57,7 @@ def told(folder):
 @pytest.mark.parametrize("kills", [3, pytest.param(20, marks=pytest.mark.slow)])
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, kills):
     moments = random.Random(kills)
-    budget = 100 * (30 + 100 * kills)
+    budget = 100 * (20 + 40 * kills)
     run = tmp_path / "run"
     # What the uninterrupted run compiles is kept for the others, for speed; the command line below compiles anew.
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}

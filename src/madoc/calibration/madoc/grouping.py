@@ -91,6 +91,8 @@ def one_at_a_time(key: PRNGKeyArray, count: int) -> Float[np.ndarray, "d d"]:
 
 def cluster(embeddings: Float[Array, "d latent"], groups: int, seed: int) -> Int[np.ndarray, " d"]:
     """Group labels of parameters: PCA to three dimensions, then k-means; labels in order of first appearance."""
+    if groups == 1:
+        return np.zeros(len(embeddings), dtype=np.int64)
     projected = project(embeddings)
     labels = KMeans(groups, n_init=10, random_state=seed).fit_predict(projected)
     order = {label: rank for rank, label in enumerate(dict.fromkeys(labels.tolist()))}
