@@ -27,6 +27,7 @@ def calibrated_on(cores):
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(len(CORES) < 2, reason="this machine has one core")
 def test_same_seed_same_result_at_one_and_two_threads():
     one, two = calibrated_on(CORES[:1]), calibrated_on(CORES[:2])

@@ -13,7 +13,7 @@ from madoc.types import Policy
 
 @dataclass(frozen=True)
 class LearnedPolicy:
-    """A policy and how its learning ended. Calling it acts.
+    """A policy and how its learning ended.
 
     Attributes:
         policy: Acts; deterministic without a key.
