@@ -16,9 +16,8 @@ def calibrated_on(cores):
     folders = [str(TESTS), str(TESTS.parent / "src")]
     plain = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     done = subprocess.run(
-        [sys.executable, str(TESTS / "calibrating.py"), "wide"],
+        ["taskset", "--cpu-list", ",".join(map(str, cores)), sys.executable, str(TESTS / "calibrating.py"), "wide"],
         env=plain | {"PYTHONPATH": os.pathsep.join(folders), "JAX_PLATFORMS": "cpu"},
-        preexec_fn=lambda: os.sched_setaffinity(0, cores),
         capture_output=True,
         text=True,
         check=False,
