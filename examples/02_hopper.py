@@ -6,7 +6,7 @@ import madoc
 
 
 def main() -> None:
-    """About five minutes on two cores."""
+    """Do it, with progress."""
     task = madoc.tasks.hopper()
     simulator = madoc.simulation.make(task)
     dataset = madoc.record(simulator, "medium", transitions=20_000, key=jax.random.key(0))
