@@ -97,7 +97,6 @@ def calibration_update(method: Madoc) -> float:
                 members,
                 jax.random.key(1),
                 mixing="dop",
-                reward_size=1.0,
                 count=count,
             )[1]
         )

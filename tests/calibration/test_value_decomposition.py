@@ -10,6 +10,7 @@ from madoc.learning.networks import descend
 
 VALUES = jnp.array([[1.0, 2.0], [3.0, -1.0]])
 REWARD = jnp.array([2.0, 0.0])
+EVEN = jnp.ones(2)
 MEMBERS = jnp.array([[True, False, True, False], [False, True, False, False], [False, False, False, True]])
 
 
@@ -56,14 +57,29 @@ def test_total_value_never_falls_where_a_groups_value_rises():
     ],
 )
 def test_value_loss_by_hand(mixing, expected, compiled):
-    loss = compiled(value_loss)(VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, mixing)
+    loss = compiled(value_loss)(VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, EVEN, mixing)
+    assert loss == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("mixing", "expected"),
+    [
+        # squared errors (7.5625, 0.0625), (1, 4), (1 + 0, 9 + 1), at shares (1.5, 0.5): ½ (1.5 a + 0.5 b) / 2
+        ("dop", 2.84375),
+        ("sum", 0.875),
+        ("independent", 1.625),
+    ],
+)
+def test_rows_count_by_their_share(mixing, expected):
+    share = jnp.array([1.5, 0.5])
+    loss = value_loss(VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, share, mixing)
     assert loss == pytest.approx(expected)
 
 
 def test_value_loss_slopes_by_hand():
     # dL/dV = (2.75, -0.25) / 2; dL/dk = sign(k) Σ dL/dV v, dL/db = Σ dL/dV
     slope = jax.grad(value_loss, argnums=(0, 1, 2))
-    values, weight, bias = slope(VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, "dop")
+    values, weight, bias = slope(VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, EVEN, "dop")
     np.testing.assert_allclose(values, [[0.6875, 2.75], [-0.0625, -0.25]])  # 1.375·(0.5, 2), -0.125·(0.5, 2)
     np.testing.assert_allclose(weight, [-1.0, 2.875])  # -(1.375·1 - 0.125·3), 1.375·2 + 0.125·1
     assert bias == pytest.approx(1.25)
@@ -71,27 +87,29 @@ def test_value_loss_slopes_by_hand():
 
 @pytest.mark.parametrize("mixing", ["sum", "independent"])
 def test_only_dop_has_k_and_b(mixing):
-    loss = value_loss(VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, mixing)
-    assert loss == value_loss(VALUES, jnp.array([7.0, 0.0]), jnp.asarray(-9.0), REWARD, mixing)
-    weight, bias = jax.grad(value_loss, argnums=(1, 2))(VALUES, jnp.ones(2), jnp.zeros(()), REWARD, mixing)
+    loss = value_loss(VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, EVEN, mixing)
+    assert loss == value_loss(VALUES, jnp.array([7.0, 0.0]), jnp.asarray(-9.0), REWARD, EVEN, mixing)
+    weight, bias = jax.grad(value_loss, argnums=(1, 2))(VALUES, jnp.ones(2), jnp.zeros(()), REWARD, EVEN, mixing)
     np.testing.assert_array_equal(weight, np.zeros(2))
     assert bias == 0
 
 
 def test_dop_at_its_start_is_vdn():
-    start = value_loss(VALUES, jnp.ones(2), jnp.zeros(()), REWARD, "dop")
-    assert start == pytest.approx(value_loss(VALUES, jnp.ones(2), jnp.zeros(()), REWARD, "sum"))
+    start = value_loss(VALUES, jnp.ones(2), jnp.zeros(()), REWARD, EVEN, "dop")
+    assert start == pytest.approx(value_loss(VALUES, jnp.ones(2), jnp.zeros(()), REWARD, EVEN, "sum"))
 
 
 def test_independent_critics_regress_the_reward_each_on_its_own():
     slope = jax.grad(value_loss)
     none = jnp.ones(2), jnp.zeros(())
-    before = slope(VALUES, *none, REWARD, "independent")
+    before = slope(VALUES, *none, REWARD, EVEN, "independent")
     np.testing.assert_allclose(before, (VALUES - REWARD[:, None]) / 2)
-    after = slope(VALUES.at[:, 1].add(100.0), *none, REWARD, "independent")
+    after = slope(VALUES.at[:, 1].add(100.0), *none, REWARD, EVEN, "independent")
     np.testing.assert_array_equal(after[:, 0], before[:, 0])
     # the others' slopes do depend on every critic: they share one error
-    assert not np.array_equal(slope(VALUES, *none, REWARD, "sum"), slope(VALUES + 1.0, *none, REWARD, "sum"))
+    assert not np.array_equal(
+        slope(VALUES, *none, REWARD, EVEN, "sum"), slope(VALUES + 1.0, *none, REWARD, EVEN, "sum")
+    )
 
 
 def test_values_are_each_groups_network_on_its_own_parameters(compiled):
@@ -127,7 +145,7 @@ def test_a_critic_learns_what_its_parameters_earn():
     reward = drawn[:, 0] * drawn[:, 2] + drawn[:, 1] ** 2 - drawn[:, 3]
 
     def loss_of(made):
-        return value_loss(made.values(drawn, MEMBERS), made.weight, made.bias, reward, "sum")
+        return value_loss(made.values(drawn, MEMBERS), made.weight, made.bias, reward, jnp.ones(512), "sum")
 
     @eqx.filter_jit
     def update(made, state):

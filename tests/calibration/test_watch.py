@@ -4,9 +4,18 @@ import numpy as np
 import pytest
 
 from madoc.calibration.madoc.actors import Actors, initial_actors
-from madoc.calibration.madoc.watch import SATURATED, SETTLING, SMOOTHING, begin_watch, observe, stalled, warnings
+from madoc.calibration.madoc.watch import (
+    CLOSE,
+    SATURATED,
+    SETTLING,
+    SMOOTHING,
+    begin_watch,
+    observe,
+    stalled,
+    warnings,
+)
 
-LARGEST = 0.3
+SMALLEST, LARGEST = 0.02, 0.3
 
 
 def actors(value):
@@ -16,7 +25,7 @@ def actors(value):
 def watched(watch, epochs, *, blur, size=1.0, at_bound=0.0, estimate=0.0, steered_to=1.0):
     metrics = {"blur": blur, "reward_size": size, "reward_at_bound": at_bound}
     for _ in range(epochs):
-        watch = observe(watch, metrics, actors(estimate), steered_to=steered_to, largest_blur=LARGEST)
+        watch = observe(watch, metrics, actors(estimate), steered_to=steered_to, blur_range=(SMALLEST, LARGEST))
     return watch
 
 
@@ -49,10 +58,23 @@ def test_until_the_discriminators_have_settled_the_latest_estimate_is_the_best()
 def test_the_estimate_of_the_lowest_mismatch_is_kept():
     watch = settled(blur=0.2, estimate=0.1)
     better = watched(watch, 40, blur=0.1, estimate=0.5)
-    worse = watched(better, 40, blur=0.25, estimate=0.9)
+    rising = watched(better, 3, blur=0.25, estimate=0.5)
+    worse = watched(rising, 40, blur=0.25, estimate=0.9)
     assert float(worse.best.mean[0]) == pytest.approx(0.5)
     assert worse.best_mismatch == better.best_mismatch
     assert SETTLING < worse.milestone_epoch <= SETTLING + 40
+
+
+def test_of_mismatches_as_low_the_latest_estimate_is_kept():
+    watch = watched(settled(blur=0.1, estimate=0.1), 40, blur=0.1 * (1 + 0.8 * CLOSE), estimate=0.5)
+    assert float(watch.best.mean[0]) == pytest.approx(0.5)
+    assert watch.best_mismatch == pytest.approx(0.1)
+
+
+def test_a_blur_at_its_smallest_is_told_by_the_reward():
+    watch = settled(blur=SMALLEST, size=1.0, estimate=0.1)
+    unsure = watched(watch, 40, blur=SMALLEST, size=0.3, estimate=0.7)
+    assert float(unsure.best.mean[0]) == pytest.approx(0.7) and unsure.best_mismatch < 0.4 * SMALLEST
 
 
 def test_a_blur_at_its_largest_says_nothing_yet():

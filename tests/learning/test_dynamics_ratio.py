@@ -11,6 +11,7 @@ from madoc.learning.dynamics_ratio import (
     blur,
     discriminator_loss,
     log_dynamics_ratio,
+    overlap,
 )
 from madoc.types import Transitions
 
@@ -23,14 +24,14 @@ def rows(observation, action, next_observation):
     )
 
 
-def discriminators(pair, triple, bound=2.0):
+def discriminators(pair, triple, bound=2.0, pair_bound=None):
     """One observation, no action: f_sa from (s,), f_sas from (s, s'), each bound·tanh of an affine map."""
-    made = Discriminators(1, 0, (), key=jax.random.key(0), bound=bound, dropout=0.0)
+    made = Discriminators(1, 0, (), key=jax.random.key(0), bound=bound, pair_bound=pair_bound or bound, dropout=0.0)
     return eqx.tree_at(lambda parts: (parts.pair, parts.triple), made, (affine(*pair), affine(*triple)))
 
 
 def random_discriminators(bound=2.0, dropout=0.0, hidden=(16, 16)):
-    return Discriminators(3, 2, hidden, key=jax.random.key(0), bound=bound, dropout=dropout)
+    return Discriminators(3, 2, hidden, key=jax.random.key(0), bound=bound, pair_bound=bound, dropout=dropout)
 
 
 def random_features(count=64, size=1.0, seed=1):
@@ -123,6 +124,25 @@ def test_the_optimal_discriminators_give_the_log_ratio_of_the_dynamics():
     np.testing.assert_allclose(np.asarray(gradients.triple.layers[0].weight) / bound, 0.0, atol=0.01)
     ratio = log_dynamics_ratio(best, nothing[:5], jnp.linspace(-2, 2, 5)[:, None])
     np.testing.assert_allclose(ratio, [-2, -1, 0, 1, 2], atol=1e-3)
+
+
+def test_overlap_by_hand():
+    # f_sa = (2 tanh s, -2 tanh s): p = 1/2 at s = 0; at tanh s = ½ log(3) / 2, log odds log 3: p = 3/4, 4 · 3/16.
+    parts = discriminators(([[1.0], [-1.0]], [0, 0]), (np.zeros((2, 2)), [0, 0]))
+    three_quarters = np.arctanh(np.log(3) / 4)
+    pair = jnp.asarray([[0.0], [three_quarters], [-three_quarters]], jnp.float32)
+    np.testing.assert_allclose(overlap(parts, pair), [1.0, 0.75, 0.75], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("pair_bound", "left"), [(2.0, True), (10.0, False)])
+def test_what_the_pair_may_not_say_the_triple_says_in_its_place(pair_bound, left):
+    # Logged rows all at s = 1, simulated ones all at s = -1; s' tells nothing. With f_sa at its bound for both,
+    # the triple's loss still slopes by about e^-4 where that bound is 2, and by nothing where it is 10.
+    saturated = discriminators(([[9.0], [-9.0]], [0, 0]), (np.zeros((2, 2)), [0, 0]), pair_bound=pair_bound)
+    rows, nothing = jnp.ones((4, 1)), jnp.zeros((4, 1))
+    gradients, _ = eqx.filter_grad(discriminator_loss, has_aux=True)(saturated, (rows, nothing), (-rows, nothing))
+    slope = np.abs(np.asarray(gradients.triple.layers[0].weight)[:, 0])
+    assert (slope > 0.01).all() if left else (slope < 1e-6).all()
 
 
 def test_dropout_acts_in_the_loss_with_a_key_and_never_in_the_ratio():

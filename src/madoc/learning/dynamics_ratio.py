@@ -63,11 +63,22 @@ def _spread(column: np.ndarray) -> np.ndarray:
 
 
 class Discriminators(eqx.Module):
-    """f_sa and f_sas, each two logits (target, source), bounded by `bound` tanh (appendix C, Jiang et al. 2024)."""
+    """f_sa and f_sas, each two logits (target, source), bounded by a tanh (appendix C, Jiang et al. 2024: both by 2).
+
+    A wider bound of f_sa keeps the reward clean: where simulated (s, a) are far from logged ones, what f_sa may not
+    say of them f_sas says in its place, and it reads as a difference in dynamics.
+
+    Attributes:
+        pair: f_sa's network.
+        triple: f_sas's network.
+        bound: Of f_sas, and so of half the reward.
+        pair_bound: Of f_sa.
+    """
 
     pair: Network
     triple: Network
     bound: float = eqx.field(static=True)
+    pair_bound: float = eqx.field(static=True)
 
     def __init__(
         self,
@@ -77,6 +88,7 @@ class Discriminators(eqx.Module):
         *,
         key: PRNGKeyArray,
         bound: float,
+        pair_bound: float,
         dropout: float,
     ) -> None:
         of_pair, of_triple = jax.random.split(key)
@@ -84,16 +96,21 @@ class Discriminators(eqx.Module):
         self.pair = Network(pair, 2, hidden, key=of_pair, dropout=dropout)
         self.triple = Network(pair + observation_size, 2, hidden, key=of_triple, dropout=dropout)
         self.bound = bound
+        self.pair_bound = pair_bound
 
     def __call__(
         self, pair: Array, following: Array, key: PRNGKeyArray | None = None
     ) -> tuple[Float[Array, "rows 2"], Float[Array, "rows 2"]]:
         """Log probabilities (target, source) given (s, a), and given (s, a, s')."""
         keys = (None, None) if key is None else jax.random.split(key)
-        logits_pair = self.bound * jnp.tanh(self.pair(pair, keys[0]))
+        logits_pair = self.pair_logits(pair, keys[0])
         triple = jnp.concatenate([pair, following], axis=-1)
         logits_triple = self.bound * jnp.tanh(self.triple(triple, keys[1])) + logits_pair
         return jax.nn.log_softmax(logits_pair), jax.nn.log_softmax(logits_triple)
+
+    def pair_logits(self, pair: Array, key: PRNGKeyArray | None = None) -> Float[Array, "rows 2"]:
+        """f_sa: logits (target, source) given (s, a)."""
+        return self.pair_bound * jnp.tanh(self.pair(pair, key))
 
 
 def discriminator_loss(
@@ -140,6 +157,16 @@ def log_dynamics_ratio(discriminators: Discriminators, pair: Array, following: A
     """
     log_pair, log_triple = discriminators(pair, following)
     return log_triple[:, TARGET] - log_triple[:, SOURCE] - log_pair[:, TARGET] + log_pair[:, SOURCE]
+
+
+def overlap(discriminators: Discriminators, pair: Array) -> Float[Array, " rows"]:
+    """4 p (1 - p) of D_sa's p: 1 where (s, a) is as likely in either domain, 0 where only one domain has it.
+
+    Not in the paper. f_sas learns only where D_sa is unsure; elsewhere its ratio is a guess, and rows count by this.
+    """
+    logits = discriminators.pair_logits(pair)
+    target = jax.nn.sigmoid(logits[:, TARGET] - logits[:, SOURCE])
+    return 4.0 * target * (1.0 - target)
 
 
 def blur(

@@ -1,11 +1,13 @@
 """Networks and the scan that trains them."""
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 Carry = TypeVar("Carry")
@@ -59,6 +61,12 @@ def scan_updates(
 
     arrays, metrics = jax.lax.scan(body, arrays, jax.random.split(key, count))
     return eqx.combine(arrays, static), jax.tree.map(jnp.mean, metrics)
+
+
+@cache
+def adam(learning_rate: float) -> optax.GradientTransformation:
+    """Optax's Adam; the same object for the same rate, so that what was traced with it is not traced again."""
+    return optax.adam(learning_rate)
 
 
 def descend(optimiser, gradients: PyTree, optimiser_state: PyTree, parameters: Carry) -> tuple[Carry, PyTree]:

@@ -1,13 +1,11 @@
 """What calibration updates: discriminators, group critics, actors, their prior; and the update itself."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from madoc.calibration.madoc.actors import (
@@ -20,13 +18,14 @@ from madoc.calibration.madoc.actors import (
 )
 from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
 from madoc.learning import replay
-from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio
-from madoc.learning.networks import descend, moving_average, scan_updates
+from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
+from madoc.learning.networks import adam, descend, moving_average, scan_updates
 
 AT_BOUND = 0.95
 """A reward past this share of its bound is counted as saturated."""
-BLUR_RANGE = (1e-4, 0.3)
-"""Shares of a step's spread; it starts at the largest. Rows far off the data need little: their (s, a) tell already."""
+BLUR_RANGE = (0.02, 0.3)
+"""Shares of a step's spread; it starts at the largest. Below the smallest the networks cannot follow s', and are as
+unsure as if the domains were the same."""
 
 
 @jax.tree_util.register_dataclass
@@ -63,7 +62,9 @@ class AgentSettings:
     Attributes:
         hidden: Units per layer of the discriminators.
         critic_hidden: Units per layer of each group's critic.
-        bound: Discriminator logits are this many tanh.
+        bound: Logits of f_sas are this many tanh.
+        pair_bound: Logits of f_sa are; the paper's 2 leaves (s, a) in the reward of free-running rows.
+        weigh_overlap: Rows count by how well (s, a) of both domains overlap there; in the paper all count the same.
         dropout: In the discriminators.
         batch: Logged rows, and simulated rows, an update.
         actor_batch: Draws an update of the actors.
@@ -76,14 +77,15 @@ class AgentSettings:
         prior_rate: Of the prior's moving average.
         prior_every: Updates between two moves of the prior.
         average_rate: Of the estimate's moving average.
-        reward_size: Mean |reward| that the blur is steered to; 0 for no blur, as in the paper. None leaves it to
-            the caller of `update`.
+        reward_size: Mean |reward| that the blur is steered to; 0 for no blur, as in the paper.
         blur_rate: How fast it is steered.
     """
 
     hidden: tuple[int, ...] = (128, 128)
     critic_hidden: tuple[int, ...] = (64, 64)
     bound: float = 2.0
+    pair_bound: float = 10.0
+    weigh_overlap: bool = True
     dropout: float = 0.0
     batch: int = 256
     actor_batch: int = 64
@@ -96,7 +98,7 @@ class AgentSettings:
     prior_rate: float = 0.1
     prior_every: int = 10
     average_rate: float = 1e-3
-    reward_size: float | None = None
+    reward_size: float = 1.0
     blur_rate: float = 3e-3
 
     def init(self, *, observation: int, action: int, parameters: int, groups: int, key: PRNGKeyArray) -> Agents:
@@ -108,6 +110,7 @@ class AgentSettings:
             self.hidden,
             key=of_discriminators,
             bound=self.bound,
+            pair_bound=self.pair_bound,
             dropout=self.dropout,
         )
         critics = GroupCritics(groups, parameters, self.critic_hidden, key=of_critics)
@@ -120,9 +123,9 @@ class AgentSettings:
             average=initial_actors(parameters),
             log_blur=jnp.full((), np.log(BLUR_RANGE[1]), jnp.float32),
             updates=jnp.zeros((), jnp.int32),
-            discriminator_optimiser=self._discriminator_adam.init(eqx.filter(discriminators, eqx.is_array)),
-            critic_optimiser=self._critic_adam.init(eqx.filter(critics, eqx.is_array)),
-            actor_optimiser=self._actor_adam.init(actors),
+            discriminator_optimiser=adam(self.discriminator_rate).init(eqx.filter(discriminators, eqx.is_array)),
+            critic_optimiser=adam(self.critic_rate).init(eqx.filter(critics, eqx.is_array)),
+            actor_optimiser=adam(self.actor_rate).init(actors),
         )
 
     @eqx.filter_jit
@@ -135,7 +138,6 @@ class AgentSettings:
         key: PRNGKeyArray,
         *,
         mixing: Mixing,
-        reward_size: float,
         count: int,
     ) -> tuple[Agents, dict[str, Array]]:
         """`count` updates, one scan: Algorithm 1, lines 13 to 19.
@@ -149,7 +151,6 @@ class AgentSettings:
             members: Which parameters belong to which group.
             key: Randomness.
             mixing: How credit is given.
-            reward_size: Mean |reward| that the blur is steered to, 0 for no blur.
             count: Updates.
         """
 
@@ -157,30 +158,20 @@ class AgentSettings:
             of_logged, of_simulated, of_blur, of_dropout, of_actors = jax.random.split(key, 5)
             rows = jax.random.randint(of_logged, (self.batch,), 0, len(logged[0]))
             drawn = replay.sample(simulated, of_simulated, self.batch)
-            scale = jnp.exp(agents.log_blur) if reward_size else 0.0
+            scale = jnp.exp(agents.log_blur) if self.reward_size else 0.0
             target, source = blur((logged[1][rows], drawn["following"]), scale, of_blur)
             agents, metrics = self._update_discriminators(
                 agents, (logged[0][rows], target), (drawn["pair"], source), of_dropout
             )
             reward = log_dynamics_ratio(agents.discriminators, drawn["pair"], drawn["following"])
-            agents = self._steer_blur(agents, reward, reward_size)
-            agents, value_metrics = self._update_critics(agents, drawn["parameters"], reward, members, mixing)
+            common = overlap(agents.discriminators, drawn["pair"])
+            share = common / common.mean() if self.weigh_overlap else jnp.ones_like(reward)
+            agents, reward_metrics = self._steer_blur(agents, reward, share)
+            agents, value_metrics = self._update_critics(agents, drawn["parameters"], reward, share, members, mixing)
             agents, actor_metrics = self._update_actors(agents, members, of_actors)
-            return agents, metrics | value_metrics | actor_metrics | {"blur": jnp.exp(agents.log_blur)}
+            return agents, metrics | reward_metrics | value_metrics | actor_metrics | {"overlap": common.mean()}
 
         return scan_updates(update, agents, key, count)
-
-    @cached_property
-    def _discriminator_adam(self) -> optax.GradientTransformation:
-        return optax.adam(self.discriminator_rate)
-
-    @cached_property
-    def _critic_adam(self) -> optax.GradientTransformation:
-        return optax.adam(self.critic_rate)
-
-    @cached_property
-    def _actor_adam(self) -> optax.GradientTransformation:
-        return optax.adam(self.actor_rate)
 
     def _update_discriminators(
         self, agents: Agents, target: tuple[Array, Array], source: tuple[Array, Array], key: PRNGKeyArray
@@ -189,32 +180,35 @@ class AgentSettings:
             agents.discriminators, target, source, key
         )
         discriminators, optimiser = descend(
-            self._discriminator_adam, gradients, agents.discriminator_optimiser, agents.discriminators
+            adam(self.discriminator_rate), gradients, agents.discriminator_optimiser, agents.discriminators
         )
         return replace(agents, discriminators=discriminators, discriminator_optimiser=optimiser), metrics
 
-    def _steer_blur(self, agents: Agents, reward: Float[Array, " rows"], reward_size: float) -> Agents:
+    def _steer_blur(
+        self, agents: Agents, reward: Float[Array, " rows"], share: Float[Array, " rows"]
+    ) -> tuple[Agents, dict[str, Array]]:
         """More blur where the discriminators are too sure, less where they cannot tell."""
-        surplus = jnp.clip(jnp.abs(reward).mean() - reward_size, -1.0, 1.0)
+        size = (share * jnp.abs(reward)).mean()
+        surplus = jnp.clip(size - self.reward_size, -1.0, 1.0)
         log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *np.log(BLUR_RANGE))
-        return replace(agents, log_blur=log_blur)
+        metrics = {
+            "reward": (share * reward).mean(),
+            "reward_size": size,
+            "reward_at_bound": (share * (jnp.abs(reward) > AT_BOUND * 2 * self.bound)).mean(),
+            "blur": jnp.exp(log_blur),
+        }
+        return replace(agents, log_blur=log_blur), metrics
 
     def _update_critics(
-        self, agents: Agents, parameters: Array, reward: Array, members: Array, mixing: Mixing
+        self, agents: Agents, parameters: Array, reward: Array, share: Array, members: Array, mixing: Mixing
     ) -> tuple[Agents, dict[str, Array]]:
         def loss_of(critics: GroupCritics) -> Array:
             values = critics.values(parameters, members)
-            return value_loss(values, critics.weight, critics.bias, reward, mixing)
+            return value_loss(values, critics.weight, critics.bias, reward, share, mixing)
 
         loss, gradients = eqx.filter_value_and_grad(loss_of)(agents.critics)
-        critics, optimiser = descend(self._critic_adam, gradients, agents.critic_optimiser, agents.critics)
-        metrics = {
-            "value_loss": loss,
-            "reward": reward.mean(),
-            "reward_size": jnp.abs(reward).mean(),
-            "reward_at_bound": (jnp.abs(reward) > AT_BOUND * 2 * self.bound).mean(),
-        }
-        return replace(agents, critics=critics, critic_optimiser=optimiser), metrics
+        critics, optimiser = descend(adam(self.critic_rate), gradients, agents.critic_optimiser, agents.critics)
+        return replace(agents, critics=critics, critic_optimiser=optimiser), {"value_loss": loss}
 
     def _update_actors(self, agents: Agents, members: Array, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
         weight = prior_weight(agents.updates, time_constant=self.prior_time, largest=self.prior_largest)
@@ -230,7 +224,7 @@ class AgentSettings:
             )
 
         loss, gradients = jax.value_and_grad(loss_of)(agents.actors)
-        actors, optimiser = descend(self._actor_adam, gradients, agents.actor_optimiser, agents.actors)
+        actors, optimiser = descend(adam(self.actor_rate), gradients, agents.actor_optimiser, agents.actors)
         due = (agents.updates + 1) % self.prior_every == 0
         following = replace(
             agents,

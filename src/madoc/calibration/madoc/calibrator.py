@@ -4,14 +4,12 @@ Jiang et al. 2024, Algorithm 1. Every equation it uses lives in a file of its ow
 """
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
 from madoc.calibration.base import CalibrationProblem, Estimate
@@ -25,6 +23,7 @@ from madoc.calibration.madoc.watch import Watch
 from madoc.errors import MadocError, check_at_least
 from madoc.learning import replay
 from madoc.learning.cloning import clone
+from madoc.learning.networks import adam
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.rollout import Walkers, begin
 from madoc.types import Metrics
@@ -32,8 +31,6 @@ from madoc.types import Metrics
 Grouping = Literal["learned", "one", "each"]
 GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
 """Parameter draws an epoch, and control steps a row lives under one draw, by start mode."""
-REWARD_SIZE = {"policy": 2.0, "logged": 1.0, "replay": 1.0}
-"""Mean |reward| that the blur is steered to. Free-running rows are told by their (s, a) too, and that part stays."""
 _NAMES = {("learned", "sum"): "madoc-vdn", ("learned", "independent"): "madoc-isac"}
 
 
@@ -105,7 +102,7 @@ class Madoc:
     batch: int = 256
     learning_rate: float = 1e-3
     replay_capacity: int = 50_000
-    patience: int = 100
+    patience: int = 150
     agents: AgentSettings = field(default_factory=AgentSettings)
 
     def __post_init__(self) -> None:
@@ -124,6 +121,8 @@ class Madoc:
         """
         agents = AgentSettings(
             hidden=(256, 256),
+            pair_bound=2.0,
+            weigh_overlap=False,
             dropout=0.2,
             actor_batch=256,
             critic_rate=3e-4,
@@ -189,9 +188,9 @@ class Madoc:
         )
         return MadocState(
             policy=policy,
-            policy_optimiser=self._adam.init(eqx.filter(policy, eqx.is_array)),
+            policy_optimiser=adam(self.learning_rate).init(eqx.filter(policy, eqx.is_array)),
             vae=vae,
-            vae_optimiser=self._adam.init(eqx.filter(vae, eqx.is_array)),
+            vae_optimiser=adam(self.learning_rate).init(eqx.filter(vae, eqx.is_array)),
             schemes=np.zeros((max(1, self.grouping_epochs // 20), count), dtype=np.int64),
             labels=np.arange(count) if self.groups == "each" else np.zeros(count, dtype=np.int64),
             agents=agents,
@@ -258,15 +257,6 @@ class Madoc:
         draws, horizon = GEOMETRY[self.starts]
         return self.draws or draws, self.horizon or horizon
 
-    @property
-    def _reward_size(self) -> float:
-        chosen = self.agents.reward_size
-        return REWARD_SIZE[self.starts] if chosen is None else chosen
-
-    @cached_property
-    def _adam(self) -> optax.GradientTransformation:
-        return optax.adam(self.learning_rate)
-
     def _group_count(self, problem: CalibrationProblem) -> int:
         count = len(problem.simulator.parameters)
         chosen = {"one": 1, "each": count, "learned": self.group_count or problem.simulator.task.groups}
@@ -283,7 +273,7 @@ class Madoc:
             state.policy_optimiser,
             problem.pairs,
             of_batches,
-            optimiser=self._adam,
+            optimiser=adam(self.learning_rate),
             batch=self.batch,
             count=self.cloning_updates,
         )
@@ -309,7 +299,7 @@ class Madoc:
             state.vae_optimiser,
             rows,
             of_batches,
-            optimiser=self._adam,
+            optimiser=adam(self.learning_rate),
             batch=self.batch,
             count=self.grouping_updates,
         )
@@ -354,12 +344,11 @@ class Madoc:
             jnp.asarray(grouping.members(state.labels, self._group_count(problem))),
             of_updates,
             mixing=self.mixing,
-            reward_size=self._reward_size,
             count=self.updates,
         )
         metrics = _scalars(device_metrics)
         watched = watch.observe(
-            state.watch, metrics, agents.average, steered_to=self._reward_size, largest_blur=BLUR_RANGE[1]
+            state.watch, metrics, agents.average, steered_to=self.agents.reward_size, blur_range=BLUR_RANGE
         )
         following = replace(
             state,

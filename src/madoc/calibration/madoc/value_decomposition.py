@@ -51,13 +51,15 @@ def value_loss(
     weight: Float[Array, " groups"],
     bias: Float[Array, ""],
     reward: Float[Array, " rows"],
+    share: Float[Array, " rows"],
     mixing: Mixing,
 ) -> Float[Array, ""]:
     """Eq. (12): half the mean of (V_tot - R)². A bandit: there is no next value.
 
+    Each row counts by its `share`, of mean 1; the paper's are all 1.
     `sum` (VDN) has k = 1 and b = 0; `independent` (ISAC) regresses every critic on the shared reward alone.
     """
     if mixing == "independent":
-        return 0.5 * ((values - reward[:, None]) ** 2).mean(0).sum()
+        return 0.5 * (share[:, None] * (values - reward[:, None]) ** 2).mean(0).sum()
     total = total_value(values, weight, bias) if mixing == "dop" else values.sum(-1)
-    return 0.5 * ((total - reward) ** 2).mean()
+    return 0.5 * (share * (total - reward) ** 2).mean()

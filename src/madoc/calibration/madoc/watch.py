@@ -16,6 +16,8 @@ SETTLING = 30
 """Epochs in which discriminators and blur find each other."""
 TELLING = 0.7
 """Share of the steered reward size below which a blur is still being found, or can no longer be."""
+CLOSE = 0.25
+"""A mismatch within this share of the lowest is as good: the later estimate is the better one."""
 SATURATED = 0.5
 """Share of rows at the reward's bound past which a user is warned."""
 
@@ -28,13 +30,13 @@ class Watch:
     Attributes:
         epochs: Calibration epochs watched.
         mismatch: How far simulated rows are from logged ones: the blur at which the discriminators would be as
-            unsure as they are steered to be (its size times the surplus of |reward| where it is at an end of
-            its range), or the mean |reward| where there is no blur.
+            unsure as they are steered to be (its size times |reward| over what that is steered to), or the mean
+            |reward| where there is no blur.
         at_bound: Share of rows whose reward stands at its bound.
         best_mismatch: The lowest `mismatch` since it could be told.
         milestone: The mismatch when it last fell by a share worth the name, ...
         milestone_epoch: ... and when that was.
-        best: The actors' moving average then.
+        best: The actors' moving average when the mismatch was last close to its lowest.
     """
 
     epochs: int
@@ -51,12 +53,14 @@ def begin_watch(actors: Actors) -> Watch:
     return Watch(0, 0.0, 0.0, 0.0, 0.0, 0, actors)
 
 
-def observe(watch: Watch, metrics: Metrics, average: Actors, *, steered_to: float, largest_blur: float) -> Watch:
-    """Take in one epoch; keep its estimate if the mismatch has never been lower.
+def observe(
+    watch: Watch, metrics: Metrics, average: Actors, *, steered_to: float, blur_range: tuple[float, float]
+) -> Watch:
+    """Take in one epoch; keep its estimate unless the mismatch has been clearly lower.
 
-    A blur says something only once the discriminators have settled, while it is below its largest, and while
-    they can tell at it: while the mean |reward| is near the size it is `steered_to` (0 where there is no blur).
-    Before that, and without a blur, the latest estimate is the best.
+    A blur says something once the discriminators have settled and it has left its largest; and while they can tell
+    at it, that is while the mean |reward| is near the size it is `steered_to` (0 where there is no blur), or the
+    blur can become no smaller. Before that, and without a blur, the latest estimate is the best.
     """
     blur, size, at_bound = metrics["blur"], metrics["reward_size"], metrics["reward_at_bound"]
     mismatch = blur * size / steered_to if steered_to else size
@@ -64,11 +68,14 @@ def observe(watch: Watch, metrics: Metrics, average: Actors, *, steered_to: floa
         mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
     watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, at_bound=at_bound)
-    if not steered_to or watch.epochs <= SETTLING or blur > 0.99 * largest_blur:
+    smallest, largest = blur_range
+    if not steered_to or watch.epochs <= SETTLING or blur > 0.99 * largest:
         return _mark(replace(watch, best=average, best_mismatch=mismatch))
-    if size < TELLING * steered_to or mismatch >= watch.best_mismatch:
+    if size < TELLING * steered_to and blur > 1.01 * smallest:
         return watch
-    watch = replace(watch, best=average, best_mismatch=mismatch)
+    lowest = min(mismatch, watch.best_mismatch)
+    best = average if mismatch <= (1.0 + CLOSE) * lowest else watch.best
+    watch = replace(watch, best=best, best_mismatch=lowest)
     return _mark(watch) if mismatch < (1.0 - PROGRESS) * watch.milestone else watch
 
 
