@@ -132,6 +132,8 @@ def test_overlap_by_hand():
     three_quarters = np.arctanh(np.log(3) / 4)
     pair = jnp.asarray([[0.0], [three_quarters], [-three_quarters]], jnp.float32)
     np.testing.assert_allclose(overlap(parts, pair), [1.0, 0.75, 0.75], rtol=1e-5)
+    sure = discriminators(([[9.0], [-9.0]], [0, 0]), (np.zeros((2, 2)), [0, 0]), pair_bound=10.0)
+    np.testing.assert_allclose(overlap(sure, COLUMN), 4 * np.exp(-20.0), rtol=1e-4)
 
 
 @pytest.mark.parametrize(("pair_bound", "left"), [(2.0, True), (10.0, False)])

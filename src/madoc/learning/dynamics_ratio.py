@@ -162,11 +162,12 @@ def log_dynamics_ratio(discriminators: Discriminators, pair: Array, following: A
 def overlap(discriminators: Discriminators, pair: Array) -> Float[Array, " rows"]:
     """4 p (1 - p) of D_sa's p: 1 where (s, a) is as likely in either domain, 0 where only one domain has it.
 
-    Not in the paper. f_sas learns only where D_sa is unsure; elsewhere its ratio is a guess, and rows count by this.
+    Never quite 0. Not in the paper. f_sas learns only where D_sa is unsure; elsewhere its ratio is a guess, and rows
+    count by this.
     """
     logits = discriminators.pair_logits(pair)
-    target = jax.nn.sigmoid(logits[:, TARGET] - logits[:, SOURCE])
-    return 4.0 * target * (1.0 - target)
+    log_odds = logits[:, TARGET] - logits[:, SOURCE]
+    return 4.0 * jax.nn.sigmoid(log_odds) * jax.nn.sigmoid(-log_odds)
 
 
 def blur(

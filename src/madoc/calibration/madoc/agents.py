@@ -23,7 +23,7 @@ from madoc.learning.networks import adam, descend, moving_average, scan_updates
 
 AT_BOUND = 0.95
 """A reward past this share of its bound is counted as saturated."""
-BLUR_RANGE = (0.02, 0.3)
+BLUR_RANGE = (0.01, 0.3)
 """Shares of a step's spread; it starts at the largest. Below the smallest the networks cannot follow s', and are as
 unsure as if the domains were the same."""
 
@@ -34,7 +34,8 @@ class Agents:
     """What updates change.
 
     Attributes:
-        discriminators: The reward.
+        discriminators: Tell logged from simulated rows.
+        judges: Their moving average, which gives the reward: one network's passing opinions would move the actors.
         critics: One a group.
         actors: The calibration distribution.
         prior: Its moving average, the p of Eq. (13).
@@ -44,6 +45,7 @@ class Agents:
     """
 
     discriminators: Discriminators
+    judges: Discriminators
     critics: GroupCritics
     actors: Actors
     prior: Actors
@@ -71,6 +73,7 @@ class AgentSettings:
         discriminator_rate: Adam's learning rate.
         critic_rate: Adam's learning rate.
         actor_rate: Adam's learning rate.
+        judge_rate: Of the judges' moving average; 1 lets the discriminators judge themselves, as in the paper.
         entropy_weight: α of Eq. (13).
         prior_time: Updates in which λ of Eq. (13) grows by e.
         prior_largest: Where λ stops growing.
@@ -92,6 +95,7 @@ class AgentSettings:
     discriminator_rate: float = 1e-3
     critic_rate: float = 1e-3
     actor_rate: float = 3e-3
+    judge_rate: float = 0.01
     entropy_weight: float = 0.05
     prior_time: float = 2e5
     prior_largest: float = 10.0
@@ -117,6 +121,7 @@ class AgentSettings:
         actors = initial_actors(parameters)
         return Agents(
             discriminators=discriminators,
+            judges=jax.tree.map(lambda leaf: leaf.copy() if eqx.is_array(leaf) else leaf, discriminators),
             critics=critics,
             actors=actors,
             prior=initial_actors(parameters),
@@ -163,8 +168,8 @@ class AgentSettings:
             agents, metrics = self._update_discriminators(
                 agents, (logged[0][rows], target), (drawn["pair"], source), of_dropout
             )
-            reward = log_dynamics_ratio(agents.discriminators, drawn["pair"], drawn["following"])
-            common = overlap(agents.discriminators, drawn["pair"])
+            reward = log_dynamics_ratio(agents.judges, drawn["pair"], drawn["following"])
+            common = overlap(agents.judges, drawn["pair"])
             share = common / common.mean() if self.weigh_overlap else jnp.ones_like(reward)
             agents, reward_metrics = self._steer_blur(agents, reward, share)
             agents, value_metrics = self._update_critics(agents, drawn["parameters"], reward, share, members, mixing)
@@ -182,7 +187,8 @@ class AgentSettings:
         discriminators, optimiser = descend(
             adam(self.discriminator_rate), gradients, agents.discriminator_optimiser, agents.discriminators
         )
-        return replace(agents, discriminators=discriminators, discriminator_optimiser=optimiser), metrics
+        judges = moving_average(agents.judges, discriminators, self.judge_rate)
+        return replace(agents, discriminators=discriminators, judges=judges, discriminator_optimiser=optimiser), metrics
 
     def _steer_blur(
         self, agents: Agents, reward: Float[Array, " rows"], share: Float[Array, " rows"]

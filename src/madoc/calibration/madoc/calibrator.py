@@ -123,6 +123,7 @@ class Madoc:
             hidden=(256, 256),
             pair_bound=2.0,
             weigh_overlap=False,
+            judge_rate=1.0,
             dropout=0.2,
             actor_batch=256,
             critic_rate=3e-4,
@@ -168,6 +169,7 @@ class Madoc:
         """
         task, simulator = problem.simulator.task, problem.simulator
         count, observation, action = len(simulator.parameters), task.observation_size, simulator.action_size
+        groups = self._group_count(problem)
         of_policy, of_vae, of_agents, of_start, key = jax.random.split(key, 5)
         logged = np.asarray(problem.dataset.transitions.observation)
         policy = TanhGaussianPolicy(
@@ -183,7 +185,7 @@ class Madoc:
             observation=observation,
             action=action,
             parameters=count,
-            groups=self._group_count(problem),
+            groups=groups,
             key=of_agents,
         )
         return MadocState(
@@ -192,7 +194,7 @@ class Madoc:
             vae=vae,
             vae_optimiser=adam(self.learning_rate).init(eqx.filter(vae, eqx.is_array)),
             schemes=np.zeros((max(1, self.grouping_epochs // 20), count), dtype=np.int64),
-            labels=np.arange(count) if self.groups == "each" else np.zeros(count, dtype=np.int64),
+            labels=np.arange(count) if groups == count else np.zeros(count, dtype=np.int64),
             agents=agents,
             rows=empty_rows(problem, self.replay_capacity),
             walkers=_out_of_step(self._begin(problem, self._geometry[0], of_start), task.max_episode_steps),
@@ -235,7 +237,7 @@ class Madoc:
         """What the next epoch does."""
         if self._will_clone and state.cloned < self.cloning_epochs:
             return "cloning"
-        if self.groups == "learned" and state.grouped < self.grouping_epochs:
+        if 1 < len(state.agents.critics.weight) < len(state.labels) and state.grouped < self.grouping_epochs:
             return "grouping"
         return "calibrating"
 
