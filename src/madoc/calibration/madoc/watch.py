@@ -18,6 +18,8 @@ TELLING = 0.7
 """Share of the steered reward size below which a blur is still being found, or can no longer be."""
 CLOSE = 0.25
 """A mismatch within this share of the lowest is as good: the later estimate is the better one."""
+AT_END = 0.95
+"""In [-1, 1], past which a parameter is said to stand at the end of its range: entropy keeps it from the end itself."""
 SATURATED = 0.5
 """Share of rows at the reward's bound past which a user is warned."""
 
@@ -108,7 +110,7 @@ def warnings(
             f"the discriminators are sure of {watch.at_bound:.0%} of the simulated rows (reward at its bound), "
             "so the reward has no slope; start rollouts at logged states, or narrow the ranges"
         )
-    at_end = [name for name, value in zip(names, unit, strict=True) if abs(value) > 0.98]
+    at_end = [name for name, value in zip(names, unit, strict=True) if abs(value) > AT_END]
     if at_end:
         found.append(f"at the end of its range: {', '.join(at_end)}; widen the range or doubt the model")
     if failures:
