@@ -4,6 +4,7 @@ from functools import partial
 
 from madoc.calibration.base import CalibrationProblem, Calibrator, Estimate
 from madoc.calibration.calibrate import calibrate
+from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.madoc.calibrator import Madoc
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.types import MethodEntry
@@ -18,6 +19,9 @@ CALIBRATORS: dict[str, MethodEntry[Calibrator]] = {
     "madoc-isac": MethodEntry(partial(Madoc, mixing="independent"), "agents share one reward, no credit", _PAPER, 2024),
     "madoc-ungrouped": MethodEntry(partial(Madoc, groups="each"), "one agent a parameter", _PAPER, 2024),
     "madoc-paper": MethodEntry(Madoc.paper, "Madoc with the paper's own constants", _PAPER, 2024),
+    "least-squares": MethodEntry(
+        LeastSquares, "damped Gauss-Newton on next states, robust, with intervals", "Levenberg; Marquardt", 1963
+    ),
 }
 
 __all__ = [
@@ -26,6 +30,7 @@ __all__ = [
     "CalibrationResult",
     "Calibrator",
     "Estimate",
+    "LeastSquares",
     "Madoc",
     "ParameterEstimate",
     "calibrate",

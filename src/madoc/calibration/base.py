@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from madoc.data import Dataset, logged_states
 from madoc.errors import MadocError
@@ -40,15 +40,23 @@ class CalibrationProblem:
         object.__setattr__(self, "dataset", replace(self.dataset, true_parameters=None))
 
     @cached_property
-    def logged_states(self) -> Float[np.ndarray, "rows state"]:
+    def _rebuilt(self) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
+        return logged_states(self.dataset, self.simulator.task)
+
+    @property
+    def logged_states(self) -> Float[np.ndarray, "states state"]:
         """States rebuilt from logged observations, where that is exact."""
-        return logged_states(self.dataset, self.simulator.task)[0]
+        return self._rebuilt[0]
+
+    @property
+    def logged_rows(self) -> Int[np.ndarray, " states"]:
+        """The rows of the data that `logged_states` were rebuilt from, ascending."""
+        return self._rebuilt[1]
 
     @cached_property
-    def logged_actions(self) -> Float[np.ndarray, "rows action"]:
+    def logged_actions(self) -> Float[np.ndarray, "states action"]:
         """The actions taken at `logged_states`."""
-        rows = logged_states(self.dataset, self.simulator.task)[1]
-        return np.asarray(self.dataset.transitions.action)[rows]
+        return np.asarray(self.dataset.transitions.action)[self.logged_rows]
 
     @cached_property
     def probe(self) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
@@ -95,12 +103,16 @@ class Estimate:
         std: Its spread under the calibration distribution, shape (d,).
         groups: Parameters calibrated together, as indices; one group of all where a method has none.
         warnings: What a user should know about it, one sentence each.
+        covariance: Its joint spread, shape (d, d), where the method knows it; the diagonal is `std` squared.
+        interval: 95 % confidence interval of each, columns low and high, where the method knows it.
     """
 
     mean: Float[np.ndarray, " d"]
     std: Float[np.ndarray, " d"]
     groups: tuple[tuple[int, ...], ...]
     warnings: tuple[str, ...] = field(default=())
+    covariance: Float[np.ndarray, "d d"] | None = None
+    interval: Float[np.ndarray, "d 2"] | None = None
 
 
 class Calibrator(Protocol):

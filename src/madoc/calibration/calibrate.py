@@ -7,9 +7,10 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 from madoc import loop
-from madoc.calibration.base import CalibrationProblem, Calibrator
+from madoc.calibration.base import CalibrationProblem, Calibrator, Estimate
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
+from madoc.parameters import ParameterSpace
 from madoc.run_folder import RunFolder
 from madoc.simulation.sensitivity import refuse_insensitive
 
@@ -67,16 +68,24 @@ def calibrate(
         seconds=round(finished.seconds, 3),
         seed=seed_of(key),
         groups=[[space.names[index] for index in group] for group in estimate.groups],
-        parameters={
-            parameter.name: ParameterEstimate(float(mean), float(std), parameter.low, parameter.high, parameter.unit)
-            for parameter, mean, std in zip(space.parameters, estimate.mean, estimate.std, strict=True)
-        },
+        parameters=_parameters(space, estimate),
         warnings=list(estimate.warnings),
         error=None if known is None else calibration_error(estimate.mean, known, space),
+        covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
     )
     if folder is not None:
         folder.write_json("result.json", result.to_json())
     return result
+
+
+def _parameters(space: ParameterSpace, estimate: Estimate) -> dict[str, ParameterEstimate]:
+    """The estimate of each parameter, by name."""
+    intervals = [None] * len(space) if estimate.interval is None else estimate.interval.tolist()
+    columns = zip(space.parameters, estimate.mean, estimate.std, intervals, strict=True)
+    return {
+        row.name: ParameterEstimate(float(mean), float(std), row.low, row.high, row.unit, interval)
+        for row, mean, std, interval in columns
+    }
 
 
 def seed_of(key: PRNGKeyArray) -> int:

@@ -1,6 +1,7 @@
 """What a calibration returns: an estimate with its doubts, as a table, as JSON."""
 
 import io
+import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -14,13 +15,14 @@ from madoc.errors import MadocError
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """One parameter: `estimate` ± `std` within [`low`, `high`], in `unit`."""
+    """One parameter: `estimate` ± `std` within [`low`, `high`], in `unit`; `interval` is its 95 %, where known."""
 
     estimate: float
     std: float
     low: float
     high: float
     unit: str
+    interval: list[float] | None = None
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class CalibrationResult:
         parameters: By name.
         warnings: What to know before trusting it, one sentence each.
         error: Only where the truth was given: `mean_absolute`, `mean_percent_of_range`, `per_parameter`.
+        covariance: Rows of the estimates' covariance in physical units, in the task's order, where known.
     """
 
     method: str
@@ -52,6 +55,7 @@ class CalibrationResult:
     parameters: dict[str, ParameterEstimate]
     warnings: list[str] = field(default_factory=list)
     error: dict[str, Any] | None = None
+    covariance: list[list[float]] | None = None
 
     @property
     def mean(self) -> np.ndarray:
@@ -64,10 +68,11 @@ class CalibrationResult:
         return np.array([parameter.std for parameter in self.parameters.values()])
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON; `error` is left out where no truth was given."""
+        """As JSON; what is not known (`error`, `covariance`, an `interval`) is left out."""
         fields = asdict(self)
-        if self.error is None:
-            del fields["error"]
+        for row in (fields, *fields["parameters"].values()):
+            for name in [name for name in ("error", "covariance", "interval") if row.get(name, "") is None]:
+                del row[name]
         return fields
 
     @classmethod
@@ -84,7 +89,7 @@ class CalibrationResult:
             raise MadocError(f"this is not the result of a calibration: {error}") from error
 
     def table(self) -> Table:
-        """The parameters as a rich table: name, unit, estimate ± std, range, group, and the error if known."""
+        """The parameters as a rich table: name, unit, estimate ± std, range, group; interval and error if known."""
         table = Table(
             title=f"{self.method} on {self.task}",
             title_justify="left",
@@ -95,7 +100,8 @@ class CalibrationResult:
         group_of = {name: index for index, names in enumerate(self.groups, 1) for name in names}
         table.add_column("parameter", min_width=max(map(len, self.parameters)))
         table.add_column("unit")
-        for heading in ("estimate ± std", "range", "group"):
+        intervals = any(row.interval for row in self.parameters.values())
+        for heading in ("estimate ± std", *(["95 %"] if intervals else []), "range", "group"):
             table.add_column(heading, justify="right")
         errors = self.error["per_parameter"] if self.error else {}
         if errors:
@@ -105,6 +111,7 @@ class CalibrationResult:
                 name,
                 row.unit,
                 f"{row.estimate:.4g} ± {row.std:.2g}",
+                *([_span(row.interval)] if intervals else []),
                 f"[{row.low:g}, {row.high:g}]",
                 str(group_of.get(name, "")),
             ]
@@ -129,3 +136,13 @@ class CalibrationResult:
         console = Console(file=stream, width=100)
         console.print(self.table())
         return stream.getvalue() + self.summary()
+
+
+def _span(interval: list[float] | None) -> str:
+    """An interval with the digits in which its ends differ."""
+    if interval is None:
+        return ""
+    low, high = interval
+    width = max(high - low, 1e-9 * max(abs(low), abs(high)), 1e-12)
+    digits = min(9, max(0, 1 - math.floor(math.log10(width))))
+    return f"[{low:.{digits}f}, {high:.{digits}f}]"

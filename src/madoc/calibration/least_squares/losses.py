@@ -1,0 +1,73 @@
+"""Robust losses of residuals, and how one epoch's residuals become the terms of a least-squares problem.
+
+With z = (r / c)², a residual r costs c² / 2 · ρ(z); SciPy's `least_squares` has the same four. Its slope is
+ψ(r) = ρ'(z) r, the slope of that is ρ'(z) + 2 z ρ''(z).
+"""
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+Loss = Literal["linear", "huber", "soft-l1", "cauchy"]
+
+TUNING: dict[Loss, float] = {"linear": 1.0, "huber": 1.345, "soft-l1": 1.345, "cauchy": 2.385}
+"""c in standard deviations: 95 % efficient under normal noise (Holland and Welsch 1977); soft-l1 as Huber's."""
+_NORMAL_MAD = 1.4826
+"""Standard deviations in a median absolute deviation, for normal noise."""
+_SMALLEST_SCALE = 1e-12
+"""Residuals are in units of a channel's typical change; below this they are rounding."""
+ALL_FAILED = 1e30
+"""Cost where no simulation succeeded; a state holds no infinity."""
+
+Residuals = Float[np.ndarray, "*windows values"]
+
+
+def loss_value(z: Residuals, loss: Loss) -> Residuals:
+    """ρ(z): z; z up to 1 and 2√z - 1 beyond; 2(√(1 + z) - 1); ln(1 + z)."""
+    if loss == "linear":
+        return z
+    if loss == "huber":
+        return np.where(z <= 1.0, z, 2.0 * np.sqrt(np.maximum(z, 1.0)) - 1.0)
+    if loss == "soft-l1":
+        return 2.0 * (np.sqrt(1.0 + z) - 1.0)
+    return np.log1p(z)
+
+
+def loss_slope(z: Residuals, loss: Loss) -> Residuals:
+    """ρ'(z): the weight of a squared residual."""
+    if loss == "linear":
+        return np.ones_like(z)
+    if loss == "huber":
+        return 1.0 / np.sqrt(np.maximum(z, 1.0))
+    if loss == "soft-l1":
+        return 1.0 / np.sqrt(1.0 + z)
+    return 1.0 / (1.0 + z)
+
+
+def loss_curvature(z: Residuals, loss: Loss) -> Residuals:
+    """ρ'(z) + 2 z ρ''(z): how fast ψ grows with the residual. Negative for Cauchy's far tails."""
+    if loss == "linear":
+        return np.ones_like(z)
+    if loss == "huber":
+        return (z <= 1.0).astype(np.float64)
+    if loss == "soft-l1":
+        return (1.0 + z) ** -1.5
+    return (1.0 - z) / (1.0 + z) ** 2
+
+
+def scale_of(residuals: Residuals, loss: Loss) -> float:
+    """c: the tuning constant times the standard deviation that the median |residual| speaks of; 1 for `linear`."""
+    if loss == "linear" or not residuals.size:
+        return 1.0
+    return TUNING[loss] * max(_NORMAL_MAD * float(np.median(np.abs(residuals))), _SMALLEST_SCALE)
+
+
+def mean_cost(residuals: Float[np.ndarray, "windows values"], scale: float, loss: Loss) -> float:
+    """Mean of c² ρ(z) over values; a window that failed (NaN) counts as the worst that did not, and at least as 1."""
+    failed: Bool[np.ndarray, " windows"] = ~np.isfinite(residuals).all(-1)
+    if failed.all():
+        return ALL_FAILED
+    cost = scale**2 * loss_value((residuals[~failed] / scale) ** 2, loss).mean(-1)
+    worst = max(1.0, float(cost.max()))
+    return float((cost.sum() + worst * failed.sum()) / len(residuals))

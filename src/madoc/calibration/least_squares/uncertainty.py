@@ -1,0 +1,111 @@
+"""How sure a least-squares estimate is, and what the data cannot tell. All in [-1, 1] of the ranges."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.stats import t
+
+from madoc.calibration.least_squares.linearisation import Linearisation
+from madoc.calibration.least_squares.losses import Loss, loss_curvature, loss_slope
+
+CONFIDENCE = 0.95
+BOX_VARIANCE = 1.0 / 3.0
+"""Of a uniform distribution over [-1, 1]: what is known of a direction that the data says nothing of."""
+_BLIND = 1e-12
+"""Squared slope, relative to the largest, below which a direction is only the error of the differences."""
+_CORRELATED = 0.95
+_SHARE = 0.2
+"""Of a direction's largest component, from which a parameter is named as part of it."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What is known around an estimate, in units of [-1, 1].
+
+    Attributes:
+        covariance: Of the estimate; directions the data cannot identify have the box's variance.
+        correlation: Of the estimates as the slopes alone have it: residuals of clean data are rounding errors.
+        unidentified: Unit vectors along which the data cannot tell, one a row.
+    """
+
+    covariance: Float[np.ndarray, "d d"]
+    correlation: Float[np.ndarray, "d d"]
+    unidentified: Float[np.ndarray, "directions d"]
+
+
+def bread(around: Linearisation, scale: float, loss: Loss) -> Float[np.ndarray, "d d"]:
+    """Σ ψ' J Jᵀ: how fast the loss curves. Cauchy's tails curve downwards; should they prevail, Σ ρ' J Jᵀ."""
+    z = (around.residuals / scale) ** 2
+    curved = _sum_of_products(around, loss_curvature(z, loss))
+    return curved if np.linalg.eigvalsh(curved)[0] > 0 else _sum_of_products(around, loss_slope(z, loss))
+
+
+def meat(around: Linearisation, scale: float, loss: Loss) -> Float[np.ndarray, "d d"]:
+    """Σ g gᵀ over windows, g = Σ ψ J: how much the windows' slopes scatter; n / (n - d) for the parameters spent.
+
+    Residuals of one window are taken to depend on each other, those of different windows not.
+    """
+    windows, _, count = around.jacobian.shape
+    slope = loss_slope((around.residuals / scale) ** 2, loss) * around.residuals
+    scores = np.einsum("wv,wvd->wd", slope, around.jacobian)
+    return scores.T @ scores * windows / max(1, windows - count)
+
+
+def sandwich(bread: Float[np.ndarray, "d d"], meat: Float[np.ndarray, "d d"]) -> Uncertainty:
+    """bread⁻¹ meat bread⁻¹ (Huber 1967) where the data can tell, the box where it cannot.
+
+    It holds for robust losses, for channels of unequal noise, and for noise that is not normal.
+    """
+    values, vectors = np.linalg.eigh(bread)
+    told: Bool[np.ndarray, " d"] = values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)
+    inverse = (vectors[:, told] / values[told]) @ vectors[:, told].T
+    covariance = inverse @ meat @ inverse
+    told &= np.einsum("id,ij,jd->d", vectors, covariance, vectors) < BOX_VARIANCE
+    kept, lost = vectors[:, told] @ vectors[:, told].T, vectors[:, ~told]
+    deviation = np.sqrt(np.maximum(np.diag(inverse), np.finfo(float).tiny))
+    return Uncertainty(
+        covariance=kept @ covariance @ kept + BOX_VARIANCE * lost @ lost.T,
+        correlation=inverse / deviation[:, None] / deviation,
+        unidentified=lost.T,
+    )
+
+
+def half_width(covariance: Float[np.ndarray, "d d"], windows: int) -> Float[np.ndarray, " d"]:
+    """Half of the 95 % interval: Student's t with windows - d degrees of freedom times the standard error."""
+    freedom = max(1, windows - len(covariance))
+    return t.ppf(0.5 + CONFIDENCE / 2.0, freedom) * np.sqrt(np.diag(covariance))
+
+
+def identifiability(found: Uncertainty, names: tuple[str, ...]) -> tuple[str, ...]:
+    """A sentence for each direction the data cannot identify, and one for the pairs it can hardly tell apart."""
+    sentences = []
+    for direction in np.abs(found.unidentified):
+        involved = [name for name, part in zip(names, direction, strict=True) if part > _SHARE * direction.max()]
+        if len(involved) == 1:
+            sentences.append(f"the data does not identify {involved[0]}; leave it out or narrow its range")
+        else:
+            sentences.append(
+                f"the data does not identify {', '.join(involved)} together: they can change jointly without changing "
+                "what is seen; leave one of them out"
+            )
+    pairs = correlated_pairs(found.correlation, names)
+    if pairs:
+        told = ", ".join(f"{first} and {second} ({value:+.2f})" for first, second, value in pairs)
+        sentences.append(f"the data can hardly tell apart (correlation of the estimates): {told}")
+    return tuple(sentences)
+
+
+def correlated_pairs(
+    correlation: Float[np.ndarray, "d d"], names: tuple[str, ...], threshold: float = _CORRELATED
+) -> list[tuple[str, str, float]]:
+    """Pairs of parameters whose estimates correlate by more than the threshold, strongest first."""
+    rows, columns = np.triu_indices(len(names), 1)
+    strong = [(names[i], names[j], float(correlation[i, j])) for i, j in zip(rows, columns, strict=True)]
+    return sorted((pair for pair in strong if abs(pair[2]) > threshold), key=lambda pair: -abs(pair[2]))
+
+
+def _sum_of_products(around: Linearisation, weights: Float[np.ndarray, "windows values"]) -> Float[np.ndarray, "d d"]:
+    count = around.jacobian.shape[-1]
+    flat = around.jacobian.reshape(-1, count)
+    return flat.T @ (weights.reshape(-1, 1) * flat)
