@@ -7,6 +7,7 @@ from madoc.calibration.calibrate import calibrate
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.madoc.calibrator import Madoc
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
+from madoc.calibration.uncalibrated import Uncalibrated
 from madoc.types import MethodEntry
 
 _PAPER = "Jiang et al., Madoc"
@@ -22,6 +23,13 @@ CALIBRATORS: dict[str, MethodEntry[Calibrator]] = {
     "least-squares": MethodEntry(
         LeastSquares, "damped Gauss-Newton on next states, robust, with intervals", "Levenberg; Marquardt", 1963
     ),
+    "nominal": MethodEntry(Uncalibrated, "mid-range, uncalibrated: a yardstick", "no paper: a yardstick", 2024),
+    "uniform": MethodEntry(
+        partial(Uncalibrated, randomised=True),
+        "the whole box as randomization",
+        "Tobin et al., domain randomization",
+        2017,
+    ),
 }
 
 __all__ = [
@@ -33,5 +41,6 @@ __all__ = [
     "LeastSquares",
     "Madoc",
     "ParameterEstimate",
+    "Uncalibrated",
     "calibrate",
 ]

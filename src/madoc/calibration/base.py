@@ -26,7 +26,7 @@ class CalibrationProblem:
     The data's true parameters, where it carries any, are dropped here: no method can read them.
 
     Raises:
-        MadocError: The data belongs to another task.
+        MadocError: The data belongs to another task, or shows another observation than the simulator.
     """
 
     dataset: Dataset
@@ -36,6 +36,12 @@ class CalibrationProblem:
         if self.dataset.task_name != self.simulator.task.name:
             raise MadocError(
                 f"the data was recorded from {self.dataset.task_name}, the simulator is {self.simulator.task.name}"
+            )
+        logged, shown = self.dataset.transitions.observation.shape[-1], self.simulator.task.observation_size
+        if logged != shown:
+            raise MadocError(
+                f"the data has {logged} values per observation, the simulator's {self.simulator.task.name} shows "
+                f"{shown}; where the data hides velocities, make the simulator of data.observed_task(task, dataset)"
             )
         object.__setattr__(self, "dataset", replace(self.dataset, true_parameters=None))
 
@@ -57,6 +63,18 @@ class CalibrationProblem:
     def logged_actions(self) -> Float[np.ndarray, "states action"]:
         """The actions taken at `logged_states`."""
         return np.asarray(self.dataset.transitions.action)[self.logged_rows]
+
+    def require_pairs(self, method: str) -> None:
+        """Refuse data in which it is not known which next observation followed which row.
+
+        Raises:
+            MadocError: The next observations are shuffled.
+        """
+        if self.dataset.disturbance.shuffled == "next_observations":
+            raise MadocError(
+                f"{method} compares each row's next observation with a simulated one, and those of "
+                f"{self.dataset.origin} are shuffled; take a method that compares distributions"
+            )
 
     @cached_property
     def probe(self) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:

@@ -45,7 +45,9 @@ def calibrate(
     """
     space = problem.simulator.parameters
     known = None if truth is None else space.vector(dict(truth))
-    probing = refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0))
+    idle = method.converged(method.init(problem, key)) is not None
+    # A method that has ended before its first epoch simulates nothing, so nothing is spent on its behalf either.
+    probing = 0 if idle else refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0))
     finished = loop.run(
         method,
         problem,
@@ -69,7 +71,7 @@ def calibrate(
         seed=seed_of(key),
         groups=[[space.names[index] for index in group] for group in estimate.groups],
         parameters=_parameters(space, estimate),
-        warnings=list(estimate.warnings),
+        warnings=[*estimate.warnings, *problem.dataset.disturbance.sentences()],
         error=None if known is None else calibration_error(estimate.mean, known, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
     )

@@ -143,6 +143,6 @@ def _span(interval: list[float] | None) -> str:
     if interval is None:
         return ""
     low, high = interval
-    width = max(high - low, 1e-9 * max(abs(low), abs(high)), 1e-12)
-    digits = min(9, max(0, 1 - math.floor(math.log10(width))))
+    width = max(high - low, 1e-6 * max(abs(low), abs(high)), 1e-12)
+    digits = min(6, max(0, 1 - math.floor(math.log10(width))))
     return f"[{low:.{digits}f}, {high:.{digits}f}]"

@@ -1,8 +1,22 @@
 """Logged data: `load` reads any known format into a `Dataset`, `save` writes Madoc's own."""
 
-from madoc.data.dataset import Dataset, logged_states, subsample
+from madoc.data.dataset import Dataset, Disturbance, logged_states, subsample
+from madoc.data.disturbance import disturb, hide_velocities, observed_task
 from madoc.data.formats import FORMATS, Format, load
 from madoc.data.native import save
 from madoc.data.validation import validate
 
-__all__ = ["FORMATS", "Dataset", "Format", "load", "logged_states", "save", "subsample", "validate"]
+__all__ = [
+    "FORMATS",
+    "Dataset",
+    "Disturbance",
+    "Format",
+    "disturb",
+    "hide_velocities",
+    "load",
+    "logged_states",
+    "observed_task",
+    "save",
+    "subsample",
+    "validate",
+]

@@ -1,6 +1,7 @@
 """A dataset: logged transitions, where their episodes begin, and where they come from."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import jax
 import numpy as np
@@ -9,6 +10,61 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from madoc.errors import MadocError
 from madoc.tasks import Task
 from madoc.types import Transitions
+
+Shuffled = Literal["none", "rows", "next_observations"]
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What keeps logged data from being clean: the truth of sensors, put there on purpose or not.
+
+    Attributes:
+        noise: Deviation of the noise on every observation, as a share of its channel's typical change in a step.
+        hidden_velocities: Observations show positions alone.
+        shuffled: `rows`: rows (s, a, s') stay whole but their order is lost; `next_observations`: which s' belongs
+            to which (s, a) is lost as well.
+        friction: Of all contacts in the target, as a multiple of the model's: a gap no parameter can close.
+    """
+
+    noise: float = 0.0
+    hidden_velocities: bool = False
+    shuffled: Shuffled = "none"
+    friction: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.noise) and self.noise >= 0):
+            raise MadocError(f"expected noise as a share of a step's change, 0 or more, got {self.noise}")
+        if not (np.isfinite(self.friction) and self.friction > 0):
+            raise MadocError(f"expected friction as a positive multiple of the model's, got {self.friction}")
+
+    def joined(self, other: "Disturbance") -> "Disturbance":
+        """Both, one after the other."""
+        return Disturbance(
+            noise=float(np.hypot(self.noise, other.noise)),
+            hidden_velocities=self.hidden_velocities or other.hidden_velocities,
+            shuffled=other.shuffled if self.shuffled == "none" else self.shuffled,
+            friction=self.friction * other.friction,
+        )
+
+    def sentences(self) -> tuple[str, ...]:
+        """What a reader of an estimate should know, one sentence each; none where the data is clean."""
+        found = []
+        if self.noise:
+            found.append(
+                f"the data carries observation noise of {100 * self.noise:g} % of a step's change: states rebuilt from "
+                "it are not exact, and methods that take them for true are biased"
+            )
+        if self.hidden_velocities:
+            found.append("the data hides velocities: its states cannot be rebuilt, and a clone acts on positions alone")
+        if self.shuffled == "rows":
+            found.append("the data's rows are in random order: nothing longer than one row can be replayed")
+        if self.shuffled == "next_observations":
+            found.append("the data's next observations are not those of their rows: only their distribution is known")
+        if self.friction != 1.0:
+            found.append(
+                f"the target's friction is {self.friction:g} times the simulator's: the estimate will make up for it"
+            )
+        return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -23,6 +79,7 @@ class Dataset:
         physics: `legacy`, `modern`, or `unknown` where the file does not say.
         origin: The file, or a description.
         true_parameters: The target's physical values by parameter name, if known. Only evaluation reads them.
+        disturbance: What it is known to suffer from.
     """
 
     transitions: Transitions
@@ -31,6 +88,7 @@ class Dataset:
     physics: str
     origin: str
     true_parameters: dict[str, float] | None = None
+    disturbance: Disturbance = field(default_factory=Disturbance)
 
     def __len__(self) -> int:
         return len(self.transitions)

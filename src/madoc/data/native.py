@@ -2,11 +2,15 @@
 
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
-from madoc.data.dataset import Dataset
+from madoc.data.dataset import Dataset, Disturbance
+from madoc.data.disturbance import observed_task
 from madoc.data.npz import array_names, is_npz, read_arrays
 from madoc.data.validation import (
     NAMES,
@@ -72,6 +76,7 @@ def load(path: str | os.PathLike) -> Dataset:
         physics=metadata["physics"],
         origin=metadata["origin"],
         true_parameters=metadata["true_parameters"],
+        disturbance=_disturbance(metadata.get("disturbance", {}), source),
     )
 
 
@@ -81,7 +86,8 @@ def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
     Raises:
         MadocError: As `load`, or refused by `validate`.
     """
-    return validate(load(path), task, clip_actions=clip_actions)
+    dataset = load(path)
+    return validate(dataset, observed_task(task, dataset), clip_actions=clip_actions)
 
 
 def _arrays(dataset: Dataset) -> dict[str, np.ndarray]:
@@ -92,6 +98,7 @@ def _arrays(dataset: Dataset) -> dict[str, np.ndarray]:
         "physics": dataset.physics,
         "origin": dataset.origin,
         "true_parameters": None if truth is None else {name: float(value) for name, value in truth.items()},
+        "disturbance": asdict(dataset.disturbance),
         "parameter_units": {name: _unit(name) for name in truth or {}},
     }
     arrays = {name: np.asarray(getattr(dataset.transitions, name)) for name in NAMES}
@@ -112,6 +119,14 @@ def _row_numbers(values: np.ndarray, path: Path) -> np.ndarray:
             "the file is damaged, make it again"
         )
     return values.astype(np.int64)
+
+
+def _disturbance(fields: Any, path: Path) -> Disturbance:
+    """What the file says it suffers from; nothing, where it was written before files said so."""
+    try:
+        return TypeAdapter(Disturbance).validate_python(fields)
+    except ValidationError as error:
+        raise MadocError(f"the disturbance in the metadata of {path} cannot be read ({error})") from error
 
 
 def _metadata(text: np.ndarray, path: Path) -> dict:

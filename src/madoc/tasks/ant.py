@@ -50,6 +50,7 @@ def ant(physics: str = "legacy") -> Task:
         reference_returns=(-325.6, 3879.7),
         state_from_observation=state_from_observation,
         rebuildable=always_rebuildable,
+        velocities=14,
     )
 
 

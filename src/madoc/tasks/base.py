@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -19,6 +20,14 @@ def healthy_reward(state: Batch, action: Batch, next_state: Batch, healthy: Batc
     """Speed along the first coordinate (m/s), 1 where healthy, less `cost` times the squared action."""
     speed = (next_state[..., 0] - state[..., 0]) / dt
     return speed + healthy - cost * (action**2).sum(-1)
+
+
+def scaled_friction(spec: Callable[[], mujoco.MjSpec], factor: float) -> mujoco.MjSpec:
+    """The spec with every geom's sliding friction times `factor`; a contact takes the larger of its two."""
+    changed = spec()
+    for geom in changed.geoms:
+        geom.friction[0] *= factor
+    return changed
 
 
 Span = tuple[float, float]
@@ -58,6 +67,7 @@ class Task:
         reference_returns: Returns of (random, expert) for the normalized score, from D4RL.
         state_from_observation: observation -> state; None where the observation does not determine the state.
         rebuildable: observation -> whether `state_from_observation` is exact for that row.
+        velocities: How many values at the end of an observation are velocities; 0 where they cannot be told apart.
     """
 
     name: str
@@ -76,6 +86,7 @@ class Task:
     reference_returns: tuple[float, float]
     state_from_observation: Callable[[Batch], Batch] | None = None
     rebuildable: Callable[[Batch], Batch] | None = None
+    velocities: int = 0
 
     def compile(self) -> mujoco.MjModel:
         """A fresh model at nominal parameters."""
@@ -90,6 +101,10 @@ class Task:
         if level not in self.ranges:
             raise MadocError(f"no range level {level!r} for {self.name}; there are: {', '.join(self.ranges)}")
         return replace(self, parameters=self.ranges[level])
+
+    def with_friction(self, factor: float) -> "Task":
+        """The same task with the friction of every contact times `factor`."""
+        return replace(self, spec=partial(scaled_friction, self.spec, factor))
 
     def with_parameters(self, names: list[str]) -> "Task":
         """The same task with only the named parameters calibratable."""

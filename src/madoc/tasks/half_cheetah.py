@@ -54,6 +54,7 @@ def half_cheetah(physics: str = "legacy") -> Task:
         reference_returns=(-280.178953, 12135.0),
         state_from_observation=planar_state_from_observation,
         rebuildable=always_rebuildable,
+        velocities=9,
     )
 
 

@@ -52,6 +52,7 @@ def hopper(physics: str = "legacy") -> Task:
         reference_returns=(-20.272305, 3234.3),
         state_from_observation=planar_state_from_observation,
         rebuildable=partial(observe_is_unclipped, positions=5),
+        velocities=6,
     )
 
 

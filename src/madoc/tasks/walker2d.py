@@ -57,6 +57,7 @@ def walker2d(physics: str = "legacy") -> Task:
         reference_returns=(1.629008, 4592.3),
         state_from_observation=planar_state_from_observation,
         rebuildable=partial(observe_is_unclipped, positions=8),
+        velocities=9,
     )
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.cautions import at_end_of_range, exploded
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.calibration.least_squares.linearisation import Linearisation, difference_points, linearise, simulate
+from madoc.calibration.least_squares.linearisation import difference_points, linearise, simulate
 from madoc.calibration.least_squares.losses import ALL_FAILED, Loss, mean_cost, scale_of
 from madoc.calibration.least_squares.uncertainty import bread, half_width, identifiability, meat, sandwich
 from madoc.data.windows import Windows, first_rows, windows_at
@@ -20,7 +20,7 @@ TRIALS = (1e-2, 1.0, 1e2)
 """Dampings tried at once, relative to the last that helped; where none helps, the next are a thousand times larger."""
 DAMPING_RANGE = (1e-10, 1e10)
 FIRST_DAMPING = 1e-2
-SETTLED = 0.03
+SETTLED = 0.1
 """Of its standard error: a step smaller than this changes nothing worth a simulation."""
 
 
@@ -70,11 +70,11 @@ class LeastSquares:
         starts: Searches: from mid-range, the others from random places. The best goes on.
         search_windows: Windows while searching.
         search_epochs: Epochs of searching, at most; it ends once the best search has settled.
-        tolerance: Of each range: a step that moves no parameter by more (nor by 3 % of its standard error) is the last.
+        tolerance: Of each range: a step that moves no parameter by more (nor by a tenth of its standard error) is the last.
     """
 
     horizon: int = 1
-    loss: Loss = "huber"
+    loss: Loss = "cauchy"
     windows: int = 1000
     starts: int = 3
     search_windows: int = 64
@@ -98,8 +98,10 @@ class LeastSquares:
         """Windows drawn, searches at their starts.
 
         Raises:
-            MadocError: No state can be rebuilt, no episode is long enough, or there are fewer values than parameters.
+            MadocError: No state can be rebuilt, no episode is long enough, there are fewer values than parameters,
+                or the data's next observations are shuffled.
         """
+        problem.require_pairs(self.name)
         of_windows, of_starts = jax.random.split(key)
         count, task = len(problem.simulator.parameters), problem.simulator.task
         possible = first_rows(problem.dataset, problem.logged_rows, self.horizon)
@@ -157,7 +159,8 @@ class LeastSquares:
             bread=plans[leader].bread,
             meat=plans[leader].meat,
             epochs=state.epochs + 1,
-            control_steps=state.control_steps + windows.steps * len(windows) * running * (points.shape[1] + len(TRIALS)),
+            control_steps=state.control_steps
+            + windows.steps * len(windows) * running * (points.shape[1] + len(TRIALS)),
             failures=state.failures + sum(int((~np.isfinite(part).all(-1)).sum()) for part in (around, tried)),
         )
         metrics = {"residual": float(np.sqrt(cost[leader])), "moved": float(moved[leader])}

@@ -1,0 +1,76 @@
+"""The yardsticks that cost nothing: the middle of every range, and the whole box as randomization."""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from madoc.calibration.base import CalibrationProblem, Estimate
+from madoc.types import Metrics
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class UncalibratedState:
+    """Nothing but the random key that every state carries."""
+
+    key: PRNGKeyArray
+
+
+@dataclass(frozen=True)
+class Uncalibrated:
+    """What is known before any data is looked at. It simulates nothing and has converged before its first epoch.
+
+    Attributes:
+        randomised: False is `nominal`: mid-range without a spread, the simulator as it comes. True is `uniform`:
+            mid-range with the deviation of a uniform distribution over each range, (high - low) / √12.
+    """
+
+    randomised: bool = False
+
+    @property
+    def name(self) -> str:
+        """As `madoc methods` lists it."""
+        return "uniform" if self.randomised else "nominal"
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """No metrics."""
+        return ()
+
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> UncalibratedState:
+        """Nothing to begin with."""
+        return UncalibratedState(key)
+
+    def step(self, problem: CalibrationProblem, state: UncalibratedState) -> tuple[UncalibratedState, Metrics]:
+        """Nothing happens."""
+        return state, {}
+
+    def estimate(self, problem: CalibrationProblem, state: UncalibratedState) -> Estimate:
+        """The middle of every range, whatever the data says."""
+        space = problem.simulator.parameters
+        std = (space.high - space.low) / np.sqrt(12.0) if self.randomised else np.zeros(len(space))
+        return Estimate(
+            mean=space.middle,
+            std=std,
+            groups=(tuple(range(len(space))),),
+            warnings=("nothing was calibrated: this is the middle of every range, whatever the data says",),
+            covariance=np.diag(std**2),
+        )
+
+    def control_steps(self, state: UncalibratedState) -> int:
+        """None."""
+        return 0
+
+    def stage(self, state: UncalibratedState) -> str:
+        """There is only one."""
+        return "calibrating"
+
+    def progress(self, state: UncalibratedState, budget: int) -> float:
+        """It is done."""
+        return 1.0
+
+    def converged(self, state: UncalibratedState) -> str | None:
+        """Always."""
+        return "there is nothing to simulate"
