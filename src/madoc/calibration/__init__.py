@@ -6,6 +6,7 @@ from madoc.calibration.base import CalibrationProblem, Calibrator, Estimate
 from madoc.calibration.calibrate import calibrate
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.madoc.calibrator import Madoc
+from madoc.calibration.oted import Oted
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.calibration.uncalibrated import Uncalibrated
 from madoc.types import MethodEntry
@@ -22,6 +23,9 @@ CALIBRATORS: dict[str, MethodEntry[Calibrator]] = {
     "madoc-paper": MethodEntry(Madoc.paper, "Madoc with the paper's own constants", _PAPER, 2024),
     "least-squares": MethodEntry(
         LeastSquares, "damped Gauss-Newton on next states, robust, with intervals", "Levenberg; Marquardt", 1963
+    ),
+    "oted": MethodEntry(
+        Oted, "(s, a) distribution matching by a bandit's gradient", "Gur et al. (from its abstract)", 2021
     ),
     "nominal": MethodEntry(Uncalibrated, "mid-range, uncalibrated: a yardstick", "no paper: a yardstick", 2024),
     "uniform": MethodEntry(
@@ -40,6 +44,7 @@ __all__ = [
     "Estimate",
     "LeastSquares",
     "Madoc",
+    "Oted",
     "ParameterEstimate",
     "Uncalibrated",
     "calibrate",

@@ -70,7 +70,8 @@ class LeastSquares:
         starts: Searches: from mid-range, the others from random places. The best goes on.
         search_windows: Windows while searching.
         search_epochs: Epochs of searching, at most; it ends once the best search has settled.
-        tolerance: Of each range: a step that moves no parameter by more (nor by a tenth of its standard error) is the last.
+        tolerance: Share of each range; a step that moves no parameter by more, nor by a tenth of its standard error,
+            is the last.
     """
 
     horizon: int = 1

@@ -18,7 +18,7 @@ def triangular_factors(
     root = np.sqrt(loss_slope((residuals / scale) ** 2, loss) / max(1, len(residuals)))
     # Zero rows keep the factor square where there are fewer values than parameters.
     stacked = np.concatenate([root[:, None] * np.column_stack([jacobian, residuals]), np.zeros((count + 1, count + 1))])
-    factor = np.linalg.qr(stacked, mode="r")
+    factor = np.asarray(np.linalg.qr(stacked, mode="r"))
     return factor[:count, :count], factor[:count, count]
 
 

@@ -1,0 +1,351 @@
+"""OTED: a distribution over parameters whose rollouts visit the states and actions of the data, by bandit gradient.
+
+Gur, Nachum and Faust 2021, "Offline tuning of simulators". Only its abstract and appendix D.2 of Jiang et al. 2024
+could be had: a distribution over simulator parameters, a divergence between the (s, a) of data and simulator, and a
+bandit's policy gradient. Everything else here is our choice, and said so where it is made.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+
+from madoc.calibration.base import CalibrationProblem, Estimate
+from madoc.calibration.cautions import at_end_of_range, exploded
+from madoc.errors import check_at_least
+from madoc.learning import replay
+from madoc.learning.cloning import clone
+from madoc.learning.networks import Network, descend, scan_updates
+from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll
+from madoc.types import Metrics
+
+LOG_STD_RANGE = (-6.0, 0.5)
+REWARD_BOUND = 10.0
+"""Log ratios beyond this say no more than that the discriminator is sure."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Distribution:
+    """Independent Gaussians whose tanh are parameters in [-1, 1]."""
+
+    mean: Float[np.ndarray, " d"]
+    log_std: Float[np.ndarray, " d"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class OtedState:
+    """Everything OTED carries. `average` follows `distribution` slowly; the estimate is read from it."""
+
+    policy: TanhGaussianPolicy
+    policy_optimiser: PyTree
+    discriminator: Network
+    discriminator_optimiser: PyTree
+    rows: replay.Replay
+    walkers: Walkers
+    distribution: Distribution
+    average: Distribution
+    key: PRNGKeyArray
+    cloned: int
+    epochs: int
+    control_steps: int
+    failures: int
+
+
+@dataclass(frozen=True)
+class Oted:
+    """Match the (s, a) distribution of a cloned policy's rollouts to that of the data.
+
+    Attributes:
+        starts: `logged` rolls out from logged states anew in every epoch; `policy` lets walkers run on from resets.
+        draws: Parameter draws an epoch, in antithetic pairs.
+        rows: Walkers under each draw.
+        horizon: Control steps each walks under it.
+        updates: Discriminator updates an epoch.
+        batch: Logged rows, and as many simulated ones, in an update.
+        mean_rate: Natural-gradient step of the distribution's mean, in its standard deviations.
+        std_rate: The same of the logarithm of its deviation.
+        first_std: Deviation it begins with, before tanh.
+        smallest_std: It stops once the mean deviation has shrunk to this.
+        average_rate: Of the slow average that is the estimate.
+        hidden: Units per layer of clone and discriminator.
+        cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
+        cloning_updates: Updates in each.
+        learning_rate: Adam's, of both networks.
+        replay_capacity: Simulated rows kept for the discriminator.
+    """
+
+    starts: Literal["logged", "policy"] = "logged"
+    draws: int = 50
+    rows: int = 2
+    horizon: int = 20
+    updates: int = 50
+    batch: int = 256
+    mean_rate: float = 0.3
+    std_rate: float = 0.1
+    first_std: float = 0.6
+    smallest_std: float = 0.02
+    average_rate: float = 0.03
+    hidden: tuple[int, ...] = (128, 128)
+    cloning_epochs: int = 40
+    cloning_updates: int = 200
+    learning_rate: float = 1e-3
+    replay_capacity: int = 20_000
+
+    def __post_init__(self) -> None:
+        counts = ("rows", "updates", "batch", "hidden", "cloning_updates", "replay_capacity")
+        check_at_least(self, **dict.fromkeys(counts, 1), draws=2, horizon=2, cloning_epochs=0)
+        check_at_least(self, **dict.fromkeys(("mean_rate", "std_rate", "first_std", "average_rate"), 0.0))
+
+    @property
+    def name(self) -> str:
+        """As `madoc methods` lists it."""
+        return "oted"
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Metrics beside the progress bar."""
+        return ("reward", "std", "cloning_loss")
+
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> OtedState:
+        """Fresh networks, the distribution around mid-range, walkers at their starts.
+
+        Raises:
+            MadocError: Rollouts are to start at logged states, but those cannot be rebuilt.
+        """
+        task, simulator = problem.simulator.task, problem.simulator
+        observation, action, count = task.observation_size, simulator.action_size, len(simulator.parameters)
+        of_policy, of_discriminator, of_start, key = jax.random.split(key, 4)
+        logged = np.asarray(problem.dataset.transitions.observation)
+        policy = TanhGaussianPolicy(
+            observation,
+            action,
+            self.hidden,
+            key=of_policy,
+            offset=logged.mean(0),
+            scale=np.maximum(logged.std(0), 1e-3),
+        )
+        discriminator = Network(observation + action, 1, self.hidden, key=of_discriminator)
+        distribution = Distribution(np.zeros(count), np.full(count, np.log(self.first_std)))
+        return OtedState(
+            policy=policy,
+            policy_optimiser=self._adam.init(eqx.filter(policy, eqx.is_array)),
+            discriminator=discriminator,
+            discriminator_optimiser=self._adam.init(eqx.filter(discriminator, eqx.is_array)),
+            rows=replay.empty(self.replay_capacity, pair=(observation + action,)),
+            walkers=self._begin(problem, of_start),
+            distribution=distribution,
+            average=distribution,
+            key=key,
+            cloned=0,
+            epochs=0,
+            control_steps=0,
+            failures=0,
+        )
+
+    def step(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Metrics]:
+        """One epoch of whichever stage is due."""
+        return (self._clone if self.stage(state) == "cloning" else self._calibrate)(problem, state)
+
+    def estimate(self, problem: CalibrationProblem, state: OtedState) -> Estimate:
+        """The averaged distribution through tanh: its centre, and its deviation to first order."""
+        space, average = problem.simulator.parameters, state.average
+        unit = np.tanh(average.mean)
+        std = (1.0 - unit**2) * np.exp(average.log_std) * (space.high - space.low) / 2.0
+        return Estimate(
+            mean=space.to_physical(unit),
+            std=std,
+            groups=(tuple(range(len(space))),),
+            warnings=(
+                *at_end_of_range(unit, space.names),
+                *exploded(state.failures, state.control_steps),
+            ),
+            covariance=np.diag(std**2),
+        )
+
+    def control_steps(self, state: OtedState) -> int:
+        """Simulated control steps so far."""
+        return state.control_steps
+
+    def stage(self, state: OtedState) -> str:
+        """What the next epoch does."""
+        return "cloning" if state.cloned < self.cloning_epochs else "calibrating"
+
+    def progress(self, state: OtedState, budget: int) -> float:
+        """Share of the control steps and of the cloning done; cloning counts as a tenth."""
+        cloned = state.cloned / self.cloning_epochs if self.cloning_epochs else 1.0
+        return min(1.0, 0.1 * cloned + 0.9 * state.control_steps / budget)
+
+    def converged(self, state: OtedState) -> str | None:
+        """A sentence once the distribution is as narrow as it may become."""
+        spread = _mean_std(state.distribution)
+        if spread > self.smallest_std:
+            return None
+        return f"the distribution has shrunk to a deviation of {spread:.3g} before tanh"
+
+    @cached_property
+    def _adam(self) -> optax.GradientTransformation:
+        return optax.adam(self.learning_rate)
+
+    def _starts(self, problem: CalibrationProblem) -> Starts:
+        return chosen_states(problem.logged_states) if self.starts == "logged" else reset_states(problem.simulator)
+
+    def _begin(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Walkers:
+        return begin(self._starts(problem), key, systems=2 * (self.draws // 2), rows=self.rows)
+
+    def _clone(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Metrics]:
+        of_batches, key = jax.random.split(state.key)
+        policy, optimiser_state, metrics = clone(
+            state.policy,
+            state.policy_optimiser,
+            problem.pairs,
+            of_batches,
+            optimiser=self._adam,
+            batch=self.batch,
+            count=self.cloning_updates,
+        )
+        following = replace(state, policy=policy, policy_optimiser=optimiser_state, key=key, cloned=state.cloned + 1)
+        return following, {name: float(value) for name, value in metrics.items()}
+
+    def _calibrate(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Metrics]:
+        of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
+        simulator, distribution = problem.simulator, state.distribution
+        noise = antithetic_noise(of_draws, self.draws // 2, len(distribution.mean))
+        draws = np.tanh(distribution.mean + np.exp(distribution.log_std) * noise)
+        walkers = self._begin(problem, of_start) if self.starts == "logged" else state.walkers
+        rollout, walkers = roll(
+            simulator.bind(simulator.parameters.to_physical(draws)),
+            simulator.task,
+            state.policy,
+            walkers,
+            steps=self.horizon,
+            starts=self._starts(problem),
+            key=of_action,
+            restart_key=of_restart,
+        )
+        # The first pair of a row is where it was put: the draw had no part in it.
+        pairs = problem.scalings["standardised"].features(rollout.transitions)[0][1:]
+        valid = rollout.valid[1:]
+        rows = replay.add(state.rows, {"pair": replay.flatten_rows(pairs, 3)}, valid.reshape(-1))
+        discriminator, optimiser_state, metrics = _learn(
+            state.discriminator,
+            state.discriminator_optimiser,
+            problem.standardised_features[0],
+            rows,
+            of_updates,
+            optimiser=self._adam,
+            batch=self.batch,
+            count=self.updates,
+        )
+        ratio = np.asarray(_log_ratio(discriminator, jnp.asarray(pairs)), np.float64)
+        rewards = mean_rewards(ratio, valid)
+        moved = natural_step(distribution, noise, advantages(rewards), mean_rate=self.mean_rate, std_rate=self.std_rate)
+        following = replace(
+            state,
+            discriminator=discriminator,
+            discriminator_optimiser=optimiser_state,
+            rows=rows,
+            walkers=state.walkers if self.starts == "logged" else walkers,
+            distribution=moved,
+            average=jax.tree.map(lambda slow, fast: slow + self.average_rate * (fast - slow), state.average, moved),
+            key=key,
+            epochs=state.epochs + 1,
+            control_steps=state.control_steps + rollout.valid.size,
+            failures=state.failures + rollout.failures,
+        )
+        told = {name: float(value) for name, value in metrics.items()}
+        return following, told | {"reward": float(rewards.mean()), "std": _mean_std(moved)}
+
+
+def antithetic_noise(key: PRNGKeyArray, pairs: int, count: int) -> Float[np.ndarray, "draws d"]:
+    """Standard normal draws, each with its mirror image: what is odd in the reward is seen without the even part."""
+    half = np.asarray(jax.random.normal(key, (pairs, count)), np.float64)
+    return np.concatenate([half, -half])
+
+
+def discriminator_loss(
+    discriminator: Network, logged: Float[Array, "batch pair"], simulated: Float[Array, "batch pair"]
+) -> Float[Array, ""]:
+    """Cross-entropy of logged (1) against simulated (0) pairs: its logit becomes log p_data(s, a) / p_sim(s, a)."""
+    return jax.nn.softplus(-discriminator(logged)).mean() + jax.nn.softplus(discriminator(simulated)).mean()
+
+
+def mean_rewards(
+    log_ratio: Float[np.ndarray, "steps draws rows"], valid: Bool[np.ndarray, "steps draws rows"]
+) -> Float[np.ndarray, " draws"]:
+    """Reward of each draw: the mean of log p_data / p_sim over the pairs it visited.
+
+    Its mean over draws is -KL(sim || data), and the part of the gradient that goes through p_sim is 0 on average, so
+    the bandit climbs down the divergence itself. The choice of this KL is ours. A draw of which no row survived gets
+    the lowest reward there is.
+    """
+    count = valid.sum((0, 2))
+    total = np.where(valid, np.clip(log_ratio, -REWARD_BOUND, REWARD_BOUND), 0.0).sum((0, 2))
+    rewards = total / np.maximum(count, 1)
+    return np.where(count, rewards, rewards[count > 0].min(initial=-REWARD_BOUND) if not count.all() else 0.0)
+
+
+def advantages(rewards: Float[np.ndarray, " draws"]) -> Float[np.ndarray, " draws"]:
+    """Rewards less their mean, over their deviation: the size of a step is that of its rate, whatever the units."""
+    return (rewards - rewards.mean()) / (rewards.std() + 1e-8)
+
+
+def natural_step(
+    distribution: Distribution,
+    noise: Float[np.ndarray, "draws d"],
+    advantage: Float[np.ndarray, " draws"],
+    *,
+    mean_rate: float,
+    std_rate: float,
+) -> Distribution:
+    """The bandit's policy gradient, preconditioned by the Fisher matrix of a Gaussian (Wierstra et al. 2014).
+
+    Score-function gradient of the expected reward: μ by A ε / σ, log σ by A (ε² - 1); the Fisher matrix is 1 / σ² and
+    2. So μ moves by σ E[A ε], log σ by ½ E[A (ε² - 1)].
+    """
+    weight = advantage[:, None] / len(advantage)
+    mean = distribution.mean + mean_rate * np.exp(distribution.log_std) * (weight * noise).sum(0)
+    log_std = distribution.log_std + 0.5 * std_rate * (weight * (noise**2 - 1.0)).sum(0)
+    return Distribution(mean, np.clip(log_std, *LOG_STD_RANGE))
+
+
+def _mean_std(distribution: Distribution) -> float:
+    return float(np.exp(distribution.log_std).mean())
+
+
+@eqx.filter_jit
+def _log_ratio(discriminator: Network, pairs: Array) -> Array:
+    return discriminator(pairs)[..., 0]
+
+
+@partial(eqx.filter_jit, donate="none")
+def _learn(
+    discriminator: Network,
+    optimiser_state: PyTree,
+    logged: Array,
+    rows: replay.Replay,
+    key: PRNGKeyArray,
+    *,
+    optimiser: optax.GradientTransformation,
+    batch: int,
+    count: int,
+) -> tuple[Network, PyTree, dict[str, Array]]:
+    """Updates of the discriminator on logged and simulated pairs."""
+
+    def update(carry: tuple[Network, PyTree], key: PRNGKeyArray) -> tuple[tuple[Network, PyTree], dict[str, Array]]:
+        of_logged, of_simulated = jax.random.split(key)
+        chosen = logged[jax.random.randint(of_logged, (batch,), 0, len(logged))]
+        simulated = replay.sample(rows, of_simulated, batch)["pair"]
+        loss, gradients = eqx.filter_value_and_grad(discriminator_loss)(carry[0], chosen, simulated)
+        return descend(optimiser, gradients, carry[1], carry[0]), {"discriminator_loss": loss}
+
+    (discriminator, optimiser_state), metrics = scan_updates(update, (discriminator, optimiser_state), key, count)
+    return discriminator, optimiser_state, metrics
