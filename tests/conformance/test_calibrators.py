@@ -9,8 +9,17 @@ import pytest
 
 import madoc.data.targets
 from madoc import checkpoint, simulation
-from madoc.calibration import CALIBRATORS, CalibrationProblem, CalibrationResult, calibrate
-from madoc.data import Dataset
+from madoc.calibration import (
+    CALIBRATORS,
+    CalibrationProblem,
+    CalibrationResult,
+    LeastSquares,
+    Madoc,
+    Oted,
+    Uncalibrated,
+    calibrate,
+)
+from madoc.data import Dataset, Disturbance, disturb, observed_task
 from madoc.errors import MadocError
 from madoc.parameters import Parameter
 from madoc.run_folder import RunFolder
@@ -35,7 +44,12 @@ METHODS = {
     **{name: small(name) for name in CALIBRATORS if name.startswith("madoc")},
     "madoc, free running": small("madoc", starts="policy"),
     "madoc, replaying": small("madoc", starts="replay"),
+    "least-squares": LeastSquares(windows=6, search_windows=3, starts=2, search_epochs=2, tolerance=0.0),
+    "least-squares, windows": LeastSquares(horizon=3, windows=4, search_windows=2, search_epochs=1, tolerance=0.0),
+    "oted": Oted(draws=6, rows=2, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=2, cloning_updates=3),
+    "oted, free running": Oted("policy", draws=4, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=0),
 }
+IDLE = {"nominal": Uncalibrated(), "uniform": Uncalibrated(randomised=True)}
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +72,7 @@ def problem(dataset, simulator):
     return CalibrationProblem(dataset, simulator)
 
 
-QUICK = ("madoc", "madoc, free running")  # the others differ by a value; `make test-slow` holds them to every rule too
+QUICK = ("madoc", "madoc, free running", "least-squares", "oted")  # the others differ by a value; `make test-slow` holds them to every rule too
 
 
 @pytest.fixture(params=[pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in METHODS])
@@ -83,12 +97,12 @@ def through_all_stages(method, problem, *, key=KEY):
 
 
 def test_no_calibrator_is_forgotten():
-    assert set(CALIBRATORS) <= set(METHODS), "add the new calibrator to METHODS"
+    assert set(CALIBRATORS) <= {*METHODS, *IDLE}, "add the new calibrator to METHODS"
 
 
 @pytest.mark.parametrize("name", CALIBRATORS)
 def test_a_method_knows_the_name_it_is_listed_under(name):
-    assert CALIBRATORS[name].make().name in CALIBRATORS
+    assert CALIBRATORS[name].make().name == name
     assert CALIBRATORS[name].summary
     assert CALIBRATORS[name].paper
     assert 1900 < CALIBRATORS[name].year < 2100
@@ -231,16 +245,43 @@ def test_data_of_another_robot_is_refused(dataset, simulator):
 
 @pytest.mark.parametrize("starts", ["logged", "replay"])
 def test_logged_starts_without_states_are_refused(method, dataset, starts):
+    if isinstance(method, Madoc):
+        method = replace(method, starts=starts, horizon=None)
+    elif isinstance(method, Oted):
+        method = replace(method, starts="logged")
     blind = replace(two_link_arm(), state_from_observation=None)
     problem = CalibrationProblem(dataset, simulation.make(blind, threads=1))
     with pytest.raises(MadocError, match="does not determine its state, so nothing can start at logged states"):
-        calibrate(replace(method, starts=starts, horizon=None), problem, key=KEY, budget=BUDGET)
+        calibrate(method, problem, key=KEY, budget=BUDGET)
 
 
-def test_free_running_needs_no_states(dataset):
-    blind = replace(two_link_arm(), state_from_observation=None)
-    problem = CalibrationProblem(dataset, simulation.make(blind, threads=1))
-    assert calibrate(METHODS["madoc, free running"], problem, key=KEY, budget=BUDGET).status == "finished"
+@pytest.mark.parametrize("name", ["madoc, free running", "oted, free running", "nominal", "uniform"])
+def test_hidden_velocities_leave_methods_that_need_no_states(dataset, name):
+    whole = replace(two_link_arm(), velocities=2)
+    hidden = disturb(dataset, Disturbance(hidden_velocities=True), whole, KEY)
+    problem = CalibrationProblem(hidden, simulation.make(observed_task(whole, hidden), threads=1))
+    result = calibrate((METHODS | IDLE)[name], problem, key=KEY, budget=BUDGET)
+    assert result.status in ("finished", "converged")
+    assert any("hides velocities" in warning for warning in result.warnings)
+
+
+def test_data_that_shows_other_observations_is_refused(dataset, simulator):
+    hidden = disturb(dataset, Disturbance(hidden_velocities=True), replace(two_link_arm(), velocities=2), KEY)
+    with pytest.raises(MadocError, match="the data has 2 values per observation, the simulator's two_link_arm shows 4"):
+        CalibrationProblem(hidden, simulator)
+
+
+@pytest.mark.parametrize("name", IDLE)
+def test_what_simulates_nothing_costs_nothing(problem, simulator, task, tmp_path, name):
+    with RunFolder.create(tmp_path / "run", {"seed": 0}) as folder:
+        result = calibrate(IDLE[name], problem, key=KEY, budget=1, truth=ARM_TRUTH, folder=folder)
+        again = calibrate(IDLE[name], problem, key=KEY, budget=1, truth=ARM_TRUTH, folder=folder, resume=True)
+    assert again == result
+    assert (result.status, result.control_steps, simulator.rows) == ("converged", 0, 0)
+    assert (result.mean == task.parameters.middle).all()
+    width = task.parameters.high - task.parameters.low
+    assert result.std == pytest.approx(width / 12**0.5 if name == "uniform" else 0.0 * width)
+    assert CalibrationResult.from_json(json.loads(json.dumps(result.to_json()))) == result
 
 
 def test_a_parameter_that_changes_nothing_is_refused_before_any_budget_is_spent(method, dataset: Dataset, monkeypatch):

@@ -64,6 +64,17 @@ class CalibrationProblem:
         """The actions taken at `logged_states`."""
         return np.asarray(self.dataset.transitions.action)[self.logged_rows]
 
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What is known to keep the simulator from moving as the data does, one sentence each."""
+        recorded, simulated = self.dataset.physics, self.simulator.task.physics
+        gap = (
+            f"the data was recorded in {recorded} physics and the simulator's is {simulated}: "
+            "the estimate will make up for the difference"
+        )
+        gaps = () if recorded in ("unknown", simulated) else (gap,)
+        return (*gaps, *self.dataset.disturbance.sentences())
+
     def require_pairs(self, method: str) -> None:
         """Refuse data in which it is not known which next observation followed which row.
 

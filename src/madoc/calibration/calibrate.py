@@ -71,7 +71,7 @@ def calibrate(
         seed=seed_of(key),
         groups=[[space.names[index] for index in group] for group in estimate.groups],
         parameters=_parameters(space, estimate),
-        warnings=[*estimate.warnings, *problem.dataset.disturbance.sentences()],
+        warnings=[*estimate.warnings, *problem.doubts],
         error=None if known is None else calibration_error(estimate.mean, known, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
     )

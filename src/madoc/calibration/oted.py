@@ -6,7 +6,7 @@ bandit's policy gradient. Everything else here is our choice, and said so where 
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Literal
 
 import equinox as eqx
@@ -326,7 +326,7 @@ def _log_ratio(discriminator: Network, pairs: Array) -> Array:
     return discriminator(pairs)[..., 0]
 
 
-@partial(eqx.filter_jit, donate="none")
+@eqx.filter_jit
 def _learn(
     discriminator: Network,
     optimiser_state: PyTree,

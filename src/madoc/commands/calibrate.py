@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from madoc.commands.answer import Answer, Output, left_behind
+from madoc.commands.disturbed import Disturbed, disturbance_of
 from madoc.errors import MadocError
 
 Settings = UseAppendAction[tuple[tuple[str, ...], ...]]
@@ -30,6 +31,7 @@ class Calibrate:
     """Clip actions outside [-1, 1] instead of refusing them."""
     max_transitions: int = 200_000
     """Keep at most so many rows, drawn as whole episodes."""
+    disturbed: OmitArgPrefixes[Disturbed] = field(default_factory=Disturbed)
     physics: Literal["legacy", "modern"] | None = None
     """Physics to calibrate in. Default: the data's; legacy where it does not say."""
     level: str = "normal"
@@ -63,7 +65,9 @@ class Calibrate:
             raise MadocError(f"expected the name of a robot, got {self.task!r}; the data is given with --data")
         order = CalibrationOrder(
             task=self.task,
-            source=Source(self.data, self.format, self.clip_actions, self.max_transitions),
+            source=Source(
+                self.data, self.format, self.clip_actions, self.max_transitions, disturbance_of(self.disturbed)
+            ),
             physics=self.physics,
             level=self.level,
             parameters=self.parameters,

@@ -1,13 +1,14 @@
 """`madoc record`."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output, left_behind
+from madoc.commands.disturbed import Disturbed, disturbance_of
 from madoc.errors import MadocError
 
 
@@ -28,8 +29,11 @@ class Record:
     """File to write. Default: NAME.npz."""
     physics: Literal["legacy", "modern"] = "legacy"
     """legacy is that of D4RL, NeoRL and the paper."""
+    friction: float = 1.0
+    """Friction of the target's contacts as a multiple of the model's: 1.2 is a gap that no parameter closes."""
     force: bool = False
     """Write over an existing file."""
+    disturbed: OmitArgPrefixes[Disturbed] = field(default_factory=Disturbed)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
@@ -43,12 +47,14 @@ class Record:
             raise MadocError(f"{out} exists already; choose another --out or pass --force to write over it")
         if not out.parent.is_dir():
             raise MadocError(f"no folder {out.parent} to write {out.name} into; make it first")
+        disturbance = disturbance_of(self.disturbed, friction=self.friction)
         started = time.monotonic()
         dataset = record_named(
             self.name,
             transitions=self.transitions,
             physics=self.physics,
             seed=self.seed,
+            disturbance=disturbance,
             quiet=self.output.quiet,
         )
         data.save(dataset, out)
@@ -65,7 +71,8 @@ class Record:
             "mean_return": mean_return,
             "seed": self.seed,
             "seconds": round(seconds, 3),
+            "disturbance": asdict(dataset.disturbance),
             "true_parameters": dataset.true_parameters,
         }
         line = f"{len(dataset):,} transitions in {episodes:,} episodes, mean return {mean_return:,.1f}, {seconds:.1f} s"
-        return Answer(answer, (line, left_behind(out, "data")))
+        return Answer(answer, (line, *dataset.disturbance.sentences(), left_behind(out, "data")))

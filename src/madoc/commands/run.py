@@ -9,6 +9,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output, evaluation_text, left_behind
 from madoc.commands.calibrate import Settings, changes_of
+from madoc.commands.disturbed import Disturbed, disturbance_of
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Run:
     """Clip actions outside [-1, 1] instead of refusing them."""
     transitions: int = 200_000
     """Rows to record, or to keep of the log."""
+    disturbed: OmitArgPrefixes[Disturbed] = field(default_factory=Disturbed)
     physics: Literal["legacy", "modern"] | None = None
     """Physics to calibrate in. Default: the data's; legacy where it does not say."""
     level: str = "normal"
@@ -66,13 +68,14 @@ class Run:
     def run(self) -> Answer:
         """Do it, and leave the folder."""
         from madoc.calibration import CalibrationResult
-        from madoc.pipeline import Plan, run_all
+        from madoc.pipeline import Plan, Source, run_all
         from madoc.pipeline.data_stage import absolute_source, read_truth
 
         plan = Plan(
             name=self.name,
-            data=None if self.data is None else absolute_source(self.data, self.format, self.clip_actions),
+            data=None if self.data is None else absolute_source(Source(self.data, self.format, self.clip_actions)),
             transitions=self.transitions,
+            disturbance=disturbance_of(self.disturbed),
             physics=self.physics,
             level=self.level,
             parameters=self.parameters,

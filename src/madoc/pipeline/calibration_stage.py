@@ -8,7 +8,7 @@ from typing import Any
 
 from madoc import simulation, tasks
 from madoc.calibration import CALIBRATORS, CalibrationProblem, CalibrationResult, calibrate
-from madoc.data import Dataset
+from madoc.data import Dataset, Disturbance, observed_task
 from madoc.errors import MadocError, unknown_name
 from madoc.files import read_json
 from madoc.parameters import Parameter, ParameterSpace
@@ -146,6 +146,7 @@ def _prepare(order: CalibrationOrder) -> tuple[Dataset, Task]:
     dataset = load_source(order.source, reader, seed=order.seed)
     said = dataset.physics if dataset.physics != "unknown" else None
     task = tasks.make(order.task, order.physics or said or "legacy").with_level(order.level)
+    task = observed_task(task, dataset)
     if said is not None and said != task.physics:
         warnings.warn(
             f"{order.source.path} was recorded in {said} physics and is calibrated in {task.physics}: "
@@ -185,7 +186,7 @@ def _source_of(remembered: Mapping[str, Any], folder: Path) -> Source:
     if path.startswith(("/", "..")) or (folder / path).exists():
         path = str(restored_path(path, folder))  # else the id of a Minari dataset
     wanted = {name: remembered[name] for name in ("format", "clip_actions", "max_transitions")}
-    return Source(path, **wanted)
+    return Source(path, **wanted, disturbance=Disturbance(**remembered.get("disturbance", {})))
 
 
 def _task_of(result: CalibrationResult, physics: str) -> Task:

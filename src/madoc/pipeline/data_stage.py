@@ -2,13 +2,13 @@
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from madoc import data, simulation, tasks
-from madoc.data import Dataset
+from madoc.data import Dataset, Disturbance
 from madoc.errors import MadocError, unknown_name
 from madoc.files import read_json
 from madoc.pipeline.keys import stage_key
@@ -27,18 +27,20 @@ class Source:
         format: A name in `data.FORMATS`; None looks at the content.
         clip_actions: Clip actions outside [-1, 1] instead of refusing them.
         max_transitions: Keep at most so many, drawn as whole episodes; None keeps all.
+        disturbance: What to put into it once it is read.
     """
 
     path: str
     format: str | None = None
     clip_actions: bool = False
     max_transitions: int | None = 200_000
+    disturbance: Disturbance = field(default_factory=Disturbance)
 
 
-def absolute_source(path: str, format: str | None, clip_actions: bool) -> Source:
+def absolute_source(source: Source) -> Source:
     """A source that means the same from any working directory; a Minari id stays what it is."""
-    file = Path(path).expanduser()
-    return Source(str(file.resolve()) if file.exists() else path, format, clip_actions)
+    file = Path(source.path).expanduser()
+    return replace(source, path=str(file.resolve())) if file.exists() else source
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,16 @@ def split_name(name: str) -> tuple[str, str]:
     return task_name, quality
 
 
-def record_named(name: str, *, transitions: int, physics: str, seed: int, quiet: bool = True) -> Dataset:
-    """Record `TASK-QUALITY` in the target with the paper's truth.
+def record_named(
+    name: str,
+    *,
+    transitions: int,
+    physics: str,
+    seed: int,
+    disturbance: Disturbance | None = None,
+    quiet: bool = True,
+) -> Dataset:
+    """Record `TASK-QUALITY` in the target with the paper's truth, its contacts and sensors disturbed if asked.
 
     Raises:
         MadocError: The name is no TASK-QUALITY, or `record_quality` refuses.
@@ -77,18 +87,23 @@ def record_named(name: str, *, transitions: int, physics: str, seed: int, quiet:
     if transitions < 1:
         raise MadocError(f"expected at least 1 transition to record, got {transitions}")
     key = stage_key(seed, "recording")
-    simulator = simulation.make(tasks.make(task_name, physics))
+    asked = disturbance or Disturbance()
+    task = tasks.make(task_name, physics)
+    simulator = simulation.make(task if asked.friction == 1.0 else task.with_friction(asked.friction))
     with bar(f"recording {name}", total=transitions, unit="transitions", quiet=quiet) as advance:
-        return record_quality(simulator, quality, transitions=transitions, key=key, advance=advance)
+        dataset = record_quality(simulator, quality, transitions=transitions, key=key, advance=advance)
+    return data.disturb(dataset, asked, task, stage_key(seed, "disturbing"))
 
 
 def load_source(source: Source, task: Task, *, seed: int) -> Dataset:
-    """Read logged data of a robot.
+    """Read logged data of a robot, and disturb it if the source says so.
 
     Raises:
-        MadocError: As `data.load`.
+        MadocError: As `data.load` and `data.disturb`, or friction is to be changed after the fact.
     """
-    return data.load(
+    if source.disturbance.friction != 1.0:
+        raise MadocError("the friction of a target is chosen when it is recorded; pass it to madoc record")
+    dataset = data.load(
         source.path,
         task,
         format=source.format,
@@ -96,6 +111,7 @@ def load_source(source: Source, task: Task, *, seed: int) -> Dataset:
         key=stage_key(seed, "subsampling"),
         clip_actions=source.clip_actions,
     )
+    return data.disturb(dataset, source.disturbance, task, stage_key(seed, "disturbing"))
 
 
 def fingerprint(dataset: Dataset) -> str:

@@ -76,6 +76,11 @@ def learn_in(
                 "give it the run folder of the calibration"
             )
         dataset = load_source(calibrated.source, calibrated.task, seed=calibrated.seed)
+        if dataset.disturbance.hidden_velocities:
+            raise MadocError(
+                f"{order.method} clones actions from whole observations, and {dataset.origin} hides velocities; "
+                "take a method that needs no data"
+            )
     spec = {
         "command": "learn",
         "task": calibrated.task.name,

@@ -7,6 +7,7 @@ from typing import Any
 
 from madoc import data, tasks
 from madoc.calibration import CALIBRATORS, CalibrationResult
+from madoc.data import Disturbance
 from madoc.errors import MadocError
 from madoc.files import read_json
 from madoc.pipeline.calibration_stage import (
@@ -33,6 +34,7 @@ class Plan:
         name: `TASK-QUALITY` to record, or a task's name with `data`.
         data: A log to use instead of recording one.
         transitions: Rows recorded, or kept of the log.
+        disturbance: What to put into them.
         physics: `legacy` or `modern`; None takes the log's, and `legacy` where nothing says.
         level: Ranges to search: `easy`, `normal` or `hard`.
         parameters: Calibrate only these; empty takes all.
@@ -51,6 +53,7 @@ class Plan:
     name: str
     data: Source | None = None
     transitions: int = 200_000
+    disturbance: Disturbance = field(default_factory=Disturbance)
     physics: str | None = None
     level: str = "normal"
     parameters: tuple[str, ...] = ()
@@ -117,6 +120,8 @@ def _spec(plan: Plan) -> dict[str, Any]:
     }.items():
         if value < 1:
             raise MadocError(f"expected at least 1 {what}, got {value}")
+    if plan.disturbance.friction != 1.0:
+        raise MadocError("a target of another friction is made by madoc record; pass its file as data")
     seed_key(plan.seed)
     fields = asdict(plan)
     for kind, changes, entries in (("method", "changes", CALIBRATORS), ("learner", "learner_changes", LEARNERS)):
@@ -131,9 +136,16 @@ def _data_stage(plan: Plan, out: Path, *, quiet: bool) -> None:
         return
     physics = plan.physics or "legacy"
     if plan.data is None:
-        dataset = record_named(plan.name, transitions=plan.transitions, physics=physics, seed=plan.seed, quiet=quiet)
+        dataset = record_named(
+            plan.name,
+            transitions=plan.transitions,
+            physics=physics,
+            seed=plan.seed,
+            disturbance=plan.disturbance,
+            quiet=quiet,
+        )
     else:
-        source = replace(plan.data, max_transitions=plan.transitions)
+        source = replace(plan.data, max_transitions=plan.transitions, disturbance=plan.disturbance)
         dataset = load_source(source, tasks.make(split_name(plan.name)[0], physics), seed=plan.seed)
     data.save(dataset, out / "data.npz")
 

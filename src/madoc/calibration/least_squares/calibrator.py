@@ -22,6 +22,8 @@ DAMPING_RANGE = (1e-10, 1e10)
 FIRST_DAMPING = 1e-2
 SETTLED = 0.1
 """Of its standard error: a step smaller than this changes nothing worth a simulation."""
+_SMALLEST = 1e-100
+"""Keeps a move over a tolerance of 0 finite."""
 
 
 @jax.tree_util.register_dataclass
@@ -119,7 +121,7 @@ class LeastSquares:
             unit=unit,
             damping=np.full(self.starts, FIRST_DAMPING),
             cost=np.full(self.starts, ALL_FAILED),
-            moved=np.full(self.starts, 1.0 / max(self.tolerance, 1e-300)),
+            moved=np.full(self.starts, 1.0 / _SMALLEST),
             chosen=possible[np.asarray(order)],
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),
@@ -238,7 +240,7 @@ class LeastSquares:
     def _worthwhile(self, plan: "_Plan", windows: int) -> Float[np.ndarray, " d"]:
         """The smallest move in [-1, 1] that is worth a step, by parameter."""
         error = np.sqrt(np.diag(sandwich(plan.bread, plan.meat).covariance))
-        return np.maximum(2.0 * self.tolerance, SETTLED * error)
+        return np.maximum(2.0 * max(self.tolerance, _SMALLEST), SETTLED * error)
 
 
 @dataclass(frozen=True)

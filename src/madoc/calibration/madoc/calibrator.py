@@ -152,7 +152,9 @@ class Madoc:
 
     @property
     def name(self) -> str:
-        """As `madoc methods` lists the variant."""
+        """As `madoc methods` lists the variant; raw features without a blur are the paper's own."""
+        if self.features == "raw" and self.agents.reward_size == 0.0:
+            return "madoc-paper"
         by_groups = {"one": "madoc-s", "each": "madoc-ungrouped", "learned": "madoc"}
         return _NAMES.get((self.groups, self.mixing), by_groups[self.groups])
 
