@@ -72,7 +72,12 @@ def problem(dataset, simulator):
     return CalibrationProblem(dataset, simulator)
 
 
-QUICK = ("madoc", "madoc, free running", "least-squares", "oted")  # the others differ by a value; `make test-slow` holds them to every rule too
+QUICK = (
+    "madoc",
+    "madoc, free running",
+    "least-squares",
+    "oted",
+)  # the others differ by a value; `make test-slow` holds them to every rule too
 
 
 @pytest.fixture(params=[pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in METHODS])

@@ -6,7 +6,7 @@ from madoc.calibration.base import CalibrationProblem, Calibrator, Estimate
 from madoc.calibration.calibrate import calibrate
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.madoc.calibrator import Madoc
-from madoc.calibration.oted import Oted
+from madoc.calibration.oted.calibrator import Oted
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.calibration.uncalibrated import Uncalibrated
 from madoc.types import MethodEntry

@@ -79,9 +79,11 @@ def half_width(covariance: Float[np.ndarray, "d d"], windows: int) -> Float[np.n
 
 def identifiability(found: Uncertainty, names: tuple[str, ...]) -> tuple[str, ...]:
     """A sentence for each direction the data cannot identify, and one for the pairs it can hardly tell apart."""
-    sentences = []
+    sentences: list[str] = []
+    named: set[str] = set()
     for direction in np.abs(found.unidentified):
         involved = [name for name, part in zip(names, direction, strict=True) if part > _SHARE * direction.max()]
+        named.update(involved)
         if len(involved) == 1:
             sentences.append(f"the data does not identify {involved[0]}; leave it out or narrow its range")
         else:
@@ -89,7 +91,7 @@ def identifiability(found: Uncertainty, names: tuple[str, ...]) -> tuple[str, ..
                 f"the data does not identify {', '.join(involved)} together: they can change jointly without changing "
                 "what is seen; leave one of them out"
             )
-    pairs = correlated_pairs(found.correlation, names)
+    pairs = [pair for pair in correlated_pairs(found.correlation, names) if not named.issuperset(pair[:2])]
     if pairs:
         told = ", ".join(f"{first} and {second} ({value:+.2f})" for first, second, value in pairs)
         sentences.append(f"the data can hardly tell apart (correlation of the estimates): {told}")

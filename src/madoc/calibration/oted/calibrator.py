@@ -1,4 +1,4 @@
-"""OTED: a distribution over parameters whose rollouts visit the states and actions of the data, by bandit gradient.
+"""OTED, assembled: a distribution over parameters whose rollouts visit the data's states and actions.
 
 Gur, Nachum and Faust 2021, "Offline tuning of simulators". Only its abstract and appendix D.2 of Jiang et al. 2024
 could be had: a distribution over simulator parameters, a divergence between the (s, a) of data and simulator, and a
@@ -14,30 +14,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Int, PRNGKeyArray, PyTree
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.cautions import at_end_of_range, exploded
+from madoc.calibration.oted.bandit import Distribution, advantages, antithetic_noise, mean_rewards, natural_step
+from madoc.calibration.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
 from madoc.errors import check_at_least
 from madoc.learning import replay
 from madoc.learning.cloning import clone
-from madoc.learning.networks import Network, descend, scan_updates
+from madoc.learning.networks import Network
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll
 from madoc.types import Metrics
-
-LOG_STD_RANGE = (-6.0, 0.5)
-REWARD_BOUND = 10.0
-"""Log ratios beyond this say no more than that the discriminator is sure."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Distribution:
-    """Independent Gaussians whose tanh are parameters in [-1, 1]."""
-
-    mean: Float[np.ndarray, " d"]
-    log_std: Float[np.ndarray, " d"]
 
 
 @jax.tree_util.register_dataclass
@@ -119,7 +108,8 @@ class Oted:
         """Fresh networks, the distribution around mid-range, walkers at their starts.
 
         Raises:
-            MadocError: Rollouts are to start at logged states, but those cannot be rebuilt.
+            MadocError: Rollouts are to start at logged states, but those cannot be rebuilt, or no episode is as long
+                as a rollout.
         """
         task, simulator = problem.simulator.task, problem.simulator
         observation, action, count = task.observation_size, simulator.action_size, len(simulator.parameters)
@@ -141,7 +131,7 @@ class Oted:
             discriminator=discriminator,
             discriminator_optimiser=self._adam.init(eqx.filter(discriminator, eqx.is_array)),
             rows=replay.empty(self.replay_capacity, pair=(observation + action,)),
-            walkers=self._begin(problem, of_start),
+            walkers=begin(self._starts(problem)[0], of_start, systems=self._systems, rows=self.rows),
             distribution=distribution,
             average=distribution,
             key=key,
@@ -195,11 +185,17 @@ class Oted:
     def _adam(self) -> optax.GradientTransformation:
         return optax.adam(self.learning_rate)
 
-    def _starts(self, problem: CalibrationProblem) -> Starts:
-        return chosen_states(problem.logged_states) if self.starts == "logged" else reset_states(problem.simulator)
+    @property
+    def _systems(self) -> int:
+        return 2 * (self.draws // 2)
 
-    def _begin(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Walkers:
-        return begin(self._starts(problem), key, systems=2 * (self.draws // 2), rows=self.rows)
+    def _starts(self, problem: CalibrationProblem) -> tuple[Starts, Int[np.ndarray, " rows"]]:
+        """Where rollouts start, and how often each logged row is visited by the true system from there."""
+        if self.starts == "policy":
+            return reset_states(problem.simulator), np.ones(len(problem.dataset), dtype=np.int64)
+        chosen = comparable_starts(problem.dataset, problem.logged_rows, self.horizon)
+        counts = visits(problem.dataset, problem.logged_rows[chosen], self.horizon)
+        return chosen_states(problem.logged_states[chosen]), counts
 
     def _clone(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Metrics]:
         of_batches, key = jax.random.split(state.key)
@@ -218,34 +214,37 @@ class Oted:
     def _calibrate(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Metrics]:
         of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
         simulator, distribution = problem.simulator, state.distribution
-        noise = antithetic_noise(of_draws, self.draws // 2, len(distribution.mean))
+        noise = antithetic_noise(of_draws, self._systems // 2, len(distribution.mean))
         draws = np.tanh(distribution.mean + np.exp(distribution.log_std) * noise)
-        walkers = self._begin(problem, of_start) if self.starts == "logged" else state.walkers
+        starts, reached = self._starts(problem)
+        fresh = begin(starts, of_start, systems=self._systems, rows=self.rows)
+        anew = self.starts == "logged"
         rollout, walkers = roll(
             simulator.bind(simulator.parameters.to_physical(draws)),
             simulator.task,
             state.policy,
-            walkers,
+            fresh if anew else state.walkers,
             steps=self.horizon,
-            starts=self._starts(problem),
+            starts=starts,
             key=of_action,
             restart_key=of_restart,
         )
         # The first pair of a row is where it was put: the draw had no part in it.
         pairs = problem.scalings["standardised"].features(rollout.transitions)[0][1:]
-        valid = rollout.valid[1:]
+        valid = (first_lives(rollout.transitions, rollout.valid) if anew else rollout.valid)[1:]
         rows = replay.add(state.rows, {"pair": replay.flatten_rows(pairs, 3)}, valid.reshape(-1))
-        discriminator, optimiser_state, metrics = _learn(
+        discriminator, optimiser_state, metrics = learn(
             state.discriminator,
             state.discriminator_optimiser,
             problem.standardised_features[0],
+            jnp.asarray(np.cumsum(reached), jnp.int32),
             rows,
             of_updates,
             optimiser=self._adam,
             batch=self.batch,
             count=self.updates,
         )
-        ratio = np.asarray(_log_ratio(discriminator, jnp.asarray(pairs)), np.float64)
+        ratio = np.asarray(log_ratio(discriminator, jnp.asarray(pairs)), np.float64)
         rewards = mean_rewards(ratio, valid)
         moved = natural_step(distribution, noise, advantages(rewards), mean_rate=self.mean_rate, std_rate=self.std_rate)
         following = replace(
@@ -253,7 +252,7 @@ class Oted:
             discriminator=discriminator,
             discriminator_optimiser=optimiser_state,
             rows=rows,
-            walkers=state.walkers if self.starts == "logged" else walkers,
+            walkers=state.walkers if anew else walkers,
             distribution=moved,
             average=jax.tree.map(lambda slow, fast: slow + self.average_rate * (fast - slow), state.average, moved),
             key=key,
@@ -265,87 +264,5 @@ class Oted:
         return following, told | {"reward": float(rewards.mean()), "std": _mean_std(moved)}
 
 
-def antithetic_noise(key: PRNGKeyArray, pairs: int, count: int) -> Float[np.ndarray, "draws d"]:
-    """Standard normal draws, each with its mirror image: what is odd in the reward is seen without the even part."""
-    half = np.asarray(jax.random.normal(key, (pairs, count)), np.float64)
-    return np.concatenate([half, -half])
-
-
-def discriminator_loss(
-    discriminator: Network, logged: Float[Array, "batch pair"], simulated: Float[Array, "batch pair"]
-) -> Float[Array, ""]:
-    """Cross-entropy of logged (1) against simulated (0) pairs: its logit becomes log p_data(s, a) / p_sim(s, a)."""
-    return jax.nn.softplus(-discriminator(logged)).mean() + jax.nn.softplus(discriminator(simulated)).mean()
-
-
-def mean_rewards(
-    log_ratio: Float[np.ndarray, "steps draws rows"], valid: Bool[np.ndarray, "steps draws rows"]
-) -> Float[np.ndarray, " draws"]:
-    """Reward of each draw: the mean of log p_data / p_sim over the pairs it visited.
-
-    Its mean over draws is -KL(sim || data), and the part of the gradient that goes through p_sim is 0 on average, so
-    the bandit climbs down the divergence itself. The choice of this KL is ours. A draw of which no row survived gets
-    the lowest reward there is.
-    """
-    count = valid.sum((0, 2))
-    total = np.where(valid, np.clip(log_ratio, -REWARD_BOUND, REWARD_BOUND), 0.0).sum((0, 2))
-    rewards = total / np.maximum(count, 1)
-    return np.where(count, rewards, rewards[count > 0].min(initial=-REWARD_BOUND) if not count.all() else 0.0)
-
-
-def advantages(rewards: Float[np.ndarray, " draws"]) -> Float[np.ndarray, " draws"]:
-    """Rewards less their mean, over their deviation: the size of a step is that of its rate, whatever the units."""
-    return (rewards - rewards.mean()) / (rewards.std() + 1e-8)
-
-
-def natural_step(
-    distribution: Distribution,
-    noise: Float[np.ndarray, "draws d"],
-    advantage: Float[np.ndarray, " draws"],
-    *,
-    mean_rate: float,
-    std_rate: float,
-) -> Distribution:
-    """The bandit's policy gradient, preconditioned by the Fisher matrix of a Gaussian (Wierstra et al. 2014).
-
-    Score-function gradient of the expected reward: μ by A ε / σ, log σ by A (ε² - 1); the Fisher matrix is 1 / σ² and
-    2. So μ moves by σ E[A ε], log σ by ½ E[A (ε² - 1)].
-    """
-    weight = advantage[:, None] / len(advantage)
-    mean = distribution.mean + mean_rate * np.exp(distribution.log_std) * (weight * noise).sum(0)
-    log_std = distribution.log_std + 0.5 * std_rate * (weight * (noise**2 - 1.0)).sum(0)
-    return Distribution(mean, np.clip(log_std, *LOG_STD_RANGE))
-
-
 def _mean_std(distribution: Distribution) -> float:
     return float(np.exp(distribution.log_std).mean())
-
-
-@eqx.filter_jit
-def _log_ratio(discriminator: Network, pairs: Array) -> Array:
-    return discriminator(pairs)[..., 0]
-
-
-@eqx.filter_jit
-def _learn(
-    discriminator: Network,
-    optimiser_state: PyTree,
-    logged: Array,
-    rows: replay.Replay,
-    key: PRNGKeyArray,
-    *,
-    optimiser: optax.GradientTransformation,
-    batch: int,
-    count: int,
-) -> tuple[Network, PyTree, dict[str, Array]]:
-    """Updates of the discriminator on logged and simulated pairs."""
-
-    def update(carry: tuple[Network, PyTree], key: PRNGKeyArray) -> tuple[tuple[Network, PyTree], dict[str, Array]]:
-        of_logged, of_simulated = jax.random.split(key)
-        chosen = logged[jax.random.randint(of_logged, (batch,), 0, len(logged))]
-        simulated = replay.sample(rows, of_simulated, batch)["pair"]
-        loss, gradients = eqx.filter_value_and_grad(discriminator_loss)(carry[0], chosen, simulated)
-        return descend(optimiser, gradients, carry[1], carry[0]), {"discriminator_loss": loss}
-
-    (discriminator, optimiser_state), metrics = scan_updates(update, (discriminator, optimiser_state), key, count)
-    return discriminator, optimiser_state, metrics

@@ -1,0 +1,33 @@
+import json
+
+import numpy as np
+
+from madoc.calibration import CalibrationResult, ParameterEstimate
+
+
+def result(**changes):
+    parameters = {
+        "gravity": ParameterEstimate(-9.81, 0.02, -30.0, 0.0, "m/s²", [-9.85, -9.77]),
+        "body_mass.foot": ParameterEstimate(5.0, 0.1, 4.0, 6.0, "kg"),
+    }
+    told = {"covariance": np.diag([4e-4, 1e-2]).tolist(), "groups": [["gravity", "body_mass.foot"]]} | changes
+    return CalibrationResult("m", "hopper", "finished", "done", 1, 0.0, 0, parameters=parameters, **told)
+
+
+def test_what_is_known_of_the_spread_is_kept():
+    told = json.loads(json.dumps(result().to_json()))
+    assert told["covariance"] == [[4e-4, 0.0], [0.0, 1e-2]]
+    assert told["parameters"]["gravity"]["interval"] == [-9.85, -9.77]
+    assert CalibrationResult.from_json(told) == result()
+
+
+def test_what_is_not_known_is_left_out():
+    told = result(covariance=None).to_json()
+    assert "covariance" not in told
+    assert "error" not in told
+    assert "interval" not in told["parameters"]["body_mass.foot"]
+    assert CalibrationResult.from_json(told).covariance is None
+
+
+def test_intervals_have_a_column_of_their_own():
+    assert "[-9.850, -9.770]" in str(result())

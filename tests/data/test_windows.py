@@ -1,0 +1,33 @@
+import numpy as np
+import pytest
+from layouts import make_dataset
+
+from madoc.data.windows import first_rows, windows_at
+from madoc.errors import MadocError
+
+
+def test_windows_never_cross_the_end_of_an_episode(hopper):
+    dataset = make_dataset(hopper, lengths=(3, 1, 4), falls=())
+    np.testing.assert_array_equal(first_rows(dataset, np.arange(8), 3), [0, 4, 5])
+    np.testing.assert_array_equal(first_rows(dataset, np.arange(8), 1), np.arange(8))
+
+
+def test_windows_begin_only_where_a_state_can_be_rebuilt(hopper):
+    dataset = make_dataset(hopper, lengths=(3, 4), falls=())
+    rows = np.array([1, 3, 6])
+    np.testing.assert_array_equal(rows[first_rows(dataset, rows, 2)], [1, 3])
+
+
+def test_a_window_holds_what_was_done_and_seen(hopper):
+    dataset = make_dataset(hopper, lengths=(3, 4), falls=())
+    states = np.zeros((2, 12))
+    windows = windows_at(dataset, states, np.array([0, 4]), 2)
+    assert len(windows) == windows.steps == 2
+    np.testing.assert_array_equal(windows.actions[1], dataset.transitions.action[4:6])
+    np.testing.assert_array_equal(windows.following[0], dataset.transitions.next_observation[:2])
+
+
+def test_episodes_that_are_too_short_are_refused(hopper):
+    dataset = make_dataset(hopper, lengths=(3, 4), falls=())
+    with pytest.raises(MadocError, match=r"no stretch of 5 rows .* whose longest episode has 4 rows"):
+        first_rows(dataset, np.arange(7), 5)
