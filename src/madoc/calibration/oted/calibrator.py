@@ -74,8 +74,8 @@ class Oted:
 
     starts: Literal["logged", "policy"] = "logged"
     draws: int = 50
-    rows: int = 2
-    horizon: int = 20
+    rows: int = 4
+    horizon: int = 10
     updates: int = 50
     batch: int = 256
     mean_rate: float = 0.3
