@@ -19,7 +19,7 @@ import mujoco.rollout
 import numpy as np
 
 from madoc import tasks
-from madoc.calibration import CalibrationProblem, Madoc
+from madoc.calibration import CalibrationProblem, CalibrationResult, LeastSquares, Madoc, calibrate
 from madoc.calibration.madoc import grouping
 from madoc.data.targets import paper_truth
 from madoc.policies import SAC, PolicyProblem
@@ -41,6 +41,7 @@ def main() -> None:
     }
     rows["sac_updates_per_second"] = {f"{width}x2": round(1.0 / sac_update(width), 1) for width in (256, 128)}
     rows["sac_update_floor_ms"] = round(sac_flops(256, 17, 6) / rows["gflops"] / 1e6, 3)
+    rows["least_squares_hopper_1000_rows"] = least_squares(1000)
     rows["control_steps"] = {robot: stepping(robot) for robot in tasks.TASKS}
     text = json.dumps(rows, indent=1)
     print(text)
@@ -116,6 +117,25 @@ def sac_update(width: int) -> float:
         return jax.block_until_ready(learner._update(state.learner, state.replay, None, jax.random.key(1), count)[1])
 
     return best_of(run) / count
+
+
+def least_squares(rows: int) -> dict[str, float]:
+    """Hopper's 8 parameters from that many clean transitions: seconds, control steps and the error."""
+    simulator = CpuSimulator(tasks.hopper())
+    dataset = record_quality(simulator, "medium", transitions=rows, key=jax.random.key(0))
+    problem = CalibrationProblem(dataset, simulator)
+
+    def run() -> CalibrationResult:
+        return calibrate(
+            LeastSquares(), problem, key=jax.random.key(0), budget=1_000_000, truth=dataset.true_parameters
+        )
+
+    result = run()
+    return {
+        "seconds": round(best_of(run), 2),
+        "control_steps": result.control_steps,
+        "mean_absolute_error": result.error["mean_absolute"],
+    }
 
 
 def stepping(robot: str) -> dict[str, float]:
