@@ -8,6 +8,7 @@ already there are skipped, so a row that is missing was not run.
 
 import argparse
 import json
+from dataclasses import fields
 from pathlib import Path
 
 import jax
@@ -71,9 +72,8 @@ def main() -> None:
 
 
 def _estimate(path: Path):
-    fields = json.loads(path.read_text())
-    extra = ("commit", "starts", "quality", "transitions", "wall_seconds")
-    return CalibrationResult.from_json({name: value for name, value in fields.items() if name not in extra}).mean
+    row, known = json.loads(path.read_text()), {field.name for field in fields(CalibrationResult)}
+    return CalibrationResult.from_json({name: value for name, value in row.items() if name in known}).mean
 
 
 if __name__ == "__main__":

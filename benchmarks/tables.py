@@ -16,6 +16,12 @@ RESULTS = Path(__file__).parent / "results"
 PAPER_ERROR = {
     ("halfcheetah", "madoc"): 0.06,
     ("halfcheetah", "madoc-s"): 0.13,
+    ("hopper", "dropo"): 1.20,
+    ("halfcheetah", "dropo"): 0.78,
+    ("hopper", "droid"): 0.74,
+    ("halfcheetah", "droid"): 1.13,
+    ("hopper", "oted"): 0.42,
+    ("halfcheetah", "oted"): 0.28,
     ("hopper", "madoc"): 0.33,
     ("hopper", "madoc-s"): 0.34,
     ("walker2d", "madoc"): 0.18,
@@ -27,25 +33,35 @@ PAPER_ERROR = {
 
 def main() -> None:
     parts = ["# Measured\n\nMade by `python benchmarks/tables.py` from the files beside it.\n"]
-    parts += [calibration(), policies(), speed(), not_run()]
+    parts += [calibration(), disturbed(), policies(), speed(), not_run()]
     text = "\n".join(part for part in parts if part)
     (RESULTS / "README.md").write_text(text)
     print(text)
 
 
+def calibrations() -> list[dict]:
+    """Every calibration that was run, refused ones included."""
+    rows = [json.loads(path.read_text()) for path in sorted((RESULTS / "calibration").glob("*.json"))]
+    return [{"robot": row.get("task"), "data": "clean", "budget": 300_000} | row for row in rows]
+
+
+def label(row: dict) -> str:
+    """A method and where its rollouts start, if it can choose."""
+    return row["method"] if row["starts"] == "-" else f"{row['method']}, {row['starts']}"
+
+
 def calibration() -> str:
-    """Error of every (robot, method, starts, budget), median over seeds."""
+    """Error of every (robot, method, starts, budget) on clean data, median over seeds."""
     cells = defaultdict(list)
-    for path in sorted((RESULTS / "calibration").glob("*.json")):
-        row = json.loads(path.read_text())
-        budget = path.stem.rsplit("-", 2)[1]
-        cells[row["task"], row["quality"], row["method"], row["starts"], int(budget)].append(row)
+    for row in calibrations():
+        if row["data"] == "clean" and "error" in row:
+            cells[row["robot"], row["quality"], row["method"], row["starts"], row["budget"]].append(row)
     if not cells:
         return ""
     lines = [
         "## Calibration\n\n`python benchmarks/calibration.py` (see its options). Recorded legacy data, 200 000 rows. "
         "Mean absolute error in raw units, median (lowest to highest) over seeds; the paper's took 1e6 control steps. "
-        "Seconds are of one core.\n",
+        "Seconds are of one core, shared with other work where a method's vary.\n",
         "| robot | data | method | starts | control steps | seeds | error | % of range | paper | seconds | commit |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
@@ -57,10 +73,45 @@ def calibration() -> str:
         paper = PAPER_ERROR.get((robot, method), "")
         commits = ", ".join(sorted({row["commit"] for row in rows}))
         lines.append(
-            f"| {robot} | {quality} | {method} | {starts} | {steps:,} | {len(rows)} | {np.median(errors):.3f} "
-            f"({min(errors):.3f} to {max(errors):.3f}) | {percent:.2f} | {paper} | {seconds:.0f} | {commits} |"
+            f"| {robot} | {quality} | {method} | {starts} | {steps:,} | {len(rows)} | {shown(errors)} "
+            f"| {percent:.2f} | {paper} | {seconds:.0f} | {commits} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def shown(errors: list[float]) -> str:
+    """Median (lowest to highest), three decimals or, below them, three digits."""
+    median, low, high = np.median(errors), min(errors), max(errors)
+    return f"{median:.3f} ({low:.3f} to {high:.3f})" if median >= 1e-3 else f"{median:.1e} ({low:.1e} to {high:.1e})"
+
+
+def disturbed() -> str:
+    """Median error of every method on every kind of data, or that it refuses."""
+    cells, methods = defaultdict(list), {}
+    for row in calibrations():
+        cells[row["robot"], row["data"], row["budget"], label(row)].append(row)
+        if row["data"] != "clean":
+            methods[label(row)] = None
+    if not methods:
+        return ""
+    lines = [
+        "## Under disturbances\n\n`python benchmarks/calibration.py --data-is ...`. Median of the mean absolute error "
+        "over seeds. *refuses*: with a sentence, kept in the result. Empty: not run.\n",
+        f"| robot | data | budget | {' | '.join(methods)} |",
+        "|---" * (3 + len(methods)) + "|",
+    ]
+    for robot, data, budget in sorted({cell[:3] for cell in cells}):
+        columns = [cells.get((robot, data, budget, method), []) for method in methods]
+        if any(columns):
+            lines.append(f"| {robot} | {data} | {budget:,} | {' | '.join(map(_cell, columns))} |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(rows: list[dict]) -> str:
+    errors = [row["error"]["mean_absolute"] for row in rows if "error" in row]
+    if errors:
+        return shown(errors).partition(" ")[0]
+    return "refuses" if rows else ""
 
 
 def policies() -> str:

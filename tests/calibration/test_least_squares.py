@@ -224,7 +224,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(loss):
     for seed in range(100):
         noise = 0.02 * logged.next_observation.std(0) * np.random.default_rng(seed).standard_t(4, (300, 2))
         noisy = replace(clean, transitions=replace(logged, next_observation=logged.next_observation + noise))
-        method = LeastSquares(loss=loss, starts=1)
+        method = LeastSquares(loss=loss, searches=1)
         result = calibrate(method, CalibrationProblem(noisy, simulator), key=jax.random.key(seed), budget=100_000)
         spans = np.array([row.interval for row in result.parameters.values()])
         held.append((spans[:, 0] <= truth) & (truth <= spans[:, 1]))

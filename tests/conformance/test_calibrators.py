@@ -44,7 +44,7 @@ METHODS = {
     **{name: small(name) for name in CALIBRATORS if name.startswith("madoc")},
     "madoc, free running": small("madoc", starts="policy"),
     "madoc, replaying": small("madoc", starts="replay"),
-    "least-squares": LeastSquares(windows=6, search_windows=3, starts=2, search_epochs=2, tolerance=0.0),
+    "least-squares": LeastSquares(windows=6, search_windows=3, searches=2, search_epochs=2, tolerance=0.0),
     "least-squares, windows": LeastSquares(horizon=3, windows=4, search_windows=2, search_epochs=1, tolerance=0.0),
     "oted": Oted(draws=6, rows=2, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=2, cloning_updates=3),
     "oted, free running": Oted("policy", draws=4, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=0),

@@ -45,10 +45,10 @@ class LeastSquaresState:
         failures: Windows that exploded, each counted once in every system.
     """
 
-    unit: Float[np.ndarray, "starts d"]
-    damping: Float[np.ndarray, " starts"]
-    cost: Float[np.ndarray, " starts"]
-    moved: Float[np.ndarray, " starts"]
+    unit: Float[np.ndarray, "searches d"]
+    damping: Float[np.ndarray, " searches"]
+    cost: Float[np.ndarray, " searches"]
+    moved: Float[np.ndarray, " searches"]
     chosen: Int[np.ndarray, " windows"]
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
@@ -69,7 +69,7 @@ class LeastSquares:
         horizon: Control steps replayed from each logged state; the observation after every one of them counts.
         loss: `linear`, or a robust one (`huber`, `soft-l1`, `cauchy`) whose scale follows the residuals.
         windows: Logged states it starts from, at most; all there are if fewer.
-        starts: Searches: from mid-range, the others from random places. The best goes on.
+        searches: The first begins at mid-range, the others at random places. The best goes on.
         search_windows: Windows while searching.
         search_epochs: Epochs of searching, at most; it ends once the best search has settled.
         tolerance: Share of each range; a step that moves no parameter by more, nor by a tenth of its standard error,
@@ -79,13 +79,13 @@ class LeastSquares:
     horizon: int = 1
     loss: Loss = "cauchy"
     windows: int = 1000
-    starts: int = 3
+    searches: int = 3
     search_windows: int = 64
     search_epochs: int = 8
     tolerance: float = 1e-7
 
     def __post_init__(self) -> None:
-        check_at_least(self, horizon=1, windows=1, starts=1, search_windows=1, search_epochs=1, tolerance=0.0)
+        check_at_least(self, horizon=1, windows=1, searches=1, search_windows=1, search_epochs=1, tolerance=0.0)
 
     @property
     def name(self) -> str:
@@ -115,13 +115,13 @@ class LeastSquares:
                 f"with {task.observation_size} values for {count} parameters; give it more rows or fewer parameters"
             )
         order = jax.random.choice(of_windows, len(possible), (drawn,), replace=False)
-        unit = np.array(jax.random.uniform(of_starts, (self.starts, count), minval=-1.0, maxval=1.0), np.float64)
+        unit = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
         unit[0] = 0.0
         return LeastSquaresState(
             unit=unit,
-            damping=np.full(self.starts, FIRST_DAMPING),
-            cost=np.full(self.starts, ALL_FAILED),
-            moved=np.full(self.starts, 1.0 / _SMALLEST),
+            damping=np.full(self.searches, FIRST_DAMPING),
+            cost=np.full(self.searches, ALL_FAILED),
+            moved=np.full(self.searches, 1.0 / _SMALLEST),
             chosen=possible[np.asarray(order)],
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),
@@ -135,7 +135,7 @@ class LeastSquares:
         """One damped step of every search under way: two simulations, one of slopes, one of the steps tried."""
         searching = not state.refining
         windows = self._windows(problem, state)
-        running = self.starts if searching else 1
+        running = self.searches if searching else 1
         points = np.stack([difference_points(unit) for unit in state.unit[:running]])
         around = _simulate_each(problem, windows, points)
         unit, damping, cost, moved = (getattr(state, name).copy() for name in ("unit", "damping", "cost", "moved"))
