@@ -1,8 +1,8 @@
-"""One loop runs every method, calibrator or policy learner, under a budget of simulated control steps."""
+"""One loop runs every method, calibrator or policy learner, under a budget of control steps or of updates."""
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, Protocol, TypeVar
@@ -13,8 +13,8 @@ from madoc import checkpoint
 from madoc.errors import MadocError
 from madoc.interruption import interruptible
 from madoc.progress import Moment, display
-from madoc.run_folder import RunFolder, RunLog
-from madoc.types import Metrics
+from madoc.run_folder import RunFolder, RunLog, count_name
+from madoc.types import Metrics, Unit
 
 Problem = TypeVar("Problem", contravariant=True)
 State = TypeVar("State")
@@ -39,7 +39,7 @@ class Method(Protocol[Problem, State]):
         ...
 
     def control_steps(self, state: State) -> int:
-        """Simulated control steps spent so far."""
+        """Simulated control steps spent so far; 0 for ever where the method does not simulate."""
         ...
 
     def stage(self, state: State) -> str:
@@ -64,6 +64,7 @@ class Finished(Generic[State]):
         status: "finished" (budget spent), "converged", "interrupted" (by the user) or "diverged" (NaN).
         sentence: The status in words.
         control_steps: Simulated control steps spent.
+        spent: What the budget counts.
         seconds: Wall-clock time, that before a resume included.
     """
 
@@ -71,6 +72,7 @@ class Finished(Generic[State]):
     status: Status
     sentence: str
     control_steps: int
+    spent: int
     seconds: float
 
 
@@ -86,6 +88,8 @@ def run(
     description: str = "",
     shown: Sequence[str] = (),
     checkpoint_every: float = 30.0,
+    unit: Unit = "control steps",
+    spent: Callable[[State], int] | None = None,
 ) -> Finished[State]:
     """Run a method until its budget is spent, it has converged, the user stops it, or a NaN appears.
 
@@ -96,7 +100,7 @@ def run(
         method: What to run.
         problem: What to run it on.
         key: The only source of randomness; on resume, the same key again.
-        budget: Simulated control steps; the step that reaches it is the last.
+        budget: In `unit`; the step that reaches it is the last.
         folder: Where to write logs, checkpoints and `result.json`; None to write nothing.
         resume: Go on from the folder's checkpoint, or from the start if it was killed before the first one.
             A run that had ended comes back as it is, unless `budget` grew.
@@ -104,21 +108,24 @@ def run(
         description: What the progress bar is called.
         shown: Metrics shown beside the bar, at most three; the first three if none is named.
         checkpoint_every: Seconds between two checkpoints.
+        unit: What the budget counts.
+        spent: How many of them a state has spent; `method.control_steps` where it is None.
 
     Raises:
         MadocError: The budget is not positive, there is no folder to resume, the folder holds a run and
             `resume` is false, the checkpoint is damaged or another method's, or the state cannot be saved.
     """
     if budget < 1:
-        raise MadocError(f"expected a budget of at least 1 control step, got {budget}")
+        raise MadocError(f"expected a budget of at least 1 {unit.removesuffix('s')}, got {budget}")
     _check_folder(folder, resume)
     with ExitStack() as stack:
         interruption = stack.enter_context(interruptible())
-        session = _Session(method, budget, method.init(problem, key), folder, resume)
+        allowance = _Allowance(budget, unit, spent or method.control_steps)
+        session = _Session(method, allowance, method.init(problem, key), folder, resume)
         if session.ended(interruption.asked) and session.resumed:
             return session.finish()
         session.begin(stack)
-        show = stack.enter_context(display(description, unit="control steps", quiet=quiet))
+        show = stack.enter_context(display(description, unit=unit, quiet=quiet))
         show(session.moment({}))
         due = time.monotonic() + checkpoint_every
         while session.outcome is None:
@@ -137,17 +144,32 @@ def run(
         return session.finish()
 
 
+@dataclass(frozen=True)
+class _Allowance(Generic[State]):
+    """The budget, what it counts, and how many of them a state has spent."""
+
+    budget: int
+    unit: Unit
+    spent: Callable[[State], int]
+
+
 class _Session(Generic[State]):
     """A run under way: its state, and what of it is on the disk."""
 
     def __init__(
-        self, method: Method[Any, State], budget: int, state: State, folder: RunFolder | None, resume: bool
+        self,
+        method: Method[Any, State],
+        allowance: _Allowance[State],
+        state: State,
+        folder: RunFolder | None,
+        resume: bool,
     ) -> None:
         self.state = state
         self.resumed = resume and folder is not None and folder.checkpoint.exists()
         self.outcome: tuple[Status, str] | None = None
         self._method = method
-        self._budget = budget
+        self._allowance = allowance
+        self._budget, self._unit = allowance.budget, allowance.unit
         self._folder = folder
         self._layout = checkpoint.layout(state) if folder else {}
         self._log: RunLog | None = None
@@ -164,40 +186,44 @@ class _Session(Generic[State]):
     def control_steps(self) -> int:
         return int(self._method.control_steps(self.state))
 
+    @property
+    def spent(self) -> int:
+        return int(self._allowance.spent(self.state))
+
     def begin(self, stack: ExitStack) -> None:
         """Open the logs; write the first checkpoint, which refuses a bad state before any budget is spent."""
         self._started = time.monotonic()
         if self._folder:
             self._folder.result.unlink(missing_ok=True)
             self._folder.diverged.unlink(missing_ok=True)
-            self._log = stack.enter_context(self._folder.log(self._offset, self.control_steps))
+            self._log = stack.enter_context(self._folder.log(self._offset, self.spent, unit=self._unit))
         if not self.resumed:
             self.save()
 
     def ended(self, interrupted: bool) -> bool:
         """Whether there is a reason to stop; the first one found stays the reason."""
         if self.outcome is None:
-            steps = self.control_steps
+            spent = self.spent
             why = self._method.converged(self.state)
             if why is not None:
                 self.outcome = "converged", why
-            elif steps >= self._budget:
-                self.outcome = "finished", f"the budget of {self._budget:,} control steps is spent"
+            elif spent >= self._budget:
+                self.outcome = "finished", f"the budget of {self._budget:,} {self._unit} is spent"
             elif interrupted:
-                self.outcome = "interrupted", f"interrupted at {steps:,} of {self._budget:,} control steps"
+                self.outcome = "interrupted", f"interrupted at {spent:,} of {self._budget:,} {self._unit}"
         return self.outcome is not None
 
     def moment(self, metrics: Metrics) -> Moment:
         """Where the run stands, for the progress bar."""
         fraction = min(max(self._method.progress(self.state, self._budget), 0.0), 1.0)
-        return Moment(fraction, self.control_steps, self._method.stage(self.state), metrics)
+        return Moment(fraction, self.spent, self._method.stage(self.state), metrics)
 
     def take(self, state: State, metrics: Metrics, stage: str) -> Metrics:
         """Accept the result of a step, log it, and look at its metrics."""
         self.state = state
         metrics = {name: float(value) for name, value in metrics.items()}
         if self._log:
-            self._log.append(metrics, stage=stage, control_steps=self.control_steps, seconds=self._seconds())
+            self._log.append(metrics, stage=stage, spent=self.spent, seconds=self._seconds())
         for name, value in metrics.items():
             if not math.isfinite(value):
                 self._diverge(f"metric {name} became {value} while {stage}")
@@ -219,7 +245,7 @@ class _Session(Generic[State]):
 
     def abandon(self) -> None:
         """Stop inside a step. What it may have left half-changed is not saved: the last checkpoint stays."""
-        sentence = f"interrupted inside a step, at {self.control_steps:,} of {self._budget:,} control steps"
+        sentence = f"interrupted inside a step, at {self.spent:,} of {self._budget:,} {self._unit}"
         self.outcome = "interrupted", sentence
 
     def finish(self) -> Finished[State]:
@@ -227,7 +253,7 @@ class _Session(Generic[State]):
         if self.outcome is None:
             raise RuntimeError("finish() before the run has ended")
         status, sentence = self.outcome
-        finished = Finished(self.state, status, sentence, self.control_steps, self._seconds())
+        finished = Finished(self.state, status, sentence, self.control_steps, self.spent, self._seconds())
         if self._folder and not self._folder.result.exists():
             self._folder.write_json("result.json", {"status": status, "sentence": sentence} | self._extra())
         return finished
@@ -239,7 +265,7 @@ class _Session(Generic[State]):
             where = f"; the bad state is in {self._folder.diverged}"
             if self._folder.checkpoint.exists():
                 where += f", the last good one in {self._folder.checkpoint}"
-        self.outcome = "diverged", f"stopped at {self.control_steps:,} control steps: {what}{where}"
+        self.outcome = "diverged", f"stopped at {self.spent:,} {self._unit}: {what}{where}"
 
     def _seconds(self) -> float:
         """Wall-clock time so far, up to the moment the run ended."""
@@ -250,7 +276,7 @@ class _Session(Generic[State]):
         return self._earlier + self._stopped - self._started
 
     def _extra(self) -> dict[str, Any]:
-        return {"control_steps": self.control_steps, "seconds": self._seconds()}
+        return {"control_steps": self.control_steps, count_name(self._unit): self.spent, "seconds": self._seconds()}
 
 
 def _check_folder(folder: RunFolder | None, resume: bool) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from madoc.errors import MadocError
 from madoc.files import json_text, read_json, remove_leftovers, write_json
-from madoc.types import Metrics
+from madoc.types import Metrics, Unit
 
 _FREE = ("budget", "versions")
 """Keys of a spec that may differ when a run is resumed."""
@@ -115,9 +115,9 @@ class RunFolder:
         """Write a JSON file of this folder, whole or not at all."""
         write_json(self.path / name, value)
 
-    def log(self, offset: int, control_steps: int) -> "RunLog":
-        """The logs, cut back to a checkpoint's `offset` (bytes) and `control_steps`; 0, 0 for a new run."""
-        return RunLog(self.path, offset, control_steps)
+    def log(self, offset: int, spent: int, *, unit: Unit = "control steps") -> "RunLog":
+        """The logs, cut back to a checkpoint's `offset` (bytes) and what it had `spent`; 0, 0 for a new run."""
+        return RunLog(self.path, offset, spent, unit)
 
     def _agree_on(self, spec: dict[str, Any]) -> None:
         """Refuse another spec; note other versions; take the new budget."""
@@ -147,16 +147,17 @@ class RunFolder:
 class RunLog:
     """The growing logs of a run, `metrics.jsonl` and TensorBoard events; closed at the end of its block."""
 
-    def __init__(self, path: Path, offset: int, control_steps: int) -> None:
+    def __init__(self, path: Path, offset: int, spent: int, unit: Unit) -> None:
         """Use `RunFolder.log`."""
         from tensorboardX import SummaryWriter  # slow to import, and only runs with a folder need it
 
+        self._count = count_name(unit)
         self._lines = _cut(path / "metrics.jsonl", offset).open("ab")
         events = path / "tensorboard"
         events.mkdir(exist_ok=True)
         self._events = SummaryWriter(
             str(events),
-            purge_step=control_steps + 1,
+            purge_step=spent + 1,
             # Two writers in one second would share, and so overwrite, a file.
             filename_suffix=f".{len(list(events.iterdir()))}",
         )
@@ -170,11 +171,11 @@ class RunLog:
         self._lines.close()
         self._events.close()
 
-    def append(self, metrics: Metrics, *, stage: str, control_steps: int, seconds: float) -> None:
+    def append(self, metrics: Metrics, *, stage: str, spent: int, seconds: float) -> None:
         """Add one epoch. A NaN or infinite metric is logged as null."""
         finite = {name: value if np.isfinite(value) else None for name, value in metrics.items()}
         line = {
-            "control_steps": control_steps,
+            self._count: spent,
             "seconds": round(seconds, 3),
             "stage": stage,
             "metrics": finite,
@@ -183,7 +184,7 @@ class RunLog:
         self._lines.flush()
         for name, value in finite.items():
             if value is not None:
-                self._events.add_scalar(f"{stage}/{name}", value, control_steps)
+                self._events.add_scalar(f"{stage}/{name}", value, spent)
 
     def sync(self) -> int:
         """Put all lines on the disk; the length of `metrics.jsonl` in bytes, for the checkpoint."""
@@ -191,6 +192,11 @@ class RunLog:
         os.fsync(self._lines.fileno())
         self._events.flush()
         return self._lines.tell()
+
+
+def count_name(unit: Unit) -> str:
+    """What JSON calls a count of that unit: `control_steps`, `updates`."""
+    return unit.replace(" ", "_")
 
 
 def versions() -> dict[str, str]:

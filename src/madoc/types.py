@@ -2,13 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Literal, Protocol, TypeVar
 
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 Method = TypeVar("Method", covariant=True)
+
+Unit = Literal["control steps", "updates"]
+"""What a budget counts: simulated control steps, or gradient updates where a method does not simulate."""
 
 Metrics = dict[str, float]
 """Scalars worth looking at, by name. Never needed by the next step."""
@@ -49,9 +52,10 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class MethodEntry(Generic[Method]):
-    """A line of `madoc methods`: `make` takes the method's hyperparameters as keywords."""
+    """A line of `madoc methods`: `make` takes the method's hyperparameters as keywords, `unit` is its budget's."""
 
     make: Callable[..., Method]
     summary: str
     paper: str
     year: int
+    unit: Unit = "control steps"

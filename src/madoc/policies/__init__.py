@@ -3,9 +3,11 @@
 from functools import partial
 
 from madoc.policies.base import PolicyLearner, PolicyProblem
+from madoc.policies.bc import BC
 from madoc.policies.files import load_policy, save_policy
 from madoc.policies.learn import LearnedPolicy, learn_policy
 from madoc.policies.sac import SAC
+from madoc.policies.systems import NormalParameters, ParameterDistribution, UniformParameters
 from madoc.types import MethodEntry
 
 LEARNERS: dict[str, MethodEntry[PolicyLearner]] = {
@@ -16,14 +18,25 @@ LEARNERS: dict[str, MethodEntry[PolicyLearner]] = {
         "Jiang et al., Madoc",
         2024,
     ),
+    "dr-bc": MethodEntry(
+        partial(SAC, cloning=2.5, randomize=True),
+        "SAC over the whole box, cloning the data's actions too",
+        "Tobin et al., Domain Randomization",
+        2017,
+    ),
+    "bc": MethodEntry(BC, "Clones the data's policy", "Pomerleau, ALVINN", 1988, "updates"),
 }
 
 __all__ = [
+    "BC",
     "LEARNERS",
     "SAC",
     "LearnedPolicy",
+    "NormalParameters",
+    "ParameterDistribution",
     "PolicyLearner",
     "PolicyProblem",
+    "UniformParameters",
     "learn_policy",
     "load_policy",
     "save_policy",

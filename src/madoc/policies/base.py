@@ -1,16 +1,20 @@
 """What a policy learner is given, and what it must offer."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.data import Dataset
 from madoc.errors import MadocError
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.policies.systems import ParameterDistribution
 from madoc.simulation.base import Simulator
-from madoc.types import Metrics
+from madoc.types import Metrics, Unit
 
 State = Any
 
@@ -19,24 +23,79 @@ State = Any
 class PolicyProblem:
     """Learn a policy in these systems.
 
+    The data's true parameters, where it carries any, are dropped here: no method can read them.
+
     Attributes:
         simulator: The source domain.
-        parameters: Physical values, one system a row; a vector (d,) is one system.
+        parameters: Physical values, one system a row; a vector (d,) is one system. Or a distribution, and systems
+            are drawn from it.
         dataset: Logged transitions, for learners that use them.
+
+    Raises:
+        MadocError: Parameters or data are another robot's.
     """
 
     simulator: Simulator
-    parameters: Float[np.ndarray, "systems parameters"]
+    parameters: Float[np.ndarray, "systems parameters"] | ParameterDistribution
     dataset: Dataset | None = None
 
     def __post_init__(self) -> None:
-        values = np.atleast_2d(np.asarray(self.parameters, dtype=np.float64))
-        if values.shape[1] != len(self.simulator.parameters):
-            raise MadocError(
-                f"expected {len(self.simulator.parameters)} parameter values for {self.simulator.task.name}, "
-                f"got {values.shape[1]}"
-            )
-        object.__setattr__(self, "parameters", values)
+        task = self.simulator.task
+        fixed = None if hasattr(self.parameters, "draw") else np.atleast_2d(np.asarray(self.parameters, np.float64))
+        size = self.parameters.size if fixed is None else fixed.shape[1]
+        if size != len(self.simulator.parameters):
+            raise MadocError(f"expected {len(self.simulator.parameters)} parameter values for {task.name}, got {size}")
+        if fixed is not None:
+            object.__setattr__(self, "parameters", fixed)
+        if self.dataset is not None:
+            if self.dataset.task_name != task.name:
+                raise MadocError(f"the data was recorded from {self.dataset.task_name}, the simulator is {task.name}")
+            object.__setattr__(self, "dataset", replace(self.dataset, true_parameters=None))
+
+    @cached_property
+    def logged(self) -> dict[str, Array]:
+        """The columns of the dataset that learners use, on the device, float32: what `replay.sample` gives of rows.
+
+        Raises:
+            MadocError: There is no dataset.
+        """
+        if self.dataset is None:
+            raise MadocError("this problem has no data; give it a dataset")
+        rows = self.dataset.transitions
+        columns = ("observation", "action", "reward", "next_observation", "terminated")
+        return {name: jnp.asarray(getattr(rows, name), jnp.float32) for name in columns}
+
+    def systems(self, key: PRNGKeyArray, count: int) -> Float[np.ndarray, "systems parameters"]:
+        """Physical values of the systems to act in next: the fixed ones, or `count` fresh draws."""
+        fixed = self.parameters
+        return fixed if isinstance(fixed, np.ndarray) else fixed.draw(key, count)
+
+
+def require_data(problem: PolicyProblem, learner: str, *, rows: int, rewards: bool = True) -> Dataset:
+    """The dataset, refused where a learner could not use it.
+
+    Raises:
+        MadocError: There is none, it has fewer than `rows` rows, or `rewards` are needed and all of them are 0.
+    """
+    if problem.dataset is None:
+        raise MadocError(f"{learner} learns from logged data: give it a dataset")
+    if len(problem.dataset) < rows:
+        raise MadocError(
+            f"{learner} needs at least as many rows as a batch has, {rows}, got {len(problem.dataset)} in "
+            f"{problem.dataset.origin}; give it more data or a smaller batch"
+        )
+    if rewards and not np.any(problem.dataset.transitions.reward):
+        raise MadocError(
+            f"{learner} learns from logged rewards, and every reward in {problem.dataset.origin} is 0; "
+            "use bc, or a learner that takes its rewards from the simulator"
+        )
+    return problem.dataset
+
+
+def draw_rows(logged: dict[str, Array], key: PRNGKeyArray, batch: int) -> dict[str, Array]:
+    """`batch` logged rows, uniformly with replacement."""
+    rows = jax.random.randint(key, (batch,), 0, len(logged["reward"]))
+    return {name: column[rows] for name, column in logged.items()}
 
 
 class PolicyLearner(Protocol):
@@ -50,6 +109,21 @@ class PolicyLearner(Protocol):
     @property
     def shown(self) -> tuple[str, ...]:
         """Metrics worth a place beside the progress bar."""
+        ...
+
+    @property
+    def unit(self) -> Unit:
+        """What its budget counts: `control steps` if it simulates, else `updates`."""
+        ...
+
+    @property
+    def needs_data(self) -> bool:
+        """Whether it uses the dataset."""
+        ...
+
+    @property
+    def needs_parameters(self) -> bool:
+        """Whether the problem's parameters make a difference to it."""
         ...
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> State:
@@ -66,6 +140,10 @@ class PolicyLearner(Protocol):
 
     def control_steps(self, state: State) -> int:
         """Simulated control steps spent."""
+        ...
+
+    def spent(self, state: State) -> int:
+        """What the budget counts: control steps, or updates where it does not simulate."""
         ...
 
     def stage(self, state: State) -> str:

@@ -8,7 +8,7 @@ from madoc import loop
 from madoc.policies.base import PolicyLearner, PolicyProblem
 from madoc.policies.files import save_policy
 from madoc.run_folder import RunFolder
-from madoc.types import Policy
+from madoc.types import Policy, Unit
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,8 @@ class LearnedPolicy:
         status: As `loop.Finished` has it.
         sentence: The status in words.
         control_steps: Simulated control steps spent.
+        spent: How much of the budget, in `unit`.
+        unit: What the budget counted: control steps of a learner that simulates, updates of one that does not.
         seconds: Wall-clock time.
     """
 
@@ -27,6 +29,8 @@ class LearnedPolicy:
     status: str
     sentence: str
     control_steps: int
+    spent: int
+    unit: Unit
     seconds: float
 
 
@@ -41,7 +45,10 @@ def learn_policy(
     quiet: bool = True,
     checkpoint_every: float = 60.0,
 ) -> LearnedPolicy:
-    """Learn in the problem's systems until the budget of control steps is spent.
+    """Learn until the budget is spent.
+
+    The budget is simulated control steps for a learner that simulates and gradient updates for one that does not:
+    `method.unit` says which. With one update per control step, a budget means as many updates for either.
 
     With a folder, `policy.npz` is left there: `madoc.numpy_policy` acts from it without JAX.
 
@@ -59,8 +66,18 @@ def learn_policy(
         description=f"{method.name} on {problem.simulator.task.name}",
         shown=method.shown,
         checkpoint_every=checkpoint_every,
+        unit=method.unit,
+        spent=method.spent,
     )
     policy = method.policy(finished.state)
     if folder is not None:
         save_policy(policy, folder.path / "policy.npz", task_name=problem.simulator.task.name)
-    return LearnedPolicy(policy, finished.status, finished.sentence, finished.control_steps, round(finished.seconds, 3))
+    return LearnedPolicy(
+        policy,
+        finished.status,
+        finished.sentence,
+        finished.control_steps,
+        finished.spent,
+        method.unit,
+        round(finished.seconds, 3),
+    )

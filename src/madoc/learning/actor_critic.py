@@ -1,0 +1,159 @@
+"""A tanh-Gaussian actor, twin critics and a learnt temperature, and one gradient step of each."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from madoc.learning import sac_losses
+from madoc.learning.networks import adam, descend, moving_average
+from madoc.learning.sac_losses import TwinCritic
+from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
+
+Batch = dict[str, Array]
+"""Rows as `replay.sample` gives them: observation, action, reward, next_observation, terminated."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ActorCritic:
+    """What gradient updates change."""
+
+    policy: TanhGaussianPolicy
+    critic: TwinCritic
+    target_critic: TwinCritic
+    log_temperature: Float[Array, ""]
+    policy_optimiser: PyTree
+    critic_optimiser: PyTree
+    temperature_optimiser: PyTree
+
+
+@dataclass(frozen=True)
+class Descent:
+    """How it changes them.
+
+    Attributes:
+        policy: Of the policy, and of the temperature.
+        critic: Of the critics.
+        target_rate: τ of the target critics.
+    """
+
+    policy: optax.GradientTransformation
+    critic: optax.GradientTransformation
+    target_rate: float
+
+    @classmethod
+    def by_adam(cls, *, policy: float, critic: float, target_rate: float) -> "Descent":
+        """Adam with these learning rates."""
+        return cls(adam(policy), adam(critic), target_rate)
+
+
+def fresh(
+    observation: int,
+    action: int,
+    *,
+    hidden: tuple[int, ...],
+    critic_hidden: tuple[int, ...] | None = None,
+    descent: Descent,
+    key: PRNGKeyArray,
+) -> ActorCritic:
+    """New networks for so many observations and actions, temperature 1; `critic_hidden` None is `hidden`."""
+    of_policy, of_critic = jax.random.split(key)
+    policy = TanhGaussianPolicy(observation, action, hidden, key=of_policy)
+    critic = TwinCritic(observation + action, hidden if critic_hidden is None else critic_hidden, key=of_critic)
+    log_temperature = jnp.zeros(())
+    return ActorCritic(
+        policy,
+        critic,
+        jax.tree.map(lambda leaf: leaf.copy() if eqx.is_array(leaf) else leaf, critic),
+        log_temperature,
+        descent.policy.init(eqx.filter(policy, eqx.is_array)),
+        descent.critic.init(eqx.filter(critic, eqx.is_array)),
+        descent.policy.init(log_temperature),
+    )
+
+
+def bellman_target(
+    learner: ActorCritic, batch: Batch, key: PRNGKeyArray, *, discount: float, entropy: bool = True
+) -> Float[Array, " rows"]:
+    """Where the critics of a batch should go; without `entropy`, the backup leaves out -α log π."""
+    following = batch["next_observation"]
+    action, density = sample(*learner.policy.distribution(following), key)
+    return sac_losses.soft_target(
+        batch["reward"],
+        batch["terminated"],
+        jnp.minimum(*learner.target_critic(following, action)),
+        density,
+        temperature=jnp.exp(learner.log_temperature) if entropy else jnp.zeros(()),
+        discount=discount,
+    )
+
+
+def critic_step(
+    learner: ActorCritic, loss_of: Callable[[TwinCritic], Array], descent: Descent
+) -> tuple[ActorCritic, Float[Array, ""]]:
+    """One step of the critics down a loss, and of the target critics behind them; the loss before it."""
+    loss, gradients = eqx.filter_value_and_grad(loss_of)(learner.critic)
+    critic, optimiser = descend(descent.critic, gradients, learner.critic_optimiser, learner.critic)
+    target_critic = moving_average(learner.target_critic, critic, descent.target_rate)
+    learner = eqx.tree_at(
+        lambda parts: (parts.critic, parts.target_critic, parts.critic_optimiser),
+        learner,
+        (critic, target_critic, optimiser),
+    )
+    return learner, loss
+
+
+def actor_step(
+    learner: ActorCritic,
+    observation: Float[Array, "rows observation"],
+    key: PRNGKeyArray,
+    descent: Descent,
+    combine: Callable[[TanhGaussianPolicy, Array, Array], Array] = lambda policy, loss, value: loss,
+) -> tuple[ActorCritic, dict[str, Array]]:
+    """One step of the policy and of the temperature.
+
+    Args:
+        learner: What to improve.
+        observation: Where to improve it.
+        key: Of the sampled actions.
+        descent: How.
+        combine: (policy, SAC's loss, value of each row) -> what the policy descends. SAC's loss alone by default.
+    """
+
+    def loss_of(policy: TanhGaussianPolicy) -> tuple[Array, tuple[Array, Array]]:
+        loss, (value, density) = sac_losses.actor_loss(
+            policy, learner.critic, observation, temperature=jnp.exp(learner.log_temperature), key=key
+        )
+        return combine(policy, loss, value), (loss, density)
+
+    (_, (loss, density)), gradients = eqx.filter_value_and_grad(loss_of, has_aux=True)(learner.policy)
+    policy, policy_optimiser = descend(descent.policy, gradients, learner.policy_optimiser, learner.policy)
+    target_entropy = -float(len(policy.network.layers[-1].weight) // 2)
+    slope = jax.grad(sac_losses.temperature_loss)(learner.log_temperature, density, target_entropy)
+    log_temperature, temperature_optimiser = descend(
+        descent.policy, slope, learner.temperature_optimiser, learner.log_temperature
+    )
+    learner = eqx.tree_at(
+        lambda parts: (parts.policy, parts.policy_optimiser, parts.log_temperature, parts.temperature_optimiser),
+        learner,
+        (policy, policy_optimiser, log_temperature, temperature_optimiser),
+    )
+    return learner, {"actor_loss": loss, "entropy": -density.mean(), "temperature": jnp.exp(log_temperature)}
+
+
+def soft_critic_step(
+    learner: ActorCritic, batch: Batch, key: PRNGKeyArray, descent: Descent, *, discount: float
+) -> tuple[ActorCritic, dict[str, Array]]:
+    """SAC's own step of the critics."""
+    target = bellman_target(learner, batch, key, discount=discount)
+    learner, loss = critic_step(
+        learner,
+        lambda critic: sac_losses.critic_loss(critic, batch["observation"], batch["action"], target),
+        descent,
+    )
+    return learner, {"critic_loss": loss, "value_target": target.mean()}

@@ -1,0 +1,106 @@
+"""Acting in simulated systems and remembering what came of it: what learners that simulate share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from madoc.errors import MadocError
+from madoc.learning import replay
+from madoc.policies.base import PolicyProblem
+from madoc.simulation.rollout import Rollout, Walkers, begin, reset_states, roll
+from madoc.types import Policy
+
+COLUMNS: Sequence[str] = ("observation", "action", "reward", "next_observation", "terminated")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Interaction:
+    """What acting carries: what was seen, where the rows stand, and what it has cost."""
+
+    replay: replay.Replay
+    walkers: Walkers
+    episode_return: Float[np.ndarray, "systems rows"]
+    control_steps: int
+    failures: int
+
+
+def start_acting(problem: PolicyProblem, key: PRNGKeyArray, *, environments: int, capacity: int) -> Interaction:
+    """An empty replay, and rows at reset states, spread evenly over the systems.
+
+    Raises:
+        MadocError: The environments do not fill the systems.
+    """
+    simulator = problem.simulator
+    systems = len(problem.systems(key, environments))
+    if environments % systems:
+        raise MadocError(f"expected a multiple of {systems} environments for {systems} systems, got {environments}")
+    observation, action = (simulator.task.observation_size,), (simulator.action_size,)
+    ring = replay.empty(
+        capacity, observation=observation, action=action, reward=(), next_observation=observation, terminated=()
+    )
+    walkers = begin(reset_states(simulator), key, systems=systems, rows=environments // systems)
+    return Interaction(ring, walkers, np.zeros(walkers.age.shape), 0, 0)
+
+
+def act_on(
+    problem: PolicyProblem, state: Interaction, policy: Policy, key: PRNGKeyArray, *, control_steps: int
+) -> tuple[Interaction, dict[str, float]]:
+    """Act for so many control steps in all. Where parameters are distributed, all systems are drawn anew first.
+
+    A row goes on in its new system from where it stood in the old one, as the paper's own rollouts do when
+    parameters change inside an episode.
+
+    Returns:
+        What is carried now, and the mean return of the episodes that ended, if any did.
+    """
+    of_systems, of_action, of_restart = jax.random.split(key, 3)
+    simulator = problem.simulator
+    rollout, walkers = roll(
+        simulator.bind(problem.systems(of_systems, state.walkers.age.size)),
+        simulator.task,
+        policy,
+        state.walkers,
+        steps=control_steps // state.walkers.age.size,
+        starts=reset_states(simulator),
+        key=of_action,
+        restart_key=of_restart,
+    )
+    rows = {name: replay.flatten_rows(getattr(rollout.transitions, name), 3) for name in COLUMNS}
+    finished, episode_return = _episode_returns(rollout, state.episode_return)
+    following = Interaction(
+        replay.add(state.replay, rows, rollout.valid.reshape(-1)),
+        walkers,
+        episode_return,
+        state.control_steps + rollout.valid.size,
+        state.failures + rollout.failures,
+    )
+    metrics = {"failures": float(following.failures)}
+    return following, metrics | ({"return_in_simulator": float(finished.mean())} if len(finished) else {})
+
+
+class UniformPolicy(eqx.Module):
+    """What explores before the first update: uniform random actions in [-1, 1]; 0 without a key."""
+
+    action_size: int = eqx.field(static=True)
+
+    def __call__(self, observation: Array, key: PRNGKeyArray | None = None) -> Array:
+        """Actions for a batch of observations."""
+        shape = (*observation.shape[:-1], self.action_size)
+        return jnp.zeros(shape) if key is None else jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+
+
+def _episode_returns(rollout: Rollout, running: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns of the episodes that ended in a rollout, and the running sums of those that did not."""
+    finished = []
+    seen = rollout.transitions
+    for reward, ended, valid in zip(seen.reward, seen.terminated | seen.truncated, rollout.valid, strict=True):
+        running = running + np.where(valid, reward, 0.0)
+        finished.append(running[ended])
+        running = np.where(ended | ~valid, 0.0, running)
+    return np.concatenate(finished), running
