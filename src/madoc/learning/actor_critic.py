@@ -94,10 +94,19 @@ def bellman_target(
 
 
 def critic_step(
-    learner: ActorCritic, loss_of: Callable[[TwinCritic], Array], descent: Descent
-) -> tuple[ActorCritic, Float[Array, ""]]:
-    """One step of the critics down a loss, and of the target critics behind them; the loss before it."""
-    loss, gradients = eqx.filter_value_and_grad(loss_of)(learner.critic)
+    learner: ActorCritic, loss_of: Callable[[TwinCritic], tuple[Array, Array]], descent: Descent
+) -> tuple[ActorCritic, tuple[Float[Array, ""], Float[Array, ""]]]:
+    """One step of the critics down a loss, and of the target critics behind them.
+
+    Args:
+        learner: What to improve.
+        loss_of: critic -> its loss, and a part of it worth watching.
+        descent: How.
+
+    Returns:
+        The learner, and both numbers as they were before the step.
+    """
+    (loss, part), gradients = eqx.filter_value_and_grad(loss_of, has_aux=True)(learner.critic)
     critic, optimiser = descend(descent.critic, gradients, learner.critic_optimiser, learner.critic)
     target_critic = moving_average(learner.target_critic, critic, descent.target_rate)
     learner = eqx.tree_at(
@@ -105,7 +114,7 @@ def critic_step(
         learner,
         (critic, target_critic, optimiser),
     )
-    return learner, loss
+    return learner, (loss, part)
 
 
 def actor_step(
@@ -151,9 +160,10 @@ def soft_critic_step(
 ) -> tuple[ActorCritic, dict[str, Array]]:
     """SAC's own step of the critics."""
     target = bellman_target(learner, batch, key, discount=discount)
-    learner, loss = critic_step(
-        learner,
-        lambda critic: sac_losses.critic_loss(critic, batch["observation"], batch["action"], target),
-        descent,
-    )
+
+    def loss_of(critic: TwinCritic) -> tuple[Array, Array]:
+        loss = sac_losses.critic_loss(critic, batch["observation"], batch["action"], target)
+        return loss, loss
+
+    learner, (loss, _) = critic_step(learner, loss_of, descent)
     return learner, {"critic_loss": loss, "value_target": target.mean()}

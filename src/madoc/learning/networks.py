@@ -46,6 +46,19 @@ class Network(eqx.Module):
         return rows
 
 
+def stack(count: int, make: Callable[[PRNGKeyArray], Carry], key: PRNGKeyArray) -> Carry:
+    """`count` modules of one shape as one, with a leading axis on every array."""
+    return eqx.filter_vmap(make)(jax.random.split(key, count))
+
+
+def map_stack(
+    apply: Callable[[Carry, Array], Array], stacked: Carry, inputs: Float[Array, "members *rows"] | None = None
+) -> Array:
+    """Apply each module of a stack, one after the other, each to its own inputs: plain products, the fastest on a CPU."""
+    arrays, static = eqx.partition(stacked, eqx.is_array)
+    return jax.lax.map(lambda parts: apply(eqx.combine(parts[0], static), parts[1]), (arrays, inputs))
+
+
 def scan_updates(
     update: Callable[[Carry, PRNGKeyArray], tuple[Carry, dict[str, Array]]],
     carry: Carry,

@@ -4,8 +4,11 @@ from functools import partial
 
 from madoc.policies.base import PolicyLearner, PolicyProblem
 from madoc.policies.bc import BC
+from madoc.policies.cql import CQL
 from madoc.policies.files import load_policy, save_policy
+from madoc.policies.h2o import H2O
 from madoc.policies.learn import LearnedPolicy, learn_policy
+from madoc.policies.morec import MOREC
 from madoc.policies.sac import SAC
 from madoc.policies.systems import NormalParameters, ParameterDistribution, UniformParameters
 from madoc.types import MethodEntry
@@ -25,11 +28,19 @@ LEARNERS: dict[str, MethodEntry[PolicyLearner]] = {
         2017,
     ),
     "bc": MethodEntry(BC, "Clones the data's policy", "Pomerleau, ALVINN", 1988, "updates"),
+    "cql": MethodEntry(CQL, "Conservative values, from the data alone", "Kumar et al., CQL", 2020, "updates"),
+    "morec": MethodEntry(
+        MOREC, "A learnt model, kept to transitions that look real", "Luo et al., MOREC", 2024, "updates"
+    ),
+    "h2o": MethodEntry(H2O, "Logged and simulated rows, trusted by their dynamics", "Niu et al., H2O", 2022),
 }
 
 __all__ = [
     "BC",
+    "CQL",
+    "H2O",
     "LEARNERS",
+    "MOREC",
     "SAC",
     "LearnedPolicy",
     "NormalParameters",

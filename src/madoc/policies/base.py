@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.data import Dataset
 from madoc.errors import MadocError
+from madoc.learning.features import Features
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.systems import ParameterDistribution
 from madoc.simulation.base import Simulator
@@ -59,11 +60,24 @@ class PolicyProblem:
         Raises:
             MadocError: There is no dataset.
         """
-        if self.dataset is None:
-            raise MadocError("this problem has no data; give it a dataset")
-        rows = self.dataset.transitions
+        rows = self._data.transitions
         columns = ("observation", "action", "reward", "next_observation", "terminated")
         return {name: jnp.asarray(getattr(rows, name), jnp.float32) for name in columns}
+
+    @cached_property
+    def features(self) -> Features:
+        """How networks see the data's (s, a) and s'.
+
+        Raises:
+            MadocError: There is no dataset.
+        """
+        return Features.of(self._data.transitions)
+
+    @property
+    def _data(self) -> Dataset:
+        if self.dataset is None:
+            raise MadocError("this problem has no data; give it a dataset")
+        return self.dataset
 
     def systems(self, key: PRNGKeyArray, count: int) -> Float[np.ndarray, "systems parameters"]:
         """Physical values of the systems to act in next: the fixed ones, or `count` fresh draws."""

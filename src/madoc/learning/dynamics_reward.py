@@ -1,0 +1,145 @@
+"""The dynamics reward of MOREC (Luo et al. 2024, arXiv 2310.05422): how real a transition looks, learnt by opposition.
+
+The authors never published how they train it. What they say of it: inverse reinforcement learning of a dynamics agent
+whose "policy" is the transition, in the manner of GAIL (Ho & Ermon 2016, arXiv 1606.03476), with an ensemble of past
+discriminators. Chosen here: as the agent's action, the next state, earns its reward at once, the generator climbs the
+reward's own gradient through its sample, without a reinforcement learner; and discriminators see blurred next states,
+without which they would tell a deterministic simulator from any model at once.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from madoc.learning.dynamics_ensemble import Ensemble
+from madoc.learning.networks import Network, descend, map_stack, scan_updates, stack
+
+SURE = 0.999
+"""Largest mean probability that counts; the authors'."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Opposition:
+    """A generator of transitions, the discriminator against it, and past discriminators.
+
+    Attributes:
+        generator: A dynamics model, an ensemble of one.
+        discriminator: (s, a, change of s) -> logit that it is real.
+        past: A stack of earlier discriminators, the newest last: together they are the reward.
+        generator_optimiser: State of its optimiser.
+        discriminator_optimiser: State of its optimiser.
+    """
+
+    generator: Ensemble
+    discriminator: Network
+    past: Network
+    generator_optimiser: PyTree
+    discriminator_optimiser: PyTree
+
+
+def opposition(
+    generator: Ensemble,
+    pair: int,
+    change: int,
+    *,
+    hidden: tuple[int, ...],
+    members: int,
+    optimiser: optax.GradientTransformation,
+    key: PRNGKeyArray,
+) -> Opposition:
+    """The start of it."""
+    discriminator = Network(pair + change, 1, hidden, key=key)
+    return Opposition(
+        generator,
+        discriminator,
+        stack(members, lambda _: discriminator, key),
+        *(optimiser.init(eqx.filter(net, eqx.is_array)) for net in (generator, discriminator)),
+    )
+
+
+def logit(
+    discriminator: Network, pair: Float[Array, "*rows pair"], change: Float[Array, "*rows change"]
+) -> Float[Array, "*rows"]:
+    """Log D / (1 - D) that a transition is real."""
+    return discriminator(jnp.concatenate([pair, change], axis=-1))[..., 0]
+
+
+def telling_loss(real: Float[Array, " rows"], generated: Float[Array, " rows"]) -> Float[Array, ""]:
+    """The discriminator's: mean of -log D on real transitions and of -log(1 - D) on generated ones, from logits."""
+    return jax.nn.softplus(-real).mean() + jax.nn.softplus(generated).mean()
+
+
+def deceiving_loss(generated: Float[Array, " rows"]) -> Float[Array, ""]:
+    """The generator's: minus the mean reward -log(1 - D), from logits."""
+    return -jax.nn.softplus(generated).mean()
+
+
+def dynamics_reward(logits: Float[Array, "members *rows"]) -> Float[Array, "*rows"]:
+    """R = -log(1 - mean D) over past discriminators; 0.69 where they cannot tell."""
+    return -jnp.log1p(-jnp.minimum(jax.nn.sigmoid(logits).mean(0), SURE))
+
+
+def reward_of(
+    past: Network, pair: Float[Array, "*rows pair"], change: Float[Array, "*rows change"]
+) -> Float[Array, "*rows"]:
+    """Dynamics reward of transitions."""
+    return dynamics_reward(map_stack(lambda member, _: logit(member, pair, change), past))
+
+
+def remember(opposition: Opposition) -> Opposition:
+    """The newest discriminator in, the oldest out."""
+
+    def shifted(past: Array, newest: Array) -> Array:
+        return jnp.concatenate([past[1:], newest[None]]) if eqx.is_array(past) else past
+
+    return eqx.tree_at(
+        lambda parts: parts.past, opposition, jax.tree.map(shifted, opposition.past, opposition.discriminator)
+    )
+
+
+def oppose(
+    opposition: Opposition,
+    rows: tuple[Float[Array, "rows pair"], Float[Array, "rows change"]],
+    key: PRNGKeyArray,
+    *,
+    optimiser: optax.GradientTransformation,
+    batch: int,
+    count: int,
+    noise: float,
+) -> tuple[Opposition, dict[str, Array]]:
+    """`count` updates of discriminator and generator, in turns; the discriminator is then remembered."""
+
+    def update(carry: Opposition, key: PRNGKeyArray) -> tuple[Opposition, dict[str, Array]]:
+        of_rows, of_sample, of_real, of_generated = jax.random.split(key, 4)
+        drawn = jax.random.randint(of_rows, (batch,), 0, len(rows[0]))
+        pair, change = rows[0][drawn], rows[1][drawn]
+        blur = [noise * jax.random.normal(blur_key, change.shape) for blur_key in (of_real, of_generated)]
+
+        def generated(generator: Ensemble) -> Array:
+            mean, std = (part[0, :, :-1] for part in generator(pair))
+            return mean + std * jax.random.normal(of_sample, mean.shape) + blur[1]
+
+        def telling(discriminator: Network) -> Array:
+            deceit = jax.lax.stop_gradient(generated(carry.generator))
+            return telling_loss(logit(discriminator, pair, change + blur[0]), logit(discriminator, pair, deceit))
+
+        told, gradients = eqx.filter_value_and_grad(telling)(carry.discriminator)
+        discriminator, discriminator_optimiser = descend(
+            optimiser, gradients, carry.discriminator_optimiser, carry.discriminator
+        )
+
+        def deceiving(generator: Ensemble) -> Array:
+            return deceiving_loss(logit(discriminator, pair, generated(generator)))
+
+        deceived, gradients = eqx.filter_value_and_grad(deceiving)(carry.generator)
+        generator, generator_optimiser = descend(optimiser, gradients, carry.generator_optimiser, carry.generator)
+        following = Opposition(generator, discriminator, carry.past, generator_optimiser, discriminator_optimiser)
+        return following, {"discriminator_loss": told, "generated_reward": -deceived}
+
+    following, metrics = scan_updates(update, opposition, key, count)
+    return remember(following), metrics

@@ -1,0 +1,263 @@
+"""H2O: logged rows and simulated ones together, the simulated ones trusted by their dynamics (arXiv 2206.13464)."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PRNGKeyArray, PyTree
+
+from madoc.errors import check_at_least
+from madoc.learning import replay
+from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, bellman_target, critic_step, fresh
+from madoc.learning.dynamics_ratio import Discriminators, discriminator_loss, log_dynamics_ratio
+from madoc.learning.features import Features
+from madoc.learning.h2o_losses import dynamics_gap, dynamics_ratio, h2o_loss
+from madoc.learning.networks import adam, descend, scan_updates
+from madoc.learning.sac_losses import TwinCritic
+from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.policies.base import PolicyProblem, draw_rows, require_data
+from madoc.policies.interaction import Interaction, UniformPolicy, act_on, start_acting
+from madoc.types import Metrics, Unit
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Learning:
+    """What gradient updates change."""
+
+    learner: ActorCritic
+    discriminators: Discriminators
+    discriminator_optimiser: PyTree
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class H2OState:
+    """Everything H2O carries."""
+
+    learning: Learning
+    interaction: Interaction
+    key: PRNGKeyArray
+
+
+@dataclass(frozen=True)
+class H2O:
+    """Dynamics-aware hybrid offline-and-online learning: SAC on half logged, half simulated rows.
+
+    Two discriminators tell logged from simulated transitions. Their ratio weighs the Bellman error of simulated rows,
+    and values are held down where simulated and real dynamics differ. Unlike the authors', the discriminators see
+    standardised (s, a) and s' - s, for which their input noise of 0.1 is a tenth of the spread.
+
+    Attributes:
+        hidden: Units per layer of policy, critics and discriminators.
+        environments: Rows acting at a time, spread evenly over the systems.
+        epoch_steps: Control steps per `step`.
+        updates_per_step: Gradient updates per control step.
+        warmup_steps: Control steps with uniform random actions before the first update.
+        batch: Rows per update, logged and simulated in equal numbers.
+        weight: β of the regulariser.
+        noise: Of the discriminators' inputs while they learn.
+        gap_samples: Next states drawn for the dynamics gap of a row.
+        gap_spread: How wide, in units of a step's change.
+        bound: Of the discriminators' logits.
+        discount: γ.
+        target_rate: τ of the target critics.
+        learning_rate: Adam's, for everything.
+        replay_capacity: Simulated rows kept.
+    """
+
+    hidden: tuple[int, ...] = (256, 256)
+    environments: int = 20
+    epoch_steps: int = 1000
+    updates_per_step: float = 1.0
+    warmup_steps: int = 1000
+    batch: int = 256
+    weight: float = 0.01
+    noise: float = 0.1
+    gap_samples: int = 10
+    gap_spread: float = 1.0
+    bound: float = 2.0
+    discount: float = 0.99
+    target_rate: float = 0.005
+    learning_rate: float = 3e-4
+    replay_capacity: int = 1_000_000
+
+    def __post_init__(self) -> None:
+        check_at_least(self, hidden=1, environments=1, batch=2, replay_capacity=1, warmup_steps=0, weight=0.0)
+        check_at_least(self, epoch_steps=self.environments, updates_per_step=0.0, discount=0.0, noise=0.0)
+        check_at_least(self, target_rate=0.0, learning_rate=0.0, gap_samples=1, gap_spread=0.0, bound=0.0)
+
+    @property
+    def name(self) -> str:
+        """As `madoc methods` lists it."""
+        return "h2o"
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Metrics beside the progress bar."""
+        return ("return_in_simulator", "dynamics_ratio", "value_target")
+
+    @property
+    def unit(self) -> Unit:
+        """What its budget counts."""
+        return "control steps"
+
+    @property
+    def needs_data(self) -> bool:
+        """Half of every batch."""
+        return True
+
+    @property
+    def needs_parameters(self) -> bool:
+        """It simulates."""
+        return True
+
+    def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> H2OState:
+        """Fresh networks, an empty replay, rows at reset states.
+
+        Raises:
+            MadocError: No data, too little, data without rewards, or fewer environments than systems.
+        """
+        require_data(problem, self.name, rows=self.batch)
+        of_learner, of_discriminators, of_start, key = jax.random.split(key, 4)
+        sizes = problem.simulator.task.observation_size, problem.simulator.action_size
+        learner = fresh(*sizes, hidden=self.hidden, descent=self._descent, key=of_learner)
+        discriminators = Discriminators(
+            *sizes, self.hidden, key=of_discriminators, bound=self.bound, pair_bound=self.bound, dropout=0.0
+        )
+        optimiser = adam(self.learning_rate).init(eqx.filter(discriminators, eqx.is_array))
+        interaction = start_acting(problem, of_start, environments=self.environments, capacity=self.replay_capacity)
+        return H2OState(Learning(learner, discriminators, optimiser), interaction, key)
+
+    def step(self, problem: PolicyProblem, state: H2OState) -> tuple[H2OState, Metrics]:
+        """Act for `epoch_steps` control steps, then update."""
+        of_acting, of_update, key = jax.random.split(state.key, 3)
+        explores = state.interaction.control_steps < self.warmup_steps
+        policy = UniformPolicy(problem.simulator.action_size) if explores else self.policy(state)
+        interaction, metrics = act_on(problem, state.interaction, policy, of_acting, control_steps=self.epoch_steps)
+        learning = state.learning
+        if interaction.control_steps >= self.warmup_steps:
+            count = round(self.updates_per_step * (interaction.control_steps - state.interaction.control_steps))
+            learning, losses = self._update(
+                learning, interaction.replay, problem.logged, problem.features, of_update, count
+            )
+            metrics |= {name: float(value) for name, value in losses.items()}
+        return H2OState(learning, interaction, key), metrics
+
+    @eqx.filter_jit
+    def _update(
+        self,
+        learning: Learning,
+        seen: replay.Replay,
+        logged: Batch,
+        features: Features,
+        key: PRNGKeyArray,
+        count: int,
+    ) -> tuple[Learning, dict[str, Array]]:
+        """`count` updates of discriminators, critics, policy and temperature."""
+
+        def update(learning: Learning, key: PRNGKeyArray) -> tuple[Learning, dict[str, Array]]:
+            of_logged, of_simulated, of_noise, of_critics, of_actor = jax.random.split(key, 5)
+            real = draw_rows(logged, of_logged, self.batch // 2)
+            simulated = replay.sample(seen, of_simulated, self.batch // 2)
+            discriminators, optimiser, told = self._tell_apart(learning, real, simulated, features, of_noise)
+            learner, of_values = self._value(learning.learner, discriminators, real, simulated, features, of_critics)
+            observation = jnp.concatenate([real["observation"], simulated["observation"]])
+            learner, of_policy = actor_step(learner, observation, of_actor, self._descent)
+            return Learning(learner, discriminators, optimiser), told | of_values | of_policy
+
+        return scan_updates(update, learning, key, count)
+
+    def _tell_apart(
+        self, learning: Learning, real: Batch, simulated: Batch, features: Features, key: PRNGKeyArray
+    ) -> tuple[Discriminators, PyTree, dict[str, Array]]:
+        """One step of the discriminators, on noisy inputs."""
+        described = [part for rows in (real, simulated) for part in _described(features, rows)]
+        keys = jax.random.split(key, len(described))
+        noisy = [
+            part + self.noise * jax.random.normal(part_key, part.shape)
+            for part, part_key in zip(described, keys, strict=True)
+        ]
+
+        def loss_of(discriminators: Discriminators) -> tuple[Array, dict[str, Array]]:
+            return discriminator_loss(discriminators, (noisy[0], noisy[1]), (noisy[2], noisy[3]))
+
+        (_, metrics), gradients = eqx.filter_value_and_grad(loss_of, has_aux=True)(learning.discriminators)
+        discriminators, optimiser = descend(
+            adam(self.learning_rate), gradients, learning.discriminator_optimiser, learning.discriminators
+        )
+        return discriminators, optimiser, metrics
+
+    def _value(
+        self,
+        learner: ActorCritic,
+        discriminators: Discriminators,
+        real: Batch,
+        simulated: Batch,
+        features: Features,
+        key: PRNGKeyArray,
+    ) -> tuple[ActorCritic, dict[str, Array]]:
+        """One step of the critics, without entropy in the backup."""
+        of_real, of_simulated, of_gap = jax.random.split(key, 3)
+        pair, following = _described(features, simulated)
+        ratio = dynamics_ratio(log_dynamics_ratio(discriminators, pair, following))
+        gap = dynamics_gap(
+            discriminators, pair, following, spread=self.gap_spread, samples=self.gap_samples, key=of_gap
+        )
+        targets = [
+            bellman_target(learner, rows, rows_key, discount=self.discount, entropy=False)
+            for rows, rows_key in ((real, of_real), (simulated, of_simulated))
+        ]
+
+        def loss_of(critic: TwinCritic) -> tuple[Array, Array]:
+            return h2o_loss(
+                critic,
+                (real["observation"], real["action"], targets[0]),
+                (simulated["observation"], simulated["action"], targets[1]),
+                ratio=ratio,
+                gap=gap,
+                weight=self.weight,
+            )
+
+        learner, (loss, regulariser) = critic_step(learner, loss_of, self._descent)
+        return learner, {
+            "critic_loss": loss,
+            "regulariser": regulariser,
+            "value_target": targets[0].mean(),
+            "dynamics_ratio": ratio.mean(),
+            "dynamics_gap": gap.mean(),
+        }
+
+    @property
+    def _descent(self) -> Descent:
+        return Descent.by_adam(policy=self.learning_rate, critic=self.learning_rate, target_rate=self.target_rate)
+
+    def policy(self, state: H2OState) -> TanhGaussianPolicy:
+        """The policy learnt so far; deterministic without a key."""
+        return state.learning.learner.policy
+
+    def control_steps(self, state: H2OState) -> int:
+        """Simulated control steps so far."""
+        return state.interaction.control_steps
+
+    def spent(self, state: H2OState) -> int:
+        """Its budget is control steps."""
+        return state.interaction.control_steps
+
+    def stage(self, state: H2OState) -> str:
+        """Word for the progress bar."""
+        return "learning" if self.spent(state) >= self.warmup_steps else "exploring"
+
+    def progress(self, state: H2OState, budget: int) -> float:
+        """Share of the budget spent."""
+        return min(1.0, self.spent(state) / budget)
+
+    def converged(self, state: H2OState) -> str | None:
+        """It goes on until its budget is spent."""
+        return None
+
+
+def _described(features: Features, rows: Batch) -> tuple[Array, Array]:
+    observation = rows["observation"]
+    return features.pair(observation, rows["action"]), features.change(observation, rows["next_observation"])

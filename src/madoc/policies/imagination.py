@@ -1,0 +1,144 @@
+"""Rollouts in a learnt dynamics model, on the device: the rows a model-based learner adds to the logged ones."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from madoc.learning.actor_critic import Batch
+from madoc.learning.dynamics_ensemble import Ensemble, uncertainty_penalty
+from madoc.learning.dynamics_reward import reward_of
+from madoc.learning.features import Features
+from madoc.learning.networks import Network
+from madoc.types import Policy
+
+LARGEST_CHANGE = 10.0
+"""A sampled change of an observation is cut there, in units of its spread."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Dreamers:
+    """Imagined rows under way: where they stand, and for how many steps they have been imagined."""
+
+    observation: Float[Array, "rows observation"]
+    age: Int[Array, " rows"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Filter:
+    """Which of the sampled transitions are believed (Luo et al. 2024, section 4).
+
+    Attributes:
+        elites: The models that may be sampled from.
+        past: The dynamics reward's discriminators.
+    """
+
+    elites: Int[Array, " elites"]
+    past: Network
+
+
+@dataclass(frozen=True)
+class Dreaming:
+    """How it is done.
+
+    Attributes:
+        samples: Next states drawn from each elite; the one of the highest dynamics reward is kept.
+        threshold: A row whose best dynamics reward is below ends there, as if it had fallen.
+        horizon: Steps after which a row starts again.
+        penalty: λ of MOPO, for each unit of the models' uncertainty.
+    """
+
+    samples: int
+    threshold: float
+    horizon: int
+    penalty: float
+
+
+def fall_asleep(logged: Float[Array, "logged observation"], rows: int, key: PRNGKeyArray) -> Dreamers:
+    """Rows at logged observations."""
+    return Dreamers(_some(logged, rows, key), jnp.zeros(rows, jnp.int32))
+
+
+def best_candidate(
+    candidates: Float[Array, "candidates rows outputs"], rewards: Float[Array, "candidates rows"]
+) -> tuple[Float[Array, "rows outputs"], Float[Array, " rows"]]:
+    """For each row the candidate of the highest dynamics reward, and that reward."""
+    best = rewards.argmax(0)
+    rows = jnp.arange(candidates.shape[1])
+    return candidates[best, rows], rewards[best, rows]
+
+
+def dream(
+    ensemble: Ensemble,
+    believed: Filter,
+    features: Features,
+    policy: Policy,
+    dreamers: Dreamers,
+    *,
+    logged: Float[Array, "logged observation"],
+    terminated: Callable[[Array], Bool[Array, " rows"]],
+    settings: Dreaming,
+    steps: int,
+    key: PRNGKeyArray,
+) -> tuple[Dreamers, Batch, dict[str, Array]]:
+    """Act for `steps` steps in every row; rows that end start again at logged observations.
+
+    Observations stay within the logged ones' range, widened by its width on either side.
+
+    Returns:
+        Where the rows stand, the imagined rows flat in time and row, and how they went.
+    """
+    low, high = logged.min(0), logged.max(0)
+    low, high = low - (high - low), high + (high - low)
+
+    def step(dreamers: Dreamers, key: PRNGKeyArray) -> tuple[Dreamers, tuple[Batch, dict[str, Array]]]:
+        of_action, of_sample, of_restart = jax.random.split(key, 3)
+        observation = dreamers.observation
+        action = policy(observation, of_action)
+        pair = features.pair(observation, action)
+        mean, std = ensemble(pair)
+        elite_mean, elite_std = mean[believed.elites], std[believed.elites]
+        shape = (settings.samples, *elite_mean.shape)
+        noise = jax.random.normal(of_sample, shape)
+        drawn = jnp.broadcast_to(elite_mean, shape) + jnp.broadcast_to(elite_std, shape) * noise
+        candidates = drawn.reshape(-1, *elite_mean.shape[1:])
+        change = jnp.clip(candidates[..., :-1], -LARGEST_CHANGE, LARGEST_CHANGE)
+        pairs = jnp.broadcast_to(pair, (*change.shape[:2], pair.shape[-1]))
+        outcome, reality = best_candidate(
+            jnp.concatenate([change, candidates[..., -1:]], axis=-1), reward_of(believed.past, pairs, change)
+        )
+        following = features.following(observation, outcome[:, :-1])
+        following = jnp.clip(following, jnp.broadcast_to(low, following.shape), jnp.broadcast_to(high, following.shape))
+        penalty = uncertainty_penalty(std, features)
+        reward = features.reward_offset + features.reward_scale * outcome[:, -1]
+        unreal = reality < settings.threshold
+        ends = terminated(following) | unreal
+        row = {
+            "observation": observation,
+            "action": action,
+            "reward": reward - settings.penalty * penalty,
+            "next_observation": following,
+            "terminated": ends.astype(jnp.float32),
+        }
+        again = ends | (dreamers.age + 1 >= settings.horizon)
+        fresh = _some(logged, len(observation), of_restart)
+        state = jnp.where(jnp.broadcast_to(again[:, None], fresh.shape), fresh, following)
+        told = {
+            "dynamics_reward": reality.mean(),
+            "stopped": unreal.mean(),
+            "penalty": penalty.mean(),
+            "imagined_reward": reward.mean(),
+        }
+        return Dreamers(state, jnp.where(again, 0, dreamers.age + 1)), (row, told)
+
+    dreamers, (rows, metrics) = jax.lax.scan(step, dreamers, jax.random.split(key, steps))
+    flat = {name: column.reshape(-1, *column.shape[2:]) for name, column in rows.items()}
+    return dreamers, flat, jax.tree.map(jnp.mean, metrics)
+
+
+def _some(logged: Array, rows: int, key: PRNGKeyArray) -> Array:
+    return logged[jax.random.randint(key, (rows,), 0, len(logged))]

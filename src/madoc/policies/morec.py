@@ -1,0 +1,352 @@
+"""MOREC: SAC in a learnt model, of whose transitions only those that look real are kept (arXiv 2310.05422)."""
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, PRNGKeyArray, PyTree
+
+from madoc.errors import MadocError, check_at_least
+from madoc.learning import replay
+from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
+from madoc.learning.dynamics_ensemble import Ensemble, fit, holdout_error
+from madoc.learning.dynamics_reward import Opposition, oppose, opposition
+from madoc.learning.features import Features
+from madoc.learning.networks import adam, scan_updates
+from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.policies.base import PolicyProblem, draw_rows, require_data
+from madoc.policies.imagination import Dreamers, Dreaming, Filter, dream, fall_asleep
+from madoc.tasks.base import Task
+from madoc.types import Metrics, Unit
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MORECState:
+    """Everything MOREC carries.
+
+    Attributes:
+        ensemble: The dynamics models.
+        ensemble_optimiser: State of their optimiser.
+        elites: Those of the smallest error on held-out rows.
+        opposition: What becomes the dynamics reward.
+        learner: SAC.
+        replay: Imagined rows.
+        dreamers: Where imagined rows stand.
+        key: The random key.
+        preparing: Updates of models and discriminators so far.
+        updates: Updates of the policy so far.
+    """
+
+    ensemble: Ensemble
+    ensemble_optimiser: PyTree
+    elites: Int[Array, " elites"]
+    opposition: Opposition
+    learner: ActorCritic
+    replay: replay.Replay
+    dreamers: Dreamers
+    key: PRNGKeyArray
+    preparing: int
+    updates: int
+
+
+@dataclass(frozen=True)
+class MOREC:
+    """Model-based offline learning with reward consistency, on MOPO's penalty.
+
+    An ensemble of models is fitted to the data, then discriminators are trained against a generator; a policy is then
+    learnt by SAC on rows imagined from logged states. At every imagined step each elite model draws candidates, and
+    the one that past discriminators find most real is kept; if even that is not, the row ends. The budget counts
+    updates of the policy; those of models and discriminators come before it.
+
+    The constants are the authors' where they gave them. They imagine 50 000 rows' rollouts every 1000 updates, on a
+    GPU; here a few transitions come with every update.
+
+    Attributes:
+        hidden: Units per layer of policy and critics.
+        model_hidden: Units per layer of a dynamics model.
+        models: Dynamics models.
+        elites: How many of them are sampled from.
+        model_updates: Updates of the models, before anything else.
+        discriminator_hidden: Units per layer of a discriminator.
+        discriminators: Past discriminators that make up the dynamics reward; one is kept every `epoch_updates`.
+        discriminator_updates: Updates of generator and discriminator, after the models'. Chosen, not the authors'.
+        noise: On next states that discriminators see while they learn, in units of a step's change. Chosen.
+        samples: Candidates from each elite.
+        threshold: An imagined row whose best dynamics reward is below ends there.
+        horizon: Longest imagined rollout, in control steps.
+        penalty: λ of MOPO. The authors chose it by dataset; 2.5 is their code's default.
+        real: Share of logged rows in a batch.
+        imagined_per_update: Imagined transitions for each update of the policy.
+        imagined_rows: Rows imagined at a time.
+        epoch_updates: Gradient updates per `step`.
+        holdout_every: Every so-manieth logged row is kept from the models, to choose the elites by.
+        batch: Rows per update.
+        discount: γ.
+        target_rate: τ of the target critics.
+        model_learning_rate: Adam's, for models, generator and discriminators.
+        policy_learning_rate: Adam's, for policy and temperature.
+        critic_learning_rate: Adam's, for the critics.
+        replay_capacity: Imagined rows kept.
+    """
+
+    hidden: tuple[int, ...] = (256, 256)
+    model_hidden: tuple[int, ...] = (200, 200, 200, 200)
+    models: int = 7
+    elites: int = 5
+    model_updates: int = 20_000
+    discriminator_hidden: tuple[int, ...] = (128, 128)
+    discriminators: int = 40
+    discriminator_updates: int = 8000
+    noise: float = 0.1
+    samples: int = 2
+    threshold: float = 0.6
+    horizon: int = 100
+    penalty: float = 2.5
+    real: float = 0.05
+    imagined_per_update: int = 5
+    imagined_rows: int = 50
+    epoch_updates: int = 100
+    holdout_every: int = 100
+    batch: int = 256
+    discount: float = 0.99
+    target_rate: float = 0.005
+    model_learning_rate: float = 1e-3
+    policy_learning_rate: float = 1e-4
+    critic_learning_rate: float = 3e-4
+    replay_capacity: int = 100_000
+
+    def __post_init__(self) -> None:
+        check_at_least(self, hidden=1, model_hidden=1, discriminator_hidden=1, models=self.elites, elites=1)
+        check_at_least(self, model_updates=1, discriminators=1, discriminator_updates=0, samples=1, horizon=1)
+        check_at_least(self, noise=0.0, penalty=0.0, real=0.0, epoch_updates=1, holdout_every=2, batch=2)
+        check_at_least(self, imagined_per_update=1, imagined_rows=1, replay_capacity=1, discount=0.0)
+        check_at_least(self, target_rate=0.0, model_learning_rate=0.0)
+        check_at_least(self, policy_learning_rate=0.0, critic_learning_rate=0.0)
+        if self.real >= 1.0:
+            raise MadocError(f"expected a share of logged rows below 1 for MOREC, got {self.real}")
+
+    @property
+    def name(self) -> str:
+        """As `madoc methods` lists it."""
+        return "morec"
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Metrics beside the progress bar."""
+        return ("model_error", "dynamics_reward", "value_target")
+
+    @property
+    def unit(self) -> Unit:
+        """What its budget counts."""
+        return "updates"
+
+    @property
+    def needs_data(self) -> bool:
+        """Its models know nothing else."""
+        return True
+
+    @property
+    def needs_parameters(self) -> bool:
+        """It never simulates."""
+        return False
+
+    def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> MORECState:
+        """Fresh networks, an empty replay, rows at logged observations.
+
+        Raises:
+            MadocError: No data, too little, data without rewards, or a task whose falls an observation cannot tell.
+        """
+        task = problem.simulator.task
+        require_data(problem, self.name, rows=max(self.batch, self.holdout_every))
+        if task.state_from_observation is None:
+            raise MadocError(
+                f"an observation of {task.name} does not determine its state, so morec cannot tell where an imagined "
+                "episode ends; give the task a state_from_observation, or use cql"
+            )
+        keys = jax.random.split(key, 6)
+        sizes = observation, action = task.observation_size, problem.simulator.action_size
+        ensemble = Ensemble(*sizes, self.model_hidden, models=self.models, key=keys[0])
+        adversary = opposition(
+            ensemble.only(jnp.asarray(0)),
+            observation + action,
+            observation,
+            hidden=self.discriminator_hidden,
+            members=self.discriminators,
+            optimiser=adam(self.model_learning_rate),
+            key=keys[1],
+        )
+        columns = {"observation": (observation,), "action": (action,), "next_observation": (observation,)}
+        return MORECState(
+            ensemble,
+            adam(self.model_learning_rate).init(eqx.filter(ensemble, eqx.is_array)),
+            jnp.arange(self.elites),
+            adversary,
+            fresh(*sizes, hidden=self.hidden, descent=self._descent, key=keys[2]),
+            replay.empty(self.replay_capacity, **columns, reward=(), terminated=()),
+            fall_asleep(problem.logged["observation"], self.imagined_rows, keys[3]),
+            keys[4],
+            0,
+            0,
+        )
+
+    def step(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, Metrics]:
+        """`epoch_updates` updates of the models, of the discriminators, or of the policy."""
+        key, following = jax.random.split(state.key)
+        stages = {"fitting": self._fit, "opposing": self._oppose, "learning": self._learn}
+        state, metrics = stages[self.stage(state)](problem, replace(state, key=key))
+        return replace(state, key=following), {name: float(value) for name, value in metrics.items()}
+
+    def _fit(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
+        """Fit the models, and rank them."""
+        ensemble, optimiser, elites, metrics = self._update_models(
+            state.ensemble, state.ensemble_optimiser, problem.logged, problem.features, state.key
+        )
+        state = replace(state, ensemble=ensemble, ensemble_optimiser=optimiser, elites=elites)
+        state = replace(state, preparing=state.preparing + self.epoch_updates)
+        if self.stage(state) == "opposing":
+            state = replace(state, opposition=replace(state.opposition, generator=ensemble.only(elites[0])))
+        return state, metrics
+
+    @eqx.filter_jit
+    def _update_models(
+        self, ensemble: Ensemble, optimiser: PyTree, logged: Batch, features: Features, key: PRNGKeyArray
+    ) -> tuple[Ensemble, PyTree, Int[Array, " elites"], dict[str, Array]]:
+        pair, change = _described(features, logged)
+        reward = (logged["reward"] - features.reward_offset) / features.reward_scale
+        rows = (pair, jnp.concatenate([change, reward[:, None]], axis=-1))
+        ensemble, optimiser, metrics = fit(
+            ensemble,
+            optimiser,
+            rows,
+            key,
+            optimiser=adam(self.model_learning_rate),
+            batch=self.batch,
+            count=self.epoch_updates,
+            holdout_every=self.holdout_every,
+        )
+        held_out = slice(self.holdout_every - 1, None, self.holdout_every)
+        error = holdout_error(ensemble, rows[0][held_out], rows[1][held_out])
+        elites = jnp.argsort(error)[: self.elites]
+        return ensemble, optimiser, elites, metrics | {"model_error": error[elites].mean()}
+
+    def _oppose(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
+        """Train discriminators and their generator."""
+        adversary, metrics = self._update_opposition(state.opposition, problem.logged, problem.features, state.key)
+        return replace(state, opposition=adversary, preparing=state.preparing + self.epoch_updates), metrics
+
+    @eqx.filter_jit
+    def _update_opposition(
+        self, adversary: Opposition, logged: Batch, features: Features, key: PRNGKeyArray
+    ) -> tuple[Opposition, dict[str, Array]]:
+        return oppose(
+            adversary,
+            _described(features, logged),
+            key,
+            optimiser=adam(self.model_learning_rate),
+            batch=self.batch,
+            count=self.epoch_updates,
+            noise=self.noise,
+        )
+
+    def _learn(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
+        """Imagine, then update the policy."""
+        of_dreams, of_updates = jax.random.split(state.key)
+        believed = Filter(state.elites, state.opposition.past)
+        dreamers, rows, told = self._dream(
+            problem.simulator.task,
+            state.ensemble,
+            believed,
+            problem.features,
+            state.learner.policy,
+            state.dreamers,
+            problem.logged["observation"],
+            of_dreams,
+        )
+        seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
+        learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
+        state = replace(state, learner=learner, replay=seen, dreamers=dreamers)
+        return replace(state, updates=state.updates + self.epoch_updates), told | metrics
+
+    @eqx.filter_jit
+    def _dream(
+        self,
+        task: Task,
+        ensemble: Ensemble,
+        believed: Filter,
+        features: Features,
+        policy: TanhGaussianPolicy,
+        dreamers: Dreamers,
+        logged: Array,
+        key: PRNGKeyArray,
+    ) -> tuple[Dreamers, Batch, dict[str, Array]]:
+        to_state = task.state_from_observation
+        assert to_state is not None
+        return dream(
+            ensemble,
+            believed,
+            features,
+            policy,
+            dreamers,
+            logged=logged,
+            terminated=lambda observation: task.terminated(to_state(observation)),
+            settings=Dreaming(self.samples, self.threshold, self.horizon, self.penalty),
+            steps=-(-self.epoch_updates * self.imagined_per_update // self.imagined_rows),
+            key=key,
+        )
+
+    @eqx.filter_jit
+    def _update_policy(
+        self, learner: ActorCritic, seen: replay.Replay, logged: Batch, key: PRNGKeyArray
+    ) -> tuple[ActorCritic, dict[str, Array]]:
+        """SAC on logged and imagined rows."""
+        real = round(self.real * self.batch)
+
+        def update(learner: ActorCritic, key: PRNGKeyArray) -> tuple[ActorCritic, dict[str, Array]]:
+            of_logged, of_imagined, of_critics, of_actor = jax.random.split(key, 4)
+            parts = draw_rows(logged, of_logged, real), replay.sample(seen, of_imagined, self.batch - real)
+            batch = jax.tree.map(lambda *columns: jnp.concatenate(columns), *parts)
+            learner, of_values = soft_critic_step(learner, batch, of_critics, self._descent, discount=self.discount)
+            learner, of_policy = actor_step(learner, batch["observation"], of_actor, self._descent)
+            return learner, of_values | of_policy
+
+        return scan_updates(update, learner, key, self.epoch_updates)
+
+    @property
+    def _descent(self) -> Descent:
+        return Descent.by_adam(
+            policy=self.policy_learning_rate, critic=self.critic_learning_rate, target_rate=self.target_rate
+        )
+
+    def policy(self, state: MORECState) -> TanhGaussianPolicy:
+        """The policy learnt so far; deterministic without a key."""
+        return state.learner.policy
+
+    def control_steps(self, state: MORECState) -> int:
+        """None: what it imagines is not simulated."""
+        return 0
+
+    def spent(self, state: MORECState) -> int:
+        """Its budget is updates of the policy."""
+        return state.updates
+
+    def stage(self, state: MORECState) -> str:
+        """Word for the progress bar."""
+        if state.preparing < self.model_updates:
+            return "fitting"
+        return "opposing" if state.preparing < self.model_updates + self.discriminator_updates else "learning"
+
+    def progress(self, state: MORECState, budget: int) -> float:
+        """Share of all its updates done."""
+        total = self.model_updates + self.discriminator_updates + budget
+        return min(1.0, (state.preparing + state.updates) / total)
+
+    def converged(self, state: MORECState) -> str | None:
+        """It goes on until its budget is spent."""
+        return None
+
+
+def _described(features: Features, logged: Batch) -> tuple[Array, Array]:
+    observation = logged["observation"]
+    return features.pair(observation, logged["action"]), features.change(observation, logged["next_observation"])
