@@ -42,9 +42,9 @@ def main() -> None:
     state = learner.init(problem, jax.random.key(arguments.seed))
     started, kept = time.monotonic(), 0
     with (folder / "ladder.jsonl").open("w") as ladder:
-        while state.control_steps < arguments.steps:
+        while learner.control_steps(state) < arguments.steps:
             state, _ = learner.step(problem, state)
-            if state.control_steps < (kept + 1) * arguments.every:
+            if learner.control_steps(state) < (kept + 1) * arguments.every:
                 continue
             kept += 1
             policy = learner.policy(state)
@@ -54,7 +54,7 @@ def main() -> None:
             np.savez(folder / f"{kept:04d}.npz", *[np.asarray(leaf) for leaf in leaves])
             row = {
                 "snapshot": kept,
-                "control_steps": state.control_steps,
+                "control_steps": learner.control_steps(state),
                 "seconds": round(time.monotonic() - started),
                 "deterministic": returns.summary(),
                 "sampled": sampled.summary(),

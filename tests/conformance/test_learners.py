@@ -10,20 +10,50 @@ import pytest
 from madoc import checkpoint, simulation
 from madoc.errors import MadocError
 from madoc.numpy_policy import NumpyPolicy
-from madoc.policies import LEARNERS, PolicyProblem, learn_policy, load_policy
+from madoc.policies import (
+    LEARNERS,
+    NormalParameters,
+    PolicyProblem,
+    UniformParameters,
+    learn_policy,
+    load_policy,
+)
 from madoc.run_folder import RunFolder
 from robots import ARM_TRUTH, CountingSimulator, recorded, two_link_arm
 
 KEY = jax.random.key(0)
 BUDGET = 200
 EPOCH = 40
-TINY = {"hidden": (8, 8), "environments": 4, "epoch_steps": EPOCH, "updates_per_step": 0.1, "warmup_steps": EPOCH}
-TINY |= {"batch": 16, "replay_capacity": 150}
+SMALL = {"hidden": (8, 8), "batch": 16}
+ACTING = SMALL | {"environments": 4, "epoch_steps": EPOCH, "updates_per_step": 0.1, "warmup_steps": EPOCH}
+ACTING |= {"replay_capacity": 150}
+OFFLINE = SMALL | {"epoch_updates": EPOCH}
 
 METHODS = {
-    "sac": LEARNERS["sac"].make(**TINY),
-    "sac-bc": LEARNERS["sac-bc"].make(**TINY),
+    "sac": LEARNERS["sac"].make(**ACTING),
+    "sac-bc": LEARNERS["sac-bc"].make(**ACTING),
+    "dr-bc": LEARNERS["dr-bc"].make(**ACTING),
+    "h2o": LEARNERS["h2o"].make(**ACTING),
+    "bc": LEARNERS["bc"].make(**OFFLINE),
+    "cql": LEARNERS["cql"].make(**OFFLINE, critic_hidden=(8, 8), samples=2, cloning_updates=EPOCH),
+    "morec": LEARNERS["morec"].make(
+        **OFFLINE,
+        model_hidden=(8,),
+        models=3,
+        elites=2,
+        model_updates=EPOCH,
+        discriminator_hidden=(8,),
+        discriminators=3,
+        discriminator_updates=EPOCH,
+        imagined_per_update=2,
+        imagined_rows=5,
+        replay_capacity=150,
+        holdout_every=10,
+    ),
 }
+SIMULATING = [name for name, method in METHODS.items() if method.unit == "control steps"]
+FED = [name for name, method in METHODS.items() if method.needs_data]
+REWARDED = ["h2o", "cql", "morec"]
 
 
 @pytest.fixture(scope="module")
@@ -67,12 +97,14 @@ def test_a_learner_knows_the_name_it_is_listed_under(name):
     assert LEARNERS[name].summary
     assert LEARNERS[name].paper
     assert 1900 < LEARNERS[name].year < 2100
+    assert METHODS[name].unit == LEARNERS[name].unit
 
 
 def test_the_budget_is_kept_and_counted(method, problem, simulator):
     learnt = learn_policy(method, problem, key=KEY, budget=BUDGET - 1)
-    assert learnt.status == "finished"
-    assert learnt.control_steps == simulator.rows == BUDGET
+    assert (learnt.status, learnt.spent, learnt.unit) == ("finished", BUDGET, method.unit)
+    assert learnt.sentence == f"the budget of {BUDGET - 1} {method.unit} is spent"
+    assert learnt.control_steps == simulator.rows == (BUDGET if method.unit == "control steps" else 0)
     action = learnt.policy(np.zeros((5, 4)))
     assert action.shape == (5, 2)
     assert (abs(action) <= 1.0).all()
@@ -91,13 +123,14 @@ def test_stopped_and_resumed_equals_uninterrupted(method, problem, tmp_path):
     with RunFolder.create(tmp_path / "run", {"seed": 0}) as folder:
         for budget in (EPOCH, 3 * EPOCH):  # before the first update, and after some
             part = learn_policy(method, problem, key=KEY, budget=budget, folder=folder, resume=budget > EPOCH)
-            assert part.control_steps == budget
+            assert part.spent == budget
             assert bits(part.policy) != bits(whole.policy)
         resumed = learn_policy(method, problem, key=KEY, budget=BUDGET, folder=folder, resume=True)
         assert bits(resumed.policy) == bits(whole.policy)
         assert resumed.control_steps == whole.control_steps
         told = json.loads(folder.result.read_text())
-        assert (told["status"], told["control_steps"]) == ("finished", BUDGET)
+        assert (told["status"], told["control_steps"]) == ("finished", whole.control_steps)
+        assert told[method.unit.replace(" ", "_")] == BUDGET
 
 
 def test_the_layout_of_the_state_never_changes(method, problem):
@@ -110,23 +143,27 @@ def test_the_layout_of_the_state_never_changes(method, problem):
 
 def test_stages_metrics_and_progress(method, problem):
     state = method.init(problem, KEY)
-    assert method.stage(state) == "exploring"
-    done, seen = [method.progress(state, BUDGET)], set()
-    while method.control_steps(state) < BUDGET:
+    done, stages, seen = [method.progress(state, BUDGET)], [method.stage(state)], set()
+    while method.spent(state) < BUDGET:
         state, metrics = method.step(problem, state)
         assert all(np.isfinite(value) for value in metrics.values())
         seen |= metrics.keys()
         done.append(method.progress(state, BUDGET))
-    assert method.stage(state) == "learning"
+        stages.append(method.stage(state))
     assert method.converged(state) is None
     assert done == sorted(done)
     assert (done[0], done[-1]) == (0.0, 1.0)
-    assert "temperature" in seen
+    assert seen >= set(method.shown) - {"return_in_simulator"}
+    assert list(dict.fromkeys(stages)) == {
+        "bc": ["cloning"],
+        "cql": ["cloning", "learning"],
+        "morec": ["fitting", "opposing", "learning"],
+    }.get(method.name, ["exploring", "learning"])
 
 
 def test_nothing_is_traced_again(method, problem, traced):
     state = stepped(method, problem, 4)
-    assert method.stage(state) == "learning"
+    assert method.stage(state) in ("learning", "cloning")
     before = traced()
     for _ in range(10):
         state, _ = method.step(problem, state)
@@ -149,26 +186,88 @@ def test_a_saved_policy_acts_the_same_with_and_without_jax(method, problem, tmp_
         assert all(arrays[name].dtype != object for name in arrays)
 
 
-def test_several_systems_at_a_time(method, dataset, simulator):
+def corners(simulator):
     space = simulator.parameters
-    problem = PolicyProblem(simulator, np.stack([space.low * 0.9 + space.high * 0.1, space.middle]), dataset)
-    assert learn_policy(method, problem, key=KEY, budget=2 * EPOCH).control_steps == 2 * EPOCH
+    return np.stack([space.low * 0.9 + space.high * 0.1, space.middle])
 
 
-def test_environments_that_do_not_fill_the_systems_are_refused(method, dataset, simulator):
+def distributions(space):
+    return [
+        UniformParameters(space),
+        NormalParameters(space, space.middle, np.diag(((space.high - space.low) / 8) ** 2)),
+    ]
+
+
+def test_several_systems_at_a_time(method, dataset, simulator):
+    problem = PolicyProblem(simulator, corners(simulator), dataset)
+    assert learn_policy(method, problem, key=KEY, budget=2 * EPOCH).spent == 2 * EPOCH
+
+
+@pytest.mark.parametrize("of", [0, 1])
+def test_systems_are_drawn_from_distributions(method, dataset, simulator, of):
+    problem = PolicyProblem(simulator, distributions(simulator.parameters)[of], dataset)
+    first, again = (bits(learn_policy(method, problem, key=KEY, budget=2 * EPOCH).policy) for _ in range(2))
+    assert first == again
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_parameters_matter_where_a_learner_says_so(name, dataset, simulator):
+    method = METHODS[name]
+    first, second = (
+        bits(learn_policy(method, PolicyProblem(simulator, row, dataset), key=KEY, budget=3 * EPOCH).policy)
+        for row in corners(simulator)
+    )
+    assert (first != second) == method.needs_parameters
+
+
+@pytest.mark.parametrize("name", [name for name in SIMULATING if METHODS[name].needs_parameters])
+def test_environments_that_do_not_fill_the_systems_are_refused(name, dataset, simulator):
     problem = PolicyProblem(simulator, np.stack([simulator.parameters.middle] * 3), dataset)
     with pytest.raises(MadocError, match="expected a multiple of 3 environments for 3 systems, got 4"):
-        learn_policy(method, problem, key=KEY, budget=BUDGET)
+        learn_policy(METHODS[name], problem, key=KEY, budget=BUDGET)
+
+
+def test_no_learner_sees_the_truth(dataset, problem):
+    assert dataset.true_parameters is not None
+    assert problem.dataset.true_parameters is None
+
+
+def test_data_of_another_robot_is_refused(dataset, simulator):
+    other = replace(dataset, task_name="spring")
+    with pytest.raises(MadocError, match="recorded from spring, the simulator is two_link_arm"):
+        PolicyProblem(simulator, simulator.parameters.middle, other)
+
+
+@pytest.mark.parametrize("name", FED)
+def test_no_data_is_refused(name, problem):
+    with pytest.raises(MadocError, match=f"{name} learns from logged data: give it a dataset"):
+        learn_policy(METHODS[name], replace(problem, dataset=None), key=KEY, budget=BUDGET)
+
+
+@pytest.mark.parametrize("name", FED)
+def test_too_few_rows_are_refused(name, dataset, problem):
+    few = replace(dataset, transitions=dataset.transitions.take(np.arange(5)))
+    with pytest.raises(MadocError, match=f"{name} needs at least .* 16, got 5 in a random policy"):
+        learn_policy(METHODS[name], replace(problem, dataset=few), key=KEY, budget=BUDGET)
+
+
+@pytest.mark.parametrize("name", REWARDED)
+def test_data_without_rewards_is_refused_where_they_are_learnt_from(name, dataset, problem):
+    silent = replace(dataset, transitions=replace(dataset.transitions, reward=np.zeros(len(dataset))))
+    with pytest.raises(MadocError, match=f"{name} learns from logged rewards, and every reward .* is 0"):
+        learn_policy(METHODS[name], replace(problem, dataset=silent), key=KEY, budget=BUDGET)
+
+
+def test_a_model_cannot_be_learnt_where_falls_cannot_be_told(dataset):
+    task = replace(two_link_arm(), state_from_observation=None)
+    problem = PolicyProblem(simulation.make(task, threads=1), task.parameters.middle, dataset)
+    with pytest.raises(MadocError, match="cannot tell where an imagined episode ends"):
+        learn_policy(METHODS["morec"], problem, key=KEY, budget=BUDGET)
 
 
 def test_parameters_of_another_robot_are_refused(simulator):
     with pytest.raises(MadocError, match="expected 5 parameter values for two_link_arm, got 2"):
         PolicyProblem(simulator, np.zeros(2))
-
-
-def test_cloning_without_data_is_refused(problem):
-    with pytest.raises(MadocError, match="sac-bc clones the data's actions: give it a dataset"):
-        learn_policy(METHODS["sac-bc"], replace(problem, dataset=None), key=KEY, budget=BUDGET)
 
 
 def test_without_cloning_data_makes_no_difference(problem):
@@ -177,5 +276,5 @@ def test_without_cloning_data_makes_no_difference(problem):
 
 
 def test_no_budget_is_refused(method, problem):
-    with pytest.raises(MadocError, match="budget of at least 1 control step, got 0"):
+    with pytest.raises(MadocError, match=f"budget of at least 1 {method.unit[:-1]}, got 0"):
         learn_policy(method, problem, key=KEY, budget=0)

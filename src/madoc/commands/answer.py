@@ -13,6 +13,8 @@ EXIT_CODES: Mapping[str, int] = {"finished": 0, "converged": 0, "diverged": 1, "
 
 PLACE_NAMES: Mapping[str, str] = {
     "calibrated": "at the calibrated parameters",
+    "distribution": "over the calibrated distribution",
+    "uniform": "over the whole box",
     "midrange": "at mid-range (yardstick)",
     "truth": "at the truth (yardstick)",
 }

@@ -20,13 +20,14 @@ class Learn:
     calibration: Annotated[Positional[Path], arg(metavar="RUN")]
     """A run folder of `madoc calibrate` or `madoc run`, or a result.json."""
     method: str = "sac"
-    """A policy learner, as `madoc methods` lists it; sac-bc also clones the data's actions."""
-    at: Literal["calibrated", "midrange", "truth"] = "calibrated"
-    """The parameters to learn at; the other two are the yardsticks."""
+    """A policy learner, as `madoc methods` lists it; some need the run's data."""
+    at: Literal["calibrated", "distribution", "uniform", "midrange", "truth"] = "calibrated"
+    """The parameters to learn at: the estimate; draws from the calibrated distribution, or from the whole box, anew
+    every epoch; or a yardstick: mid-range, or the truth, which only an evaluation knows."""
     set: Settings = ()
     """Hyperparameters of the method as name=value."""
     budget: int = 300_000
-    """Simulated control steps."""
+    """Simulated control steps, or updates of a learner that does not simulate, as `madoc methods` says."""
     seed: int = 0
     """Of all randomness."""
     truth: Path | None = None
@@ -58,14 +59,25 @@ class Learn:
             "status": learnt.status,
             "sentence": learnt.sentence,
             "control_steps": learnt.control_steps,
+            "budget_unit": learnt.unit,
+            "spent": learnt.spent,
             "seconds": learnt.seconds,
             "seed": self.seed,
             "policy": str(out / "policy.npz"),
         }
         lines = (
             f"{learnt.status}: {learnt.sentence}",
-            f"{self.method} {PLACE_NAMES[self.at]}: {learnt.control_steps:,} control steps, "
-            f"{learnt.seconds:.0f} s, seed {self.seed}",
+            f"{self.method} {self._place()}: {learnt.spent:,} {learnt.unit}, {learnt.seconds:.0f} s, seed {self.seed}",
             left_behind(out / "policy.npz", "policy"),
         )
         return Answer(answer, lines, learnt.status)
+
+    def _place(self) -> str:
+        """Where it learns, in words."""
+        from madoc.pipeline.methods import make_method
+        from madoc.policies import LEARNERS
+
+        method = make_method(LEARNERS, self.method, changes_of(self.set))
+        if method.needs_parameters:
+            return PLACE_NAMES[self.at]
+        return PLACE_NAMES["uniform"] if method.unit == "control steps" else "from the data alone"

@@ -50,15 +50,17 @@ class Methods:
 
         kinds = (("calibrator", CALIBRATORS), ("policy learner", LEARNERS))
         rows = [
-            {"name": name, "kind": kind, "paper": entry.paper, "year": entry.year, "summary": entry.summary}
+            {"name": name, "kind": kind, "summary": entry.summary, "paper": entry.paper, "year": entry.year}
+            | {"budget": entry.unit}
             for kind, entries in kinds
             for name, entry in entries.items()
         ]
         table = Table(title="methods", title_justify="left")
-        for heading in ("name", "kind", "summary", "paper", "year"):
-            table.add_column(heading, no_wrap=heading in ("name", "kind", "year"))
+        columns = ("name", "kind", "summary", "paper", "year", "budget")
+        for heading in columns:
+            table.add_column(heading, no_wrap=heading in ("name", "kind", "year", "budget"))
         for row in rows:
-            table.add_row(*(str(row[column]) for column in ("name", "kind", "summary", "paper", "year")))
+            table.add_row(*(str(row[column]) for column in columns))
         return Answer({"methods": rows}, (table,))
 
 

@@ -50,7 +50,7 @@ class Run:
     policy_set: Settings = ()
     """Hyperparameters of the learner as name=value."""
     policy_budget: int = 300_000
-    """Simulated control steps for each policy."""
+    """Simulated control steps for each policy, or updates of a learner that does not simulate."""
     yardsticks: bool = True
     """Learn also a policy at mid-range and one at the truth."""
     episodes: int = 20

@@ -10,7 +10,7 @@ from madoc.types import Transitions
 
 
 class Features(eqx.Module):
-    """`dynamics_ratio.Scaling` on the device, float32: (s, a) and reward standardised, s' as (s' - s) over its spread."""
+    """`dynamics_ratio.Scaling` in float32 on the device: (s, a), s' as s' - s over its spread, rewards."""
 
     pair_offset: Float[Array, " pair"]
     pair_scale: Float[Array, " pair"]

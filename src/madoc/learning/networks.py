@@ -54,7 +54,7 @@ def stack(count: int, make: Callable[[PRNGKeyArray], Carry], key: PRNGKeyArray) 
 def map_stack(
     apply: Callable[[Carry, Array], Array], stacked: Carry, inputs: Float[Array, "members *rows"] | None = None
 ) -> Array:
-    """Apply each module of a stack, one after the other, each to its own inputs: plain products, the fastest on a CPU."""
+    """Apply each module of a stack to its own inputs, one after the other: plain products, the fastest on a CPU."""
     arrays, static = eqx.partition(stacked, eqx.is_array)
     return jax.lax.map(lambda parts: apply(eqx.combine(parts[0], static), parts[1]), (arrays, inputs))
 

@@ -1,4 +1,4 @@
-"""Policy learning as a stage: in a calibrated simulator, or at one of the two yardsticks."""
+"""Policy learning as a stage: in the calibrated simulator, over a distribution of it, or at a yardstick."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,17 +8,28 @@ from typing import Any
 import numpy as np
 
 from madoc import simulation
+from madoc.calibration import CalibrationResult
 from madoc.errors import MadocError, unknown_name
+from madoc.parameters import ParameterSpace
 from madoc.pipeline.calibration_stage import Calibrated
 from madoc.pipeline.data_stage import check_truth, load_source, make_target
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
-from madoc.policies import LEARNERS, LearnedPolicy, PolicyProblem, learn_policy
+from madoc.policies import (
+    LEARNERS,
+    LearnedPolicy,
+    NormalParameters,
+    ParameterDistribution,
+    PolicyProblem,
+    UniformParameters,
+    learn_policy,
+)
 from madoc.simulation import CpuSimulator
 
-PLACES = ("calibrated", "midrange", "truth")
-"""Where a policy may be learnt: at the estimate, in the uncalibrated simulator, in the target itself."""
+PLACES = ("calibrated", "distribution", "uniform", "midrange", "truth")
+"""Where a policy may be learnt: at the estimate, over the calibrated distribution, over the whole box, in the
+uncalibrated simulator, in the target itself."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +40,7 @@ class PolicyOrder:
         at: One of `PLACES`.
         method: A name in `LEARNERS`.
         changes: Hyperparameters that differ from the method's own.
-        budget: Simulated control steps.
+        budget: Simulated control steps, or updates of a learner that does not simulate.
         seed: Of all randomness.
     """
 
@@ -62,17 +73,21 @@ def learn_in(
     Raises:
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
-    if order.budget < 1:
-        raise MadocError(f"expected a budget of at least 1 control step, got {order.budget}")
-    key = stage_key(order.seed, "learning")
     method = make_method(LEARNERS, order.method, order.changes)
+    if order.budget < 1:
+        raise MadocError(f"expected a budget of at least 1 {method.unit.removesuffix('s')}, got {order.budget}")
+    if not method.needs_parameters and order.at != PLACES[0]:
+        raise MadocError(
+            f"{order.method} does not learn at given parameters, so --at {order.at} would change nothing; leave it out"
+        )
+    key = stage_key(order.seed, "learning")
     known = calibrated.truth if truth is None else dict(truth)
     simulator, parameters = _system(calibrated, order.at, known)
     dataset = None
-    if getattr(method, "cloning", None) is not None:
+    if method.needs_data:
         if calibrated.source is None:
             raise MadocError(
-                f"{order.method} clones the data's actions, and a bare result names no data; "
+                f"{order.method} learns from logged data, and a bare result names no data; "
                 "give it the run folder of the calibration"
             )
         dataset = load_source(calibrated.source, calibrated.task, seed=calibrated.seed)
@@ -86,7 +101,7 @@ def learn_in(
         "task": calibrated.task.name,
         "physics": calibrated.task.physics,
         "at": order.at,
-        "parameters": dict(zip(simulator.parameters.names, parameters.tolist(), strict=True)),
+        "parameters": _described(simulator, parameters),
         "method": order.method,
         "hyperparameters": hyperparameters(method),
         "seed": order.seed,
@@ -101,12 +116,16 @@ def learn_in(
 
 
 def policy_folder_name(at: str, method: str) -> str:
-    """`policy-calibrated`, with the method behind it where that is not SAC."""
+    """`policy-calibrated`, with the method behind it unless that is SAC; `policy-cql` where the place is no matter."""
+    if not make_method(LEARNERS, method, {}).needs_parameters:
+        return f"policy-{method}"
     return f"policy-{at}" if method == "sac" else f"policy-{at}-{method}"
 
 
-def _system(calibrated: Calibrated, at: str, truth: Mapping[str, float] | None) -> tuple[CpuSimulator, np.ndarray]:
-    """The simulator to learn in, and its physical values."""
+def _system(
+    calibrated: Calibrated, at: str, truth: Mapping[str, float] | None
+) -> tuple[CpuSimulator, np.ndarray | ParameterDistribution]:
+    """The simulator to learn in, and its physical values, or the distribution to draw them from."""
     if at not in PLACES:
         raise unknown_name("place to learn at", at, PLACES)
     if truth is not None:
@@ -117,4 +136,22 @@ def _system(calibrated: Calibrated, at: str, truth: Mapping[str, float] | None) 
         target = make_target(calibrated.task.name, calibrated.task.physics, truth)
         return target.simulator, target.parameters
     simulator = simulation.make(calibrated.task)
+    if at == "distribution":
+        return simulator, _calibrated_distribution(simulator.parameters, calibrated.result)
+    if at == "uniform":
+        return simulator, UniformParameters(simulator.parameters)
     return simulator, calibrated.result.mean if at == "calibrated" else simulator.parameters.middle
+
+
+def _calibrated_distribution(space: ParameterSpace, result: CalibrationResult) -> NormalParameters:
+    """Normal about the estimate, with the covariance where the result has one, else with each parameter's spread."""
+    joint = getattr(result, "covariance", None)
+    return NormalParameters(space, result.mean, np.diag(result.std**2) if joint is None else np.asarray(joint))
+
+
+def _described(simulator: CpuSimulator, parameters: np.ndarray | ParameterDistribution) -> dict[str, Any]:
+    """Parameters by name for spec.json: a value, or the mean (mid-range of a box) of what they are drawn from."""
+    if isinstance(parameters, NormalParameters):
+        parameters = parameters.mean
+    values = parameters if isinstance(parameters, np.ndarray) else simulator.parameters.middle
+    return dict(zip(simulator.parameters.names, values.tolist(), strict=True))

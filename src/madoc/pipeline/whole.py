@@ -43,9 +43,9 @@ class Plan:
         learner: A name in `LEARNERS`.
         learner_changes: Hyperparameters of the learner that differ from its own.
         calibration_budget: Simulated control steps for the calibration.
-        policy_budget: Simulated control steps for each policy.
+        policy_budget: Simulated control steps for each policy, or updates of a learner that does not simulate.
         episodes: For the evaluation of each policy.
-        yardsticks: Learn also at mid-range and at the truth, where the truth is known.
+        yardsticks: Learn also at mid-range and at the truth, where the truth is known and it makes a difference.
         seed: Of all randomness.
         truth: The target's values by name; None takes the data's, if it has any.
     """
@@ -94,7 +94,8 @@ def run_all(plan: Plan, out: Path, *, resume: bool = False, quiet: bool = True) 
         if result.status not in ENDED:
             return summary | {"status": result.status, "sentence": f"calibration: {result.sentence}"}
         known = calibrated.truth is not None
-        for at in ("calibrated", "midrange", "truth") if plan.yardsticks and known else ("calibrated",):
+        compared = plan.yardsticks and known and make_method(LEARNERS, plan.learner, {}).needs_parameters
+        for at in ("calibrated", "midrange", "truth") if compared else ("calibrated",):
             policy = _policy_stage(plan, calibrated, at, out / f"policy-{at}", quiet=quiet)
             summary["policies"][at] = policy
             if policy["status"] not in ENDED:

@@ -1,5 +1,6 @@
 """MOREC: SAC in a learnt model, of whose transitions only those that look real are kept (arXiv 2310.05422)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -17,7 +18,6 @@ from madoc.learning.networks import adam, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.imagination import Dreamers, Dreaming, Filter, dream, fall_asleep
-from madoc.tasks.base import Task
 from madoc.types import Metrics, Unit
 
 
@@ -253,9 +253,11 @@ class MOREC:
     def _learn(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
         """Imagine, then update the policy."""
         of_dreams, of_updates = jax.random.split(state.key)
+        task = problem.simulator.task
+        assert task.state_from_observation is not None
         believed = Filter(state.elites, state.opposition.past)
         dreamers, rows, told = self._dream(
-            problem.simulator.task,
+            (task.terminated, task.state_from_observation),
             state.ensemble,
             believed,
             problem.features,
@@ -272,7 +274,7 @@ class MOREC:
     @eqx.filter_jit
     def _dream(
         self,
-        task: Task,
+        ends: tuple[Callable, Callable],
         ensemble: Ensemble,
         believed: Filter,
         features: Features,
@@ -281,8 +283,7 @@ class MOREC:
         logged: Array,
         key: PRNGKeyArray,
     ) -> tuple[Dreamers, Batch, dict[str, Array]]:
-        to_state = task.state_from_observation
-        assert to_state is not None
+        terminated, to_state = ends
         return dream(
             ensemble,
             believed,
@@ -290,7 +291,7 @@ class MOREC:
             policy,
             dreamers,
             logged=logged,
-            terminated=lambda observation: task.terminated(to_state(observation)),
+            terminated=lambda observation: terminated(to_state(observation)),
             settings=Dreaming(self.samples, self.threshold, self.horizon, self.penalty),
             steps=-(-self.epoch_updates * self.imagined_per_update // self.imagined_rows),
             key=key,
