@@ -75,3 +75,10 @@ def cloning_error(
 ) -> Float[Array, ""]:
     """Mean squared distance of the deterministic action to the data's (TD3+BC, Fujimoto & Gu 2021, Eq. 3)."""
     return jnp.mean((policy(observation) - action) ** 2)
+
+
+def cloned_actor_loss(
+    loss: Float[Array, ""], value: Float[Array, " rows"], error: Float[Array, ""], *, weight: float
+) -> Float[Array, ""]:
+    """SAC+BC: w / mean|Q| times SAC's loss, plus the cloning error (TD3+BC's Eq. 5); no gradient through mean|Q|."""
+    return weight / jax.lax.stop_gradient(jnp.abs(value).mean()) * loss + error

@@ -4,14 +4,13 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
 from madoc.errors import check_at_least
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
 from madoc.learning.networks import scan_updates
-from madoc.learning.sac_losses import cloning_error
+from madoc.learning.sac_losses import cloned_actor_loss, cloning_error
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, UniformPolicy, act_on, start_acting
@@ -140,8 +139,8 @@ class SAC:
             def combine(policy: TanhGaussianPolicy, loss: Array, value: Array) -> Array:
                 if cloned is None or self.cloning is None:
                     return loss
-                weight = self.cloning / jax.lax.stop_gradient(jnp.abs(value).mean())
-                return weight * loss + cloning_error(policy, cloned["observation"], cloned["action"])
+                error = cloning_error(policy, cloned["observation"], cloned["action"])
+                return cloned_actor_loss(loss, value, error, weight=self.cloning)
 
             learner, of_critics = soft_critic_step(learner, batch, of_critic, self._descent, discount=self.discount)
             learner, of_policy = actor_step(learner, batch["observation"], of_actor, self._descent, combine)

@@ -9,10 +9,12 @@ import pytest
 from scipy import stats
 
 from affine import affine
-from madoc.learning import replay
+from madoc.learning import replay, sac_losses
+from madoc.learning.actor_critic import ActorCritic, Descent, actor_step, soft_critic_step
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
-from madoc.policies.sac import SAC, Learner, uniform_policy
+from madoc.policies.interaction import UniformPolicy
+from madoc.policies.sac import SAC
 
 STATE, NEXT = np.array([1.0, -0.5]), np.array([0.5, 2.0])
 ACTION, REWARD, TERMINATED = np.array([0.3, -0.2]), np.array([1.0, -2.0]), np.array([0.0, 1.0])
@@ -41,13 +43,10 @@ def learner(optimiser):
     critic, target = twins(FIRST, SECOND), twins(TARGET_FIRST, TARGET_SECOND)
     log_temperature = jnp.asarray(np.log(TEMPERATURE), jnp.float32)
     states = (optimiser.init(eqx.filter(net, eqx.is_array)) for net in (policy, critic, log_temperature))
-    return Learner(policy, critic, target, log_temperature, *states)
+    return ActorCritic(policy, critic, target, log_temperature, *states)
 
 
-def method(**settings):
-    sac = SAC(**settings)
-    vars(sac)["_optimiser"] = optax.sgd(1.0)  # the cached property's value
-    return sac
+PLAIN = Descent(optax.sgd(1.0), optax.sgd(1.0), target_rate=0.25)
 
 
 def drawn(key, state):
@@ -59,7 +58,7 @@ def drawn(key, state):
 
 
 def test_critic_update_by_hand(compiled):
-    sac, key = method(discount=0.9, target_rate=0.25), jax.random.key(3)
+    key = jax.random.key(3)
     batch = {
         "observation": column(STATE),
         "action": column(ACTION),
@@ -68,7 +67,7 @@ def test_critic_update_by_hand(compiled):
         "terminated": jnp.asarray(TERMINATED, jnp.float32),
     }
     before = learner(optax.sgd(1.0))
-    after, metrics = compiled(sac._update_critic)(before, batch, key)
+    after, metrics = compiled(soft_critic_step)(before, batch, key, PLAIN, discount=0.9)
 
     _, next_action, density = drawn(key, NEXT)
     next_value = np.minimum(value(TARGET_FIRST, NEXT, next_action), value(TARGET_SECOND, NEXT, next_action))
@@ -117,9 +116,9 @@ def moved(after):
 
 
 def test_actor_and_temperature_update_by_hand(compiled):
-    sac, key = method(), jax.random.key(4)
+    key = jax.random.key(4)
     before = learner(optax.sgd(1.0))
-    after, metrics = compiled(lambda *parts: sac._update_actor(*parts))(before, column(STATE), None, key)
+    after, metrics = compiled(actor_step)(before, column(STATE), key, PLAIN)
     by_mean, by_log_std, smaller, density = actor_gradient(key)
     expected = [MEAN_SLOPE - (by_mean * STATE).mean(), MEAN - by_mean.mean(), np.log(STD) - by_log_std.mean()]
     np.testing.assert_allclose(moved(after), expected, rtol=1e-4)
@@ -133,10 +132,14 @@ def test_actor_and_temperature_update_by_hand(compiled):
 
 
 def test_cloning_update_by_hand(compiled):
-    sac, key = method(cloning=2.5), jax.random.key(4)
+    key = jax.random.key(4)
     cloned = column([2.0, -1.0]), column([0.9, -0.5])
-    after, metrics = compiled(lambda *parts: sac._update_actor(*parts))(
-        learner(optax.sgd(1.0)), column(STATE), cloned, key
+
+    def combine(policy, loss, value):
+        return sac_losses.cloned_actor_loss(loss, value, sac_losses.cloning_error(policy, *cloned), weight=2.5)
+
+    after, metrics = compiled(lambda *parts: actor_step(*parts, PLAIN, combine))(
+        learner(optax.sgd(1.0)), column(STATE), key
     )
     by_mean, by_log_std, smaller, density = actor_gradient(key)
     weight = 2.5 / np.abs(smaller).mean()  # TD3+BC: of the values, no gradient through it
@@ -165,7 +168,9 @@ def filled(count=64):
 @pytest.mark.parametrize("cloning", [None, 2.5])
 def test_updates_trace_once(cloning, traced):
     sac = SAC(batch=8, cloning=cloning)
-    logged = None if cloning is None else (column(STATE), column(ACTION))
+    logged = (
+        None if cloning is None else {"observation": column(STATE), "action": column(ACTION), "reward": column(STATE)}
+    )
     rows, state = filled(), learner(optax.adam(sac.learning_rate))
     keys = list(jax.random.split(jax.random.key(0), 11))
     state, _ = sac._update(state, rows, logged, keys[0], 3)
@@ -189,7 +194,7 @@ def test_updates_are_set_by_the_key():
 
 
 def test_the_exploring_policy_is_uniform():
-    policy = uniform_policy(2)
+    policy = UniformPolicy(2)
     observation = jnp.zeros((3, 1000, 5))
     action = np.asarray(policy(observation, jax.random.key(0)))
     assert action.shape == (3, 1000, 2)
