@@ -145,7 +145,7 @@ def _system(
 
 def _calibrated_distribution(space: ParameterSpace, result: CalibrationResult) -> NormalParameters:
     """Normal about the estimate, with the covariance where the result has one, else with each parameter's spread."""
-    joint = getattr(result, "covariance", None)
+    joint = result.covariance
     return NormalParameters(space, result.mean, np.diag(result.std**2) if joint is None else np.asarray(joint))
 
 

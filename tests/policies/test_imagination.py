@@ -1,0 +1,85 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from affine import affine
+from madoc.learning.dynamics_ensemble import Ensemble
+from madoc.learning.features import Features
+from madoc.learning.networks import stack
+from madoc.policies.imagination import Dreaming, Filter, best_candidate, dream, fall_asleep
+
+FEATURES = Features(jnp.zeros(2), jnp.ones(2), jnp.array([0.5]), jnp.asarray(1.0), jnp.asarray(2.0))
+LOGGED = jnp.array([[0.0], [10.0]])
+
+
+def certain(changes):
+    """Models whose (change, reward) is constant, all but sure of it."""
+    made = Ensemble(1, 1, (), models=len(changes), key=jax.random.key(0))
+    bias = jnp.array([[change, 0.0, -100.0, -100.0] for change in changes], jnp.float32)
+    layer = made.networks.layers[0]
+    made = eqx.tree_at(lambda e: e.networks.layers[0].weight, made, jnp.zeros_like(layer.weight))
+    made = eqx.tree_at(lambda e: e.networks.layers[0].bias, made, bias)
+    return eqx.tree_at(lambda e: e.smallest, made, jnp.full(2, -30.0))
+
+
+def imagined(*, slope, steps=3, penalty=0.0, terminated=lambda o: o[:, 0] > 100, horizon=100, threshold=0.1):
+    """Two models, changes 1 and 3 (0.5 and 1.5 physical); past discriminators whose logit rises by `slope` with it."""
+    past = stack(2, lambda key: affine([[0.0, 0.0, slope]], [0.0]), jax.random.key(0))
+    return dream(
+        certain([1.0, 3.0]),
+        Filter(jnp.arange(2), past),
+        FEATURES,
+        lambda observation, key: jnp.zeros_like(observation),
+        fall_asleep(LOGGED[:1], 4, jax.random.key(1)),
+        logged=LOGGED,
+        terminated=terminated,
+        settings=Dreaming(2, threshold, horizon, penalty),
+        steps=steps,
+        key=jax.random.key(2),
+    )
+
+
+def test_the_best_candidate_by_hand():
+    candidates = jnp.arange(12.0).reshape(3, 2, 2)
+    outcome, rewards = best_candidate(candidates, jnp.array([[0.0, 5.0], [2.0, 1.0], [1.0, 3.0]]))
+    np.testing.assert_array_equal(outcome, [[4.0, 5.0], [2.0, 3.0]])
+    np.testing.assert_array_equal(rewards, [2.0, 5.0])
+
+
+def test_what_looks_most_real_is_what_happens():
+    for slope, change in ((1.0, 1.5), (-0.1, 0.5)):
+        dreamers, rows, _ = imagined(slope=slope)
+        np.testing.assert_allclose(rows["next_observation"] - rows["observation"], change, rtol=1e-4)
+        np.testing.assert_allclose(rows["reward"], 1.0, rtol=1e-5)  # the offset: a standardised reward of 0
+        np.testing.assert_allclose(dreamers.observation, 3 * change, rtol=1e-4)
+        assert (np.asarray(dreamers.age) == 3).all()
+        assert not rows["terminated"].any()
+
+
+def test_what_looks_unreal_ends():
+    # even the better candidate, change 1, has D = sigmoid(-3), r = 0.0486 < 0.1
+    dreamers, rows, told = imagined(slope=-3.0, steps=1)
+    assert rows["terminated"].all()
+    assert told["stopped"] == 1.0
+    assert set(np.asarray(dreamers.observation)[:, 0].tolist()) <= {0.0, 10.0}
+    assert (np.asarray(dreamers.age) == 0).all()
+
+
+def test_a_fall_ends_and_the_horizon_only_starts_again():
+    _, rows, _ = imagined(slope=1.0, steps=1, terminated=lambda o: o[:, 0] > 1.0)
+    assert rows["terminated"].all()
+    dreamers, rows, _ = imagined(slope=1.0, steps=2, horizon=2)
+    assert not rows["terminated"].any()
+    assert (np.asarray(dreamers.age) == 0).all()
+
+
+def test_uncertainty_costs():
+    _, rows, told = imagined(slope=1.0, steps=1, penalty=1e6)
+    np.testing.assert_allclose(rows["reward"], 1.0 - 1e6 * told["penalty"], rtol=1e-4)
+    assert told["penalty"] > 0
+
+
+def test_imagined_observations_stay_near_the_logged_ones():
+    _, rows, _ = imagined(slope=1.0, steps=60)
+    assert rows["next_observation"].max() <= 20.0
