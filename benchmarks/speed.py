@@ -10,8 +10,10 @@ import json
 import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -19,10 +21,13 @@ import mujoco.rollout
 import numpy as np
 
 from madoc import tasks
-from madoc.calibration import CalibrationProblem, CalibrationResult, LeastSquares, Madoc, calibrate
+from madoc.calibration import CalibrationProblem, Madoc
 from madoc.calibration.madoc import grouping
 from madoc.data.targets import paper_truth
-from madoc.policies import SAC, PolicyProblem
+from madoc.learning import replay
+from madoc.learning.cloning import clone
+from madoc.learning.networks import adam
+from madoc.policies import LEARNERS, PolicyProblem
 from madoc.policies.behaviours import record_quality
 from madoc.simulation.cpu import CpuSimulator
 
@@ -39,8 +44,7 @@ def main() -> None:
         name: round(calibration_update(method) * 1e3, 3)
         for name, method in {"paper": Madoc.paper(), "default": Madoc()}.items()
     }
-    rows["sac_updates_per_second"] = {f"{width}x2": round(1.0 / sac_update(width), 1) for width in (256, 128)}
-    rows["sac_update_floor_ms"] = round(sac_flops(256, 17, 6) / rows["gflops"] / 1e6, 3)
+    rows["learner_updates"] = {name: learner_updates(name, rows["gflops"]) for name in FLOPS}
     rows["least_squares_hopper_1000_rows"] = least_squares(1000)
     rows["control_steps"] = {robot: stepping(robot) for robot in tasks.TASKS}
     text = json.dumps(rows, indent=1)
@@ -79,6 +83,83 @@ def sac_flops(width: int, observation: int, action: int, batch: int = 256) -> fl
     return batch * (2 * (1 + 3 + 2) * critic + 4 * policy)
 
 
+def mlp(inputs: int, width: int, outputs: int, layers: int = 2) -> float:
+    """Operations of one pass of a network over one row."""
+    return 2.0 * (inputs * width + (layers - 1) * width * width + width * outputs)
+
+
+def bc_flops(width: int, observation: int, action: int, batch: int = 256) -> float:
+    """Operations of a cloning update: forward 1, backward 2."""
+    return batch * 3 * mlp(observation, width, 2 * action)
+
+
+def h2o_flops(width: int, observation: int, action: int, batch: int = 256) -> float:
+    """SAC's, and two discriminators: one update, one ratio, and ten draws of the gap, on half the rows."""
+    pair = observation + action
+    both = mlp(pair, width, 2) + mlp(pair + observation, width, 2)
+    return sac_flops(width, observation, action, batch) + batch * 3 * both + batch / 2 * (1 + 10) * both
+
+
+def cql_flops(width: int, observation: int, action: int, batch: int = 256) -> float:
+    """SAC's of three layers, the twins on 30 more actions a row, forward and backward, and the policy for 2 more."""
+    critic = mlp(observation + action, width, 1, layers=3)
+    policy = mlp(observation, width, 2 * action, layers=3)
+    return batch * (2 * (1 + 3 + 2 + 30 * 3) * critic + (4 + 2) * policy)
+
+
+FLOPS = {"bc": bc_flops, "sac": sac_flops, "sac-bc": sac_flops, "h2o": h2o_flops, "cql": cql_flops, "morec": sac_flops}
+"""Of one update of a learner. Those of SAC+BC's cloning and of MOREC's imagined steps are left out."""
+
+
+def learner_updates(name: str, gflops: float) -> dict[str, dict[str, float]]:
+    """Updates a second on HalfCheetah's data at batch 256, by width, and how many times the time of its products."""
+    simulator = CpuSimulator(tasks.half_cheetah())
+    dataset = record_quality(simulator, "medium", transitions=5000, key=jax.random.key(0))
+    problem = PolicyProblem(simulator, simulator.parameters.middle, dataset)
+    found = {}
+    for width in (256, 128):
+        seconds = learner_update(name, problem, width)
+        floor = FLOPS[name](width, 17, 6) / gflops / 1e9
+        found[f"{width}"] = {"per_second": round(1.0 / seconds, 1), "times_floor": round(seconds / floor, 2)}
+    return found
+
+
+def learner_update(name: str, problem: PolicyProblem, width: int) -> float:
+    """Seconds of one update inside an epoch of them, without acting."""
+    count = 10 if name == "cql" else 50
+    hidden = {"hidden": (width, width)}
+    if name == "cql":
+        hidden = {"hidden": (width,) * 3, "critic_hidden": (width,) * 3, "cloning_updates": 0}
+    if name in ("sac", "sac-bc", "h2o"):
+        method = LEARNERS[name].make(**hidden, replay_capacity=50_000)
+    else:
+        method = LEARNERS[name].make(**hidden, epoch_updates=count)
+    state, key = method.init(problem, jax.random.key(0)), jax.random.key(1)
+    if name == "bc":
+        pairs = problem.logged["observation"], problem.logged["action"]
+        chosen = {"optimiser": adam(method.learning_rate), "batch": method.batch, "count": count}
+        run = lambda: clone(state.policy, state.optimiser, pairs, key, **chosen)  # noqa: E731
+    elif name == "cql":
+        run = lambda: method._update(state.learner, problem.logged, key, False, count)  # noqa: E731
+    elif name == "morec":
+        # adding to the replay consumes it, so every run starts at a copy
+        ring = state.replay
+        run = lambda: method._learn(problem, replace(state, replay=jax.tree.map(jnp.copy, ring)))[1]  # noqa: E731
+    else:
+        rows = {name: np.asarray(problem.logged[name]) for name in state.interaction.replay.rows}
+        seen = replay.add(state.interaction.replay, rows, np.ones(len(rows["reward"]), bool))
+        if name == "h2o":
+            run = lambda: method._update(  # noqa: E731
+                state.learning, seen, problem.logged, problem.features, key, count
+            )
+        else:
+            logged = problem.logged if method.needs_data else None
+            run = lambda: method._update(state.learner, seen, logged, key, count)  # noqa: E731
+    return (
+        best_of(lambda: jax.block_until_ready([leaf for leaf in jax.tree.leaves(run()) if eqx.is_array(leaf)])) / count
+    )
+
+
 def calibration_update(method: Madoc) -> float:
     """Seconds a calibration update of HalfCheetah takes."""
     simulator = CpuSimulator(tasks.half_cheetah())
@@ -103,39 +184,6 @@ def calibration_update(method: Madoc) -> float:
         )
 
     return best_of(run) / count
-
-
-def sac_update(width: int) -> float:
-    """Seconds a SAC update of HalfCheetah takes."""
-    simulator = CpuSimulator(tasks.half_cheetah())
-    learner = SAC(hidden=(width, width), replay_capacity=50_000)
-    problem = PolicyProblem(simulator, simulator.parameters.middle)
-    state = learner.init(problem, jax.random.key(0))
-    count = 50
-
-    def run() -> object:
-        return jax.block_until_ready(learner._update(state.learner, state.replay, None, jax.random.key(1), count)[1])
-
-    return best_of(run) / count
-
-
-def least_squares(rows: int) -> dict[str, float]:
-    """Hopper's 8 parameters from that many clean transitions: seconds, control steps and the error."""
-    simulator = CpuSimulator(tasks.hopper())
-    dataset = record_quality(simulator, "medium", transitions=rows, key=jax.random.key(0))
-    problem = CalibrationProblem(dataset, simulator)
-
-    def run() -> CalibrationResult:
-        return calibrate(
-            LeastSquares(), problem, key=jax.random.key(0), budget=1_000_000, truth=dataset.true_parameters
-        )
-
-    result = run()
-    return {
-        "seconds": round(best_of(run), 2),
-        "control_steps": result.control_steps,
-        "mean_absolute_error": result.error["mean_absolute"],
-    }
 
 
 def stepping(robot: str) -> dict[str, float]:

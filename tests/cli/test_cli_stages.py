@@ -100,3 +100,28 @@ def test_evaluate_shows_policies_beside_the_yardsticks(whole, tmp_path, capsys):
     assert "% of the return of the policy learnt at the truth" in told
     # The same episodes as `madoc run` saw.
     assert read(copy / "evaluation.json") == read(whole / "evaluation.json")
+
+
+@pytest.mark.parametrize("at", ["distribution", "uniform"])
+def test_learn_over_a_distribution(whole, tmp_path, capsys, at):
+    words = ["learn", whole / "calibration" / "result.json", "--at", at, "--out", tmp_path / "policy", *LEARNING]
+    answer, code = asked_for_json(capsys, words)
+    assert (answer["at"], answer["spent"], answer["budget_unit"], code) == (at, 1000, "control steps", 0)
+
+
+def test_learn_from_the_data_alone(whole, tmp_path, capsys):
+    moved = tmp_path / "run"
+    shutil.copytree(whole, moved)
+    words = ["learn", moved, "--method", "bc", "--budget", "20", "--quiet", "--set", "epoch_updates=10", "batch=32"]
+    answer, code = asked_for_json(capsys, words)
+    assert (answer["spent"], answer["budget_unit"], answer["control_steps"], code) == (20, "updates", 0, 0)
+    assert answer["policy"] == str(moved / "policy-bc" / "policy.npz")
+    lines = [json.loads(line) for line in (moved / "policy-bc" / "metrics.jsonl").read_text().splitlines()]
+    assert [line["updates"] for line in lines] == [10, 20]
+    assert read(moved / "policy-bc" / "result.json")["updates"] == 20
+
+
+@pytest.mark.parametrize("method", ["bc", "cql", "morec", "dr-bc"])
+def test_a_place_that_would_change_nothing_is_refused(whole, capsys, method):
+    assert main(["learn", str(whole), "--method", method, "--at", "midrange"]) == 2
+    assert f"{method} does not learn at given parameters" in capsys.readouterr().err

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from madoc import checkpoint, simulation
+from madoc.data.dataset import Disturbance
 from madoc.errors import MadocError
 from madoc.numpy_policy import NumpyPolicy
 from madoc.policies import (
@@ -256,6 +257,20 @@ def test_data_without_rewards_is_refused_where_they_are_learnt_from(name, datase
     silent = replace(dataset, transitions=replace(dataset.transitions, reward=np.zeros(len(dataset))))
     with pytest.raises(MadocError, match=f"{name} learns from logged rewards, and every reward .* is 0"):
         learn_policy(METHODS[name], replace(problem, dataset=silent), key=KEY, budget=BUDGET)
+
+
+@pytest.mark.parametrize("name", REWARDED)
+def test_next_observations_of_other_rows_are_refused_where_they_are_learnt_from(name, dataset, problem):
+    torn = replace(dataset, disturbance=Disturbance(shuffled="next_observations"))
+    with pytest.raises(MadocError, match=f"{name} learns from what followed on each action"):
+        learn_policy(METHODS[name], replace(problem, dataset=torn), key=KEY, budget=BUDGET)
+
+
+def test_data_of_another_observation_is_refused(dataset, simulator):
+    rows = dataset.transitions
+    narrow = replace(rows, observation=rows.observation[:, :2], next_observation=rows.next_observation[:, :2])
+    with pytest.raises(MadocError, match="the data has 2 values per observation, the simulator's two_link_arm shows 4"):
+        PolicyProblem(simulator, simulator.parameters.middle, replace(dataset, transitions=narrow))
 
 
 def test_a_model_cannot_be_learnt_where_falls_cannot_be_told(dataset):

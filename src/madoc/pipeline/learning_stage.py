@@ -93,7 +93,7 @@ def learn_in(
         dataset = load_source(calibrated.source, calibrated.task, seed=calibrated.seed)
         if dataset.disturbance.hidden_velocities:
             raise MadocError(
-                f"{order.method} clones actions from whole observations, and {dataset.origin} hides velocities; "
+                f"{order.method} learns from whole observations, and {dataset.origin} hides velocities; "
                 "take a method that needs no data"
             )
     spec = {

@@ -51,6 +51,12 @@ class PolicyProblem:
         if self.dataset is not None:
             if self.dataset.task_name != task.name:
                 raise MadocError(f"the data was recorded from {self.dataset.task_name}, the simulator is {task.name}")
+            logged = self.dataset.transitions.observation.shape[-1]
+            if logged != task.observation_size:
+                raise MadocError(
+                    f"the data has {logged} values per observation, the simulator's {task.name} shows "
+                    f"{task.observation_size}; give data and simulator of the same observation"
+                )
             object.__setattr__(self, "dataset", replace(self.dataset, true_parameters=None))
 
     @cached_property
@@ -85,11 +91,12 @@ class PolicyProblem:
         return fixed if isinstance(fixed, np.ndarray) else fixed.draw(key, count)
 
 
-def require_data(problem: PolicyProblem, learner: str, *, rows: int, rewards: bool = True) -> Dataset:
+def require_data(problem: PolicyProblem, learner: str, *, rows: int, outcomes: bool = True) -> Dataset:
     """The dataset, refused where a learner could not use it.
 
     Raises:
-        MadocError: There is none, it has fewer than `rows` rows, or `rewards` are needed and all of them are 0.
+        MadocError: There is none, or it has fewer than `rows` rows. Or `outcomes` are learnt from, r and s' of a
+            row, and all rewards are 0 or next observations are another row's.
     """
     if problem.dataset is None:
         raise MadocError(f"{learner} learns from logged data: give it a dataset")
@@ -98,10 +105,15 @@ def require_data(problem: PolicyProblem, learner: str, *, rows: int, rewards: bo
             f"{learner} needs at least as many rows as a batch has, {rows}, got {len(problem.dataset)} in "
             f"{problem.dataset.origin}; give it more data or a smaller batch"
         )
-    if rewards and not np.any(problem.dataset.transitions.reward):
+    if outcomes and not np.any(problem.dataset.transitions.reward):
         raise MadocError(
             f"{learner} learns from logged rewards, and every reward in {problem.dataset.origin} is 0; "
             "use bc, or a learner that takes its rewards from the simulator"
+        )
+    if outcomes and problem.dataset.disturbance.shuffled == "next_observations":
+        raise MadocError(
+            f"{learner} learns from what followed on each action, and the next observations in "
+            f"{problem.dataset.origin} are not those of their rows; use bc, sac-bc or dr-bc"
         )
     return problem.dataset
 

@@ -76,7 +76,7 @@ class BC:
         Raises:
             MadocError: No data, or too little.
         """
-        dataset = require_data(problem, self.name, rows=self.batch, rewards=False)
+        dataset = require_data(problem, self.name, rows=self.batch, outcomes=False)
         of_policy, key = jax.random.split(key)
         observation = np.asarray(dataset.transitions.observation)
         spread = observation.std(0)

@@ -100,7 +100,7 @@ class SAC:
             MadocError: Cloning without data or with too little, or fewer environments than systems.
         """
         if self.needs_data:
-            require_data(problem, self.name, rows=self.batch, rewards=False)
+            require_data(problem, self.name, rows=self.batch, outcomes=False)
         of_learner, of_start, key = jax.random.split(key, 3)
         sizes = problem.simulator.task.observation_size, problem.simulator.action_size
         learner = fresh(*sizes, hidden=self.hidden, descent=self._descent, key=of_learner)
