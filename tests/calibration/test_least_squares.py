@@ -15,7 +15,6 @@ from madoc.calibration.least_squares.linearisation import (
     Linearisation,
     difference_points,
     linearise,
-    simulate,
 )
 from madoc.calibration.least_squares.uncertainty import (
     bread,
@@ -25,6 +24,7 @@ from madoc.calibration.least_squares.uncertainty import (
     meat,
     sandwich,
 )
+from madoc.calibration.window_residuals import window_residuals
 from madoc.data import Disturbance, disturb
 from madoc.data.windows import windows_at
 from madoc.errors import MadocError
@@ -139,7 +139,7 @@ def test_all_slopes_come_from_one_batch():
     rows = np.arange(4)
     windows = windows_at(log, log.transitions.observation[rows], rows, 3)
     truth = task.parameters.to_unit(task.parameters.vector(SPRING_TRUTH))
-    residuals = simulate(simulator, windows, difference_points(truth), np.ones(2))
+    residuals = window_residuals(simulator, windows, difference_points(truth), np.ones(2))
     assert residuals.shape == (7, 4, 6)
     assert simulator.rows == 7 * 4 * 3
     np.testing.assert_allclose(residuals[0], 0.0, atol=1e-12)

@@ -9,9 +9,10 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.cautions import at_end_of_range, exploded
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.calibration.least_squares.linearisation import difference_points, linearise, simulate
+from madoc.calibration.least_squares.linearisation import difference_points, linearise
 from madoc.calibration.least_squares.losses import ALL_FAILED, Loss, mean_cost, scale_of
 from madoc.calibration.least_squares.uncertainty import bread, half_width, identifiability, meat, sandwich
+from madoc.calibration.window_residuals import window_residuals
 from madoc.data.windows import Windows, first_rows, windows_at
 from madoc.errors import MadocError, check_at_least
 from madoc.types import Metrics
@@ -259,7 +260,7 @@ def _simulate_each(
 ) -> Float[np.ndarray, "searches points windows values"]:
     """Residuals at the points of all searches, in one batch."""
     scale = problem.scalings["standardised"].next_scale
-    residuals = simulate(problem.simulator, windows, points.reshape(-1, points.shape[-1]), scale)
+    residuals = window_residuals(problem.simulator, windows, points.reshape(-1, points.shape[-1]), scale)
     return residuals.reshape(*points.shape[:2], *residuals.shape[1:])
 
 

@@ -1,12 +1,9 @@
-"""Residuals at many parameters in one batched simulation, and their central differences."""
+"""Slopes of residuals by central differences; `window_residuals` simulates all of their points in one batch."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-
-from madoc.data.windows import Windows
-from madoc.simulation.base import Simulator
 
 DIFFERENCE = 1e-4
 """Half width of a central difference in [-1, 1].
@@ -27,27 +24,6 @@ class Linearisation:
 
     residuals: Float[np.ndarray, "windows values"]
     jacobian: Float[np.ndarray, "windows values d"]
-
-
-def simulate(
-    simulator: Simulator,
-    windows: Windows,
-    unit: Float[np.ndarray, "systems d"],
-    scale: Float[np.ndarray, " observation"],
-) -> Float[np.ndarray, "systems windows values"]:
-    """Simulated less logged observations after every action of the windows, over `scale`; NaN once a window failed.
-
-    Spends systems · windows · steps control steps.
-    """
-    system = simulator.bind(simulator.parameters.to_physical(np.clip(unit, -1.0, 1.0)))
-    shape = (len(unit), *windows.states.shape)
-    state = np.ascontiguousarray(np.broadcast_to(windows.states, shape))
-    columns = []
-    for step in range(windows.steps):
-        action = windows.actions[:, step]
-        state = system.step(state, np.ascontiguousarray(np.broadcast_to(action, (len(unit), *action.shape))))
-        columns.append((simulator.task.observe(state) - windows.following[:, step]) / scale)
-    return np.concatenate(columns, axis=-1)
 
 
 def difference_points(unit: Float[np.ndarray, " d"]) -> Float[np.ndarray, "points d"]:
