@@ -13,6 +13,9 @@ from madoc.calibration import (
     CALIBRATORS,
     CalibrationProblem,
     CalibrationResult,
+    CmaEs,
+    Droid,
+    Dropo,
     LeastSquares,
     Madoc,
     Oted,
@@ -48,6 +51,22 @@ METHODS = {
     "least-squares, windows": LeastSquares(horizon=3, windows=4, search_windows=2, search_epochs=1, tolerance=0.0),
     "oted": Oted(draws=6, rows=2, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=2, cloning_updates=3),
     "oted, free running": Oted("policy", draws=4, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=0),
+    "dropo": Dropo(draws=4, transitions=3),
+    "e-dropo": Dropo(draws=4, transitions=3, entropy_weight=0.1),
+    "droid": Droid(horizon=3, windows=3),
+    "cma-es": CmaEs(rows=9),
+    "cma-es-distribution": CmaEs("distribution", rows=9, features=7),
+    "cma-es, acting": CmaEs(
+        "distribution",
+        "policy",
+        rows=2,
+        horizon=4,
+        features=7,
+        hidden=(8,),
+        cloning_epochs=2,
+        cloning_updates=3,
+        batch=16,
+    ),
 }
 IDLE = {"nominal": Uncalibrated(), "uniform": Uncalibrated(randomised=True)}
 
@@ -77,6 +96,9 @@ QUICK = (
     "madoc, free running",
     "least-squares",
     "oted",
+    "dropo",
+    "droid",
+    "cma-es-distribution",
 )  # the others differ by a value; `make test-slow` holds them to every rule too
 
 
@@ -252,7 +274,7 @@ def test_data_of_another_robot_is_refused(dataset, simulator):
 def test_logged_starts_without_states_are_refused(method, dataset, starts):
     if isinstance(method, Madoc):
         method = replace(method, starts=starts, horizon=None)
-    elif isinstance(method, Oted):
+    elif isinstance(method, Oted | CmaEs):
         method = replace(method, starts="logged")
     blind = replace(two_link_arm(), state_from_observation=None)
     problem = CalibrationProblem(dataset, simulation.make(blind, threads=1))
@@ -260,7 +282,7 @@ def test_logged_starts_without_states_are_refused(method, dataset, starts):
         calibrate(method, problem, key=KEY, budget=BUDGET)
 
 
-@pytest.mark.parametrize("name", ["madoc, free running", "oted, free running", "nominal", "uniform"])
+@pytest.mark.parametrize("name", ["madoc, free running", "oted, free running", "cma-es, acting", "nominal", "uniform"])
 def test_hidden_velocities_leave_methods_that_need_no_states(dataset, name):
     whole = replace(two_link_arm(), velocities=2)
     hidden = disturb(dataset, Disturbance(hidden_velocities=True), whole, KEY)

@@ -4,6 +4,9 @@ from functools import partial
 
 from madoc.calibration.base import CalibrationProblem, Calibrator, Estimate
 from madoc.calibration.calibrate import calibrate
+from madoc.calibration.cma_es.calibrator import CmaEs
+from madoc.calibration.droid import Droid
+from madoc.calibration.dropo.calibrator import ENTROPY_WEIGHT, Dropo
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.madoc.calibrator import Madoc
 from madoc.calibration.oted.calibrator import Oted
@@ -27,6 +30,18 @@ CALIBRATORS: dict[str, MethodEntry[Calibrator]] = {
     "oted": MethodEntry(
         Oted, "(s, a) distribution matching by a bandit's gradient", "Gur et al. (from its abstract)", 2021
     ),
+    "dropo": MethodEntry(Dropo, "a distribution that makes logged next states likely", "Tiboni et al., DROPO", 2022),
+    "e-dropo": MethodEntry(
+        partial(Dropo, entropy_weight=ENTROPY_WEIGHT), "DROPO with an entropy bonus", "Fickinger et al., E-DROPO", 2025
+    ),
+    "droid": MethodEntry(Droid, "replayed windows, CMA-ES, its covariance", "Tsai et al., DROID", 2021),
+    "cma-es": MethodEntry(CmaEs, "one-step error, black box: a yardstick", "Hansen and Ostermeier, CMA-ES", 2001),
+    "cma-es-distribution": MethodEntry(
+        partial(CmaEs, "distribution"),
+        "distance of unordered observations, black box",
+        "after Proprioceptive Distribution Matching",
+        2026,
+    ),
     "nominal": MethodEntry(Uncalibrated, "mid-range, uncalibrated: a yardstick", "no paper: a yardstick", 2024),
     "uniform": MethodEntry(
         partial(Uncalibrated, randomised=True),
@@ -41,6 +56,9 @@ __all__ = [
     "CalibrationProblem",
     "CalibrationResult",
     "Calibrator",
+    "CmaEs",
+    "Droid",
+    "Dropo",
     "Estimate",
     "LeastSquares",
     "Madoc",

@@ -5,18 +5,23 @@ cost adds an L1 and an L2 distance of trajectories; how they are weighed, and ov
 every channel is in units of its typical change in one step, and both distances count the same.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration import evolution
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.cautions import at_end_of_range, exploded
-from madoc.calibration.evolution import Evolution
+from madoc.calibration.population_search import (
+    SearchState,
+    draw_windows,
+    estimate_from_search,
+    mean_with_failures,
+    next_generation,
+)
 from madoc.calibration.window_residuals import window_residuals
-from madoc.data.windows import first_rows, windows_at
+from madoc.data.windows import first_rows
 from madoc.errors import check_at_least
 from madoc.types import Metrics
 
@@ -28,28 +33,16 @@ def trajectory_cost(
     return absolute * np.abs(residuals).mean(-1) + squared * (residuals**2).mean(-1)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class DroidState:
-    """Everything DROID carries; `chosen` are the rebuilt states that windows begin at."""
-
-    search: Evolution
-    chosen: Int[np.ndarray, " windows"]
-    key: PRNGKeyArray
-    control_steps: int
-    failures: int
-
-
 @dataclass(frozen=True)
 class Droid:
     """CMA-ES on the distance between logged stretches and their replay from the logged state.
 
-    The same stretches are replayed in every generation, so candidates of different ones can be compared. No stretch
-    reaches over the end of an episode.
+    The authors replay one demonstration; from a long log, a few short stretches are drawn anew for every generation.
+    None reaches over the end of an episode.
 
     Attributes:
         horizon: Control steps of a stretch.
-        windows: Stretches; all there are if fewer.
+        windows: Stretches a generation.
         absolute: Weight of the L1 distance.
         squared: Weight of the squared L2 distance.
         population: Candidates a generation; None takes 4 + ⌊3 ln d⌋.
@@ -57,7 +50,7 @@ class Droid:
     """
 
     horizon: int = 5
-    windows: int = 40
+    windows: int = 20
     absolute: float = 1.0
     squared: float = 1.0
     population: int | None = None
@@ -76,76 +69,45 @@ class Droid:
         """Metrics beside the progress bar."""
         return ("cost", "deviation")
 
-    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> DroidState:
-        """Stretches drawn, the search about mid-range.
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
+        """The search about mid-range.
 
         Raises:
             MadocError: No state can be rebuilt, no episode is long enough, or the next observations are shuffled.
         """
         problem.require_pairs(self.name)
-        of_windows, key = jax.random.split(key)
-        possible = first_rows(problem.dataset, problem.logged_rows, self.horizon)
-        count = min(self.windows, len(possible))
-        order = np.asarray(jax.random.choice(of_windows, len(possible), (count,), replace=False))
-        return DroidState(
-            search=evolution.begin(np.zeros(len(problem.simulator.parameters))),
-            chosen=possible[order],
-            key=key,
-            control_steps=0,
-            failures=0,
-        )
+        first_rows(problem.dataset, problem.logged_rows, self.horizon)
+        return SearchState(evolution.begin(np.zeros(len(problem.simulator.parameters))), key, 0, 0)
 
-    def step(self, problem: CalibrationProblem, state: DroidState) -> tuple[DroidState, Metrics]:
+    def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Metrics]:
         """One generation, all candidates in one batch."""
-        of_candidates, key = jax.random.split(state.key)
-        population = self.population or evolution.population_of(len(state.search.mean))
-        candidates = evolution.ask(state.search, of_candidates, population)
-        rows = problem.logged_rows[state.chosen]
-        windows = windows_at(problem.dataset, problem.logged_states[state.chosen], rows, self.horizon)
+        of_candidates, of_windows, key = jax.random.split(state.key, 3)
+        candidates = evolution.ask(state.search, of_candidates, self.population)
+        windows = draw_windows(problem, self.horizon, self.windows, of_windows)
         scale = problem.scalings["standardised"].next_scale
         residuals = window_residuals(problem.simulator, windows, candidates, scale)
         by_window = trajectory_cost(residuals, absolute=self.absolute, squared=self.squared)
-        costs = evolution.mean_with_failures(by_window)
-        following = replace(
-            state,
-            search=evolution.tell(state.search, candidates, costs),
-            key=key,
-            control_steps=state.control_steps + by_window.size * self.horizon,
-            failures=state.failures + int(np.isnan(by_window).sum()),
-        )
-        return following, {
-            "cost": float(costs.min()),
-            "deviation": evolution.widest_deviation(following.search),
-        }
+        costs = mean_with_failures(by_window)
+        spent, failures = by_window.size * self.horizon, int(np.isnan(by_window).sum())
+        following = next_generation(state, key, candidates, costs, spent=spent, failures=failures)
+        return following, {"cost": float(costs.min()), "deviation": evolution.widest_deviation(following.search)}
 
-    def estimate(self, problem: CalibrationProblem, state: DroidState) -> Estimate:
+    def estimate(self, problem: CalibrationProblem, state: SearchState) -> Estimate:
         """The mean of the search, and the covariance of its last candidates: the paper's randomization."""
-        space = problem.simulator.parameters
-        half = (space.high - space.low) / 2.0
-        covariance = half[:, None] * evolution.spread(state.search) * half
-        return Estimate(
-            mean=space.to_physical(state.search.mean),
-            std=np.sqrt(np.diag(covariance)),
-            groups=(tuple(range(len(space))),),
-            warnings=(
-                *at_end_of_range(state.search.mean, space.names),
-                *exploded(state.failures, state.control_steps),
-            ),
-            covariance=covariance,
-        )
+        return estimate_from_search(problem, state)
 
-    def control_steps(self, state: DroidState) -> int:
+    def control_steps(self, state: SearchState) -> int:
         """Simulated control steps so far."""
         return state.control_steps
 
-    def stage(self, state: DroidState) -> str:
+    def stage(self, state: SearchState) -> str:
         """There is only one."""
         return "calibrating"
 
-    def progress(self, state: DroidState, budget: int) -> float:
+    def progress(self, state: SearchState, budget: int) -> float:
         """Share of the control steps."""
         return min(1.0, state.control_steps / budget)
 
-    def converged(self, state: DroidState) -> str | None:
+    def converged(self, state: SearchState) -> str | None:
         """A sentence once the search is narrow."""
         return evolution.settled(state.search, self.tolerance)

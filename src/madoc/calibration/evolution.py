@@ -46,15 +46,16 @@ def begin(mean: Float[np.ndarray, " d"], deviation: float = FIRST_DEVIATION) -> 
 
 
 def population_of(dimensions: int) -> int:
-    """Candidates a generation where nobody says otherwise: 4 + ⌊3 ln d⌋ (Eq. 48 of the tutorial)."""
+    """Candidates a generation: 4 + ⌊3 ln d⌋ (Eq. 48 of the tutorial)."""
     return 4 + int(3.0 * np.log(dimensions))
 
 
-def ask(evolution: Evolution, key: PRNGKeyArray, population: int) -> Float[np.ndarray, "population d"]:
-    """The candidates of a generation.
+def ask(evolution: Evolution, key: PRNGKeyArray, population: int | None = None) -> Float[np.ndarray, "population d"]:
+    """The candidates of a generation, `population_of` the dimensions where no number is given.
 
     One that leaves the box is drawn again, a hundred times at most; then it is put on the wall.
     """
+    population = population or population_of(len(evolution.mean))
     optimiser = _optimiser(evolution, population, seed=int(jax.random.randint(key, (), 0, 2**31 - 1)))
     return np.stack([optimiser.ask() for _ in range(population)])
 
@@ -92,17 +93,6 @@ def settled(evolution: Evolution, tolerance: float) -> str | None:
     if widest / 2.0 >= tolerance:
         return None
     return f"after {evolution.generation} generations every deviation is below {tolerance:g} of its range"
-
-
-def mean_with_failures(costs: Float[np.ndarray, "candidates windows"]) -> Float[np.ndarray, " candidates"]:
-    """Mean cost of each candidate; a window that failed (NaN) costs the worst seen and as much more as that is
-    above the best, so that a candidate gains nothing by failing.
-    """
-    failed = np.isnan(costs)
-    if failed.all():
-        return np.zeros(len(costs))
-    best, worst = np.nanmin(costs), np.nanmax(costs)
-    return np.where(failed, 2.0 * worst - best, costs).mean(-1)
 
 
 def _optimiser(evolution: Evolution, population: int, seed: int = 0) -> CMA:

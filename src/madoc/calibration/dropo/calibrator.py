@@ -1,9 +1,9 @@
 """DROPO, assembled: CMA-ES over the mean and the deviation of a distribution of parameters.
 
-Tiboni et al. 2023 (arXiv 2201.08434); with an entropy bonus, E-DROPO (arXiv 2506.10133).
+Tiboni et al. 2023 (arXiv 2201.08434); with an entropy bonus it is E-DROPO (arXiv 2506.10133).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import numpy as np
@@ -19,122 +19,16 @@ from madoc.calibration.dropo.likelihood import (
     parameter_draws,
     truncated_noise,
 )
-from madoc.calibration.evolution import Evolution
+from madoc.calibration.population_search import SearchState, draw_windows, mean_with_failures, next_generation
 from madoc.calibration.window_residuals import window_residuals
-from madoc.data.windows import first_rows, windows_at
+from madoc.data.windows import first_rows
 from madoc.errors import check_at_least
 from madoc.types import Metrics
 
 DEVIATIONS = (1e-3, 0.5)
-"""Smallest and largest σ in [-1, 1]; the largest is a quarter of a range."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class DropoState:
-    """Everything DROPO carries. The search runs over (μ, log σ), both mapped to [-1, 1]."""
-
-    search: Evolution
-    key: PRNGKeyArray
-    rows_key: PRNGKeyArray
-    control_steps: int
-    failures: int
-
-
-@dataclass(frozen=True)
-class Dropo:
-    draws: int = 10
-    transitions: int = 16
-    horizon: int = 1
-    epsilon: float = 1e-4
-    entropy_weight: float = 0.0
-    population: int | None = None
-    tolerance: float = 1e-4
-    fresh: bool = True
-    tau0: float = 0.0
-
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "e-dropo" if self.entropy_weight else "dropo"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("cost", "deviation")
-
-    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> DropoState:
-        problem.require_pairs(self.name)
-        rows_key, key = jax.random.split(key)
-        count = len(problem.simulator.parameters)
-        first_rows(problem.dataset, problem.logged_rows, self.horizon)
-        return DropoState(
-            search=evolution.begin(np.append(np.zeros(count), np.full(count, self.tau0))),
-            key=key,
-            rows_key=rows_key,
-            control_steps=0,
-            failures=0,
-        )
-
-    def step(self, problem: CalibrationProblem, state: DropoState) -> tuple[DropoState, Metrics]:
-        of_candidates, of_draws, of_rows, key = jax.random.split(state.key, 4)
-        population = self.population or evolution.population_of(len(state.search.mean))
-        candidates = evolution.ask(state.search, of_candidates, population)
-        mean, std = distribution_of(candidates)
-        noise = truncated_noise(of_draws, self.draws // 2, mean.shape[1])
-        draws = parameter_draws(mean, std, noise)
-        possible = first_rows(problem.dataset, problem.logged_rows, self.horizon)
-        order = np.asarray(jax.random.randint(of_rows if self.fresh else state.rows_key, (self.transitions,), 0, len(possible)))
-        chosen = possible[order]
-        windows = windows_at(problem.dataset, problem.logged_states[chosen], problem.logged_rows[chosen], self.horizon)
-        residuals = window_residuals(
-            problem.simulator, windows, draws.reshape(-1, draws.shape[-1]), problem.scalings["standardised"].next_scale
-        ).reshape(*draws.shape[:2], len(chosen), -1)
-        by_row = negative_log_likelihood(*moments(residuals), self.epsilon)
-        costs = evolution.mean_with_failures(by_row) - self.entropy_weight * entropy(std)
-        following = replace(
-            state,
-            search=evolution.tell(state.search, candidates, costs),
-            key=key,
-            control_steps=state.control_steps + draws.shape[0] * draws.shape[1] * len(chosen) * self.horizon,
-            failures=state.failures + int((~np.isfinite(residuals).all(-1)).sum()),
-        )
-        return following, {
-            "cost": float(costs.min()),
-            "deviation": evolution.widest_deviation(following.search),
-            "std": float(distribution_of(following.search.mean)[1].mean()),
-        }
-
-    def estimate(self, problem: CalibrationProblem, state: DropoState) -> Estimate:
-        space = problem.simulator.parameters
-        unit, deviation = distribution_of(state.search.mean)
-        std = deviation * (space.high - space.low) / 2.0
-        return Estimate(
-            mean=space.to_physical(unit),
-            std=std,
-            groups=(tuple(range(len(space))),),
-            warnings=(
-                *at_end_of_range(unit, space.names),
-                *exploded(state.failures, state.control_steps),
-            ),
-            covariance=np.diag(std**2),
-        )
-
-    def control_steps(self, state: DropoState) -> int:
-        """Simulated control steps so far."""
-        return state.control_steps
-
-    def stage(self, state: DropoState) -> str:
-        """There is only one."""
-        return "calibrating"
-
-    def progress(self, state: DropoState, budget: int) -> float:
-        """Share of the control steps."""
-        return min(1.0, state.control_steps / budget)
-
-    def converged(self, state: DropoState) -> str | None:
-        """A sentence once the search is narrow."""
-        return evolution.settled(state.search, self.tolerance)
+"""Smallest and largest σ in [-1, 1]. The largest is a quarter of a range, as the authors'."""
+ENTROPY_WEIGHT = 0.1
+"""E-DROPO's bonus on the mean log-likelihood of a transition, in nats a nat; the paper's own is not known to us."""
 
 
 def distribution_of(
@@ -144,3 +38,101 @@ def distribution_of(
     count = candidate.shape[-1] // 2
     low, high = np.log(DEVIATIONS)
     return candidate[..., :count], np.exp(low + (candidate[..., count:] + 1.0) / 2.0 * (high - low))
+
+
+@dataclass(frozen=True)
+class Dropo:
+    """Maximise the likelihood of logged next states under the next states that a distribution of parameters makes.
+
+    The authors draw 100 parameter vectors for each of a few transitions, always the same. Here a generation costs
+    population · draws · transitions control steps: few draws, in antithetic pairs and the same for all candidates, of
+    few transitions, drawn anew. Residuals are in units of each channel's typical change in one step, and so is ε.
+
+    Attributes:
+        draws: Parameter vectors per candidate, S; even.
+        transitions: Logged rows a generation.
+        epsilon: ε, added to the variance of every channel.
+        entropy_weight: E-DROPO's bonus, against the collapse of σ, beside the mean log-likelihood of a transition.
+        population: Candidates a generation; None takes 4 + ⌊3 ln 2d⌋.
+        tolerance: Share of each range, of the mean's and of log σ's; it stops once the search is narrower. 0 never.
+    """
+
+    draws: int = 10
+    transitions: int = 16
+    epsilon: float = 1e-4
+    entropy_weight: float = 0.0
+    population: int | None = None
+    tolerance: float = 1e-4
+
+    def __post_init__(self) -> None:
+        check_at_least(self, draws=2, transitions=1, epsilon=1e-12, entropy_weight=0.0, population=4, tolerance=0.0)
+
+    @property
+    def name(self) -> str:
+        """As `madoc methods` lists it."""
+        return "e-dropo" if self.entropy_weight else "dropo"
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Metrics beside the progress bar."""
+        return ("cost", "std", "deviation")
+
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
+        """The search about mid-range, σ half-way between its ends on a log scale.
+
+        Raises:
+            MadocError: No state can be rebuilt, or the next observations are shuffled.
+        """
+        problem.require_pairs(self.name)
+        first_rows(problem.dataset, problem.logged_rows, 1)
+        return SearchState(evolution.begin(np.zeros(2 * len(problem.simulator.parameters))), key, 0, 0)
+
+    def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Metrics]:
+        """One generation: all draws of all candidates in one batch."""
+        of_candidates, of_draws, of_windows, key = jax.random.split(state.key, 4)
+        candidates = evolution.ask(state.search, of_candidates, self.population)
+        mean, std = distribution_of(candidates)
+        draws = parameter_draws(mean, std, truncated_noise(of_draws, self.draws // 2, mean.shape[-1]))
+        windows = draw_windows(problem, 1, self.transitions, of_windows)
+        scale = problem.scalings["standardised"].next_scale
+        flat = window_residuals(problem.simulator, windows, draws.reshape(-1, draws.shape[-1]), scale)
+        residuals = flat.reshape(*draws.shape[:2], *flat.shape[1:])
+        by_row = negative_log_likelihood(*moments(residuals), self.epsilon)
+        costs = mean_with_failures(by_row) - self.entropy_weight * entropy(std)
+        failures = int((~np.isfinite(flat).all(-1)).sum())
+        spent = flat.shape[0] * flat.shape[1]
+        following = next_generation(state, key, candidates, costs, spent=spent, failures=failures)
+        return following, {
+            "cost": float(costs.min()),
+            "std": float(distribution_of(following.search.mean)[1].mean()),
+            "deviation": evolution.widest_deviation(following.search),
+        }
+
+    def estimate(self, problem: CalibrationProblem, state: SearchState) -> Estimate:
+        """μ and σ at the centre of the search, which is steadier than its best candidate."""
+        space = problem.simulator.parameters
+        mean, deviation = distribution_of(state.search.mean)
+        std = deviation * (space.high - space.low) / 2.0
+        return Estimate(
+            mean=space.to_physical(mean),
+            std=std,
+            groups=(tuple(range(len(space))),),
+            warnings=(*at_end_of_range(mean, space.names), *exploded(state.failures, state.control_steps)),
+            covariance=np.diag(std**2),
+        )
+
+    def control_steps(self, state: SearchState) -> int:
+        """Simulated control steps so far."""
+        return state.control_steps
+
+    def stage(self, state: SearchState) -> str:
+        """There is only one."""
+        return "calibrating"
+
+    def progress(self, state: SearchState, budget: int) -> float:
+        """Share of the control steps."""
+        return min(1.0, state.control_steps / budget)
+
+    def converged(self, state: SearchState) -> str | None:
+        """A sentence once the search is narrow."""
+        return evolution.settled(state.search, self.tolerance)

@@ -1,4 +1,4 @@
-"""DROPO's objective, equation by equation: draws of parameters, the next states they make, the likelihood of logged ones.
+"""DROPO's objective by equation: draws of parameters, the next states they make, how likely the logged ones are.
 
 Tiboni et al. 2023, "DROPO: sim-to-real transfer with offline domain randomization" (arXiv 2201.08434).
 """

@@ -1,0 +1,321 @@
+"""CMA-ES, assembled: a black-box search of parameters, by one of two objectives.
+
+`one-step` compares each logged next observation with the simulated one. `distribution` compares clouds of
+observations whose order is unknown, the idea of "Simulator adaptation for sim-to-real learning of legged locomotion
+via proprioceptive distribution matching" (arXiv 2604.11090); its distance and its search are our choice.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import equinox as eqx
+import jax
+import numpy as np
+import optax
+from jaxtyping import Float, PRNGKeyArray, PyTree
+
+from madoc.calibration import evolution
+from madoc.calibration.base import CalibrationProblem, Estimate
+from madoc.calibration.cma_es.mean_embedding import (
+    CosineFeatures,
+    cosine_features,
+    discrepancies,
+)
+from madoc.calibration.population_search import (
+    SearchState,
+    draw_windows,
+    estimate_from_search,
+    mean_with_failures,
+    next_generation,
+)
+from madoc.calibration.window_residuals import window_residuals
+from madoc.data.windows import first_rows
+from madoc.errors import check_at_least
+from madoc.learning.cloning import clone
+from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.simulation.rollout import Walkers, begin, reset_states, roll
+from madoc.types import Metrics
+
+ROWS = {"one-step": 100, "distribution": 500, "policy": 50}
+"""Logged rows, or walkers, under each candidate."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Clouds:
+    """What clouds are compared by.
+
+    Attributes:
+        features: Of observations (`logged` starts), or of observations and actions (`policy`).
+        wanted: What their mean should be; zeros until the log has been read.
+        read: 1 once it has.
+    """
+
+    features: CosineFeatures
+    wanted: Float[np.ndarray, " features"]
+    read: int
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Actor:
+    """A clone of the behaviour, and where its rollouts stand."""
+
+    policy: TanhGaussianPolicy
+    optimiser: PyTree
+    walkers: Walkers
+    epochs: int
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class CmaEsState:
+    """The search; for `distribution` the clouds it compares, and who acts in them where someone does."""
+
+    inner: SearchState
+    clouds: Clouds | None
+    actor: Actor | None
+
+
+@dataclass(frozen=True)
+class CmaEs:
+    """CMA-ES over the box of parameters, all candidates of a generation in one batch.
+
+    Attributes:
+        objective: `one-step`: the mean squared error of next observations, each channel in units of its typical
+            change. `distribution`: the maximum mean discrepancy of clouds; see `starts`.
+        starts: Of `distribution`. `logged`: one control step from logged states under their actions; the cloud of
+            next observations should differ from that of observations as it does in the log, whichever belongs to
+            which. `policy`: a clone acts from resets on, and its observations and actions should be distributed as
+            the logged ones; no state needs to be rebuilt. All candidates go on from where the last best one stood.
+        rows: Logged rows, or walkers, under each candidate; None takes 100 for `one-step`, 500 and 50 for the starts.
+        horizon: Control steps each walker takes in a generation.
+        features: Random features of a cloud.
+        hidden: Units per layer of the clone.
+        cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
+        cloning_updates: Updates in each.
+        batch: Logged rows in an update.
+        learning_rate: Adam's.
+        population: Candidates a generation; None takes 4 + ⌊3 ln d⌋.
+        tolerance: Share of each range; it stops once the search is narrower in all of them. 0 never stops.
+    """
+
+    objective: Literal["one-step", "distribution"] = "one-step"
+    starts: Literal["logged", "policy"] = "logged"
+    rows: int | None = None
+    horizon: int = 10
+    features: int = 300
+    hidden: tuple[int, ...] = (128, 128)
+    cloning_epochs: int = 40
+    cloning_updates: int = 200
+    batch: int = 256
+    learning_rate: float = 1e-3
+    population: int | None = None
+    tolerance: float = 1e-5
+
+    def __post_init__(self) -> None:
+        counts = ("rows", "features", "hidden", "cloning_updates", "batch")
+        check_at_least(self, **dict.fromkeys(counts, 1), horizon=2, population=4, tolerance=0.0)
+        check_at_least(self, cloning_epochs=0, learning_rate=0.0)
+
+    @property
+    def name(self) -> str:
+        """As `madoc methods` lists it."""
+        return "cma-es" if self.objective == "one-step" else "cma-es-distribution"
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Metrics beside the progress bar."""
+        return ("cost", "deviation", "cloning_loss")
+
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> CmaEsState:
+        """The search about mid-range; features, clone and walkers where they are needed.
+
+        Raises:
+            MadocError: States are needed and none can be rebuilt, or pairs are and the next observations are shuffled.
+        """
+        if self.objective == "one-step":
+            problem.require_pairs(self.name)
+        if not self._acts:
+            first_rows(problem.dataset, problem.logged_rows, 1)
+        of_features, of_actor, key = jax.random.split(key, 3)
+        search = evolution.begin(np.zeros(len(problem.simulator.parameters)))
+        clouds = None if self.objective == "one-step" else self._begin_clouds(problem, of_features)
+        actor = self._begin_actor(problem, of_actor) if self._acts else None
+        return CmaEsState(SearchState(search, key, 0, 0), clouds, actor)
+
+    def step(self, problem: CalibrationProblem, state: CmaEsState) -> tuple[CmaEsState, Metrics]:
+        """One generation; before the first, epochs of cloning and one of reading the log."""
+        inner, clouds, actor = state.inner, state.clouds, state.actor
+        if actor is not None and self.stage(state) == "cloning":
+            return self._clone(problem, state, actor)
+        if clouds is not None and self.stage(state) == "reading":
+            return replace(state, clouds=replace(clouds, wanted=self._wanted(problem, clouds), read=1)), {}
+        of_candidates, of_rows, key = jax.random.split(inner.key, 3)
+        candidates = evolution.ask(inner.search, of_candidates, self.population)
+        if clouds is None:
+            costs, spent, failures = self._one_step(problem, candidates, of_rows)
+        elif actor is None:
+            costs, spent, failures = self._replay(problem, clouds, candidates, of_rows)
+        else:
+            costs, spent, failures, actor = self._act(problem, clouds, actor, candidates, of_rows)
+        inner = next_generation(inner, key, candidates, costs, spent=spent, failures=failures)
+        told = {"cost": float(costs.min()), "deviation": evolution.widest_deviation(inner.search)}
+        return CmaEsState(inner, clouds, actor), told
+
+    def estimate(self, problem: CalibrationProblem, state: CmaEsState) -> Estimate:
+        """Centre and covariance of the search. The covariance says where it looks, not how sure it may be."""
+        return estimate_from_search(problem, state.inner)
+
+    def control_steps(self, state: CmaEsState) -> int:
+        """Simulated control steps so far."""
+        return state.inner.control_steps
+
+    def stage(self, state: CmaEsState) -> str:
+        """What the next epoch does."""
+        if state.actor is not None and state.actor.epochs < self.cloning_epochs:
+            return "cloning"
+        return "reading" if state.clouds is not None and not state.clouds.read else "calibrating"
+
+    def progress(self, state: CmaEsState, budget: int) -> float:
+        """Share of the control steps and of the cloning done; cloning counts as a tenth."""
+        cloned = state.actor.epochs / self.cloning_epochs if state.actor is not None and self.cloning_epochs else 1.0
+        return min(1.0, 0.1 * cloned + 0.9 * state.inner.control_steps / budget)
+
+    def converged(self, state: CmaEsState) -> str | None:
+        """A sentence once the search is narrow."""
+        return evolution.settled(state.inner.search, self.tolerance)
+
+    @property
+    def _rows(self) -> int:
+        return self.rows or ROWS["policy" if self._acts else self.objective]
+
+    @property
+    def _acts(self) -> bool:
+        return self.objective == "distribution" and self.starts == "policy"
+
+    @cached_property
+    def _adam(self) -> optax.GradientTransformation:
+        return optax.adam(self.learning_rate)
+
+    def _begin_clouds(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Clouds:
+        dimensions = problem.simulator.task.observation_size + problem.simulator.action_size * self._acts
+        return Clouds(cosine_features(key, dimensions, self.features), np.zeros(self.features), 0)
+
+    def _begin_actor(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Actor:
+        of_policy, of_start = jax.random.split(key)
+        simulator, logged = problem.simulator, np.asarray(problem.dataset.transitions.observation)
+        policy = TanhGaussianPolicy(
+            simulator.task.observation_size,
+            simulator.action_size,
+            self.hidden,
+            key=of_policy,
+            offset=logged.mean(0),
+            scale=np.maximum(logged.std(0), 1e-3),
+        )
+        walkers = begin(reset_states(simulator), of_start, systems=1, rows=self._rows)
+        return Actor(policy, self._adam.init(eqx.filter(policy, eqx.is_array)), walkers, 0)
+
+    def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Metrics]:
+        of_batches, key = jax.random.split(state.inner.key)
+        policy, optimiser, metrics = clone(
+            actor.policy,
+            actor.optimiser,
+            problem.pairs,
+            of_batches,
+            optimiser=self._adam,
+            batch=self.batch,
+            count=self.cloning_updates,
+        )
+        actor = replace(actor, policy=policy, optimiser=optimiser, epochs=actor.epochs + 1)
+        following = replace(state, inner=replace(state.inner, key=key), actor=actor)
+        return following, {name: float(value) for name, value in metrics.items()}
+
+    def _standardised(
+        self, problem: CalibrationProblem, rows: Float[np.ndarray, "*rows values"]
+    ) -> Float[np.ndarray, "*rows values"]:
+        """Observations, or observations and actions, in units of the log's spread."""
+        scaling, size = problem.scalings["standardised"], rows.shape[-1]
+        return (rows - scaling.pair_offset[:size]) / scaling.pair_scale[:size]
+
+    def _wanted(self, problem: CalibrationProblem, clouds: Clouds) -> Float[np.ndarray, " features"]:
+        """Mean features of logged (s, a), or how they change from all s to all s'. Neither needs an order of rows.
+
+        The change is that of rows whose state can be rebuilt, where it is known which s' these have.
+        """
+        dataset = problem.dataset
+        logged = dataset.transitions
+        if self._acts:
+            pairs = np.concatenate([logged.observation, logged.action], axis=-1)
+            return clouds.features.mean(self._standardised(problem, pairs))
+        if dataset.disturbance.shuffled != "next_observations":
+            logged = logged.take(problem.logged_rows)
+        before, after = (
+            clouds.features.mean(self._standardised(problem, np.asarray(part)))
+            for part in (logged.observation, logged.next_observation)
+        )
+        return after - before
+
+    def _one_step(
+        self, problem: CalibrationProblem, candidates: Float[np.ndarray, "population d"], key: PRNGKeyArray
+    ) -> tuple[Float[np.ndarray, " population"], int, int]:
+        windows = draw_windows(problem, 1, self._rows, key)
+        scale = problem.scalings["standardised"].next_scale
+        squared = (window_residuals(problem.simulator, windows, candidates, scale) ** 2).mean(-1)
+        return mean_with_failures(squared), squared.size, int(np.isnan(squared).sum())
+
+    def _replay(
+        self,
+        problem: CalibrationProblem,
+        clouds: Clouds,
+        candidates: Float[np.ndarray, "population d"],
+        key: PRNGKeyArray,
+    ) -> tuple[Float[np.ndarray, " population"], int, int]:
+        """Clouds one step after logged rows.
+
+        Features of the rows themselves are taken off: all that is left of the draw of rows is how they change.
+        """
+        simulator = problem.simulator
+        chosen = np.asarray(jax.random.randint(key, (self._rows,), 0, len(problem.logged_rows)))
+        state, action = (
+            np.ascontiguousarray(np.broadcast_to(part[chosen], (len(candidates), self._rows, part.shape[-1])))
+            for part in (problem.logged_states, problem.logged_actions)
+        )
+        following = simulator.bind(simulator.parameters.to_physical(candidates)).step(state, action)
+        before, after = (
+            clouds.features(self._standardised(problem, simulator.task.observe(part))) for part in (state, following)
+        )
+        costs = discrepancies(after - before, clouds.wanted)
+        failed = ~np.isfinite(following).all(-1)
+        return mean_with_failures(costs[:, None]), failed.size, int(failed.sum())
+
+    def _act(
+        self,
+        problem: CalibrationProblem,
+        clouds: Clouds,
+        actor: Actor,
+        candidates: Float[np.ndarray, "population d"],
+        key: PRNGKeyArray,
+    ) -> tuple[Float[np.ndarray, " population"], int, int, Actor]:
+        """Clouds that the clone visits under each candidate, from where the last best one left it."""
+        simulator = problem.simulator
+        of_actions, of_restarts = jax.random.split(key)
+        rollout, after = roll(
+            simulator.bind(simulator.parameters.to_physical(candidates)),
+            simulator.task,
+            actor.policy,
+            jax.tree.map(lambda part: np.repeat(part, len(candidates), axis=0), actor.walkers),
+            steps=self.horizon,
+            starts=reset_states(simulator),
+            key=of_actions,
+            restart_key=of_restarts,
+        )
+        seen = np.concatenate([rollout.transitions.observation, rollout.transitions.action], axis=-1)
+        seen = np.where(rollout.valid[..., None], seen, np.nan)[1:]  # the first observation is where all were put
+        rows = np.swapaxes(seen, 0, 1).reshape(len(candidates), -1, seen.shape[-1])
+        costs = discrepancies(clouds.features(self._standardised(problem, rows)), clouds.wanted)
+        costs = mean_with_failures(costs[:, None])
+        best = int(np.argmin(costs))
+        walkers = jax.tree.map(lambda part: part[best : best + 1], after)
+        return costs, rollout.valid.size, rollout.failures, replace(actor, walkers=walkers)

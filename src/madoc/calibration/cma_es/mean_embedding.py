@@ -1,0 +1,64 @@
+"""Distances between clouds of rows whose order and pairing are unknown: means of random cosine features.
+
+The distance between two means is the maximum mean discrepancy (Gretton et al. 2012) under Gaussian kernels, by random
+Fourier features (Rahimi and Recht 2007).
+"""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+WIDTHS = (0.5, 1.0, 2.0)
+"""Of the kernels, in units of √dimensions: half, once and twice the typical distance of standardised rows."""
+_ROWS_AT_ONCE = 10_000
+RIDGE = 1e-3
+"""Of the mean variance of a feature, added to all of them."""
+_SMALLEST_VARIANCE = 1e-12
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class CosineFeatures:
+    """φ(x) = cos(x W + b), with rows standardised first by whoever calls it."""
+
+    frequencies: Float[np.ndarray, "dimensions features"]
+    phases: Float[np.ndarray, " features"]
+
+    def __call__(self, rows: Float[np.ndarray, "*rows dimensions"]) -> Float[np.ndarray, "*rows features"]:
+        """Features of rows."""
+        return np.cos(rows @ self.frequencies + self.phases)
+
+    def mean(self, rows: Float[np.ndarray, "rows dimensions"]) -> Float[np.ndarray, " features"]:
+        """Mean feature of many rows, a part at a time."""
+        parts = np.array_split(rows, max(1, len(rows) // _ROWS_AT_ONCE))
+        return np.sum([self(part).sum(0) for part in parts], axis=0) / len(rows)
+
+
+def cosine_features(key: PRNGKeyArray, dimensions: int, count: int) -> CosineFeatures:
+    """Random frequencies of Gaussian kernels of each width in turn, uniform phases."""
+    of_frequencies, of_phases = jax.random.split(key)
+    frequencies = np.asarray(jax.random.normal(of_frequencies, (dimensions, count)), np.float64)
+    widths = np.sqrt(dimensions) * np.resize(WIDTHS, count)
+    phases = np.asarray(jax.random.uniform(of_phases, (count,), maxval=2.0 * np.pi), np.float64)
+    return CosineFeatures(frequencies / widths, phases)
+
+
+def discrepancies(
+    features: Float[np.ndarray, "clouds rows features"], wanted: Float[np.ndarray, " features"]
+) -> Float[np.ndarray, " clouds"]:
+    """Squared distance of each cloud's mean feature m from the wanted w: n (m - w)ᵀ S⁻¹ (m - w), in standard errors.
+
+    S is the covariance of rows about their cloud's mean, pooled over clouds, with a small ridge: features that hardly
+    vary from row to row tell most. Rows that failed (NaN) are left out; NaN for a cloud in which all did.
+    """
+    valid = np.isfinite(features).all(-1)
+    count = valid.sum(1)
+    mean = np.where(valid[..., None], features, 0.0).sum(1) / np.where(count > 0, count, np.nan)[:, None]
+    off = (features - mean[:, None])[valid]
+    covariance = off.T @ off / max(1, len(off))
+    ridge = RIDGE * np.trace(covariance) / len(covariance) + _SMALLEST_VARIANCE
+    gap = mean - wanted
+    solved = np.linalg.solve(covariance + ridge * np.eye(len(covariance)), np.nan_to_num(gap).T).T
+    return count * (gap * solved).sum(-1)

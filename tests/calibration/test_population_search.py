@@ -1,0 +1,73 @@
+"""What searches share: which rows they replay, what a failure costs, what they estimate."""
+
+import jax
+import numpy as np
+import pytest
+
+from madoc import simulation
+from madoc.calibration import CalibrationProblem, evolution
+from madoc.calibration.population_search import (
+    SearchState,
+    draw_windows,
+    estimate_from_search,
+    mean_with_failures,
+    next_generation,
+)
+from madoc.errors import MadocError
+from robots import SPRING_TRUTH, recorded, spring
+
+
+@pytest.fixture(scope="module")
+def problem():
+    task = spring(max_episode_steps=6)
+    return CalibrationProblem(recorded(task, SPRING_TRUTH, 40, jax.random.key(0)), simulation.make(task, threads=1))
+
+
+def test_a_failure_costs_the_worst_and_as_much_more_as_that_is_above_the_best():
+    costs = np.array([[1.0, 3.0], [np.nan, 5.0]])
+    assert mean_with_failures(costs) == pytest.approx([2.0, (9.0 + 5.0) / 2.0])
+    assert mean_with_failures(np.full((2, 3), np.nan)) == pytest.approx([0.0, 0.0])
+
+
+def test_nothing_is_gained_by_failing_even_where_costs_are_negative():
+    costs = np.array([[-5.0, -1.0], [-5.0, np.nan]])
+    assert mean_with_failures(costs)[1] > mean_with_failures(costs)[0]
+
+
+def test_windows_never_reach_over_the_end_of_an_episode(problem):
+    windows = draw_windows(problem, 4, 200, jax.random.key(1))
+    assert windows.actions.shape == (200, 4, 1)
+    logged = problem.dataset.transitions.observation
+    rows = np.array([np.flatnonzero((logged == state).all(-1))[0] for state in windows.states])
+    starts, ends = problem.dataset.episode_starts, problem.dataset.episode_ends
+    assert (rows + 4 <= ends[np.searchsorted(starts, rows, side="right") - 1]).all()
+    assert len(np.unique(rows)) > 10
+
+
+def test_every_generation_draws_windows_of_its_own(problem):
+    first, again, other = (draw_windows(problem, 1, 10, jax.random.key(seed)).states for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_windows_longer_than_any_episode_are_refused(problem):
+    with pytest.raises(MadocError, match="no stretch of 7 rows"):
+        draw_windows(problem, 7, 10, jax.random.key(0))
+
+
+def test_the_estimate_is_the_search_in_physical_units(problem):
+    search = evolution.begin(np.array([0.5, 0.0, -1.0]), deviation=0.1)
+    estimate = estimate_from_search(problem, SearchState(search, jax.random.key(0), 0, 0))
+    assert estimate.mean == pytest.approx([7.0, 1.0, 1.0])
+    assert estimate.std == pytest.approx([0.4, 0.1, 0.1])
+    assert estimate.covariance == pytest.approx(np.diag([0.16, 0.01, 0.01]))
+    assert "at the end of its range: body_mass.cart" in estimate.warnings[0]
+
+
+def test_a_generation_adds_up_what_it_spent():
+    key = jax.random.key(0)
+    state = SearchState(evolution.begin(np.zeros(2)), key, 5, 1)
+    candidates = evolution.ask(state.search, key)
+    following = next_generation(state, key, candidates, candidates[:, 0], spent=7, failures=2)
+    assert (following.control_steps, following.failures, following.search.generation) == (12, 3, 1)
+    assert following.search.mean[0] < 0.0
