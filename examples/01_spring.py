@@ -6,7 +6,7 @@ import mujoco
 import madoc
 from madoc.data.record import record
 from madoc.parameters import Parameter, ParameterSpace
-from madoc.policies.sac import uniform_policy
+from madoc.policies.interaction import UniformPolicy
 from madoc.tasks import Task
 
 MODEL = """
@@ -57,7 +57,7 @@ def main() -> None:
     simulator = madoc.simulation.make(spring())
     # Uniform random pushes; in your case these rows come from the machine.
     dataset = record(
-        uniform_policy(1), simulator, TRUTH, transitions=2000, key=jax.random.key(0), origin="random pushes"
+        UniformPolicy(1), simulator, TRUTH, transitions=2000, key=jax.random.key(0), origin="random pushes"
     )
     problem = madoc.CalibrationProblem(dataset, simulator)
     method = madoc.Madoc(starts="replay", epoch_steps=500, group_count=3)

@@ -36,7 +36,7 @@ def test_data_disturbed_by_the_reader_is_told_in_the_result(tmp_path, capsys):
     assert main(["record", "hopper-medium", "--transitions", "300", "--quiet", "--out", str(log)]) == 0
     capsys.readouterr()
     words = ["calibrate", "hopper", "--data", log, "--out", out, "--quiet", "--noise", 0.01]
-    words += ["--method", "least-squares", "--set", "windows=50", "search_windows=20", "starts=1", "--budget", 4000]
+    words += ["--method", "least-squares", "--set", "windows=50", "search_windows=20", "searches=1", "--budget", 4000]
     answer, code = asked_for_json(capsys, words)
     assert code == 0
     assert any("observation noise of 1 %" in warning for warning in answer["warnings"])
