@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from madoc.calibration.cma_es.mean_embedding import RIDGE, CosineFeatures, cosine_features, discrepancies
+from madoc.calibration.cma_es.mean_embedding import RIDGE, CosineFeatures, adjusted, cosine_features, discrepancies
 
 
 def test_features_by_hand():
@@ -53,3 +53,20 @@ def test_all_failed_is_no_error():
 def test_at_the_truth_the_distance_is_what_chance_leaves():
     rows = np.random.default_rng(0).normal(size=(50, 500, 20))
     assert discrepancies(rows, np.zeros(20)).mean() / 20 == pytest.approx(1.0, abs=0.15)
+
+
+def test_what_a_draw_differs_from_the_log_by_is_taken_off():
+    # Features 1 + 2 z of rows whose z should be 0 on average, but is 2: their mean is 5 and becomes 1.
+    drawn = np.array([[1.0], [2.0], [3.0]])
+    found = adjusted((1.0 + 2.0 * drawn)[None], drawn)
+    assert found == pytest.approx(np.ones((1, 3, 1)), abs=1e-4)
+
+
+def test_rows_that_failed_stay_so_and_give_no_slope():
+    drawn = np.array([[1.0], [2.0], [3.0]])
+    features = np.stack([1.0 + 2.0 * drawn, np.array([[7.0], [7.0], [np.nan]])])
+    found = adjusted(features, drawn)
+    assert found[0] == pytest.approx(np.ones((3, 1)), abs=1e-4)
+    assert found[1, :2] == pytest.approx(np.full((2, 1), 7.0), abs=1e-4)
+    assert np.isnan(found[1, 2])
+    assert adjusted(np.full((1, 2, 1), np.nan), drawn[:2]).shape == (1, 2, 1)

@@ -19,6 +19,7 @@ from madoc.calibration import evolution
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.cma_es.mean_embedding import (
     CosineFeatures,
+    adjusted,
     cosine_features,
     discrepancies,
 )
@@ -47,13 +48,17 @@ class Clouds:
     """What clouds are compared by.
 
     Attributes:
-        features: Of observations (`logged` starts), or of observations and actions (`policy`).
-        wanted: What their mean should be; zeros until the log has been read.
-        read: 1 once it has.
+        of_pairs: Features of observations and actions: what `policy` starts are compared by.
+        of_observations: Features whose change is compared for `logged` starts.
+        pair: Mean of the first over logged rows; zeros until the log has been read.
+        change: How the mean of the second changes in a step, over logged rows.
+        read: 1 once the log has been read.
     """
 
-    features: CosineFeatures
-    wanted: Float[np.ndarray, " features"]
+    of_pairs: CosineFeatures
+    of_observations: CosineFeatures
+    pair: Float[np.ndarray, " features"]
+    change: Float[np.ndarray, " features"]
     read: int
 
 
@@ -105,7 +110,7 @@ class CmaEs:
     starts: Literal["logged", "policy"] = "logged"
     rows: int | None = None
     horizon: int = 10
-    features: int = 300
+    features: int = 100
     hidden: tuple[int, ...] = (128, 128)
     cloning_epochs: int = 40
     cloning_updates: int = 200
@@ -151,7 +156,7 @@ class CmaEs:
         if actor is not None and self.stage(state) == "cloning":
             return self._clone(problem, state, actor)
         if clouds is not None and self.stage(state) == "reading":
-            return replace(state, clouds=replace(clouds, wanted=self._wanted(problem, clouds), read=1)), {}
+            return replace(state, clouds=self._read(problem, clouds)), {}
         of_candidates, of_rows, key = jax.random.split(inner.key, 3)
         candidates = evolution.ask(inner.search, of_candidates, self.population)
         if clouds is None:
@@ -200,8 +205,15 @@ class CmaEs:
         return optax.adam(self.learning_rate)
 
     def _begin_clouds(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Clouds:
-        dimensions = problem.simulator.task.observation_size + problem.simulator.action_size * self._acts
-        return Clouds(cosine_features(key, dimensions, self.features), np.zeros(self.features), 0)
+        of_pairs, of_observations = jax.random.split(key)
+        size, nothing = problem.simulator.task.observation_size, np.zeros(self.features)
+        return Clouds(
+            of_pairs=cosine_features(of_pairs, size + problem.simulator.action_size, self.features),
+            of_observations=cosine_features(of_observations, size, self.features),
+            pair=nothing,
+            change=nothing,
+            read=0,
+        )
 
     def _begin_actor(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Actor:
         of_policy, of_start = jax.random.split(key)
@@ -215,6 +227,9 @@ class CmaEs:
             scale=np.maximum(logged.std(0), 1e-3),
         )
         walkers = begin(reset_states(simulator), of_start, systems=1, rows=self._rows)
+        # Ages spread evenly: time limits that fell together would show one age of episodes at a time.
+        ages = np.arange(self._rows)[None] * simulator.task.max_episode_steps // self._rows
+        walkers = replace(walkers, age=ages)
         return Actor(policy, self._adam.init(eqx.filter(policy, eqx.is_array)), walkers, 0)
 
     def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Metrics]:
@@ -239,23 +254,23 @@ class CmaEs:
         scaling, size = problem.scalings["standardised"], rows.shape[-1]
         return (rows - scaling.pair_offset[:size]) / scaling.pair_scale[:size]
 
-    def _wanted(self, problem: CalibrationProblem, clouds: Clouds) -> Float[np.ndarray, " features"]:
-        """Mean features of logged (s, a), or how they change from all s to all s'. Neither needs an order of rows.
+    def _read(self, problem: CalibrationProblem, clouds: Clouds) -> Clouds:
+        """Mean features of logged (s, a), and how those of s change. Neither needs an order of rows.
 
-        The change is that of rows whose state can be rebuilt, where it is known which s' these have.
+        For `logged` starts they are those of the rows that can be rebuilt. Where it is not known which s' these have,
+        the change is that of all rows.
         """
-        dataset = problem.dataset
-        logged = dataset.transitions
-        if self._acts:
-            pairs = np.concatenate([logged.observation, logged.action], axis=-1)
-            return clouds.features.mean(self._standardised(problem, pairs))
-        if dataset.disturbance.shuffled != "next_observations":
-            logged = logged.take(problem.logged_rows)
+        whole = problem.dataset.transitions
+        rows = whole if self._acts else whole.take(problem.logged_rows)
+        loose = problem.dataset.disturbance.shuffled == "next_observations"
         before, after = (
-            clouds.features.mean(self._standardised(problem, np.asarray(part)))
-            for part in (logged.observation, logged.next_observation)
+            clouds.of_observations.mean(self._standardised(problem, np.asarray(part)))
+            for part in ((whole if loose else rows).observation, (whole if loose else rows).next_observation)
         )
-        return after - before
+        pairs = np.concatenate([rows.observation, rows.action], axis=-1)
+        return replace(
+            clouds, pair=clouds.of_pairs.mean(self._standardised(problem, pairs)), change=after - before, read=1
+        )
 
     def _one_step(
         self, problem: CalibrationProblem, candidates: Float[np.ndarray, "population d"], key: PRNGKeyArray
@@ -272,9 +287,9 @@ class CmaEs:
         candidates: Float[np.ndarray, "population d"],
         key: PRNGKeyArray,
     ) -> tuple[Float[np.ndarray, " population"], int, int]:
-        """Clouds one step after logged rows.
+        """Clouds one step after logged rows, compared by how their features change from the rows themselves.
 
-        Features of the rows themselves are taken off: all that is left of the draw of rows is how they change.
+        So the draw of rows matters little; what of it still shows in the features of (s, a) is taken off as well.
         """
         simulator = problem.simulator
         chosen = np.asarray(jax.random.randint(key, (self._rows,), 0, len(problem.logged_rows)))
@@ -284,9 +299,12 @@ class CmaEs:
         )
         following = simulator.bind(simulator.parameters.to_physical(candidates)).step(state, action)
         before, after = (
-            clouds.features(self._standardised(problem, simulator.task.observe(part))) for part in (state, following)
+            clouds.of_observations(self._standardised(problem, simulator.task.observe(part)))
+            for part in (state, following)
         )
-        costs = discrepancies(after - before, clouds.wanted)
+        pairs = np.concatenate([simulator.task.observe(state[0]), action[0]], axis=-1)
+        covariates = clouds.of_pairs(self._standardised(problem, pairs)) - clouds.pair
+        costs = discrepancies(adjusted(after - before, covariates), clouds.change)
         failed = ~np.isfinite(following).all(-1)
         return mean_with_failures(costs[:, None]), failed.size, int(failed.sum())
 
@@ -314,7 +332,7 @@ class CmaEs:
         seen = np.concatenate([rollout.transitions.observation, rollout.transitions.action], axis=-1)
         seen = np.where(rollout.valid[..., None], seen, np.nan)[1:]  # the first observation is where all were put
         rows = np.swapaxes(seen, 0, 1).reshape(len(candidates), -1, seen.shape[-1])
-        costs = discrepancies(clouds.features(self._standardised(problem, rows)), clouds.wanted)
+        costs = discrepancies(clouds.of_pairs(self._standardised(problem, rows)), clouds.pair)
         costs = mean_with_failures(costs[:, None])
         best = int(np.argmin(costs))
         walkers = jax.tree.map(lambda part: part[best : best + 1], after)

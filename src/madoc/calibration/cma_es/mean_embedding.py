@@ -16,6 +16,8 @@ _ROWS_AT_ONCE = 10_000
 RIDGE = 1e-3
 """Of the mean variance of a feature, added to all of them."""
 _SMALLEST_VARIANCE = 1e-12
+_SLOPE_RIDGE = 1e-6
+"""Added to the mean squares of covariates, which are cosines: those that hardly vary explain nothing."""
 
 
 @jax.tree_util.register_dataclass
@@ -62,3 +64,21 @@ def discrepancies(
     gap = mean - wanted
     solved = np.linalg.solve(covariance + ridge * np.eye(len(covariance)), np.nan_to_num(gap).T).T
     return count * (gap * solved).sum(-1)
+
+
+def adjusted(
+    features: Float[np.ndarray, "clouds rows features"], covariates: Float[np.ndarray, "rows covariates"]
+) -> Float[np.ndarray, "clouds rows features"]:
+    """Features of drawn rows, less the part by which the draw differs from the whole log.
+
+    Covariates are known of all logged rows and have mean 0 there; their mean in a draw, times the slopes of features
+    on them, is chance. This is the regression estimator of survey sampling (Särndal et al. 1992, section 6.4). Slopes
+    are each cloud's own, from rows that failed in none.
+    """
+    whole = np.isfinite(features).all((0, 2))
+    if not whole.any():
+        return features
+    known = np.concatenate([np.ones((whole.sum(), 1)), covariates[whole]], axis=1)
+    squares = known.T @ known / len(known)
+    slopes = np.linalg.solve(squares + _SLOPE_RIDGE * np.eye(len(squares)), known.T @ features[:, whole] / len(known))
+    return features - covariates @ slopes[:, 1:]
