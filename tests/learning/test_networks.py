@@ -6,7 +6,7 @@ import optax
 import pytest
 
 from affine import affine, layered
-from madoc.learning.networks import Network, descend, moving_average, scan_updates
+from madoc.learning.networks import Network, descend, drop, moving_average, scan_updates
 
 
 def test_network_is_affine_relu_affine(compiled):
@@ -43,14 +43,20 @@ def test_dropout_acts_only_with_a_key():
 
 
 def test_dropout_scales_what_it_keeps(compiled):
-    # 100 hidden units of 1 summed: the output is (units kept) / (1 - 0.2), never dropped itself, 100 on average
+    # 0.2 is 51 of 256 bytes, rounded; 100 units of 1 summed: (units kept) / (205 / 256), never dropped itself
     network = layered((np.zeros((100, 1)), np.ones(100)), (np.ones((1, 100)), [0]), dropout=0.2)
     outputs = compiled(network)(jnp.zeros((2000, 1)), jax.random.key(0))[:, 0]
-    kept = np.asarray(outputs) * 0.8
+    kept = np.asarray(outputs) * 205 / 256
     np.testing.assert_allclose(kept, np.round(kept), atol=1e-3)
-    # binomial(100, 0.8): mean 80, std 4; the mean of 2000 rows has std 0.09
-    assert kept.mean() == pytest.approx(80, abs=0.4)
+    # binomial(100, 0.8008): mean 80.08, std 4; the mean of 2000 rows has std 0.09
+    assert kept.mean() == pytest.approx(80.08, abs=0.3)
     assert kept.std() == pytest.approx(4, rel=0.1)
+
+
+def test_each_unit_is_dropped_by_its_own_byte():
+    # four masks come from one random number: neighbours must be as independent as strangers
+    kept = np.asarray(drop(jnp.ones((3000, 6)), 0.5, jax.random.key(0)) > 0).astype(float)
+    np.testing.assert_allclose(np.corrcoef(kept.T), np.eye(6), atol=0.08)
 
 
 def test_dropout_is_drawn_anew_in_every_layer():
