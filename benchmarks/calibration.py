@@ -78,6 +78,8 @@ def main() -> None:
                     "commit": revision,
                 }
                 row |= run(method, {"starts": starts} if chosen else {}, problem, dataset, seed, arguments.budget)
+                if row.get("status") == "interrupted":
+                    return
                 path.write_text(json.dumps(row, indent=1) + "\n")
                 print(path.name, row["error"]["mean_absolute"] if "error" in row else row["refusal"], flush=True)
 

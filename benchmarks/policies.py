@@ -1,25 +1,31 @@
-"""Return in the target of a policy learnt at the calibrated parameters, at the truth, and at mid-range.
+"""Return in the target of learnt policies: any learner, anywhere it can learn. One JSON file a run.
 
-    python benchmarks/policies.py --robots hopper halfcheetah --seeds 0 1 2
+    python benchmarks/policies.py --robots hopper halfcheetah --at calibrated truth midrange --seeds 0 1 2
+    python benchmarks/policies.py --methods bc cql morec --budget 20000
+    python benchmarks/policies.py --methods h2o --at midrange --set updates_per_step=0.25
 
-Takes the calibrated parameters from `results/calibration` (run `calibration.py` first). One JSON file a run; those
-already there are skipped, so a row that is missing was not run.
+Takes the calibrated parameters, and the spread of `distribution`, from `results/calibration`, and the logged data that
+`calibration.py` records. Runs already there are skipped, so a row that is missing was not run. The budget is control
+steps, or updates of a learner that does not simulate.
 """
 
 import argparse
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
+from itertools import product
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from calibration import RESULTS as CALIBRATIONS
-from calibration import commit
+from calibration import commit, recorded
 from madoc import tasks
 from madoc.calibration import CalibrationResult
 from madoc.data.targets import paper_truth
 from madoc.evaluation import evaluate
-from madoc.policies import SAC, PolicyProblem, learn_policy
+from madoc.pipeline.methods import make_method, parse_settings
+from madoc.policies import LEARNERS, NormalParameters, PolicyProblem, UniformParameters, learn_policy
 from madoc.simulation.cpu import CpuSimulator
 
 RESULTS = Path(__file__).parent / "results" / "policies"
@@ -28,52 +34,82 @@ RESULTS = Path(__file__).parent / "results" / "policies"
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--robots", nargs="+", default=["hopper", "halfcheetah"])
-    parser.add_argument("--at", nargs="+", default=["calibrated", "truth", "midrange"])
+    parser.add_argument("--methods", nargs="+", default=["sac"], choices=list(LEARNERS))
+    parser.add_argument(
+        "--at", nargs="+", default=["calibrated"], help="calibrated distribution uniform midrange truth"
+    )
+    parser.add_argument("--calibrator", default="madoc-logged-300000", help="whose estimate, as results are named")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--budget", type=int, default=300_000)
-    parser.add_argument("--hidden", type=int, default=256)
-    parser.add_argument("--updates-per-step", type=float, default=1.0)
+    parser.add_argument("--set", nargs="*", default=[], help="hyperparameters as name=value")
+    parser.add_argument("--transitions", type=int, default=200_000)
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--threads", type=int, default=None)
+    parser.add_argument("--folder", type=Path, default=Path("runs/benchmark-data"), help="where recorded data is kept")
     arguments = parser.parse_args()
+    revision = commit()
     RESULTS.mkdir(parents=True, exist_ok=True)
-    for seed in arguments.seeds:
-        for robot in arguments.robots:
-            simulator = CpuSimulator(tasks.make(robot, "legacy"), threads=arguments.threads)
-            truth = simulator.parameters.vector(paper_truth(robot))
-            calibrated = CALIBRATIONS / f"{robot}-medium-madoc-logged-300000-{seed}.json"
-            parameters = {
-                "calibrated": lambda path=calibrated: _estimate(path),
-                "truth": lambda truth=truth: truth,
-                "midrange": lambda simulator=simulator: simulator.parameters.middle,
+    for robot, name, seed in product(arguments.robots, arguments.methods, arguments.seeds):
+        method = make_method(LEARNERS, name, parse_settings(arguments.set))
+        for at in arguments.at if method.needs_parameters else ["-"]:
+            where = f"{at}-{arguments.calibrator}" if at in ("calibrated", "distribution") else at
+            words = [robot, name, *([where] if at != "-" else []), arguments.budget, *arguments.set, seed]
+            path = RESULTS / ("-".join(map(str, words)).replace(" ", "") + ".json")
+            if path.exists():
+                continue
+            row = {
+                "robot": robot,
+                "method": name,
+                "at": at,
+                "calibrator": arguments.calibrator if where != at else None,
+                "seed": seed,
+                "budget": arguments.budget,
+                "unit": method.unit,
+                "set": arguments.set,
+                "commit": revision,
             }
-            for at in arguments.at:
-                path = RESULTS / f"{robot}-{at}-{arguments.budget}-{seed}.json"
-                if path.exists():
-                    continue
-                learner = SAC(hidden=(arguments.hidden,) * 2, updates_per_step=arguments.updates_per_step)
-                problem = PolicyProblem(simulator, parameters[at]())
-                learnt = learn_policy(learner, problem, key=jax.random.key(seed), budget=arguments.budget)
-                returns = evaluate(
-                    learnt.policy, simulator, truth, key=jax.random.key(1000 + seed), episodes=arguments.episodes
-                )
-                row = returns.summary() | {
-                    "robot": robot,
-                    "at": at,
-                    "seed": seed,
-                    "budget": arguments.budget,
-                    "hidden": arguments.hidden,
-                    "updates_per_step": arguments.updates_per_step,
-                    "seconds": learnt.seconds,
-                    "commit": commit(),
-                }
-                path.write_text(json.dumps(row, indent=1) + "\n")
-                print(path.name, round(row["return"]), round(learnt.seconds), flush=True)
+            row |= run(method, robot, at, arguments, seed)
+            if row["status"] == "interrupted":
+                return
+            path.write_text(json.dumps(row, indent=1) + "\n")
+            print(path.name, round(row["return"]), round(row["seconds"]), flush=True)
 
 
-def _estimate(path: Path):
-    row, known = json.loads(path.read_text()), {field.name for field in fields(CalibrationResult)}
-    return CalibrationResult.from_json({name: value for name, value in row.items() if name in known}).mean
+def run(method, robot: str, at: str, arguments: argparse.Namespace, seed: int) -> dict:
+    """What the policy learnt there earns in the target, and what it cost."""
+    simulator = CpuSimulator(tasks.make(robot, "legacy"), threads=arguments.threads)
+    truth = simulator.parameters.vector(paper_truth(robot))
+    dataset = None
+    if method.needs_data:
+        dataset = recorded(simulator.task, "medium", arguments.transitions, arguments.folder)
+        dataset = replace(dataset, true_parameters=None)
+    name = f"{robot}-medium-{arguments.calibrator}-{seed}.json"
+    places = {
+        "calibrated": lambda: _calibration(name).mean,
+        "distribution": lambda: _distribution(simulator, _calibration(name)),
+        "uniform": lambda: UniformParameters(simulator.parameters),
+        "midrange": lambda: simulator.parameters.middle,
+        "truth": lambda: truth,
+        "-": lambda: simulator.parameters.middle,
+    }
+    problem = PolicyProblem(simulator, places[at](), dataset)
+    learnt = learn_policy(method, problem, key=jax.random.key(seed), budget=arguments.budget)
+    judged = {"key": jax.random.key(1000 + seed), "episodes": arguments.episodes}
+    return evaluate(learnt.policy, simulator, truth, **judged).summary() | {
+        "seconds": learnt.seconds,
+        "status": learnt.status,
+        "spent": learnt.spent,
+    }
+
+
+def _calibration(name: str) -> CalibrationResult:
+    row, known = json.loads((CALIBRATIONS / name).read_text()), {field.name for field in fields(CalibrationResult)}
+    return CalibrationResult.from_json({name: value for name, value in row.items() if name in known})
+
+
+def _distribution(simulator: CpuSimulator, result: CalibrationResult) -> NormalParameters:
+    joint = np.diag(result.std**2) if result.covariance is None else np.asarray(result.covariance)
+    return NormalParameters(simulator.parameters, result.mean, joint)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,20 @@ PAPER_ERROR = {
     ("ant", "madoc-s"): 0.25,
 }
 
+# Table 1, Jiang et al. 2024: normalized return on D4RL medium, and its 95 % interval over 6 seeds.
+PAPER_RETURN = {
+    ("halfcheetah", "sac", "calibrated"): "91.9 ± 7.7",
+    ("halfcheetah", "h2o", "midrange"): "57.3 ± 3.7",
+    ("halfcheetah", "dr-bc", "uniform"): "31.9 ± 14.5",
+    ("halfcheetah", "cql", "-"): "52.0 ± 3.0",
+    ("halfcheetah", "morec", "-"): "73.9 ± 3.0",
+    ("hopper", "sac", "calibrated"): "76.0 ± 13.9",
+    ("hopper", "h2o", "midrange"): "83.7 ± 19.0",
+    ("hopper", "dr-bc", "uniform"): "43.2 ± 24.7",
+    ("hopper", "cql", "-"): "50.3 ± 18.8",
+    ("hopper", "morec", "-"): "105.0 ± 1.0",
+}
+
 
 def main() -> None:
     parts = ["# Measured\n\nMade by `python benchmarks/tables.py` from the files beside it.\n"]
@@ -115,26 +129,27 @@ def _cell(rows: list[dict]) -> str:
 
 
 def policies() -> str:
-    """Return in the target by where the policy was learnt, median over seeds."""
+    """Return in the target of every learner, where it learnt and how, over seeds."""
     cells = defaultdict(list)
     for path in sorted((RESULTS / "policies").glob("*.json")):
         row = json.loads(path.read_text())
-        cells[row["robot"], row["at"], row["budget"], row["hidden"], row["updates_per_step"]].append(row)
+        cells[row["robot"], row["method"], row["at"], row["budget"], row["unit"], " ".join(row["set"])].append(row)
     if not cells:
         return ""
     lines = [
-        "## Policies\n\n`python benchmarks/policies.py` (see its options). Deterministic, return in the target.\n",
-        "| robot | learnt at | control steps | hidden | updates | seeds | return | normalized | seconds | commit |",
+        "## Policies\n\n`python benchmarks/policies.py` (see its options). Deterministic, in the target; medium data "
+        "where a learner takes data. The paper's: normalized, 1e6 control steps or updates, D4RL's own data.\n",
+        "| robot | learner | learnt at | budget | settings | seeds | return | normalized (mean ± std) | paper | s |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for (robot, at, budget, hidden, updates), rows in sorted(cells.items()):
+    for (robot, method, at, budget, unit, settings), rows in sorted(cells.items()):
         returns = [row["return"] for row in rows]
-        normalized = np.median([row["normalized"] for row in rows])
-        seconds = np.median([row["seconds"] for row in rows])
-        commits = ", ".join(sorted({row["commit"] for row in rows}))
+        normalized = [row["normalized"] for row in rows]
+        spread = f" ± {np.std(normalized, ddof=1):.1f}" if len(rows) > 1 else ""
         lines.append(
-            f"| {robot} | {at} | {budget:,} | 2x{hidden} | {updates:g} | {len(rows)} | {np.median(returns):.0f} "
-            f"({min(returns):.0f} to {max(returns):.0f}) | {normalized:.1f} | {seconds:.0f} | {commits} |"
+            f"| {robot} | {method} | {at} | {budget:,} {unit} | {settings} | {len(rows)} | {np.median(returns):.0f} "
+            f"({min(returns):.0f} to {max(returns):.0f}) | {np.mean(normalized):.1f}{spread} "
+            f"| {PAPER_RETURN.get((robot, method, at), '')} | {np.median([row['seconds'] for row in rows]):.0f} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -145,6 +160,36 @@ def speed() -> str:
     if not path.exists():
         return ""
     return f"## Speed\n\n`python benchmarks/speed.py`\n\n```json\n{path.read_text()}```\n"
+
+
+POLICIES = [
+    ("sac", ("calibrated", "truth", "midrange"), 300_000),
+    ("sac", ("uniform", "distribution"), 300_000),
+    ("sac-bc", ("calibrated",), 300_000),
+    ("dr-bc", ("uniform",), 300_000),
+    ("h2o", ("midrange",), 300_000),
+    ("bc", ("-",), 20_000),
+    ("cql", ("-",), 300_000),
+    ("morec", ("-",), 300_000),
+]
+"""Learners, where they learn, and the budget the table should hold."""
+
+
+def policies_not_run() -> list[str]:
+    """Of every learner, robot and place, the seeds that no settings have been run with."""
+    rows = [json.loads(path.read_text()) for path in (RESULTS / "policies").glob("*.json")]
+    done = {(row["robot"], row["method"], row["at"], row["seed"]) for row in rows}
+    lines = []
+    for (method, places, budget), robot in product(POLICIES, ("hopper", "halfcheetah")):
+        for at in places:
+            seeds = [str(seed) for seed in range(3) if (robot, method, at, seed) not in done]
+            where = "" if at == "-" else f" --at {at}"
+            if seeds:
+                lines.append(
+                    f"- `python benchmarks/policies.py --robots {robot} --methods {method}{where} --budget {budget} "
+                    f"--seeds {' '.join(seeds)}`"
+                )
+    return lines
 
 
 def not_run() -> str:
@@ -160,8 +205,7 @@ def not_run() -> str:
                     f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --starts {starts} "
                     f"--seeds {' '.join(map(str, seeds))}`"
                 )
-    if len(list((RESULTS / "policies").glob("*.json"))) < 18:
-        lines.append("- `python benchmarks/policies.py --robots hopper halfcheetah --seeds 0 1 2`")
+    lines += policies_not_run()
     if not (RESULTS / "speed.json").exists():
         lines.append("- `python benchmarks/speed.py`")
     return "\n".join(["## Not run yet\n", *lines]) + "\n" if lines else ""
