@@ -21,7 +21,7 @@ import mujoco.rollout
 import numpy as np
 
 from madoc import tasks
-from madoc.calibration import CalibrationProblem, Madoc
+from madoc.calibration import CalibrationProblem, LeastSquares, Madoc, calibrate
 from madoc.calibration.madoc import grouping
 from madoc.calibration.madoc.agents import AgentSettings
 from madoc.data.targets import paper_truth
@@ -200,6 +200,19 @@ def calibration_update(method: Madoc) -> float:
         )
 
     return best_of(run) / count
+
+
+def least_squares(transitions: int) -> dict[str, float]:
+    """Least squares of Hopper's eight parameters from so many exact transitions, recording not counted."""
+    simulator = CpuSimulator(tasks.hopper())
+    dataset = record_quality(simulator, "medium", transitions=transitions, key=jax.random.key(0))
+    key, budget = jax.random.key(1), 1_000_000
+    started = time.perf_counter()
+    result = calibrate(
+        LeastSquares(), CalibrationProblem(dataset, simulator), key=key, budget=budget, truth=dataset.true_parameters
+    )
+    seconds = round(time.perf_counter() - started, 2)
+    return {"seconds": seconds, "control_steps": result.control_steps, "error": result.error["mean_absolute"]}
 
 
 def stepping(robot: str) -> dict[str, float]:
