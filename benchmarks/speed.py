@@ -54,15 +54,15 @@ def main() -> None:
     arguments.out.write_text(text + "\n")
 
 
-def best_of(run: Callable[[], object], times: int = 3) -> float:
-    """Seconds of the fastest of several runs, the first (compilation) not counted."""
-    run()
+def best_of(*runs: Callable[[], object], times: int = 3) -> list[float]:
+    """Seconds of the fastest of several runs of each, taken in turns, the first (compilation) not counted."""
     seconds = []
-    for _ in range(times):
-        started = time.perf_counter()
-        run()
-        seconds.append(time.perf_counter() - started)
-    return min(seconds)
+    for turn in range(times + 1):
+        for run in runs:
+            started = time.perf_counter()
+            run()
+            seconds.append((turn, run, time.perf_counter() - started))
+    return [min(spent for turn, other, spent in seconds if turn and other is run) for run in runs]
 
 
 def gflops() -> float:
@@ -73,7 +73,7 @@ def gflops() -> float:
     def chain(rows: jax.Array) -> jax.Array:
         return jax.lax.scan(lambda rows, _: (jnp.tanh(rows @ square), None), rows, None, length=1000)[0]
 
-    return 1000 * 2 * 256**3 / best_of(lambda: chain(square).block_until_ready()) / 1e9
+    return 1000 * 2 * 256**3 / best_of(lambda: chain(square).block_until_ready())[0] / 1e9
 
 
 def against_floor(seconds: float, flops: float, gflops: float) -> dict[str, float]:
@@ -172,7 +172,8 @@ def learner_update(name: str, problem: PolicyProblem, width: int) -> float:
             logged = problem.logged if method.needs_data else None
             run = lambda: method._update(state.learner, seen, logged, key, count)  # noqa: E731
     return (
-        best_of(lambda: jax.block_until_ready([leaf for leaf in jax.tree.leaves(run()) if eqx.is_array(leaf)])) / count
+        best_of(lambda: jax.block_until_ready([leaf for leaf in jax.tree.leaves(run()) if eqx.is_array(leaf)]))[0]
+        / count
     )
 
 
@@ -199,7 +200,7 @@ def calibration_update(method: Madoc) -> float:
             )[1]
         )
 
-    return best_of(run) / count
+    return best_of(run)[0] / count
 
 
 def least_squares(transitions: int) -> dict[str, float]:
@@ -234,8 +235,7 @@ def stepping(robot: str) -> dict[str, float]:
     initial = np.concatenate([np.zeros((SYSTEMS * ROWS, 1)), start.reshape(SYSTEMS * ROWS, -1)], axis=1)
     control = np.repeat(actions.reshape(STEPS, SYSTEMS * ROWS, -1).transpose(1, 0, 2), skip, axis=1)
     with mujoco.rollout.Rollout(nthread=simulator.threads) as pool:
-        bare = best_of(lambda: pool.rollout(repeated, data, initial, control))
-    stepped = best_of(through_system)
+        bare, stepped = best_of(lambda: pool.rollout(repeated, data, initial, control), through_system, times=7)
     total = STEPS * SYSTEMS * ROWS
     return {"system_step": round(total / stepped), "bare": round(total / bare), "ratio": round(bare / stepped, 3)}
 
