@@ -61,7 +61,7 @@ def evaluate(
     total, length = np.zeros((1, episodes)), np.zeros((1, episodes))
     for step in range(task.max_episode_steps):
         stream = None if deterministic else of_action
-        action = np.asarray(act(policy, task.observe(state), stream, np.int32(step)), dtype=np.float64)
+        action = np.asarray(act(policy, system.observe(state), stream, np.int32(step)), dtype=np.float64)
         next_state = system.step(state, action)
         alive &= np.isfinite(next_state).all(-1)
         next_state = np.where(alive[..., None], next_state, state)

@@ -97,7 +97,7 @@ class CalibratedEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observe(), reward, terminated, failed, {**info, "failed": failed}
 
     def _observe(self) -> np.ndarray:
-        return np.array(self.task.observe(self._state))
+        return np.array(self._system.observe(self._state[None, None])[0, 0])
 
     def _position(self) -> dict[str, Any]:
         return {"x_position": float(self._state[0])} if self.task.name in ROBOTS.values() else {}

@@ -19,10 +19,10 @@ def window_residuals(
     """
     system = simulator.bind(simulator.parameters.to_physical(np.clip(unit, -1.0, 1.0)))
     shape = (len(unit), *windows.states.shape)
-    state = np.ascontiguousarray(np.broadcast_to(windows.states, shape))
+    state = system.unbiased(np.ascontiguousarray(np.broadcast_to(windows.states, shape)))
     columns = []
     for step in range(windows.steps):
         action = windows.actions[:, step]
         state = system.step(state, np.ascontiguousarray(np.broadcast_to(action, (len(unit), *action.shape))))
-        columns.append((simulator.task.observe(state) - windows.following[:, step]) / scale)
+        columns.append((system.observe(state) - windows.following[:, step]) / scale)
     return np.concatenate(columns, axis=-1)

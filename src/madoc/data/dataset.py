@@ -139,7 +139,8 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
 def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
     """Simulator states of the rows whose observation determines them, and which rows those are.
 
-    Root positions that never enter the dynamics are 0.
+    Root positions that never enter the dynamics are 0. Pending actions are those of the rows before, so the first rows
+    of an episode have no state where a state carries any. Sensors are taken to have no bias: `System.unbiased`.
 
     Raises:
         MadocError: The task's observation does not determine its state, or no row can be rebuilt.
@@ -159,4 +160,18 @@ def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "stat
             f"observation (every row has a clipped value) in {dataset.origin}; start rollouts from the "
             "task's reset"
         )
-    return np.asarray(task.state_from_observation(observation[rows]), dtype=np.float64), rows
+    rows = rows[_age(dataset)[rows] >= task.pending]
+    if not len(rows):
+        raise MadocError(
+            f"a state of {task.name} carries the {task.pending} actions before it, and no episode of {dataset.origin} "
+            "has so many before a row; give it data with its rows in order, or a shorter action_delay"
+        )
+    rebuilt = np.asarray(task.state_from_observation(observation[rows]), dtype=np.float64)
+    action = np.asarray(dataset.transitions.action, dtype=np.float64)
+    return np.concatenate([rebuilt, *(action[rows - back] for back in range(1, task.pending + 1))], axis=-1), rows
+
+
+def _age(dataset: Dataset) -> Int[np.ndarray, " rows"]:
+    """How many rows of its episode come before each row."""
+    rows = np.arange(len(dataset))
+    return rows - dataset.episode_starts[np.searchsorted(dataset.episode_starts, rows, side="right") - 1]

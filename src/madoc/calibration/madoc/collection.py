@@ -1,5 +1,6 @@
 """Where Madoc's simulated rows come from: three ways to start, and the buffer they are kept in."""
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from madoc.simulation.rollout import (
     replay_actions,
     reset_states,
     roll,
+    unbiased_starts,
 )
 from madoc.types import Policy
 
@@ -45,7 +47,7 @@ def collect(
             policy act from where the walkers stand.
         policy: The running policy.
         draws: One system each.
-        walkers: Where rows stand; `replay` only takes their number.
+        walkers: Where rows stand, of `logged` at states rebuilt from the log; `replay` only takes their number.
         steps: Control steps per row; 1 for `replay`.
         keys: Randomness of the actions, and of the restarts.
     """
@@ -55,13 +57,16 @@ def collect(
         states, actions = problem.logged_states, problem.logged_actions
         rows = walkers.age.shape[1]
         return replay_actions(system, simulator.task, states, actions, rows=rows, key=keys[0]), walkers
+    starts = starts_of(problem, mode)
+    if mode == "logged":  # every walker stands at a logged state
+        starts, walkers = unbiased_starts(system, starts), replace(walkers, state=system.unbiased(walkers.state))
     return roll(
         system,
         simulator.task,
         policy,
         walkers,
         steps=steps,
-        starts=starts_of(problem, mode),
+        starts=starts,
         key=keys[0],
         restart_key=keys[1],
     )
