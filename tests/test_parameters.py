@@ -128,7 +128,7 @@ def test_a_value_shared_by_elements():
 
 def test_a_unit_of_its_own():
     assert Parameter("dof_damping", "rail", 0.0, 2.0, measured_in="N·s/m").unit == "N·s/m"
-    with pytest.raises(MadocError, match="starts at -1.0 N·s/m, below its physical bound 0.0"):
+    with pytest.raises(MadocError, match=r"starts at -1.0 N·s/m, below its physical bound 0.0"):
         Parameter("dof_damping", "rail", -1.0, 2.0, measured_in="N·s/m")
 
 

@@ -18,6 +18,7 @@ from madoc.commands.learn import Learn
 from madoc.commands.lists import Methods, Tasks
 from madoc.commands.record import Record
 from madoc.commands.run import Run
+from madoc.commands.spec import Init, Spec
 from madoc.errors import MadocError
 from madoc.files import json_text
 
@@ -33,6 +34,8 @@ Commands = (
     | Annotated[Calibrate, subcommand("calibrate")]
     | Annotated[Learn, subcommand("learn")]
     | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Init, subcommand("init")]
+    | Annotated[Spec, subcommand("spec")]
     | Annotated[Tasks, subcommand("tasks")]
     | Annotated[Methods, subcommand("methods")]
 )

@@ -22,7 +22,7 @@ class Calibrate:
     """
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
-    """The robot, as `madoc tasks` lists it."""
+    """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
     data: str
     """The log: a D4RL, NeoRL or Minari file, one of `madoc record`, or a Minari id."""
     format: str | None = None
@@ -77,7 +77,7 @@ class Calibrate:
             seed=self.seed,
             truth=None if self.truth is None else read_truth(self.truth),
         )
-        out = self.out or Path("runs") / f"{self.task}-{self.method}-{self.seed}"
+        out = self.out or Path("runs") / f"{Path(self.task).stem}-{self.method}-{self.seed}"
         result = calibrate_in(out, order, resume=self.resume, quiet=self.output.quiet)
         lines = (result.table(), result.summary(), left_behind(out, "run folder"))
         return Answer(result.to_json(), lines, result.status)

@@ -6,13 +6,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from madoc import simulation, tasks
+from madoc import robots, simulation, tasks
 from madoc.calibration import CALIBRATORS, CalibrationProblem, CalibrationResult, calibrate
 from madoc.data import Dataset, Disturbance, observed_task
 from madoc.errors import MadocError, unknown_name
 from madoc.files import read_json
 from madoc.parameters import Parameter, ParameterSpace
-from madoc.pipeline.data_stage import Source, check_truth, fingerprint, load_source
+from madoc.pipeline.data_stage import Source, check_truth, fingerprint, load_source, stored_robot, task_of_spec
 from madoc.pipeline.folders import restored_path, stored_path, working_folder
 from madoc.pipeline.keys import seed_key
 from madoc.pipeline.methods import hyperparameters, make_method
@@ -24,7 +24,7 @@ class CalibrationOrder:
     """What a calibration is asked.
 
     Attributes:
-        task: Name of the robot.
+        task: Name of the robot, or the path of a spec file.
         source: The logged data.
         physics: `legacy` or `modern`; None takes the data's, and `legacy` where the data does not say.
         level: Ranges to search: `easy`, `normal` or `hard`.
@@ -118,7 +118,9 @@ def read_calibration(path: Path, *, physics: str | None = None) -> Calibrated:
     if not file.exists():
         raise MadocError(f"there is no calibration at {path}; name a run folder or its result.json")
     result = CalibrationResult.from_json(read_json(file))
-    task = _task_of(result, spec.get("physics") or physics or "legacy")
+    said = {"task": result.task, "physics": spec.get("physics") or physics or "legacy"}
+    whole = task_of_spec(spec | said)
+    task = replace(whole, parameters=_space_of(result, whole))
     remembered = spec.get("data")
     return Calibrated(
         task=task,
@@ -138,14 +140,15 @@ def calibration_ended(folder: Path) -> bool:
 
 def _prepare(order: CalibrationOrder) -> tuple[Dataset, Task]:
     """The data, and the robot as the order wants it."""
-    reader = tasks.make(order.task, order.physics or "legacy")
+    reader = robots.resolve(order.task, order.physics)
     for name in order.parameters:
         if name not in reader.parameters.names:
             raise unknown_name(f"parameter of {order.task}", name, reader.parameters.names)
     reader.with_level(order.level)
     dataset = load_source(order.source, reader, seed=order.seed)
     said = dataset.physics if dataset.physics != "unknown" else None
-    task = tasks.make(order.task, order.physics or said or "legacy").with_level(order.level)
+    whole = reader if reader.source is not None else tasks.make(order.task, order.physics or said or "legacy")
+    task = whole.with_level(order.level)
     task = observed_task(task, dataset)
     if said is not None and said != task.physics:
         warnings.warn(
@@ -178,7 +181,7 @@ def _spec(
         "seed": order.seed,
         "budget": order.budget,
         "truth": truth,
-    }
+    } | stored_robot(task)
 
 
 def _source_of(remembered: Mapping[str, Any], folder: Path) -> Source:
@@ -189,10 +192,12 @@ def _source_of(remembered: Mapping[str, Any], folder: Path) -> Source:
     return Source(path, **wanted, disturbance=Disturbance(**remembered.get("disturbance", {})))
 
 
-def _task_of(result: CalibrationResult, physics: str) -> Task:
-    """The robot with exactly the parameters and ranges of a result."""
+def _space_of(result: CalibrationResult, whole: Task) -> ParameterSpace:
+    """Exactly the parameters and ranges of a result."""
+    known = {row.name: row for row in whole.parameters.parameters}
     rows = []
     for name, row in result.parameters.items():
         field_name, _, element = name.partition(".")
-        rows.append(Parameter(field_name, element, row.low, row.high))
-    return replace(tasks.make(result.task, physics), parameters=ParameterSpace(tuple(rows)))
+        named = known.get(name) or Parameter(field_name, element, row.low, row.high)
+        rows.append(replace(named, low=row.low, high=row.high))
+    return ParameterSpace(tuple(rows))

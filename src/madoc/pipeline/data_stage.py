@@ -4,10 +4,11 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from madoc import data, simulation, tasks
+from madoc import data, robots, simulation, tasks
 from madoc.data import Dataset, Disturbance
 from madoc.errors import MadocError, unknown_name
 from madoc.files import read_json
@@ -52,11 +53,13 @@ class Target:
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """`hopper-medium-replay` as (`hopper`, `medium-replay`); the quality of a bare `hopper` is empty.
+    """`hopper-medium-replay` as (`hopper`, `medium-replay`); the quality of a bare `hopper` or `arm.yaml` is empty.
 
     Raises:
         MadocError: No such task, or no such quality.
     """
+    if robots.is_spec_path(name):
+        return name, ""
     task_name, _, quality = name.partition("-")
     if task_name not in TASKS:
         raise unknown_name("task", task_name, TASKS)
@@ -143,7 +146,7 @@ def check_truth(truth: Mapping[str, float], task: Task, *, physics: str) -> None
     Raises:
         MadocError: Names the parameter.
     """
-    known = tasks.make(task.name, physics).parameters.names
+    known = robots.remake(task, physics).parameters.names
     for name in truth:
         if name not in known:
             raise unknown_name(f"parameter of {task.name} in the truth", name, known)
@@ -152,8 +155,22 @@ def check_truth(truth: Mapping[str, float], task: Task, *, physics: str) -> None
         raise MadocError(f"the truth has no value for {missing[0]}; add it, or leave it out of --parameters")
 
 
-def make_target(task_name: str, physics: str, truth: Mapping[str, float]) -> Target:
+def make_target(task: Task, truth: Mapping[str, float]) -> Target:
     """The target: all true parameters are bound, also those that were not calibrated."""
-    whole = tasks.make(task_name, physics)
+    whole = robots.remake(task)
     simulator = simulation.make(replace(whole, parameters=whole.parameters.select(list(truth))))
     return Target(simulator, simulator.parameters.vector(dict(truth)))
+
+
+def stored_robot(task: Task) -> dict[str, Any]:
+    """What a run's spec.json keeps of a robot of one's own, so that the folder is complete; nothing of Madoc's."""
+    return {} if task.source is None else {"robot": dict(task.source)}
+
+
+def task_of_spec(spec: Mapping[str, Any]) -> Task:
+    """The robot of a run, from its spec.json alone.
+
+    Raises:
+        MadocError: It names no robot, or keeps one that cannot be made.
+    """
+    return robots.restore(spec["robot"]) if "robot" in spec else tasks.make(spec["task"], spec["physics"])

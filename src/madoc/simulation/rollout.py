@@ -6,6 +6,7 @@ from functools import partial
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -135,10 +136,13 @@ def roll(
 
 @eqx.filter_jit
 def act(
-    policy: Policy, observation: Float[Array, "*rows observation"], key: PRNGKeyArray | None, step: np.int32
+    policy: Policy,
+    observation: Float[Array | np.ndarray, "*rows observation"],
+    key: PRNGKeyArray | None,
+    step: np.int32,
 ) -> Array:
     """Actions of a policy, jitted; step `step` of the stream `key`, deterministic without a key."""
-    return policy(observation, None if key is None else jax.random.fold_in(key, step))
+    return policy(jnp.asarray(observation), None if key is None else jax.random.fold_in(key, step))
 
 
 @partial(jax.jit, static_argnums=(0, 2))

@@ -202,7 +202,7 @@ _READERS: dict[str, Callable[[mujoco.MjModel, int], float]] = {
     "body_mass": lambda model, body: model.body_mass[body],
     "body_mass_and_inertia": lambda model, body: model.body_mass[body],
     "body_inertia": lambda model, body: model.body_inertia[body].max(),
-    "body_com": lambda model, body: np.linalg.norm(model.body_ipos[body]),
+    "body_com": lambda model, body: float(np.linalg.norm(model.body_ipos[body])),
     "dof_damping": lambda model, joint: model.dof_damping[_first_dof(model, joint)],
     "dof_armature": lambda model, joint: model.dof_armature[_first_dof(model, joint)],
     "dof_frictionloss": lambda model, joint: model.dof_frictionloss[_first_dof(model, joint)],
