@@ -149,13 +149,13 @@ class CpuSystem:
         simulator: CpuSimulator,
         models: list[mujoco.MjModel],
         *,
-        delay: Float[np.ndarray, " systems"],
-        bias: Float[np.ndarray, "systems observation"] | None,
+        delay: Float[np.ndarray, " systems"] | None = None,
+        bias: Float[np.ndarray, "systems observation"] | None = None,
     ) -> None:
         self.models = models
         self._simulator = simulator
         self._physical = models[0].nq + models[0].nv
-        self._delay, self._bias = delay, bias
+        self._delay, self._bias = np.zeros(len(models)) if delay is None else delay, bias
         self._rows = 0
 
     @property
