@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from madoc.robots.draft import SCALES, Draft, is_slide
-from madoc.robots.model import AddedActuator, names_of
+from madoc.robots.draft import SCALES, Draft
+from madoc.robots.model import AddedActuator, is_single, is_slide, names_of
 from madoc.robots.spec import ActionSpec
 from madoc.tasks.base import ActionChannel
 
@@ -16,7 +16,7 @@ def _joint(draft: Draft, index: int) -> int:
     if action.joint not in joints:
         raise draft.document.unknown(place, "the name of a joint", str(action.joint), joints)
     joint = int(draft.plain.joint(action.joint).id)
-    if draft.plain.jnt_type[joint] not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+    if not is_single(draft.plain, joint):
         raise draft.document.error(place, f"expected a hinge or a slide, got {action.joint!r}, which is a ball or free")
     return joint
 

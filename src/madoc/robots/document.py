@@ -92,12 +92,10 @@ def read_document(content: bytes, file: str) -> Document:
         raise MadocError(f"{file}, line {line}: expected text in UTF-8, got byte {content[error.start]:#x}") from error
     try:
         for event in yaml.parse(text, Loader=yaml.SafeLoader):
-            if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
-                raise MadocError(
-                    f"{file}, line {event.start_mark.line + 1}: anchors and aliases (& and *) are not read here; "
-                    "write the value out"
-                )
+            _refuse_cleverness(event, file)
         root = yaml.compose(text, Loader=yaml.SafeLoader)
+    except MadocError:
+        raise
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = file if mark is None else f"{file}, line {mark.line + 1}"
@@ -110,6 +108,15 @@ def read_document(content: bytes, file: str) -> Document:
         raise MadocError(f"{file} is empty; write one with: madoc init MODEL")
     lines: dict[Place, int] = {}
     return Document(file, _value(root, (), _Reader(file, lines)), lines)
+
+
+def _refuse_cleverness(event: yaml.Event, file: str) -> None:
+    """Refuse anchors, aliases and tags: a spec has no use for them."""
+    where = f"{file}, line {event.start_mark.line + 1}"
+    if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
+        raise MadocError(f"{where}: anchors and aliases (& and *) are not read here; write the value out")
+    if getattr(event, "tag", None):
+        raise MadocError(f"{where}: expected a plain value, got the tag {event.tag}; leave it out")
 
 
 @dataclass(frozen=True)
@@ -125,8 +132,6 @@ def _value(node: yaml.Node, place: Place, reader: _Reader) -> Any:
     reader.lines[place] = node.start_mark.line + 1
     if len(place) > DEEPEST:
         raise reader.error(node, f"nested more than {DEEPEST} deep, which no spec is")
-    if not node.tag.startswith("tag:yaml.org,2002:"):
-        raise reader.error(node, f"expected a plain value, got the tag {node.tag}; leave it out")
     if isinstance(node, yaml.SequenceNode):
         return [_value(child, (*place, index), reader) for index, child in enumerate(node.value)]
     if isinstance(node, yaml.MappingNode):

@@ -27,8 +27,3 @@ class Draft:
     files: ModelFiles
     base: mujoco.MjSpec
     plain: mujoco.MjModel
-
-
-def is_slide(model: mujoco.MjModel, joint: int) -> bool:
-    """Whether a joint slides; what turns has other units."""
-    return bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)

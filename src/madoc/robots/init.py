@@ -11,7 +11,7 @@ import numpy as np
 
 from madoc.errors import MadocError
 from madoc.files import replacing
-from madoc.robots.model import ModelFiles, compiled, names_of
+from madoc.robots.model import ModelFiles, compiled, is_single, is_slide, joint_kind, names_of
 from madoc.tasks import TASKS
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z]+)?|(position|velocity)\([A-Za-z_][A-Za-z0-9_]*\)")
@@ -111,7 +111,7 @@ def _signals(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[str, st
     """Name, expression and unit of every position, then of every velocity."""
     for kind in ("position", "velocity"):
         for joint in joints:
-            place = model.jnt_type[model.joint(joint).id]
+            place = joint_kind(model, model.joint(joint).id)
             speed = kind == "velocity"
             reads = f"{kind}({joint if joint.isidentifier() else json.dumps(joint, ensure_ascii=False)})"
             parts = {mujoco.mjtJoint.mjJNT_FREE: _OF_FREE, mujoco.mjtJoint.mjJNT_BALL: _OF_BALL}.get(place)
@@ -160,9 +160,9 @@ def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Itera
         return
     for joint in joints:
         index = model.joint(joint).id
-        if model.jnt_type[index] not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+        if not is_single(model, index):
             continue
-        slide = model.jnt_type[index] == mujoco.mjtJoint.mjJNT_SLIDE
+        slide = is_slide(model, index)
         limited = bool(model.jnt_actfrclimited[index])
         low, high = model.jnt_actfrcrange[index] if limited else (-1.0, 1.0)
         means, unit = ("force", "N") if slide else ("torque", "N·m")
@@ -199,13 +199,13 @@ def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Field
     for field, wanted in (("dof_damping", True), ("dof_frictionloss", False)):
         for joint in joints:
             index = model.joint(joint).id
-            if model.jnt_type[index] == mujoco.mjtJoint.mjJNT_FREE:
+            if joint_kind(model, index) == mujoco.mjtJoint.mjJNT_FREE:
                 continue
             dof = model.jnt_dofadr[index]
             value = float(getattr(model, field)[dof])
             # Where the model says nothing: what would stop the joint, and all that hangs on it, in 0.1 s.
             high = 2 * value if value > 0 else 10 * float(model.dof_M0[dof])
-            slide = model.jnt_type[index] == mujoco.mjtJoint.mjJNT_SLIDE
+            slide = is_slide(model, index)
             units = ("N·s/m", "N") if slide else ("N·m·s/rad", "N·m")
             unit = units[field == "dof_frictionloss"]
             fields: Fields = {"field": field, "element": joint, "low": 0.0, "high": _round(high)}

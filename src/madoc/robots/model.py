@@ -135,6 +135,21 @@ def is_urdf(content: bytes) -> bool:
     return first is not None and first[1] == b"robot"
 
 
+def joint_kind(model: mujoco.MjModel, joint: int) -> mujoco.mjtJoint:
+    """Hinge, slide, ball or free."""
+    return mujoco.mjtJoint(int(model.jnt_type[joint]))
+
+
+def is_slide(model: mujoco.MjModel, joint: int) -> bool:
+    """Whether a joint slides; what turns has other units."""
+    return joint_kind(model, joint) == mujoco.mjtJoint.mjJNT_SLIDE
+
+
+def is_single(model: mujoco.MjModel, joint: int) -> bool:
+    """Whether a joint is a hinge or a slide, with one position and one velocity."""
+    return joint_kind(model, joint) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
 def names_of(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[str]:
     """Names of all elements of a kind that have one."""
     return [name for index in range(count) if (name := mujoco.mj_id2name(model, kind, index))]

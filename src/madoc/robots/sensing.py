@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from madoc.robots.document import nearest
 from madoc.robots.expressions import Expression, ExpressionError, Read
-from madoc.robots.model import names_of
+from madoc.robots.model import joint_kind, names_of
 from madoc.tasks.base import Batch
 
 _POSITIONS = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}
@@ -41,7 +41,7 @@ class Layout:
         """The layout of a model."""
         joints = {name: model.joint(name).id for name in names_of(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt)}
         sensors = {name: model.sensor(name).id for name in names_of(model, mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor)}
-        kinds = {name: mujoco.mjtJoint(int(model.jnt_type[index])) for name, index in joints.items()}
+        kinds = {name: joint_kind(model, index) for name, index in joints.items()}
         return cls(
             position={
                 name: (int(model.jnt_qposadr[index]), _POSITIONS.get(kinds[name], 1)) for name, index in joints.items()
@@ -55,7 +55,9 @@ class Layout:
             },
             physical=int(model.nq + model.nv),
             accelerating=frozenset(
-                name for name, index in sensors.items() if model.sensor_needstage[index] == mujoco.mjtStage.mjSTAGE_ACC
+                name
+                for name, index in sensors.items()
+                if mujoco.mjtStage(int(model.sensor_needstage[index])) == mujoco.mjtStage.mjSTAGE_ACC
             ),
         )
 

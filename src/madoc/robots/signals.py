@@ -5,6 +5,7 @@ import numpy as np
 
 from madoc.robots.draft import SCALES, Draft
 from madoc.robots.expressions import Expression, ExpressionError, parse
+from madoc.robots.model import is_single, is_slide
 from madoc.robots.sensing import Layout, Signals, quiet_arithmetic
 
 
@@ -38,10 +39,10 @@ def _plain_unit(draft: Draft, expression: Expression) -> str:
     ((read, weight),) = affine[0].items()
     if read.kind == "sensor" or weight != 1.0:
         return ""
-    slide = draft.plain.jnt_type[draft.plain.joint(read.name).id]
-    if slide not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+    joint = int(draft.plain.joint(read.name).id)
+    if not is_single(draft.plain, joint):
         return ""
-    return ("m" if slide == mujoco.mjtJoint.mjJNT_SLIDE else "rad") + ("/s" if read.kind == "velocity" else "")
+    return ("m" if is_slide(draft.plain, joint) else "rad") + ("/s" if read.kind == "velocity" else "")
 
 
 def signal_unit(draft: Draft, expression: Expression, index: int) -> str:

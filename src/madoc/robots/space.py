@@ -4,9 +4,9 @@ import mujoco
 
 from madoc.errors import MadocError
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
-from madoc.robots.draft import Draft, is_slide
+from madoc.robots.draft import Draft
 from madoc.robots.expressions import parse
-from madoc.robots.model import names_of
+from madoc.robots.model import is_slide, names_of
 from madoc.robots.signals import signal_unit
 from madoc.robots.spec import ParameterSpec
 from madoc.simulation.write import find_elements

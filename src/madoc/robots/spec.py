@@ -167,7 +167,10 @@ def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
     try:
         return RobotSpec.model_validate(document.data), document
     except ValidationError as error:
-        details = sorted(error.errors(), key=lambda detail: document.line(_place(detail)))
+        # What is missing may be there under a misspelt name, which says more.
+        details = sorted(
+            error.errors(), key=lambda detail: (detail["type"] == "missing", document.line(_place(detail)))
+        )
         more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
         place = _place(details[0])
         raise document.error(place, _sentence(details[0], place) + more) from error
