@@ -216,9 +216,9 @@ def test_a_name_is_taken_across_signals_and_actions(tmp_path):
         (b"? [a]\n: 1", "line 1: expected a word before the colon"),
         (b"name: caf\xe9\n", "line 1: expected text in UTF-8, got byte 0xe9"),
         (b"\n\na: \x00", "this is not YAML"),
-        (b"[" * 5000, "this is not|nested more than"),
+        (b"[" * 5000, "line 1: nested more than 20 deep"),
         (b"a: " + b"[" * 30 + b"]" * 30, "line 1: nested more than 20 deep"),
-        (b"#" * 1_000_001, "has 1,000,001 bytes, a robot's spec at most 1,000,000"),
+        (b"#" * 200_001, "has 200,001 bytes, a robot's spec at most 200,000"),
     ],
 )
 def test_what_is_no_yaml_of_ours(tmp_path, content, sentence):

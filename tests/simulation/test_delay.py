@@ -84,12 +84,12 @@ def test_a_switch_within_a_physics_step_is_blended(cart):
 
 
 def test_what_follows_is_continuous_in_the_delay(cart):
-    delays = np.linspace(0.0, 0.05, 501)
-    system = cart.bind(np.stack([np.ones(501), delays], -1))
-    state = np.broadcast_to([0.0, 0.0, 0.9, -0.8, 0.7], (501, 1, 5))
-    ends = system.step(state, np.full((501, 1, 1), -1.0))[:, 0]
-    assert np.abs(np.diff(ends[:, 1])).max() <= 20.0 * 1e-4 + 1e-12
-    assert len(np.unique(ends[:, 1].round(9))) > 400
+    delays = np.linspace(0.0, 0.05, 101)
+    system = cart.bind(np.stack([np.ones(101), delays], -1))
+    state = np.broadcast_to([0.0, 0.0, 0.9, -0.8, 0.7], (101, 1, 5))
+    ends = system.step(state, np.full((101, 1, 1), -1.0))[:, 0]
+    assert np.abs(np.diff(ends[:, 1])).max() <= 20.0 * 5e-4 + 1e-12
+    assert len(np.unique(ends[:, 1].round(9))) > 80
 
 
 def test_a_delay_of_a_whole_step_is_the_action_before(cart):

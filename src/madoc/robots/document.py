@@ -14,8 +14,8 @@ from madoc.errors import MadocError
 Place = tuple[str | int, ...]
 """Where something stands: keys and positions, as `("signals", 0, "name")`."""
 
-LARGEST = 1_000_000
-"""Bytes. A spec file of a robot with a hundred joints has some ten thousand."""
+LARGEST = 200_000
+"""Bytes. A spec file of a robot with a hundred joints has some twenty thousand."""
 DEEPEST = 20
 
 _INTEGER = re.compile(r"[-+]?[0-9]+")
@@ -91,8 +91,10 @@ def read_document(content: bytes, file: str) -> Document:
         line = content[: error.start].count(b"\n") + 1
         raise MadocError(f"{file}, line {line}: expected text in UTF-8, got byte {content[error.start]:#x}") from error
     try:
+        depth = 0
         for event in yaml.parse(text, Loader=yaml.SafeLoader):
-            _refuse_cleverness(event, file)
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            _refuse_cleverness(event, depth, file)
         root = yaml.compose(text, Loader=yaml.SafeLoader)
     except MadocError:
         raise
@@ -110,13 +112,15 @@ def read_document(content: bytes, file: str) -> Document:
     return Document(file, _value(root, (), _Reader(file, lines)), lines)
 
 
-def _refuse_cleverness(event: yaml.Event, file: str) -> None:
-    """Refuse anchors, aliases and tags: a spec has no use for them."""
+def _refuse_cleverness(event: yaml.Event, depth: int, file: str) -> None:
+    """Refuse anchors, aliases, tags and deep nesting: a spec has no use for them, and they make YAML slow or unsafe."""
     where = f"{file}, line {event.start_mark.line + 1}"
     if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
         raise MadocError(f"{where}: anchors and aliases (& and *) are not read here; write the value out")
     if getattr(event, "tag", None):
         raise MadocError(f"{where}: expected a plain value, got the tag {event.tag}; leave it out")
+    if depth > DEEPEST:
+        raise MadocError(f"{where}: nested more than {DEEPEST} deep, which no spec is")
 
 
 @dataclass(frozen=True)
@@ -130,8 +134,6 @@ class _Reader:
 
 def _value(node: yaml.Node, place: Place, reader: _Reader) -> Any:
     reader.lines[place] = node.start_mark.line + 1
-    if len(place) > DEEPEST:
-        raise reader.error(node, f"nested more than {DEEPEST} deep, which no spec is")
     if isinstance(node, yaml.SequenceNode):
         return [_value(child, (*place, index), reader) for index, child in enumerate(node.value)]
     if isinstance(node, yaml.MappingNode):

@@ -59,7 +59,9 @@ class ModelFiles:
         return cls(stored["main"], {name: _restored(content) for name, content in stored["contents"].items()})
 
     def spec(self) -> mujoco.MjSpec:
-        """A MuJoCo spec of it.
+        """A MuJoCo spec of it, in which what has no name of its own is named by what it belongs to.
+
+        A joint takes the name of its body, where it is the only one there, and an actuator that of its joint.
 
         Raises:
             MadocError: MuJoCo does not take it; the sentence is MuJoCo's.
@@ -72,9 +74,15 @@ class ModelFiles:
         includes = {name: content for name, content in others.items() if PurePosixPath(name).suffix == ".xml"}
         assets = {name: content for name, content in others.items() if name not in includes}
         try:
-            return mujoco.MjSpec.from_string(text, include=includes, assets=assets)
+            spec = mujoco.MjSpec.from_string(text, include=includes, assets=assets)
         except (ValueError, mujoco.FatalError) as error:
             raise MadocError(f"model {self.main} cannot be read: {_one_line(error)}") from error
+        _name_by_owner(
+            [(joint, joint.parent.name) for joint in spec.joints if len(joint.parent.joints) == 1], spec.joints
+        )
+        of_joint = [part for part in spec.actuators if part.trntype == mujoco.mjtTrn.mjTRN_JOINT]
+        _name_by_owner([(actuator, actuator.target) for actuator in of_joint], spec.actuators)
+        return spec
 
 
 @dataclass(frozen=True)
@@ -153,6 +161,15 @@ def is_single(model: mujoco.MjModel, joint: int) -> bool:
 def names_of(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[str]:
     """Names of all elements of a kind that have one."""
     return [name for index in range(count) if (name := mujoco.mj_id2name(model, kind, index))]
+
+
+def _name_by_owner(owned: list[tuple[Any, str]], everything: Any) -> None:
+    """Name what has no name by its owner, unless that name is taken or would be given twice."""
+    taken = [part.name for part in everything]
+    wanted = [owner for part, owner in owned if not part.name]
+    for part, owner in owned:
+        if not part.name and owner and owner not in taken and wanted.count(owner) == 1:
+            part.name = owner
 
 
 def _read(path: Path, owner: str = "") -> bytes:
