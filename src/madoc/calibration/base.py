@@ -89,12 +89,15 @@ class CalibrationProblem:
 
     @cached_property
     def probe(self) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
-        """States and actions at which every parameter must matter: logged ones where states can be rebuilt."""
+        """States and actions at which every parameter must matter: logged ones where states can be rebuilt.
+
+        Else where the first logged actions lead from a reset, as at rest many parameters have no say.
+        """
         task = self.simulator.task
         if task.state_from_observation is not None:
             return self.logged_states, self.logged_actions
-        states = reset_states(self.simulator)(jax.random.key(0), 64)
-        return states, np.asarray(self.dataset.transitions.action)[np.arange(64) % len(self.dataset)]
+        actions = np.asarray(self.dataset.transitions.action, dtype=np.float64)[np.arange(64) % len(self.dataset)]
+        return _walked(self.simulator, actions), actions
 
     @cached_property
     def pairs(self) -> tuple[Float[Array, "rows observation"], Float[Array, "rows action"]]:
@@ -121,6 +124,18 @@ class CalibrationProblem:
     def _features(self, name: str) -> tuple[Array, Array]:
         pair, following = self.scalings[name].features(self.dataset.transitions)
         return jnp.asarray(pair), jnp.asarray(following)
+
+
+def _walked(simulator: Simulator, actions: Float[np.ndarray, "rows action"]) -> Float[np.ndarray, "rows state"]:
+    """The states that actions are taken at, one after the other from a reset, at mid-range parameters."""
+    system = simulator.bind(simulator.parameters.middle[None])
+    state = first = reset_states(simulator)(jax.random.key(0), 1)[None]
+    passed = []
+    for action in actions:
+        passed.append(state[0, 0])
+        state = system.step(state, action[None, None])
+        state = state if np.isfinite(state).all() else first
+    return np.stack(passed)
 
 
 @dataclass(frozen=True)

@@ -146,9 +146,10 @@ def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "stat
         MadocError: The task's observation does not determine its state, or no row can be rebuilt.
     """
     if task.state_from_observation is None:
+        wanted = "a state_from_observation" if task.source is None else "signals of every position and velocity"
         raise MadocError(
             f"an observation of {task.name} does not determine its state, so nothing can start at logged "
-            "states; give the task a state_from_observation, or start rollouts from its reset"
+            f"states; give the task {wanted}, or start rollouts from its reset"
         )
     observation = np.asarray(dataset.transitions.observation, dtype=np.float64)
     rows = np.arange(len(observation))
