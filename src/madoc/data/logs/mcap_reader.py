@@ -129,7 +129,7 @@ def _parts(value: Any) -> dict[str, Any]:
         return {}
     if isinstance(value, Mapping):
         return {str(key): part for key, part in value.items()}
-    slots: tuple[str, ...] = getattr(value, "__slots__", ())
+    slots: Any = getattr(value, "__slots__", ())
     fields = getattr(value, "__dict__", None) or {key: getattr(value, key) for key in slots}
     return {key: part for key, part in fields.items() if not key.startswith("_")}
 
