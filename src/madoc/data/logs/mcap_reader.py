@@ -147,7 +147,11 @@ def _table(name: str, topic: _Topic, origin: int, others: Mapping[str, str]) -> 
     """Rows as columns, NaN where a message lacks a field; in the order they were logged in."""
     names = list(dict.fromkeys(key for row in topic.rows for key in row))
     columns = {key: np.array([row.get(key, np.nan) for row in topic.rows]) for key in names}
-    clocks = {CLOCK: topic.log_times, "publish_time": topic.publish_times, "header.stamp": topic.stamps}
+    clocks: dict[str, Sequence[int | None]] = {
+        CLOCK: topic.log_times,
+        "publish_time": topic.publish_times,
+        "header.stamp": topic.stamps,
+    }
     for clock, times in clocks.items():
         known = [time for time in times if time is not None]
         if len(known) == len(times):
