@@ -13,6 +13,7 @@ from tyro.conf import subcommand
 
 from madoc.commands.answer import EXIT_CODES, Answer, Command
 from madoc.commands.calibrate import Calibrate
+from madoc.commands.check import Check
 from madoc.commands.evaluate import Evaluate
 from madoc.commands.learn import Learn
 from madoc.commands.lists import Methods, Tasks
@@ -36,6 +37,7 @@ Commands = (
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Init, subcommand("init")]
     | Annotated[Spec, subcommand("spec")]
+    | Annotated[Check, subcommand("check")]
     | Annotated[Tasks, subcommand("tasks")]
     | Annotated[Methods, subcommand("methods")]
 )

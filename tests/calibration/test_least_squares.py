@@ -8,15 +8,19 @@ import pytest
 
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
-from madoc.calibration.least_squares import losses
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.calibration.least_squares.linearisation import (
+from madoc.data import Disturbance, disturb
+from madoc.data.windows import windows_at
+from madoc.errors import MadocError
+from madoc.parameters import Parameter
+from madoc.residuals import losses
+from madoc.residuals.linearisation import (
     DIFFERENCE,
     Linearisation,
     difference_points,
     linearise,
 )
-from madoc.calibration.least_squares.uncertainty import (
+from madoc.residuals.uncertainty import (
     bread,
     correlated_pairs,
     half_width,
@@ -24,11 +28,7 @@ from madoc.calibration.least_squares.uncertainty import (
     meat,
     sandwich,
 )
-from madoc.calibration.window_residuals import window_residuals
-from madoc.data import Disturbance, disturb
-from madoc.data.windows import windows_at
-from madoc.errors import MadocError
-from madoc.parameters import Parameter
+from madoc.residuals.window_residuals import window_residuals
 from robots import SPRING_TRUTH, CountingSimulator, recorded, spring
 
 ROBUST = ("huber", "soft-l1", "cauchy")

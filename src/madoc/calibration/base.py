@@ -73,7 +73,8 @@ class CalibrationProblem:
             "the estimate will make up for the difference"
         )
         gaps = () if recorded in ("unknown", simulated) else (gap,)
-        return (*gaps, *self.dataset.disturbance.sentences())
+        told = (finding.sentence for finding in self.dataset.findings if finding.level == "warning")
+        return (*gaps, *self.dataset.disturbance.sentences(), *told)
 
     def require_pairs(self, method: str) -> None:
         """Refuse data in which it is not known which next observation followed which row.

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from rich.console import RenderableType
 from rich.table import Table
 
-EXIT_CODES: Mapping[str, int] = {"finished": 0, "converged": 0, "diverged": 1, "interrupted": 130}
+EXIT_CODES: Mapping[str, int] = {"finished": 0, "converged": 0, "diverged": 1, "rejected": 2, "interrupted": 130}
 """Exit codes by how a run ended; 2 is a refusal."""
 
 PLACE_NAMES: Mapping[str, str] = {

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from madoc.errors import MadocError
+from madoc.findings import Finding
 from madoc.tasks import Task
 from madoc.types import Transitions
 
@@ -80,6 +81,9 @@ class Dataset:
         origin: The file, or a description.
         true_parameters: The target's physical values by parameter name, if known. Only evaluation reads them.
         disturbance: What it is known to suffer from.
+        run_names: The run of each episode, where it was read from a user's logs: episodes of one name are stretches of
+            one run.
+        findings: What reading and checking it told.
     """
 
     transitions: Transitions
@@ -89,6 +93,8 @@ class Dataset:
     origin: str
     true_parameters: dict[str, float] | None = None
     disturbance: Disturbance = field(default_factory=Disturbance)
+    run_names: tuple[str, ...] | None = None
+    findings: tuple[Finding, ...] = ()
 
     def __len__(self) -> int:
         return len(self.transitions)
@@ -133,7 +139,8 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
     rows = np.concatenate([np.arange(starts[episode], ends[episode]) for episode in chosen])[:max_transitions]
     new_starts = np.append(0, filled[: episodes - 1])
     transitions = close_episodes(dataset.transitions.take(rows), new_starts)
-    return replace(dataset, transitions=transitions, episode_starts=new_starts)
+    names = None if dataset.run_names is None else tuple(dataset.run_names[episode] for episode in chosen)
+    return replace(dataset, transitions=transitions, episode_starts=new_starts, run_names=names)
 
 
 def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:

@@ -105,7 +105,12 @@ def _with_observations(dataset: Dataset, shown: slice) -> Dataset:
 def _shuffle_rows(dataset: Dataset, order: Int[np.ndarray, " rows"]) -> Dataset:
     """Every row an episode of its own: nothing is known of what came before or after it."""
     starts = np.arange(len(dataset))
-    return replace(dataset, transitions=close_episodes(dataset.transitions.take(order), starts), episode_starts=starts)
+    names = dataset.run_names
+    if names is not None:
+        episode = np.searchsorted(dataset.episode_starts, order, side="right") - 1
+        names = tuple(names[index] for index in episode)
+    transitions = close_episodes(dataset.transitions.take(order), starts)
+    return replace(dataset, transitions=transitions, episode_starts=starts, run_names=names)
 
 
 def _shuffle_next_observations(dataset: Dataset, order: Int[np.ndarray, " rows"]) -> Dataset:

@@ -12,6 +12,7 @@ from madoc.data import Dataset, Disturbance, observed_task
 from madoc.errors import MadocError, unknown_name
 from madoc.files import read_json
 from madoc.parameters import Parameter, ParameterSpace
+from madoc.pipeline.check_stage import checked
 from madoc.pipeline.data_stage import Source, check_truth, fingerprint, load_source, stored_robot, task_of_spec
 from madoc.pipeline.folders import restored_path, stored_path, working_folder
 from madoc.pipeline.keys import seed_key
@@ -83,7 +84,10 @@ def calibrate_in(out: Path, order: CalibrationOrder, *, resume: bool = False, qu
     truth = dataset.true_parameters if order.truth is None else dict(order.truth)
     if truth is not None:
         check_truth(truth, task, physics=task.physics)
-    problem = CalibrationProblem(dataset, simulation.make(task))
+    simulator = simulation.make(task)
+    if task.source is not None:
+        dataset = checked(dataset, simulator)
+    problem = CalibrationProblem(dataset, simulator)
     spec = _spec(order, method, task, dataset, truth, out)
     with working_folder(out, spec, resume=resume) as folder:
         return calibrate(

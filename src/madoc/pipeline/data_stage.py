@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from madoc import data, robots, simulation, tasks
-from madoc.data import Dataset, Disturbance
+from madoc.data import Dataset, Disturbance, logs
+from madoc.data.native import recognises as is_recorded
 from madoc.errors import MadocError, unknown_name
 from madoc.files import read_json
 from madoc.pipeline.keys import stage_key
@@ -102,18 +103,26 @@ def load_source(source: Source, task: Task, *, seed: int) -> Dataset:
     """Read logged data of a robot, and disturb it if the source says so.
 
     Raises:
-        MadocError: As `data.load` and `data.disturb`, or friction is to be changed after the fact.
+        MadocError: As `data.load`, or `logs.read` for a robot of one's own, and `data.disturb`; or friction is to be
+            changed after the fact.
     """
     if source.disturbance.friction != 1.0:
         raise MadocError("the friction of a target is chosen when it is recorded; pass it to madoc record")
-    dataset = data.load(
-        source.path,
-        task,
-        format=source.format,
-        max_transitions=source.max_transitions,
-        key=stage_key(seed, "subsampling"),
-        clip_actions=source.clip_actions,
-    )
+    key = stage_key(seed, "subsampling")
+    if task.source is not None and source.format is None and not is_recorded(Path(source.path)):
+        robot = robots.restore_robot(task.source)
+        dataset = logs.read(source.path, robot, clip_actions=source.clip_actions)
+        if source.max_transitions is not None:
+            dataset = data.subsample(dataset, source.max_transitions, key)
+    else:
+        dataset = data.load(
+            source.path,
+            task,
+            format=source.format,
+            max_transitions=source.max_transitions,
+            key=key,
+            clip_actions=source.clip_actions,
+        )
     return data.disturb(dataset, source.disturbance, task, stage_key(seed, "disturbing"))
 
 

@@ -72,12 +72,21 @@ def restore(source: Mapping[str, Any]) -> Task:
     Raises:
         MadocError: It is no such description.
     """
+    return restore_robot(source).task
+
+
+def restore_robot(source: Mapping[str, Any]) -> Robot:
+    """The robot that `Task.source` describes, as `restore`.
+
+    Raises:
+        MadocError: It is no such description.
+    """
     try:
         file, content = Path(source["file"]), source["spec"].encode()
         model = ModelFiles.from_json(source["model"])
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise MadocError(f"the robot in this run's spec.json cannot be read: {error}; restore the file") from error
-    return _robot(file, content, model).task
+    return _robot(file, content, model)
 
 
 def resolve(name: str | Path, physics: str | None = None) -> Task:
@@ -133,5 +142,6 @@ __all__ = [
     "remake",
     "resolve",
     "restore",
+    "restore_robot",
     "schema",
 ]

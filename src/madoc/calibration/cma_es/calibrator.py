@@ -30,11 +30,11 @@ from madoc.calibration.population_search import (
     mean_with_failures,
     next_generation,
 )
-from madoc.calibration.window_residuals import window_residuals
 from madoc.data.windows import first_rows
 from madoc.errors import check_at_least
 from madoc.learning.cloning import clone
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.residuals.window_residuals import window_residuals
 from madoc.simulation.rollout import Walkers, begin, reset_states, roll
 from madoc.types import Metrics
 

@@ -9,12 +9,12 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.cautions import at_end_of_range, exploded
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.calibration.least_squares.linearisation import difference_points, linearise
-from madoc.calibration.least_squares.losses import ALL_FAILED, Loss, mean_cost, scale_of
-from madoc.calibration.least_squares.uncertainty import bread, half_width, identifiability, meat, sandwich
-from madoc.calibration.window_residuals import window_residuals
 from madoc.data.windows import Windows, first_rows, windows_at
 from madoc.errors import MadocError, check_at_least
+from madoc.residuals.linearisation import difference_points, linearise
+from madoc.residuals.losses import ALL_FAILED, Loss, mean_cost, scale_of
+from madoc.residuals.uncertainty import bread, half_width, identifiability, meat, sandwich
+from madoc.residuals.window_residuals import window_residuals
 from madoc.types import Metrics
 
 TRIALS = (1e-2, 1.0, 1e2)

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import t
 
-from madoc.calibration.least_squares.linearisation import Linearisation
-from madoc.calibration.least_squares.losses import Loss, loss_curvature, loss_slope
+from madoc.residuals.linearisation import Linearisation
+from madoc.residuals.losses import Loss, loss_curvature, loss_slope
 
 CONFIDENCE = 0.95
 BOX_VARIANCE = 1.0 / 3.0
