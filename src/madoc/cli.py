@@ -18,6 +18,7 @@ from madoc.commands.learn import Learn
 from madoc.commands.lists import Methods, Tasks
 from madoc.commands.record import Record
 from madoc.commands.run import Run
+from madoc.commands.selftest import Selftest
 from madoc.errors import MadocError
 from madoc.files import json_text
 
@@ -31,6 +32,7 @@ Commands = (
     Annotated[Run, subcommand("run")]
     | Annotated[Record, subcommand("record")]
     | Annotated[Calibrate, subcommand("calibrate")]
+    | Annotated[Selftest, subcommand("selftest")]
     | Annotated[Learn, subcommand("learn")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Tasks, subcommand("tasks")]
