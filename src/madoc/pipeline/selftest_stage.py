@@ -1,6 +1,5 @@
 """`madoc selftest`: would this data show a truth? From an order to an answer; nothing is left behind."""
 
-
 import jax
 
 from madoc.calibration import CALIBRATORS

@@ -21,7 +21,7 @@ from madoc.verdict.identifiability import half_widths, told_shares
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, evenly, nearby_best, replays_of
 from madoc.verdict.statistics import better_than_chance, interval_of, resampled
 from madoc.verdict.systematic import autocorrelation, explained
-from madoc.verdict.two_sample import Sample, Told, behaviour, replayed, rolled, tell_apart, windows_of
+from madoc.verdict.two_sample import Told, WindowView, behaviour, replayed, rolled, tell_apart
 
 NEGLIGIBLE = 1e-3
 """Of a step's typical change. No sensor is as good, and no use of a model notices."""
@@ -72,9 +72,14 @@ class Bench:
         return behaviour(self.split.kept, self.key)
 
     @cached_property
-    def seen_windows(self) -> Sample:
-        """The hold-out as the classifier sees it where states cannot be rebuilt."""
-        return windows_of(self.split.held, self.scaling)
+    def view(self) -> WindowView:
+        """How rows are shown to the classifier where states cannot be rebuilt."""
+        return WindowView.of(self.split.kept, self.scaling)
+
+    @cached_property
+    def middle_apart(self) -> Told:
+        """How well rows of mid-range are told from those held out, where states cannot be rebuilt."""
+        return self.rolled_apart(np.zeros(len(self.simulator.parameters)))
 
     @cached_property
     def judged_rows(self) -> Int[np.ndarray, " rows"]:
@@ -109,13 +114,13 @@ class Bench:
         episodes = np.searchsorted(held.episode_starts, rows, side="right") - 1
         return better_than_chance(guess / spread, followed / spread, episodes)
 
-    def rolled_apart(self, unit: Float[np.ndarray, " d"], noise: Float[np.ndarray, " observation"]) -> Told:
-        """The two-sample test of rollouts under the clone, whose sensors are as noisy as given."""
+    def rolled_apart(self, unit: Float[np.ndarray, " d"]) -> Told:
+        """The two-sample test of rollouts under the clone, whose sensors are as noisy as those of the log."""
         parameters, held = self.simulator.parameters.to_physical(unit), self.split.held
         length = int(np.clip(np.median(held.episode_ends - held.episode_starts), 2, _LONGEST_ROLLOUT))
-        key = jax.random.fold_in(self.key, 1)
+        noise, key = sensors.difference_noise(self.split.kept), jax.random.fold_in(self.key, 1)
         simulated = rolled(self.clone, self.simulator, parameters, length=length, key=key, noise=noise)
-        return tell_apart(self.seen_windows, windows_of(simulated, self.scaling), overlap=True)
+        return tell_apart(self.view.sample(held), self.view.sample(simulated), overlap=True)
 
 
 @dataclass(frozen=True)
@@ -212,7 +217,7 @@ def _by_prediction(bench: Bench, unit: np.ndarray, interval: np.ndarray | None) 
         errors={
             name: dict(zip(replays.horizons, kind.mean((0, -1)).tolist(), strict=True)) for name, kind in named.items()
         },
-        explained_share=left.explained,
+        explained_share=max(left.explained, _said_of_the_end(bench, residuals[best])),
         correlation=left.autocorrelation,
         shares=told_shares(half, interval, space.high - space.low),
         follows={
@@ -246,6 +251,17 @@ class _Left:
     control_steps: int
 
 
+def _said_of_the_end(bench: Bench, residuals: Float[np.ndarray, "windows steps observation"]) -> float:
+    """The share of residuals after the longest horizon that start and actions say: small errors add up there."""
+    replays = bench.replays
+    done = np.isfinite(residuals[:, -1]).all(-1)
+    end = sensors.clipped(residuals[done, -1])
+    if not done.any() or np.sqrt((end**2).mean(0)).max() <= _ROUNDING:
+        return 0.0
+    actions = replays.windows.actions.reshape(len(done), -1)
+    return explained(np.concatenate([replays.observation, actions], axis=1)[done], end)[0]
+
+
 def _what_is_left(bench: Bench, unit: np.ndarray) -> _Left:
     held, rows, scale = bench.split.held, bench.judged_rows, bench.scaling.next_scale
     followed = np.asarray(held.transitions.next_observation)[rows]
@@ -267,11 +283,8 @@ def _by_rows(bench: Bench, unit: np.ndarray, interval: np.ndarray | None) -> Ass
     """Where no state can be rebuilt: rows of rollouts under a clone against rows of the log."""
     scale = bench.scaling.next_scale
     deviation = sensors.difference_noise(bench.split.kept)
-    areas = {
-        name: bench.rolled_apart(point, deviation)
-        for name, point in (("mid-range", np.zeros(len(unit))), ("estimate", unit))
-    }
-    half, probing = half_widths(bench.problem, unit, np.maximum(np.sqrt(2.0) * deviation / scale, NEGLIGIBLE))
+    areas = {"mid-range": bench.middle_apart, "estimate": bench.rolled_apart(unit)}
+    half, probing = half_widths(bench.problem, unit, np.maximum(deviation / scale, NEGLIGIBLE))
     space = bench.simulator.parameters
     told = areas["estimate"]
     return _assembled(

@@ -22,9 +22,13 @@ FEWEST_WINDOWS = 20
 """A longer horizon is left out where fewer windows are as long, unless there are fewer of one step too."""
 WORST = 1.0
 """Steps' changes that a failed window counts for at least."""
-NEARBY_STEPS = 3
-"""Gauss-Newton steps from an estimate: enough to come to the bottom of the hollow it lies in."""
+NEARBY_STEPS = 8
+"""Gauss-Newton steps from an estimate, at most: enough to come to the bottom of the hollow it lies in."""
+_STILL = 1e-7
+"""A step in [-1, 1] so small is the last."""
 _DAMPING = 1e-6
+_KEPT = 2
+"""Points looked at over all horizons: the last, and the one before, should the last have left the hollow."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +98,7 @@ def replays_of(held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " o
 
 
 def nearby_best(replays: Replays, unit: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, "points d"], int]:
-    """Where `NEARBY_STEPS` Gauss-Newton steps on single steps of the windows lead from an estimate, and their cost.
+    """Where Gauss-Newton steps on single steps of the windows lead from an estimate, and their cost.
 
     They look at the rows held out, so none is an estimate: they tell what the parameters could explain at best.
     """
@@ -108,9 +112,12 @@ def nearby_best(replays: Replays, unit: Float[np.ndarray, " d"]) -> tuple[Float[
         if not len(around.residuals):
             break
         scale = scale_of(around.residuals, "cauchy")
-        unit = unit + damped_step(*triangular_factors(around, scale, "cauchy"), unit, _DAMPING)
+        step = damped_step(*triangular_factors(around, scale, "cauchy"), unit, _DAMPING)
+        unit = unit + step
         found.append(unit)
-    return np.array(found).reshape(-1, len(unit)), spent
+        if np.abs(step).max() < _STILL:
+            break
+    return np.array(found[-_KEPT:]).reshape(-1, len(unit)), spent
 
 
 def evenly(positions: Int[np.ndarray, " positions"], count: int) -> Int[np.ndarray, " chosen"]:

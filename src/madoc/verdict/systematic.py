@@ -13,7 +13,7 @@ _FEWEST = 2 * FOLDS
 
 EXPLAINERS = {
     "a linear function": lambda: make_pipeline(StandardScaler(), RidgeCV(np.logspace(-3, 3, 7))),
-    "trees": lambda: ExtraTreesRegressor(20, min_samples_leaf=3, random_state=0),
+    "trees": lambda: ExtraTreesRegressor(10, min_samples_leaf=3, random_state=0),
 }
 """What tries to say a residual from state and action: motion in the large, and contacts."""
 

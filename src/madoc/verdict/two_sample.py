@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from sklearn.ensemble import HistGradientBoostingClassifier
+from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import StratifiedKFold
 from threadpoolctl import threadpool_limits
 
@@ -23,11 +24,16 @@ from madoc.types import Transitions
 from madoc.verdict.prediction import Replays, evenly
 from madoc.verdict.statistics import area_under_curve, interval_of
 
-MOST_ROWS = 1500
-"""Of either kind: an area under the curve of so many is known to ±0.02."""
+MOST_ROWS = 1000
+"""Of either kind: an area under the curve of so many is known to ±0.025."""
+RESOLUTION = 0.1
+"""Of the typical change of motion. Without noise a classifier would tell parameters a millionth off."""
+_FITTED = 5000
+"""Rows that the line goes through."""
 FOLDS = 5
 TREES = 40
 LEAVES = 8
+BINS = 32
 """Small trees, and few: some hundred rows hold no more."""
 ODDS_LIMIT = 10.0
 """Rows count at most so unequally; past this there is no overlap to speak of."""
@@ -81,9 +87,9 @@ def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Told:
     label = np.repeat([True, False], [len(real), len(simulated)])
     before = np.concatenate([real.before, simulated.before])
     after = np.concatenate([real.after, simulated.after])
-    weight = np.ones(len(label))
+    weight = None
     if overlap:
-        likely = np.clip(_unseen(before, label, weight), 0.01, 0.99)
+        likely = np.clip(_unseen(before, label, None), 0.01, 0.99)
         odds = np.clip(likely / (1.0 - likely), 1.0 / ODDS_LIMIT, ODDS_LIMIT)
         weight = np.where(label, 1.0, odds / odds[~label].mean())
     scores = _unseen(np.concatenate([before, after], axis=1), label, weight)
@@ -173,10 +179,14 @@ def rolled(
         key=of_action,
         restart_key=of_restart,
     )
-    seen = jax.tree.map(lambda column: np.swapaxes(column[:, 0], 0, 1).reshape(-1, *column.shape[3:]), rollout)
-    flat = seen.transitions
-    ends = flat.terminated | flat.truncated | ~seen.valid
+    flat, valid = jax.tree.map(
+        lambda column: np.swapaxes(column[:, 0], 0, 1).reshape(-1, *column.shape[3:]),
+        (rollout.transitions, rollout.valid),
+    )
+    ends = flat.terminated | flat.truncated
     ends[length - 1 :: length] = True
+    ends[:-1] |= ~valid[1:]
+    flat, ends = flat.take(valid), ends[valid]
     same = np.random.default_rng(0).standard_normal((len(flat) + 1, len(noise))) * noise
     noisy = Transitions(
         flat.observation + same[:-1],
@@ -189,49 +199,80 @@ def rolled(
     return Dataset(noisy, starts_after(ends), task.name, task.physics, "a clone in the simulator")
 
 
-def windows_of(dataset: Dataset, scaling: Scaling) -> Sample:
-    """Two rows that follow each other: what was seen and done in both, and what came after; single rows where none do.
+@dataclass(frozen=True)
+class WindowView:
+    """How rows are shown to the classifier where one observation is not the state; made from the rows kept.
 
-    Velocities are not seen but in what two observations differ by.
+    What came before is what was seen and done in two rows that follow each other (in one, where none do), what followed
+    is how the motion changed, `RESOLUTION` of it blurred, and what of that a line through the rows kept does not say.
+
+    Attributes:
+        scaling: Of observations and actions.
+        spread: Of the change of motion.
+        line: From what came before to how the motion changed.
     """
+
+    scaling: Scaling
+    spread: Float[np.ndarray, " observation"]
+    line: RidgeCV
+
+    @classmethod
+    def of(cls, kept: Dataset, scaling: Scaling) -> "WindowView":
+        """The view of a log."""
+        before, after, _ = _change_of_motion(kept, scaling)
+        spread = np.where(after.std(0) > 1e-8, after.std(0), 1.0)
+        chosen = evenly(np.arange(len(before)), _FITTED)
+        line = RidgeCV(np.logspace(-4, 2, 7)).fit(before[chosen], after[chosen] / spread)
+        return cls(scaling, spread, line)
+
+    def sample(self, dataset: Dataset) -> Sample:
+        """The rows of a dataset."""
+        before, after, episodes = _change_of_motion(dataset, self.scaling)
+        after = after / self.spread
+        after = after + RESOLUTION * np.random.default_rng(len(after)).standard_normal(after.shape)
+        unsaid = after - np.reshape(self.line.predict(before), after.shape)
+        return Sample(before, np.concatenate([after, unsaid], axis=1), episodes)
+
+
+def _change_of_motion(dataset: Dataset, scaling: Scaling) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What came before, how the motion changed after it, and the episode of each window."""
     logged = dataset.transitions
     second = np.setdiff1d(np.arange(len(dataset)), dataset.episode_starts)
+    rows = second if len(second) else np.arange(len(dataset))
+    pair, moved = scaling.features(logged.take(rows))
+    episodes = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
     if not len(second):
-        return _sample(logged, np.arange(len(dataset)), dataset, scaling)
-    sample = _sample(logged.take(second), second, dataset, scaling)
-    pair, moved = scaling.features(logged.take(second - 1))
-    action = pair[:, np.asarray(logged.observation).shape[1] :]
-    return Sample(np.concatenate([sample.before, moved, action], axis=1), sample.after, sample.episodes)
-
-
-def _sample(rows: Transitions, where: np.ndarray, dataset: Dataset, scaling: Scaling) -> Sample:
-    return Sample(*scaling.features(rows), np.searchsorted(dataset.episode_starts, where, side="right") - 1)
+        return pair.astype(np.float64), moved.astype(np.float64), episodes
+    earlier, moved_before = scaling.features(logged.take(second - 1))
+    action = earlier[:, moved.shape[1] :]
+    before = np.concatenate([pair, moved_before, action], axis=1).astype(np.float64)
+    return before, moved.astype(np.float64) - moved_before, episodes
 
 
 def _unseen(
     features: Float[np.ndarray, "rows features"],
     label: Bool[np.ndarray, " rows"],
-    weight: Float[np.ndarray, " rows"],
+    weight: Float[np.ndarray, " rows"] | None,
 ) -> Float[np.ndarray, " rows"]:
     """How likely each row is a logged one, by a classifier that has not seen it."""
     scores = np.empty(len(label))
     with threadpool_limits(1):  # the same bits on any number of cores, and no threads that wait for each other
         for seen, unseen in StratifiedKFold(FOLDS, shuffle=True, random_state=0).split(features, label):
             trees = HistGradientBoostingClassifier(
-                max_iter=TREES, max_leaf_nodes=LEAVES, early_stopping=False, random_state=0
+                max_iter=TREES, max_leaf_nodes=LEAVES, max_bins=BINS, early_stopping=False, random_state=0
             )
-            trees.fit(features[seen], label[seen], weight[seen])
+            trees.fit(features[seen], label[seen], None if weight is None else weight[seen])
             scores[unseen] = trees.predict_proba(features[unseen])[:, 1]
     return scores
 
 
-def _interval(scores: np.ndarray, label: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+def _interval(scores: np.ndarray, label: np.ndarray, weight: np.ndarray | None) -> tuple[float, float]:
     """Percentiles over resampled rows of each kind."""
     rng = np.random.default_rng(0)
     kinds = [np.flatnonzero(label), np.flatnonzero(~label)]
     draws = []
     for _ in range(_RESAMPLES):
         rows = np.concatenate([rng.choice(kind, len(kind)) for kind in kinds])
-        draws.append(area_under_curve(scores[rows], label[rows], weight[rows]))
+        draws.append(area_under_curve(scores[rows], label[rows], None if weight is None else weight[rows]))
     low, high = interval_of(np.array(draws))
     return float(low), float(high)
