@@ -19,6 +19,7 @@ from madoc.commands.learn import Learn
 from madoc.commands.lists import Methods, Tasks
 from madoc.commands.record import Record
 from madoc.commands.run import Run
+from madoc.commands.selftest import Selftest
 from madoc.commands.spec import Init, Spec
 from madoc.errors import MadocError
 from madoc.files import json_text
@@ -33,6 +34,7 @@ Commands = (
     Annotated[Run, subcommand("run")]
     | Annotated[Record, subcommand("record")]
     | Annotated[Calibrate, subcommand("calibrate")]
+    | Annotated[Selftest, subcommand("selftest")]
     | Annotated[Learn, subcommand("learn")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Init, subcommand("init")]

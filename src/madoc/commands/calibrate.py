@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from madoc.commands.answer import Answer, Output, left_behind
+from madoc.commands.answer import Answer, Output, calibration_status, calibration_text, left_behind
 from madoc.commands.disturbed import Disturbed, disturbance_of
 from madoc.errors import MadocError
 
@@ -18,7 +18,9 @@ Settings = UseAppendAction[tuple[tuple[str, ...], ...]]
 class Calibrate:
     """Find the parameters under which the simulator moves as the data does.
 
-    Leaves a run folder: result.json, spec.json, metrics.jsonl, TensorBoard events and a checkpoint.
+    Leaves a run folder: result.json, spec.json, metrics.jsonl, TensorBoard events and a checkpoint. With a hold-out
+    the exit code is the verdict's: 0 CALIBRATED, 10 NO_IMPROVEMENT, 11 NOT_IDENTIFIABLE, 12 MODEL_MISMATCH,
+    13 DATA_REJECTED.
     """
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
@@ -39,11 +41,13 @@ class Calibrate:
     parameters: tuple[str, ...] = ()
     """Calibrate only these. Default: all of the robot's."""
     method: str = "madoc"
-    """A calibrator, as `madoc methods` lists it."""
+    """A calibrator, as `madoc methods` lists it, or auto: what the data allows, compared on a hold-out."""
+    holdout: float | None = None
+    """Share of the rows that no method sees, to judge the result by. Default: 0.2 for auto, else none."""
     starts: Literal["policy", "logged", "replay"] | None = None
     """Where rollouts start: free running from resets, short ones from logged states, or one step of the log."""
     set: Settings = ()
-    """Hyperparameters of the method as name=value."""
+    """Hyperparameters of the method as name=value; of a method that auto tries as madoc.name=value."""
     budget: int = 300_000
     """Simulated control steps."""
     seed: int = 0
@@ -58,7 +62,7 @@ class Calibrate:
 
     def run(self) -> Answer:
         """Calibrate, and leave the run folder."""
-        from madoc.pipeline import CalibrationOrder, Source, calibrate_in, split_name
+        from madoc.pipeline import AUTO, CalibrationOrder, Source, calibrate_auto_in, calibrate_in, split_name
         from madoc.pipeline.data_stage import read_truth
 
         if split_name(self.task)[1]:
@@ -76,11 +80,13 @@ class Calibrate:
             budget=self.budget,
             seed=self.seed,
             truth=None if self.truth is None else read_truth(self.truth),
+            holdout=self.holdout,
         )
         out = self.out or Path("runs") / f"{Path(self.task).stem}-{self.method}-{self.seed}"
-        result = calibrate_in(out, order, resume=self.resume, quiet=self.output.quiet)
-        lines = (result.table(), result.summary(), left_behind(out, "run folder"))
-        return Answer(result.to_json(), lines, result.status)
+        stage = calibrate_auto_in if self.method == AUTO else calibrate_in
+        result = stage(out, order, resume=self.resume, quiet=self.output.quiet)
+        lines = (*calibration_text(result), left_behind(out, "run folder"))
+        return Answer(result.to_json(), lines, calibration_status(result))
 
 
 def changes_of(settings: tuple[tuple[str, ...], ...], starts: str | None = None) -> dict[str, str]:
