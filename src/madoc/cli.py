@@ -14,9 +14,11 @@ from tyro.conf import subcommand
 from madoc.commands.answer import EXIT_CODES, Answer, Command
 from madoc.commands.calibrate import Calibrate
 from madoc.commands.evaluate import Evaluate
+from madoc.commands.export import Export
 from madoc.commands.learn import Learn
 from madoc.commands.lists import Methods, Tasks
 from madoc.commands.record import Record
+from madoc.commands.report import Report
 from madoc.commands.run import Run
 from madoc.commands.spec import Init, Spec
 from madoc.errors import MadocError
@@ -36,6 +38,8 @@ Commands = (
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Init, subcommand("init")]
     | Annotated[Spec, subcommand("spec")]
+    | Annotated[Report, subcommand("report")]
+    | Annotated[Export, subcommand("export")]
     | Annotated[Tasks, subcommand("tasks")]
     | Annotated[Methods, subcommand("methods")]
 )

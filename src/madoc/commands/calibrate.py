@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from madoc.commands.answer import Answer, Output, left_behind
+from madoc.commands.answer import Answer, Output, left_behind, page_line
 from madoc.commands.disturbed import Disturbed, disturbance_of
 from madoc.errors import MadocError
 
@@ -58,7 +58,7 @@ class Calibrate:
 
     def run(self) -> Answer:
         """Calibrate, and leave the run folder."""
-        from madoc.pipeline import CalibrationOrder, Source, calibrate_in, split_name
+        from madoc.pipeline import CalibrationOrder, Source, calibrate_in, leave_report, split_name
         from madoc.pipeline.data_stage import read_truth
 
         if split_name(self.task)[1]:
@@ -80,7 +80,7 @@ class Calibrate:
         out = self.out or Path("runs") / f"{Path(self.task).stem}-{self.method}-{self.seed}"
         result = calibrate_in(out, order, resume=self.resume, quiet=self.output.quiet)
         lines = (result.table(), result.summary(), left_behind(out, "run folder"))
-        return Answer(result.to_json(), lines, result.status)
+        return Answer(result.to_json(), (*lines, *page_line(leave_report(out))), result.status)
 
 
 def changes_of(settings: tuple[tuple[str, ...], ...], starts: str | None = None) -> dict[str, str]:

@@ -3,7 +3,9 @@
 from madoc.pipeline.calibration_stage import CalibrationOrder, calibrate_in, read_calibration
 from madoc.pipeline.data_stage import Source, fingerprint, load_source, record_named, split_name
 from madoc.pipeline.evaluation_stage import evaluate_folder
+from madoc.pipeline.export_stage import export_run
 from madoc.pipeline.learning_stage import PolicyOrder, learn_in
+from madoc.pipeline.report_stage import leave_report
 from madoc.pipeline.whole import Plan, run_all
 
 __all__ = [
@@ -13,8 +15,10 @@ __all__ = [
     "Source",
     "calibrate_in",
     "evaluate_folder",
+    "export_run",
     "fingerprint",
     "learn_in",
+    "leave_report",
     "load_source",
     "read_calibration",
     "record_named",
