@@ -12,7 +12,7 @@ demo: $(STAMP)  ## the main job on Hopper, small: record, calibrate, learn, eval
 	  --policy-set "hidden=[128, 128]" --episodes 10
 
 test: $(STAMP)  ## every test that takes seconds
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 -rs
 
 test-slow: $(STAMP)  ## the others
 	$(BIN)/python -m pytest -n 2 -m slow

@@ -15,9 +15,11 @@ from madoc.commands.answer import EXIT_CODES, Answer, Command
 from madoc.commands.calibrate import Calibrate
 from madoc.commands.check import Check
 from madoc.commands.evaluate import Evaluate
+from madoc.commands.export import Export
 from madoc.commands.learn import Learn
 from madoc.commands.lists import Methods, Tasks
 from madoc.commands.record import Record
+from madoc.commands.report import Report
 from madoc.commands.run import Run
 from madoc.commands.selftest import Selftest
 from madoc.commands.spec import Init, Spec
@@ -40,6 +42,8 @@ Commands = (
     | Annotated[Init, subcommand("init")]
     | Annotated[Spec, subcommand("spec")]
     | Annotated[Check, subcommand("check")]
+    | Annotated[Report, subcommand("report")]
+    | Annotated[Export, subcommand("export")]
     | Annotated[Tasks, subcommand("tasks")]
     | Annotated[Methods, subcommand("methods")]
 )

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -158,6 +158,15 @@ class Estimate:
     warnings: tuple[str, ...] = field(default=())
     covariance: Float[np.ndarray, "d d"] | None = None
     interval: Float[np.ndarray, "d 2"] | None = None
+
+
+@runtime_checkable
+class EmbedsParameters(Protocol):
+    """What a method may have besides: it learns which parameters act alike, and can show it."""
+
+    def embeddings(self, problem: CalibrationProblem, state: State) -> Float[np.ndarray, "d latent"] | None:
+        """One vector a parameter, near for those that act alike; None while nothing is learnt of it."""
+        ...
 
 
 class Calibrator(Protocol):

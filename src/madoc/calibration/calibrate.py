@@ -4,12 +4,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc import loop
-from madoc.calibration.base import CalibrationProblem, Calibrator, Estimate
+from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
+from madoc.files import replacing
 from madoc.parameters import ParameterSpace
 from madoc.run_folder import RunFolder
 from madoc.simulation.sensitivity import refuse_insensitive
@@ -76,8 +78,17 @@ def calibrate(
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
     )
     if folder is not None:
+        if isinstance(method, EmbedsParameters):
+            _keep_embeddings(folder, space, method.embeddings(problem, finished.state))
         folder.write_json("result.json", result.to_json())
     return result
+
+
+def _keep_embeddings(folder: RunFolder, space: ParameterSpace, vectors: np.ndarray | None) -> None:
+    """Leave `embeddings.npz`: names of parameters, and what was learnt of which act alike."""
+    if vectors is not None:
+        with replacing(folder.path / "embeddings.npz") as stream:
+            np.savez(stream, allow_pickle=False, names=np.array(space.names), vectors=vectors)
 
 
 def _parameters(space: ParameterSpace, estimate: Estimate) -> dict[str, ParameterEstimate]:

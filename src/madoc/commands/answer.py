@@ -139,3 +139,8 @@ def calibration_status(result: "CalibrationResult") -> str:
 def left_behind(path: Path, what: str) -> str:
     """A line on what was left where."""
     return f"{what}: {path}"
+
+
+def page_line(page: Path | None) -> tuple[str, ...]:
+    """Where a run's page is, if it could be written."""
+    return () if page is None else (left_behind(page, "report"),)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from madoc.commands.answer import Answer, Output, calibration_status, calibration_text, left_behind
+from madoc.commands.answer import Answer, Output, calibration_status, calibration_text, left_behind, page_line
 from madoc.commands.disturbed import Disturbed, disturbance_of
 from madoc.errors import MadocError
 
@@ -62,7 +62,15 @@ class Calibrate:
 
     def run(self) -> Answer:
         """Calibrate, and leave the run folder."""
-        from madoc.pipeline import AUTO, CalibrationOrder, Source, calibrate_auto_in, calibrate_in, split_name
+        from madoc.pipeline import (
+            AUTO,
+            CalibrationOrder,
+            Source,
+            calibrate_auto_in,
+            calibrate_in,
+            leave_report,
+            split_name,
+        )
         from madoc.pipeline.data_stage import read_truth
 
         if split_name(self.task)[1]:
@@ -85,7 +93,7 @@ class Calibrate:
         out = self.out or Path("runs") / f"{Path(self.task).stem}-{self.method}-{self.seed}"
         stage = calibrate_auto_in if self.method == AUTO else calibrate_in
         result = stage(out, order, resume=self.resume, quiet=self.output.quiet)
-        lines = (*calibration_text(result), left_behind(out, "run folder"))
+        lines = (*calibration_text(result), left_behind(out, "run folder"), *page_line(leave_report(out)))
         return Answer(result.to_json(), lines, calibration_status(result))
 
 

@@ -259,18 +259,23 @@ def spec_of(order: CalibrationOrder, prepared: Prepared, out: Path) -> dict[str,
     where = stored_path(path, out) if path.exists() else order.source.path
     task, dataset = prepared.simulator.task, prepared.dataset
     held = {} if order.holdout is None else {"holdout": order.holdout}
-    return {
-        "command": "calibrate",
-        "task": task.name,
-        "physics": task.physics,
-        "level": order.level,
-        "parameters": {row.name: [row.low, row.high] for row in task.parameters.parameters},
-        "method": order.method,
-        "data": asdict(replace(order.source, path=where)) | {"rows": len(dataset), "fingerprint": fingerprint(dataset)},
-        "seed": order.seed,
-        "budget": order.budget,
-        "truth": prepared.truth,
-    } | held | stored_robot(task)
+    return (
+        {
+            "command": "calibrate",
+            "task": task.name,
+            "physics": task.physics,
+            "level": order.level,
+            "parameters": {row.name: [row.low, row.high] for row in task.parameters.parameters},
+            "method": order.method,
+            "data": asdict(replace(order.source, path=where))
+            | {"rows": len(dataset), "fingerprint": fingerprint(dataset)},
+            "seed": order.seed,
+            "budget": order.budget,
+            "truth": prepared.truth,
+        }
+        | held
+        | stored_robot(task)
+    )
 
 
 def _source_of(remembered: Mapping[str, Any], folder: Path) -> Source:

@@ -231,6 +231,10 @@ class Madoc:
             ),
         )
 
+    def embeddings(self, problem: CalibrationProblem, state: MadocState) -> np.ndarray | None:
+        """The VAE's embedding of each parameter, once it has been trained."""
+        return np.asarray(state.vae.embeddings(), dtype=np.float64) if state.grouped else None
+
     def control_steps(self, state: MadocState) -> int:
         """Simulated control steps so far, grouping included."""
         return state.control_steps
