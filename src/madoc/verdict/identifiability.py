@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.linearisation import DIFFERENCE, difference_points, linearise
-from madoc.calibration.least_squares.uncertainty import BOX_VARIANCE
+from madoc.residuals.linearisation import DIFFERENCE, difference_points, linearise
+from madoc.residuals.uncertainty import BOX_VARIANCE
 from madoc.verdict.prediction import MOST_WINDOWS, evenly
 
 WINDOW = 20

@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.calibration.least_squares.linearisation import difference_points, linearise
-from madoc.calibration.least_squares.losses import scale_of
-from madoc.calibration.window_residuals import window_residuals
 from madoc.data import Dataset, logged_states
 from madoc.data.windows import Windows, first_rows, windows_at
 from madoc.errors import MadocError
+from madoc.residuals.linearisation import difference_points, linearise
+from madoc.residuals.losses import scale_of
+from madoc.residuals.window_residuals import window_residuals
 from madoc.simulation.base import Simulator
 
 HORIZONS = (1, 5, 20)
