@@ -35,13 +35,8 @@ class Check:
         from madoc.diagnosis import tables, to_json
         from madoc.pipeline.check_stage import check_logs
 
-        found = check_logs(
-            self.spec,
-            self.data,
-            clip_actions=self.clip_actions,
-            budget=self.budget if self.forecast else None,
-            seed=self.seed,
-        )
+        budget = self.budget if self.forecast else None
+        found = check_logs(self.spec, self.data, clip_actions=self.clip_actions, budget=budget, seed=self.seed)
         status = "rejected" if found.fatal else "finished"
         if found.diagnosis is None:
             assert found.refusal is not None

@@ -21,6 +21,8 @@ HORIZONS = (5, 25)
 WINDOWS = {5: 200, 25: 60}
 ROUNDS = 3
 """Times the slopes are taken: from the best draw, the residual falls to what no parameter explains within two steps."""
+INSIDE = 0.98
+"""Slopes are taken no nearer to an end of [-1, 1]."""
 WIDE = 0.25
 """Of its range: an expected interval with a larger half width says little."""
 _UNSEEN = 25
@@ -93,7 +95,7 @@ def _excited(
     chosen, steps, available = _apart(dataset, rows, horizon, key)
     windows = windows_at(dataset, states[chosen], rows[chosen], steps)
     scale = _typical_change(dataset)
-    unit, best, spent = start, None, 0
+    unit, best, spent = np.clip(start, -0.9 * INSIDE, 0.9 * INSIDE), None, 0
     for _ in range(ROUNDS):
         points = difference_points(unit)
         around = linearise(points, window_residuals(simulator, windows, points, scale))
@@ -168,14 +170,14 @@ def excitation_findings(found: Excitation, simulator: CpuSimulator) -> list[Find
 
 
 def _bounded_step(around: Linearisation, unit: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
-    """The Gauss-Newton step that stays in the box."""
+    """The Gauss-Newton step that stays clear of the box's ends, where a mass of 0 or the like has no slope."""
     count = len(unit)
     jacobian, residuals = around.jacobian.reshape(-1, count), around.residuals.reshape(-1)
     factor = np.linalg.qr(np.column_stack([jacobian, residuals]), mode="r")
     padded = np.zeros((max(count, len(factor)), count + 1))
     padded[: len(factor)] = factor
-    step = lsq_linear(padded[:, :count], -padded[:, count], bounds=(-1.0 - unit - 1e-12, 1.0 - unit + 1e-12)).x
-    return np.clip(unit + step, -1.0, 1.0)
+    step = lsq_linear(padded[:, :count], -padded[:, count], bounds=(-INSIDE - unit, INSIDE - unit)).x
+    return np.clip(unit + step, -INSIDE, INSIDE)
 
 
 def _apart(

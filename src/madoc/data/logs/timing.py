@@ -98,10 +98,11 @@ def _wrong_rate(series: Series, control_step: float, tolerance: float) -> MadocE
                 f"expected time in s in {series.run}, got steps of {usual:g} where the control step is "
                 f"{control_step:g} s; is it in {unit}? divide it by {factor:g}"
             )
-    if abs(usual / control_step - 1.0) <= tolerance:
+    mean = float(np.mean(np.diff(series.time)))
+    if min(abs(usual / control_step - 1.0), abs(mean / control_step - 1.0)) <= tolerance:
         return MadocError(
             f"most time steps of {series.run} are more than {100 * tolerance:g} % off the control step of "
-            f"{control_step:g} s, though their median is {usual:.6g} s; raise log: tolerance, or ask for log: "
+            f"{control_step:g} s, though they are {mean:.4g} s on average; raise log: tolerance, or ask for log: "
             "resample: hold or linear"
         )
     return MadocError(
