@@ -80,7 +80,7 @@ def test_physics_is_the_datas_unless_asked_otherwise(recorded):
     from madoc.pipeline.calibration_stage import CalibrationOrder, _prepare
     from madoc.pipeline.data_stage import Source
 
-    source = Source(str(recorded))
+    source = Source((str(recorded),))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         dataset, task = _prepare(CalibrationOrder("hopper", source))

@@ -26,7 +26,7 @@ def spec(**changes):
         "physics": "legacy",
         "parameters": {name: [row[2], row[3]] for name, row in PARAMETERS.items()},
         "method": "madoc",
-        "data": {"path": "../data.npz", "rows": 5000, "fingerprint": "8c66c3a4"},
+        "data": {"paths": ["../data.npz"], "rows": 5000, "fingerprint": "8c66c3a4"},
         "seed": 0,
         "budget": 3000,
         "truth": {name: row[5] for name, row in PARAMETERS.items()},

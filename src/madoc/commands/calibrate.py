@@ -25,8 +25,9 @@ class Calibrate:
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
-    data: str
-    """The log: a D4RL, NeoRL or Minari file, one of `madoc record`, or a Minari id."""
+    data: tuple[str, ...]
+    """The log: a D4RL, NeoRL or Minari file, one of `madoc record`, or a Minari id; of a robot of your own, files or
+    folders of logs."""
     format: str | None = None
     """Format of the log: d4rl, neorl, minari or madoc. Default: look at its content."""
     clip_actions: bool = False
@@ -40,8 +41,9 @@ class Calibrate:
     """Ranges to search: easy, normal or hard."""
     parameters: tuple[str, ...] = ()
     """Calibrate only these. Default: all of the robot's."""
-    method: str = "madoc"
-    """A calibrator, as `madoc methods` lists it, or auto: what the data allows, compared on a hold-out."""
+    method: str | None = None
+    """A calibrator, as `madoc methods` lists it, or auto: what the data allows, compared on a hold-out. Default: auto
+    for a robot of your own, else madoc."""
     holdout: float | None = None
     """Share of the rows that no method sees, to judge the result by. Default: 0.2 for auto, else none."""
     starts: Literal["policy", "logged", "replay"] | None = None
@@ -72,9 +74,13 @@ class Calibrate:
             split_name,
         )
         from madoc.pipeline.data_stage import read_truth
+        from madoc.robots import is_spec_path
 
         if split_name(self.task)[1]:
             raise MadocError(f"expected the name of a robot, got {self.task!r}; the data is given with --data")
+        if not self.data:
+            raise MadocError("expected the log of the target after --data, got nothing")
+        method = self.method or (AUTO if is_spec_path(self.task) else "madoc")
         order = CalibrationOrder(
             task=self.task,
             source=Source(
@@ -83,15 +89,15 @@ class Calibrate:
             physics=self.physics,
             level=self.level,
             parameters=self.parameters,
-            method=self.method,
+            method=method,
             changes=changes_of(self.set, self.starts),
             budget=self.budget,
             seed=self.seed,
             truth=None if self.truth is None else read_truth(self.truth),
             holdout=self.holdout,
         )
-        out = self.out or Path("runs") / f"{Path(self.task).stem}-{self.method}-{self.seed}"
-        stage = calibrate_auto_in if self.method == AUTO else calibrate_in
+        out = self.out or Path("runs") / f"{Path(self.task).stem}-{method}-{self.seed}"
+        stage = calibrate_auto_in if method == AUTO else calibrate_in
         result = stage(out, order, resume=self.resume, quiet=self.output.quiet)
         lines = (*calibration_text(result), left_behind(out, "run folder"), *page_line(leave_report(out)))
         return Answer(result.to_json(), lines, calibration_status(result))

@@ -73,7 +73,7 @@ class Run:
 
         plan = Plan(
             name=self.name,
-            data=None if self.data is None else absolute_source(Source(self.data, self.format, self.clip_actions)),
+            data=None if self.data is None else absolute_source(Source((self.data,), self.format, self.clip_actions)),
             transitions=self.transitions,
             disturbance=disturbance_of(self.disturbed),
             physics=self.physics,

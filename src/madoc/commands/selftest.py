@@ -22,8 +22,8 @@ class Selftest:
     """
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
-    """The robot, as `madoc tasks` lists it."""
-    data: str
+    """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
+    data: tuple[str, ...]
     """The log whose actions, starts and noise are used."""
     format: str | None = None
     """Format of the log: d4rl, neorl, minari or madoc. Default: look at its content."""

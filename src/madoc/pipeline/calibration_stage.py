@@ -38,7 +38,7 @@ class CalibrationOrder:
         physics: `legacy` or `modern`; None takes the data's, and `legacy` where the data does not say.
         level: Ranges to search: `easy`, `normal` or `hard`.
         parameters: Calibrate only these; empty takes all.
-        method: A name in `CALIBRATORS`.
+        method: A name in `CALIBRATORS`, or `auto` where a stage compares.
         changes: Hyperparameters that differ from the method's own.
         budget: Simulated control steps.
         seed: Of all randomness.
@@ -246,7 +246,7 @@ def _read(order: CalibrationOrder) -> tuple[Dataset, Task]:
     task = observed_task(task, dataset)
     if said is not None and said != task.physics:
         warnings.warn(
-            f"{order.source.path} was recorded in {said} physics and is calibrated in {task.physics}: "
+            f"{order.source.words} was recorded in {said} physics and is calibrated in {task.physics}: "
             "the estimate will make up for the difference; leave out --physics to take the data's",
             stacklevel=2,
         )
@@ -255,8 +255,8 @@ def _read(order: CalibrationOrder) -> tuple[Dataset, Task]:
 
 def spec_of(order: CalibrationOrder, prepared: Prepared, out: Path) -> dict[str, Any]:
     """An order as `spec.json` keeps it."""
-    path = Path(order.source.path).expanduser()
-    where = stored_path(path, out) if path.exists() else order.source.path
+    paths = {path: Path(path).expanduser() for path in order.source.paths}
+    where = tuple(stored_path(file, out) if file.exists() else path for path, file in paths.items())
     task, dataset = prepared.simulator.task, prepared.dataset
     held = {} if order.holdout is None else {"holdout": order.holdout}
     return (
@@ -267,7 +267,7 @@ def spec_of(order: CalibrationOrder, prepared: Prepared, out: Path) -> dict[str,
             "level": order.level,
             "parameters": {row.name: [row.low, row.high] for row in task.parameters.parameters},
             "method": order.method,
-            "data": asdict(replace(order.source, path=where))
+            "data": asdict(replace(order.source, paths=where))
             | {"rows": len(dataset), "fingerprint": fingerprint(dataset)},
             "seed": order.seed,
             "budget": order.budget,
@@ -279,11 +279,12 @@ def spec_of(order: CalibrationOrder, prepared: Prepared, out: Path) -> dict[str,
 
 
 def _source_of(remembered: Mapping[str, Any], folder: Path) -> Source:
-    path = remembered["path"]
-    if path.startswith(("/", "..")) or (folder / path).exists():
-        path = str(restored_path(path, folder))  # else the id of a Minari dataset
+    paths = []
+    for path in remembered["paths"]:
+        stored = path.startswith(("/", "..")) or (folder / path).exists()  # else the id of a Minari dataset
+        paths.append(str(restored_path(path, folder)) if stored else path)
     wanted = {name: remembered[name] for name in ("format", "clip_actions", "max_transitions")}
-    return Source(path, **wanted, disturbance=Disturbance(**remembered.get("disturbance", {})))
+    return Source(tuple(paths), **wanted, disturbance=Disturbance(**remembered.get("disturbance", {})))
 
 
 def _space_of(result: CalibrationResult, whole: Task) -> ParameterSpace:

@@ -25,24 +25,30 @@ class Source:
     """Where logged data is and how to read it.
 
     Attributes:
-        path: A file, a Minari directory or a Minari id.
+        paths: A file, a Minari directory or a Minari id; of a robot of one's own also several files or folders.
         format: A name in `data.FORMATS`; None looks at the content.
         clip_actions: Clip actions outside [-1, 1] instead of refusing them.
         max_transitions: Keep at most so many, drawn as whole episodes; None keeps all.
         disturbance: What to put into it once it is read.
     """
 
-    path: str
+    paths: tuple[str, ...]
     format: str | None = None
     clip_actions: bool = False
     max_transitions: int | None = 200_000
     disturbance: Disturbance = field(default_factory=Disturbance)
 
+    @property
+    def words(self) -> str:
+        """The paths as a sentence has them."""
+        return ", ".join(self.paths)
+
 
 def absolute_source(source: Source) -> Source:
     """A source that means the same from any working directory; a Minari id stays what it is."""
-    file = Path(source.path).expanduser()
-    return replace(source, path=str(file.resolve())) if file.exists() else source
+    files = [Path(path).expanduser() for path in source.paths]
+    whole = (str(file.resolve()) if file.exists() else path for file, path in zip(files, source.paths, strict=True))
+    return replace(source, paths=tuple(whole))
 
 
 @dataclass(frozen=True)
@@ -104,19 +110,21 @@ def load_source(source: Source, task: Task, *, seed: int) -> Dataset:
 
     Raises:
         MadocError: As `data.load`, or `logs.read` for a robot of one's own, and `data.disturb`; or friction is to be
-            changed after the fact.
+            changed after the fact, or several files are given where one is read.
     """
     if source.disturbance.friction != 1.0:
         raise MadocError("the friction of a target is chosen when it is recorded; pass it to madoc record")
     key = stage_key(seed, "subsampling")
-    if task.source is not None and source.format is None and not is_recorded(Path(source.path)):
+    if task.source is not None and source.format is None and not is_recorded(Path(source.paths[0])):
         robot = robots.restore_robot(task.source)
-        dataset = logs.read(source.path, robot, clip_actions=source.clip_actions)
+        dataset = logs.read(source.paths, robot, clip_actions=source.clip_actions)
         if source.max_transitions is not None:
             dataset = data.subsample(dataset, source.max_transitions, key)
     else:
+        if len(source.paths) != 1:
+            raise MadocError(f"expected one file or dataset of {task.name}, got {len(source.paths)}: {source.words}")
         dataset = data.load(
-            source.path,
+            source.paths[0],
             task,
             format=source.format,
             max_transitions=source.max_transitions,

@@ -71,7 +71,7 @@ def provenance_of(calibrated: Calibrated) -> Provenance:
         run=whole.parent.name if whole.name == "calibration" else whole.name,
         method=calibrated.result.method,
         seed=calibrated.seed,
-        data={name: known[name] for name in ("path", "rows", "fingerprint") if name in known},
+        data={name: known[name] for name in ("paths", "rows", "fingerprint") if name in known},
         versions=spec.get("versions", {}),
         verdict=result.get("verdict"),
         warnings=calibrated.result.warnings,

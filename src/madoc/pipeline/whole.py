@@ -160,7 +160,7 @@ def _calibration_stage(plan: Plan, out: Path, *, quiet: bool) -> CalibrationResu
         return CalibrationResult.from_json(read_json(folder / "result.json"))
     order = CalibrationOrder(
         task=split_name(plan.name)[0],
-        source=Source(str(out / "data.npz"), max_transitions=None),
+        source=Source((str(out / "data.npz"),), max_transitions=None),
         physics=plan.physics,
         level=plan.level,
         parameters=plan.parameters,
