@@ -276,7 +276,7 @@ class _Session(Generic[State]):
         return self._earlier + self._stopped - self._started
 
     def _extra(self) -> dict[str, Any]:
-        return {"control_steps": self.control_steps, count_name(self._unit): self.spent, "seconds": self._seconds()}
+        return {count_name(self._unit): self.spent, "control_steps": self.control_steps, "seconds": self._seconds()}
 
 
 def _check_folder(folder: RunFolder | None, resume: bool) -> None:

@@ -26,7 +26,8 @@ def wait_for(place, process):
 def test_a_run_leaves_everything(whole):
     found = {file.name for file in whole.iterdir()} - {".lock"}
     policies = {"policy-calibrated", "policy-midrange", "policy-truth"}
-    assert found == {"data.npz", "calibration", "evaluation.json", "summary.json", "spec.json"} | policies
+    files = {"data.npz", "evaluation.json", "summary.json", "spec.json", "report.html"}
+    assert found == files | {"calibration"} | policies
     assert all((whole / name / "policy.npz").exists() for name in policies)
     summary = summary_of(whole)
     assert summary["status"] == "finished"

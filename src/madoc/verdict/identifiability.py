@@ -11,6 +11,8 @@ from madoc.verdict.prediction import MOST_WINDOWS, evenly
 WINDOW = 20
 """Control steps that are looked at together where velocities are hidden: they are told by what follows."""
 _NORMAL_95 = 1.959964
+_HARDLY_TOLD = 0.25
+"""Of the box's variance: the data has narrowed the direction by less than half."""
 _KNOWN = 1e-9
 """Singular values of the starts' slopes, relative to the largest, below which a start changes nothing that is seen."""
 
@@ -41,14 +43,26 @@ def half_widths(
         share = len(problem.dataset) / max(1, len(slopes))
     flat = slopes.reshape(-1, len(unit))
     information = flat.T @ flat * share + np.eye(len(unit)) / BOX_VARIANCE
-    return _NORMAL_95 * np.sqrt(np.diag(np.linalg.inv(information))), spent
+    return _NORMAL_95 * np.sqrt(np.diag(widened(np.linalg.inv(information)))), spent
+
+
+def widened(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
+    """The covariance with directions that the data hardly tells as long as the box allows.
+
+    A direction of several parameters is longer than any of them: along it, each may go through all of its range while
+    the normal distribution that stands for the box ends on a ball.
+    """
+    variances, directions = np.linalg.eigh(covariance)
+    longest = np.abs(directions).max(0)
+    variances = np.where(variances > _HARDLY_TOLD * BOX_VARIANCE, variances / longest**2, variances)
+    return (directions * variances) @ directions.T
 
 
 def told_shares(
     half: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None, width: Float[np.ndarray, " d"]
 ) -> Float[np.ndarray, " d"]:
-    """How much of each range the 95 % interval covers: the method's own where it has one, at most all of it."""
-    share = half if interval is None else (interval[:, 1] - interval[:, 0]) / width
+    """How much of each range the 95 % interval covers, at most all: the method's own, and no less than at best."""
+    share = half if interval is None else np.maximum(half, (interval[:, 1] - interval[:, 0]) / width)
     return np.minimum(share, 1.0)
 
 

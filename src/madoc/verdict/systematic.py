@@ -28,12 +28,13 @@ def explained(
     """
     total = float((residuals**2).sum())
     best, said = 0.0, np.zeros_like(residuals)
+    wanted = residuals.ravel() if residuals.shape[1] == 1 else residuals
     if len(pairs) < _FEWEST or total == 0.0:
         return best, said
     for make in EXPLAINERS.values():
         guess = np.empty_like(residuals)
         for seen, unseen in KFold(FOLDS).split(pairs):
-            model = make().fit(pairs[seen], residuals[seen])
+            model = make().fit(pairs[seen], wanted[seen])
             guess[unseen] = np.reshape(model.predict(pairs[unseen]), (len(unseen), -1))
         share = 1.0 - float(((residuals - guess) ** 2).sum()) / total
         if share > best:
