@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from madoc.commands.answer import Answer, Output, calibration_status, calibration_text, left_behind, page_line
-from madoc.commands.disturbed import Disturbed, disturbance_of
+from madoc.commands.log import Log
 from madoc.errors import MadocError
 
 Settings = UseAppendAction[tuple[tuple[str, ...], ...]]
@@ -25,22 +25,7 @@ class Calibrate:
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
-    data: tuple[str, ...]
-    """The log: a D4RL, NeoRL or Minari file, one of `madoc record`, or a Minari id; of a robot of your own, files or
-    folders of logs."""
-    format: str | None = None
-    """Format of the log: d4rl, neorl, minari or madoc. Default: look at its content."""
-    clip_actions: bool = False
-    """Clip actions outside [-1, 1] instead of refusing them."""
-    max_transitions: int = 200_000
-    """Keep at most so many rows, drawn as whole episodes."""
-    disturbed: OmitArgPrefixes[Disturbed] = field(default_factory=Disturbed)
-    physics: Literal["legacy", "modern"] | None = None
-    """Physics to calibrate in. Default: the data's; legacy where it does not say."""
-    level: str = "normal"
-    """Ranges to search: easy, normal or hard."""
-    parameters: tuple[str, ...] = ()
-    """Calibrate only these. Default: all of the robot's."""
+    log: OmitArgPrefixes[Log]
     method: str | None = None
     """A calibrator, as `madoc methods` lists it, or auto: what the data allows, compared on a hold-out. Default: auto
     for a robot of your own, else madoc."""
@@ -64,31 +49,15 @@ class Calibrate:
 
     def run(self) -> Answer:
         """Calibrate, and leave the run folder."""
-        from madoc.pipeline import (
-            AUTO,
-            CalibrationOrder,
-            Source,
-            calibrate_auto_in,
-            calibrate_in,
-            leave_report,
-            split_name,
-        )
+        from madoc.pipeline import AUTO, calibrate_auto_in, calibrate_in, leave_report, split_name
         from madoc.pipeline.data_stage import read_truth
         from madoc.robots import is_spec_path
 
         if split_name(self.task)[1]:
             raise MadocError(f"expected the name of a robot, got {self.task!r}; the data is given with --data")
-        if not self.data:
-            raise MadocError("expected the log of the target after --data, got nothing")
         method = self.method or (AUTO if is_spec_path(self.task) else "madoc")
-        order = CalibrationOrder(
-            task=self.task,
-            source=Source(
-                self.data, self.format, self.clip_actions, self.max_transitions, disturbance_of(self.disturbed)
-            ),
-            physics=self.physics,
-            level=self.level,
-            parameters=self.parameters,
+        order = self.log.order(
+            self.task,
             method=method,
             changes=changes_of(self.set, self.starts),
             budget=self.budget,

@@ -1,14 +1,14 @@
 """`madoc selftest`."""
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output
 from madoc.commands.calibrate import Settings, changes_of
-from madoc.commands.disturbed import Disturbed, disturbance_of
+from madoc.commands.log import Log
 
 if TYPE_CHECKING:
     from madoc.verdict.selftest import Selftest as Outcome
@@ -23,21 +23,7 @@ class Selftest:
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
-    data: tuple[str, ...]
-    """The log whose actions, starts and noise are used."""
-    format: str | None = None
-    """Format of the log: d4rl, neorl, minari or madoc. Default: look at its content."""
-    clip_actions: bool = False
-    """Clip actions outside [-1, 1] instead of refusing them."""
-    max_transitions: int = 200_000
-    """Keep at most so many rows, drawn as whole episodes."""
-    disturbed: OmitArgPrefixes[Disturbed] = field(default_factory=Disturbed)
-    physics: Literal["legacy", "modern"] | None = None
-    """Physics of the simulator. Default: the data's; legacy where it does not say."""
-    level: str = "normal"
-    """Ranges to search: easy, normal or hard."""
-    parameters: tuple[str, ...] = ()
-    """Calibrate only these. Default: all of the robot's."""
+    log: OmitArgPrefixes[Log]
     method: str = "auto"
     """A calibrator, as `madoc methods` lists it, or auto: the first that the data allows."""
     set: Settings = ()
@@ -52,20 +38,10 @@ class Selftest:
 
     def run(self) -> Answer:
         """Plant, calibrate, compare."""
-        from madoc.pipeline import CalibrationOrder, Source, selftest_of
+        from madoc.pipeline import selftest_of
 
-        order = CalibrationOrder(
-            task=self.task,
-            source=Source(
-                self.data, self.format, self.clip_actions, self.max_transitions, disturbance_of(self.disturbed)
-            ),
-            physics=self.physics,
-            level=self.level,
-            parameters=self.parameters,
-            method=self.method,
-            changes=changes_of(self.set),
-            budget=self.budget,
-            seed=self.seed,
+        order = self.log.order(
+            self.task, method=self.method, changes=changes_of(self.set), budget=self.budget, seed=self.seed
         )
         outcome = selftest_of(order, truths=self.truths, quiet=self.output.quiet)
         status = "finished" if outcome.passed else "NOT_RECOVERABLE"
