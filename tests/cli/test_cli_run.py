@@ -35,6 +35,15 @@ def test_a_run_leaves_everything(whole):
     assert summary["data"]["transitions"] == 1000
 
 
+def test_the_log_of_a_calibration_has_the_estimates_on_their_way(whole):
+    lines = [json.loads(line) for line in (whole / "calibration" / "metrics.jsonl").read_text().splitlines()]
+    assert lines[0]["metrics"]["estimate/gravity"] == -15.0
+    last = json.loads((whole / "calibration" / "result.json").read_text())["parameters"]
+    for name, row in last.items():
+        assert lines[-1]["metrics"][f"estimate/{name}"] == row["estimate"]
+        assert lines[-1]["metrics"][f"std/{name}"] == row["std"]
+
+
 def test_resuming_a_finished_run_only_reads_it(whole, capsys):
     before = {file: file.stat().st_mtime_ns for file in whole.rglob("*.npz")}
     answer, code = asked_for_json(capsys, [*WHOLE, "--out", whole, "--resume"])

@@ -61,6 +61,7 @@ def calibrate(
         description=f"{method.name} on {problem.simulator.task.name}",
         shown=method.shown,
         checkpoint_every=checkpoint_every,
+        trace=lambda state: _trace(space, method.estimate(problem, state)),
     )
     estimate = method.estimate(problem, finished.state)
     result = CalibrationResult(
@@ -82,6 +83,17 @@ def calibrate(
             _keep_embeddings(folder, space, method.embeddings(problem, finished.state))
         folder.write_json("result.json", result.to_json())
     return result
+
+
+def _trace(space: ParameterSpace, estimate: Estimate) -> dict[str, float]:
+    """What the log keeps of an estimate on its way."""
+    columns = zip(space.names, estimate.mean.tolist(), estimate.std.tolist(), strict=True)
+    both = {
+        f"{kind}/{name}": value
+        for name, *pair in columns
+        for kind, value in zip(("estimate", "std"), pair, strict=True)
+    }
+    return {name: value for name, value in both.items() if np.isfinite(value)}
 
 
 def _keep_embeddings(folder: RunFolder, space: ParameterSpace, vectors: np.ndarray | None) -> None:
