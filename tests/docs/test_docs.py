@@ -98,6 +98,14 @@ def test_equations_become_mathml():
     assert "arithmatex" not in told
 
 
+def test_no_equation_keeps_a_command_that_was_not_understood():
+    hooks = load_hooks()
+    equations = re.findall(r"\$\$(.*?)\$\$", (DOCS / "concepts" / "equations.md").read_text(), re.DOTALL)
+    assert equations
+    for equation in equations:
+        assert "\\" not in hooks.on_page_content(rf'<div class="arithmatex">\[{equation}\]</div>'), equation
+
+
 def load_hooks():
     pytest.importorskip("latex2mathml", reason="the extra docs is not installed")
     spec = importlib.util.spec_from_file_location("hooks", DOCS / "hooks.py")
