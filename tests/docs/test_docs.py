@@ -18,7 +18,13 @@ from madoc.cli import main
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PENDULUM = Path(os.environ.get("MADOC_PENDULUM", ROOT.parent / "shared" / "data" / "dfki_simple_pendulum"))
-SLOW = {"real-pendulum.md", "how-to/compare-methods.md", "how-to/partial-observation.md", "how-to/resume.md"}
+SLOW = {
+    "real-pendulum.md",
+    "how-to/compare-methods.md",
+    "how-to/export.md",
+    "how-to/partial-observation.md",
+    "how-to/resume.md",
+}
 
 BLOCK = re.compile(r"^```(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGES = [str(page.relative_to(DOCS)) for page in sorted(DOCS.rglob("*.md")) if "```" in page.read_text()]
