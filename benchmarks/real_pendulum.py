@@ -72,7 +72,7 @@ def calibrated(data: Path, folder: Path) -> dict:
         shutil.copy(log_of(data, run), runs / f"{run}.csv")
     order = pipeline.CalibrationOrder(
         task=str(PENDULUM / "pendulum.yaml"),
-        source=pipeline.Source(str(runs)),
+        source=pipeline.Source((str(runs),)),
         method="least-squares",
         changes=SETTINGS,
         holdout=0.25,

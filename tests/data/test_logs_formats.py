@@ -3,6 +3,7 @@
 import json
 import sys
 import warnings
+import zipfile
 
 import gymnasium
 import h5py
@@ -355,6 +356,21 @@ def test_a_folder_is_a_run_a_file(robot, columns, tmp_path):
     several = logs.read([tmp_path / "logs" / "b.csv", tmp_path / "logs" / "a" / "c.csv"], robot)
     assert several.run_names == ("b.csv", "c.csv")
     assert len(several) == 2 * 49
+
+
+def test_a_run_folder_among_the_logs_is_no_log(robot, columns, tmp_path):
+    write_csv(tmp_path / "run.csv", columns)
+    for name in ("spec.json", "result.json", "export/table.csv", "evidence.npz"):
+        (tmp_path / "calibrated" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "calibrated" / name).write_text("{}")
+    assert logs.read(tmp_path, robot).run_names == ("run.csv",)
+
+
+def test_a_zip_archive_of_other_files_is_refused(robot, tmp_path):
+    with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
+        archive.writestr("method.json", "{}")
+    with pytest.raises(MadocError, match=r"only arrays in .*log.npz, got the file 'method.json'"):
+        logs.read(tmp_path / "log.npz", robot)
 
 
 @pytest.mark.parametrize(

@@ -65,6 +65,12 @@ def test_of_the_arm(tmp_path):
     assert robot.spec.control_step == 0.02
 
 
+def test_of_a_spring(tmp_path):
+    space = robots.load(written(tmp_path, SPRING)).task.parameters
+    assert space.names == ("body_mass.cart", "jnt_stiffness.slide", "dof_damping.slide")
+    assert (space.low[1], space.high[1], space.parameters[1].unit) == (2.0, 8.0, "N/m")
+
+
 def test_of_a_model_without_actuators(tmp_path):
     (action,) = robots.load(written(tmp_path, URDF, "model.urdf")).actions
     assert (action.name, action.low, action.high, action.unit) == ("hinge joint_torque", -5.0, 5.0, "N·m")

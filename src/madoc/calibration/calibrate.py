@@ -9,6 +9,7 @@ from jaxtyping import PRNGKeyArray
 
 from madoc import loop
 from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
+from madoc.calibration.cautions import told_once
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
 from madoc.files import replacing
@@ -74,7 +75,7 @@ def calibrate(
         seed=seed_of(key),
         groups=[[space.names[index] for index in group] for group in estimate.groups],
         parameters=_parameters(space, estimate),
-        warnings=[*estimate.warnings, *problem.doubts],
+        warnings=told_once(estimate.warnings, problem.doubts),
         error=None if known is None else calibration_error(estimate.mean, known, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
     )

@@ -38,7 +38,7 @@ class Init:
             "actions": len(robot.actions),
             "parameters": len(robot.spec.parameters),
         }
-        told = ", ".join(f"{count} {what}" for what, count in counts.items())
+        told = ", ".join(f"{count} {what.removesuffix('s') if count == 1 else what}" for what, count in counts.items())
         lines = (f"{told}; edit it, then: madoc spec {out}", left_behind(out, "spec"))
         return Answer({"spec": str(out), "name": robot.spec.name, **counts}, lines)
 

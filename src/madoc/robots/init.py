@@ -172,8 +172,8 @@ def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Itera
 
 
 def _parameters(model: mujoco.MjModel, joints: list[str]) -> Iterator[str]:
-    """Masses of what moves, and damping and friction of joints; friction, and all past the first few, as comments."""
-    found = [*_masses(model), *_of_joints(model, joints)]
+    """Masses, stiffness, damping and friction; friction, and all past the first few, as comments."""
+    found = [*_masses(model), *_stiffness(model, joints), *_of_joints(model, joints)]
     active = 0
     for fields, comment, wanted in found:
         active += wanted
@@ -193,6 +193,22 @@ def _masses(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
         if name:
             fields: Fields = {"field": "body_mass", "element": name, "low": _round(mass / 2), "high": _round(mass * 2)}
             yield fields, f"kg; the model has {mass:.4g}", True
+
+
+def _stiffness(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
+    """Of joints that have a spring."""
+    for joint in joints:
+        index = model.joint(joint).id
+        value = float(np.atleast_1d(model.jnt_stiffness[index])[0])
+        if value > 0 and is_single(model, index):
+            unit = "N/m" if is_slide(model, index) else "N·m/rad"
+            fields: Fields = {
+                "field": "jnt_stiffness",
+                "element": joint,
+                "low": _round(value / 2),
+                "high": _round(value * 2),
+            }
+            yield fields, f"{unit}; the model has {value:.4g}", True
 
 
 def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:

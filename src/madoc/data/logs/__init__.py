@@ -56,6 +56,8 @@ _BY_SUFFIX = {suffix: name for name, entry in LOG_FORMATS.items() for suffix in 
 _SUFFIX_LIST = ", ".join(_BY_SUFFIX)
 _NOT_LOGS = frozenset((".yaml", ".yml", ".xml", ".urdf", ".md", ".json", ".pdf", ".png", ".jpg", ".stl", ".obj", ""))
 """What lies beside logs without being one."""
+_OF_A_RUN = ("metrics.jsonl", "result.json")
+"""Beside spec.json they mark a run folder, under way or ended."""
 
 
 def read(
@@ -102,7 +104,9 @@ def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
     files = sorted(
         file
         for file in source.rglob("*")
-        if file.is_file() and not any(part.startswith(".") for part in file.relative_to(source).parts)
+        if file.is_file()
+        and not any(part.startswith(".") for part in file.relative_to(source).parts)
+        and not _is_of_a_run_folder(file, source)
     )
     known = [file for file in files if file.suffix.lower() in _BY_SUFFIX and not _is_prose(file)]
     others = [file for file in files if file not in known and file.suffix.lower() not in _NOT_LOGS]
@@ -114,6 +118,14 @@ def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
         name = file.relative_to(source).as_posix()
         runs += [_renamed(run, file.name, name) for run in _entry(file).read(file, wanted)]
     return runs, [file.relative_to(source).as_posix() for file in others if not _is_prose(file)]
+
+
+def _is_of_a_run_folder(file: Path, source: Path) -> bool:
+    """Whether Madoc wrote it: a run folder among the logs holds arrays too."""
+    folders = (folder for folder in file.parents if folder.is_relative_to(source))
+    return any(
+        (folder / "spec.json").is_file() and any((folder / name).is_file() for name in _OF_A_RUN) for folder in folders
+    )
 
 
 def _is_prose(file: Path) -> bool:
