@@ -61,6 +61,21 @@ def test_one_episode_is_cut_and_says_so():
     assert "only one episode" in split.sentence
 
 
+def test_stretches_of_one_long_episode_are_held_out():
+    whole = log(1000)
+    split = hold_out(whole, 0.2, KEY)
+    assert sorted(numbers(split.kept) + numbers(split.held)) == numbers(whole)
+    assert len(split.held) == 200
+    assert split.sentence.startswith("2 of 10 stretches of the only episode are held out, 200 of 1,000 rows")
+    for part in (split.kept, split.held):
+        for start, end in zip(part.episode_starts, part.episode_ends, strict=True):
+            rows = numbers(part)[start:end]
+            assert len(rows) == 100
+            assert rows[0] % 100 == 0
+            assert part.transitions.truncated[end - 1]
+    assert numbers(split.held) != numbers(hold_out(whole, 0.2, jax.random.key(1)).held)
+
+
 def test_two_rows_leave_one_on_each_side():
     split = hold_out(log(2), 0.01, KEY)
     assert (numbers(split.kept), numbers(split.held)) == ([0], [1])

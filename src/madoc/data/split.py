@@ -9,6 +9,11 @@ from jaxtyping import Int, PRNGKeyArray
 from madoc.data.dataset import Dataset, close_episodes
 from madoc.errors import MadocError
 
+STRETCHES = 10
+"""That a log of one episode is cut into."""
+_SHORTEST = 20
+"""Rows of a stretch."""
+
 
 @dataclass(frozen=True)
 class Split:
@@ -28,8 +33,9 @@ class Split:
 def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
     """Hold out about `share` of the rows: whole episodes drawn at random, at least one on each side.
 
-    An episode joins those held out where that brings their rows nearer to the share. A log of one episode is cut: its
-    last rows are held out.
+    An episode joins those held out where that brings their rows nearer to the share. A log of one episode is cut into
+    stretches, and some of them are held out: its end alone may not be like the rest, a robot that has come to its goal.
+    One too short for that has its last rows held out.
 
     Raises:
         MadocError: The share is not between 0 and 1, or there are fewer than 2 rows.
@@ -39,6 +45,8 @@ def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
     rows, starts = len(dataset), dataset.episode_starts
     if rows < 2:
         raise MadocError(f"expected at least 2 rows to hold one out, got {rows} in {dataset.origin}")
+    if len(starts) == 1 and rows >= STRETCHES * _SHORTEST:
+        return _stretches(dataset, share, key)
     if len(starts) == 1:
         cut = min(rows - 1, max(1, round((1.0 - share) * rows)))
         begin = np.zeros(1, np.int64)
@@ -52,6 +60,18 @@ def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
     kept, rest = (episodes_of(dataset, np.flatnonzero(side)) for side in (~held, held))
     sentence = f"{int(held.sum()):,} of {len(starts):,} episodes are held out, {len(rest):,} of {rows:,} rows"
     return Split(kept, rest, sentence)
+
+
+def _stretches(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
+    """A log of one episode, as if each of its stretches were one."""
+    starts = np.linspace(0, len(dataset), STRETCHES, endpoint=False).astype(np.int64)
+    split = hold_out(_part(dataset, np.arange(len(dataset)), starts), share, key)
+    held = len(split.held.episode_starts)
+    sentence = (
+        f"{held} of {STRETCHES} stretches of the only episode are held out, {len(split.held):,} of {len(dataset):,} "
+        "rows; they lie beside those calibrated to"
+    )
+    return replace(split, sentence=sentence)
 
 
 def episodes_of(dataset: Dataset, episodes: Int[np.ndarray, " episodes"]) -> Dataset:
