@@ -1,6 +1,6 @@
 """Robots as a user would describe them: spec files of the two small robots, and of a cart that floats freely."""
 
-from robots import ARM, SPRING
+from robots import ARM, PENDULUM, SPRING
 
 ARM_SPEC = """\
 madoc: 1
@@ -64,7 +64,24 @@ parameters:
   - {field: body_mass, element: cart, low: 0.5, high: 2}
 """
 
-MODELS = {"arm.xml": ARM, "spring.xml": SPRING, "cart.xml": CART}
+PENDULUM_SPEC = """\
+madoc: 1
+name: pendulum
+model: pendulum.xml
+control_step: 0.02
+signals:
+  - {name: angle, reads: position(pivot), unit: rad}
+actions:
+  - {name: torque, actuator: pivot, low: -1, high: 1}
+parameters:
+  - {field: body_mass, element: rod, low: 0.5, high: 2}
+  - {field: dof_damping, element: pivot, low: 0, high: 0.5}
+  - {field: actuator_gain, element: pivot, low: 1, high: 3}
+max_episode_steps: 200
+"""
+"""An encoder alone."""
+
+MODELS = {"arm.xml": ARM, "spring.xml": SPRING, "cart.xml": CART, "pendulum.xml": PENDULUM}
 
 
 def write_robot(folder, spec, file="robot.yaml", **models):

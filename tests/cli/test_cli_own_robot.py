@@ -9,10 +9,12 @@ from command_line import asked_for_json, without_seconds
 
 from madoc import data, robots
 from madoc.cli import main
-from own_robots import ARM_SPEC, write_robot
+from own_robots import ARM_SPEC, PENDULUM_SPEC, write_robot
 from robots import ARM, ARM_TRUTH, recorded
 
 FIT = ["--method", "least-squares", "--budget", "100000", "--quiet", "--set", "windows=100"]
+
+KEY = jax.random.key(1)
 
 
 @pytest.fixture
@@ -54,11 +56,27 @@ def test_spec_as_tables(tmp_path, capsys):
     for words in (
         *("two_link_arm: signals", "shoulder_motor", "dof_damping.elbow", "N·m·s/rad", "shoulder, elbow"),
         "one action every 0.02 s, 2 physics steps each; 7 parameters in 4 groups",
-        "states cannot be rebuilt from the log, so methods that start at logged states refuse: no signal is the",
+        "states cannot be rebuilt from the log, as no signal is the velocity of elbow: least-squares estimates them",
         "a state carries the last 2 actions",
         "no reward: madoc learn refuses this robot until the spec has one",
     ):
         assert words in told
+
+
+def test_velocities_from_positions_are_asked_for(tmp_path, capsys):
+    path = write_robot(tmp_path, PENDULUM_SPEC, "pendulum.yaml")
+    task, log = robots.load(path).task, tmp_path / "log.npz"
+    data.save(recorded(task, dict(zip(task.parameters.names, (1.2, 0.15, 1.6), strict=True)), 300, KEY), log)
+    command = ["calibrate", path, "--data", log, "--method", "droid", "--budget", "2000", "--quiet"]
+    assert main([str(word) for word in command]) == 2
+    assert "does not determine its state" in capsys.readouterr().err
+    answer, code = asked_for_json(capsys, [*command, "--out", tmp_path / "run", "--velocities", "differences"])
+    assert code == 0
+    assert any("velocities are differences of positions" in warning for warning in answer["warnings"])
+    arm_path = write_robot(tmp_path, ARM_SPEC, "arm.yaml")
+    data.save(recorded(robots.load(arm_path).task, ARM_TRUTH, 300, KEY), log)
+    assert main(["calibrate", str(arm_path), "--data", str(log), "--velocities", "differences"]) == 2
+    assert "has velocities; velocities=differences is for data without" in capsys.readouterr().err
 
 
 def test_the_schema(capsys, tmp_path):

@@ -393,3 +393,17 @@ def test_names_and_paths_resolve(tmp_path, monkeypatch):
     whole = robots.remake(robots.resolve(path).with_parameters(["gravity"]))
     assert len(whole.parameters) == 5
     assert robots.remake(madoc.tasks.make("hopper", "modern")).physics == "modern"
+
+
+def test_what_signals_tell_of_a_state(tmp_path):
+    # The elbow's encoder sees the sum of both angles; only the elbow's speed is measured, as twice itself plus 1.
+    spec = ARM_SPEC.replace("reads: position(elbow)", "reads: position(shoulder) + position(elbow)")
+    spec = spec.replace("  - {name: shoulder_speed, reads: velocity(shoulder)}\n", "")
+    spec = spec.replace("reads: velocity(elbow)", "reads: 1 + 2 * velocity(elbow)")
+    task = task_of(tmp_path, spec)
+    assert task.state_from_observation is None
+    state = np.random.default_rng(0).normal(size=(5, 4))
+    expected = state.copy()
+    expected[:, 2] = np.nan
+    np.testing.assert_allclose(task.posture(task.observe(state)), expected, atol=1e-12)
+    assert task_of(tmp_path, ARM_SPEC.replace("position(", "velocity(")).posture is None

@@ -109,7 +109,11 @@ def _sentences(robot: "Robot") -> list[str]:
         said.append("states can be rebuilt from the log: every method can calibrate this robot")
     else:
         missing = ", ".join(robot.undetermined) or "the signals do not tell joints apart"
-        said.append(f"states cannot be rebuilt from the log, so methods that start at logged states refuse: {missing}")
+        willing = "least-squares estimates them, madoc looks at windows of rows, " if task.posture else ""
+        said.append(
+            f"states cannot be rebuilt from the log, as {missing}: {willing}methods that take logged states for true "
+            "refuse"
+        )
     if task.pending:
         said.append(f"a state carries the last {task.pending} action{'s' * (task.pending > 1)}")
     if not task.rewarded:

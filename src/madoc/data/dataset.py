@@ -13,6 +13,7 @@ from madoc.tasks import Task
 from madoc.types import Transitions
 
 Shuffled = Literal["none", "rows", "next_observations"]
+Velocities = Literal["logged", "differences"]
 
 
 @dataclass(frozen=True)
@@ -25,12 +26,14 @@ class Disturbance:
         shuffled: `rows`: rows (s, a, s') stay whole but their order is lost; `next_observations`: which s' belongs
             to which (s, a) is lost as well.
         friction: Of all contacts in the target, as a multiple of the model's: a gap no parameter can close.
+        velocities: `logged`, or `differences` of positions in place of those that are hidden.
     """
 
     noise: float = 0.0
     hidden_velocities: bool = False
     shuffled: Shuffled = "none"
     friction: float = 1.0
+    velocities: Velocities = "logged"
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.noise) and self.noise >= 0):
@@ -45,6 +48,7 @@ class Disturbance:
             hidden_velocities=self.hidden_velocities or other.hidden_velocities,
             shuffled=other.shuffled if self.shuffled == "none" else self.shuffled,
             friction=self.friction * other.friction,
+            velocities=other.velocities if self.velocities == "logged" else self.velocities,
         )
 
     def sentences(self) -> tuple[str, ...]:
@@ -55,7 +59,12 @@ class Disturbance:
                 f"the data carries observation noise of {100 * self.noise:g} % of a step's change: states rebuilt from "
                 "it are not exact, and methods that take them for true are biased"
             )
-        if self.hidden_velocities:
+        if self.velocities == "differences":
+            found.append(
+                "the data's velocities are differences of positions: states rebuilt from them are not exact, and "
+                "methods that take them for true are biased"
+            )
+        elif self.hidden_velocities:
             found.append("the data hides velocities: its states cannot be rebuilt, and a clone acts on positions alone")
         if self.shuffled == "rows":
             found.append("the data's rows are in random order: nothing longer than one row can be replayed")
@@ -156,7 +165,8 @@ def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "stat
         wanted = "a state_from_observation" if task.source is None else "signals of every position and velocity"
         raise MadocError(
             f"an observation of {task.name} does not determine its state, so nothing can start at logged "
-            f"states; give the task {wanted}, or start rollouts from its reset"
+            f"states; give the task {wanted}, take least-squares, which estimates states where positions are known, or "
+            "start rollouts from the task's reset: madoc or oted with starts=policy"
         )
     observation = np.asarray(dataset.transitions.observation, dtype=np.float64)
     rows = np.arange(len(observation))
@@ -168,15 +178,27 @@ def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "stat
             f"observation (every row has a clipped value) in {dataset.origin}; start rollouts from the "
             "task's reset"
         )
-    rows = rows[_age(dataset)[rows] >= task.pending]
+    rebuilt = np.asarray(task.state_from_observation(observation[rows]), dtype=np.float64)
+    return with_pending(dataset, task, rebuilt, rows)
+
+
+def with_pending(
+    dataset: Dataset, task: Task, states: Float[np.ndarray, "rows physical"], rows: Int[np.ndarray, " rows"]
+) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
+    """(qpos, qvel) of rows with the actions that are pending there, and which rows have so many behind them.
+
+    Raises:
+        MadocError: None has.
+    """
+    known = _age(dataset)[rows] >= task.pending
+    states, rows = states[known], rows[known]
     if not len(rows):
         raise MadocError(
             f"a state of {task.name} carries the {task.pending} actions before it, and no episode of {dataset.origin} "
             "has so many before a row; give it data with its rows in order, or a shorter action_delay"
         )
-    rebuilt = np.asarray(task.state_from_observation(observation[rows]), dtype=np.float64)
     action = np.asarray(dataset.transitions.action, dtype=np.float64)
-    return np.concatenate([rebuilt, *(action[rows - back] for back in range(1, task.pending + 1))], axis=-1), rows
+    return np.concatenate([states, *(action[rows - back] for back in range(1, task.pending + 1))], axis=-1), rows
 
 
 def _age(dataset: Dataset) -> Int[np.ndarray, " rows"]:

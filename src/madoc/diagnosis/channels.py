@@ -81,7 +81,8 @@ def channels_of(dataset: Dataset, task: Task, robot: Robot | None = None) -> tup
     observation, following = np.asarray(logged.observation), np.asarray(logged.next_observation)
     both = np.stack([np.minimum(observation, following).min(0), np.maximum(observation, following).max(0)])
     change = (following - observation).std(0)
-    units = [signal.unit or "" for signal in robot.signals] if robot else [""] * task.observation_size
+    units = [signal.unit or "" for signal in robot.signals] if robot else []
+    units += [""] * (task.observation_size - len(units))  # of velocities made from positions too
     signals = [
         Channel(name, "signal", unit, float(low), float(high), float(step))
         for name, unit, low, high, step in zip(signal_names(task), units, *both, change, strict=True)

@@ -115,7 +115,7 @@ def _states(
         finding = Finding(
             "note",
             f"states cannot be rebuilt from the log ({reasons}), so the model was not compared with it, and methods "
-            "that need states will refuse",
+            "that take logged states for true will refuse",
             "signals",
             "log the position and the velocity of every joint if you can",
         )

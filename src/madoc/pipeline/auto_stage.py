@@ -34,7 +34,7 @@ class Candidate:
 
     Attributes:
         name: In `CALIBRATORS`.
-        hidden: Hyperparameters that differ where states cannot be rebuilt.
+        hidden: Hyperparameters that differ where the log does not tell where rollouts may start.
     """
 
     name: str
@@ -105,7 +105,7 @@ def candidates_for(prepared: Prepared, changes: Mapping[str, Any]) -> dict[str, 
     Raises:
         MadocError: A hyperparameter is not given as `madoc.updates`, or as `make_method`.
     """
-    hidden = prepared.simulator.task.state_from_observation is None
+    hidden = not prepared.problem.starts_known
     mine = _changes_by_candidate(changes)
     return {
         candidate.name: make_method(

@@ -52,7 +52,7 @@ def forecast(problem: CalibrationProblem, *, budget: int) -> tuple[Forecast, ...
 
 
 def _least_squares(problem: CalibrationProblem) -> Forecast:
-    method, count = LeastSquares(), len(problem.simulator.parameters)
+    method = LeastSquares()
     try:
         state = method.init(problem, jax.random.key(0))
     except MadocError as error:
@@ -60,14 +60,12 @@ def _least_squares(problem: CalibrationProblem) -> Forecast:
     started = time.monotonic()
     state, _ = method.step(problem, state)
     seconds = time.monotonic() - started
-    a_step = method.control_steps(state)
-    points = 2 * count + 4
-    total = a_step * method.search_epochs + len(state.chosen) * method.horizon * points * REFINING_EPOCHS
-    return Forecast(method.name, seconds / a_step * total, total)
+    total = method.whole_run(problem, state, refining_epochs=REFINING_EPOCHS)
+    return Forecast(method.name, seconds / method.control_steps(state) * total, total)
 
 
 def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
-    starts: Any = "logged" if problem.simulator.task.state_from_observation is not None else "policy"
+    starts: Any = "logged" if problem.starts_known else "policy"
     method = Madoc(groups="one", starts=starts, cloning_epochs=0)
     name = Madoc().name
     try:

@@ -7,7 +7,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from madoc.robots.document import nearest
 from madoc.robots.expressions import Expression, ExpressionError, Read
@@ -131,6 +131,22 @@ class Signals:
 
     def rebuild(self) -> Callable[[Batch], Batch] | None:
         """Observation -> (qpos, qvel), where weighted sums of single reads determine them all; else None."""
+        forward, constant = self._weights()
+        backward = _inverse(forward)
+        return None if backward is None else lambda observation: (observation - constant) @ backward
+
+    def posture(self) -> Callable[[Batch], Batch] | None:
+        """Observation -> (qpos, qvel) as far as weighted sums tell, NaN elsewhere; None where they tell no position."""
+        forward, constant = self._weights()
+        backward, told = _partial_inverse(forward)
+        positions = [start + step for start, count in self.layout.position.values() for step in range(count)]
+        if not told[positions].any():
+            return None
+        blank = np.where(told, 0.0, np.nan)
+        return lambda observation: (observation - constant) @ backward + blank
+
+    def _weights(self) -> tuple[Float[np.ndarray, "signals state"], Float[np.ndarray, " signals"]]:
+        """Of (qpos, qvel) in every signal that is a weighted sum of them, and its constant; others are 0."""
         size = self.layout.physical
         forward, constant = np.zeros((len(self.expressions), size)), np.zeros(len(self.expressions))
         for row, expression in enumerate(self.expressions):
@@ -140,8 +156,7 @@ class Signals:
             constant[row] = affine[1]
             for read, weight in affine[0].items():
                 forward[row, self.layout.address(read)] += weight
-        backward = _inverse(forward)
-        return None if backward is None else lambda observation: (observation - constant) @ backward
+        return forward, constant
 
 
 def _inverse(forward: Float[np.ndarray, "signals state"]) -> Float[np.ndarray, "signals state"] | None:
@@ -159,6 +174,17 @@ def _inverse(forward: Float[np.ndarray, "signals state"]) -> Float[np.ndarray, "
     if np.linalg.matrix_rank(even) < forward.shape[1]:
         return None
     return (np.linalg.pinv(even) / np.where(scale > 0, scale, 1.0).T).T
+
+
+def _partial_inverse(
+    forward: Float[np.ndarray, "signals state"],
+) -> tuple[Float[np.ndarray, "signals state"], Bool[np.ndarray, " state"]]:
+    """From observations, less their constants, to those values of a state that they determine, and which these are."""
+    scale = np.abs(forward).max(1, initial=0.0, keepdims=True)
+    even = np.divide(forward, scale, out=np.zeros_like(forward), where=scale > 0)
+    inverse = np.linalg.pinv(even)
+    told = np.abs(inverse @ even - np.eye(forward.shape[1])).max(0) < 1e-9
+    return (inverse / np.where(scale > 0, scale, 1.0).T).T * told, told
 
 
 @contextlib.contextmanager

@@ -85,6 +85,7 @@ def make_task(spec: RobotSpec, document: Document, files: ModelFiles, source: di
         max_episode_steps=spec.max_episode_steps,
         reference_returns=(0.0, 100.0),
         state_from_observation=signals.rebuild(),
+        posture=signals.posture(),
         pending=pending,
         actions=actions,
         signals=names,

@@ -196,11 +196,11 @@ class CpuSystem:
 
     def unbiased(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows state"]:
         """States rebuilt from logged observations, corrected for the bias that each system's sensors have."""
-        rebuild = self._simulator.task.state_from_observation
+        rebuild = self._simulator.task.state_from_observation or self._simulator.task.posture
         if self._bias is None or rebuild is None:
             return state
         shift = np.zeros((self.count, 1, state.shape[-1]))
-        shift[:, 0, : self._physical] = rebuild(self._bias) - rebuild(np.zeros_like(self._bias))
+        shift[:, 0, : self._physical] = np.nan_to_num(rebuild(self._bias) - rebuild(np.zeros_like(self._bias)))
         return state - shift
 
     def _sensordata(self, state: Float[np.ndarray, "systems rows state"]) -> np.ndarray:

@@ -98,6 +98,7 @@ class Task:
         sense: (state, sensordata) -> observation, where it reads the model's sensors.
         rewarded: Whether `reward` says anything; without it nothing can be learnt or judged.
         source: What makes this task again (`robots.restore`), as JSON; None where its name does.
+        posture: observation -> (qpos, qvel) as far as it tells, NaN elsewhere; None where it tells no position.
     """
 
     name: str
@@ -123,6 +124,7 @@ class Task:
     sense: Callable[[Batch, Batch], Batch] | None = None
     rewarded: bool = True
     source: Mapping[str, Any] | None = None
+    posture: Callable[[Batch], Batch] | None = None
 
     @property
     def action_size(self) -> int:
