@@ -193,15 +193,17 @@ def test_what_reading_told_is_among_the_findings(robot, columns, checked):
 
 
 def test_half_widths_shrink_with_the_log(robot, tmp_path):
-    """Four times as many noisy rows: half the width, give or take."""
+    """Four times as many noisy runs: half the width, give or take."""
     widths = []
     simulator = simulation.make(robot.task, threads=1)
-    for rows in (200, 800):
-        columns = columns_of(robot, rows, seed=3)
-        noise = 1e-3 * np.asarray(jax.random.normal(jax.random.key(rows), (4, rows)), np.float64)
-        for name, part in zip(("shoulder", "elbow", "shoulder_speed", "elbow_speed"), noise, strict=True):
-            columns[name] = columns[name] + part
-        dataset = logs.read(write_csv(tmp_path / "log.csv", columns), robot)
+    for runs in (2, 8):
+        for run in range(runs):
+            columns = columns_of(robot, 150, seed=run)
+            noise = 1e-3 * np.asarray(jax.random.normal(jax.random.key(run), (4, 150)), np.float64)
+            for name, part in zip(("shoulder", "elbow", "shoulder_speed", "elbow_speed"), noise, strict=True):
+                columns[name] = columns[name] + part
+            write_csv(tmp_path / str(runs) / f"{run}.csv", columns)
+        dataset = logs.read(tmp_path / str(runs), robot)
         start, key = simulator.parameters.to_unit(TRUTH), jax.random.key(0)
         found = excite(dataset, simulator, *logged_states(dataset, robot.task), start=start, key=key)
         widths.append(found.half_width)

@@ -11,10 +11,9 @@ from pathlib import Path
 import jax
 import pytest
 
-from comparing import TINY
+from comparing import TINY, listed
 from madoc import data
 from madoc.data import Disturbance, disturb
-from madoc.tasks import make
 from robots import SPRING_TRUTH, recorded
 
 TESTS = Path(__file__).parents[1]
@@ -46,7 +45,7 @@ def told(folder):
 @pytest.mark.slow
 def test_killed_and_resumed_equals_uninterrupted(tmp_path):
     # A wrong fixed parameter: no candidate explains all, so both run.
-    task = make("spring")
+    task = listed("legacy")
     log = disturb(recorded(task, SPRING_TRUTH, 500, jax.random.key(1)), Disturbance(noise=0.1), task, jax.random.key(2))
     data.save(log, tmp_path / "spring.npz")
     words = [

@@ -106,7 +106,7 @@ def channel_findings(dataset: Dataset, simulator: CpuSimulator, channels: tuple[
         everything = len(still) == sum(channel.kind == kind for channel in channels)
         level = "fatal" if everything and kind == "signal" else "warning"
         for channel in still:
-            what = f"it never moves: {channel.low:g} in all {len(dataset):,} rows"
+            what = f"it never moves: {channel.low + 0.0:g} in all {len(dataset):,} rows"
             remedy = "a dead sensor, or the wrong column?" if kind == "signal" else "is it the column of the command?"
             found.append(Finding(level, what, channel.name, remedy))  # type: ignore[arg-type]
     for index, channel in enumerate(channel for channel in channels if channel.kind == "action"):
