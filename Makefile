@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: demo test test-slow check lock clean
+.PHONY: demo test test-slow check docs lock clean
 
 demo: $(STAMP)  ## the main job on Hopper, small: record, calibrate, learn, evaluate
 	rm -rf runs/demo
@@ -12,16 +12,19 @@ demo: $(STAMP)  ## the main job on Hopper, small: record, calibrate, learn, eval
 	  --policy-set "hidden=[128, 128]" --episodes 10
 
 test: $(STAMP)  ## every test that takes seconds
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 -rs
 
 test-slow: $(STAMP)  ## the others
 	$(BIN)/python -m pytest -n 2 -m slow
 
 check: $(STAMP)  ## format, lint, types, layers
-	$(BIN)/ruff format --check src tests benchmarks examples
-	$(BIN)/ruff check src tests benchmarks examples
+	$(BIN)/ruff format --check src tests benchmarks examples docs/hooks.py
+	$(BIN)/ruff check src tests benchmarks examples docs/hooks.py
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(STAMP)  ## the site, in build/site; opens from there without a server or a network
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --clean
 
 lock: $(STAMP)  ## write the installed versions down, without addresses
 	$(BIN)/python -m pip freeze --exclude-editable > requirements.lock

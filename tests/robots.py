@@ -1,4 +1,4 @@
-"""Two robots small enough to work out by hand or to calibrate in seconds, and logs of them."""
+"""Robots small enough to work out by hand or to calibrate in seconds, and logs of them."""
 
 import jax
 import mujoco
@@ -20,6 +20,19 @@ SPRING = """
     </body>
   </worldbody>
   <actuator><motor name="push" joint="slide" gear="1"/></actuator>
+</mujoco>
+"""
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.01" gravity="0 0 -9.81"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="rod">
+      <joint name="pivot" type="hinge" axis="0 1 0" damping="0.1"/>
+      <geom name="rod" type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="pivot" joint="pivot" gear="2"/></actuator>
 </mujoco>
 """
 
@@ -101,6 +114,36 @@ def two_link_arm(*parameters: Parameter) -> Task:
         max_episode_steps=100,
         reference_returns=(-100.0, 0.0),
         state_from_observation=lambda observation: observation,
+    )
+
+
+def pendulum(*parameters: Parameter) -> Task:
+    """A rod swinging in a vertical plane: state (angle, its speed), one motor. It never falls."""
+    space = ParameterSpace(
+        parameters
+        or (
+            Parameter("body_mass", "rod", 0.5, 2.0),
+            Parameter("dof_damping", "pivot", 0.0, 0.5),
+            Parameter("actuator_gain", "pivot", 0.5, 1.5),
+        )
+    )
+    return Task(
+        name="pendulum",
+        physics="modern",
+        spec=lambda: mujoco.MjSpec.from_string(PENDULUM),
+        frame_skip=2,
+        observation_size=2,
+        observe=lambda state: state,
+        reward=lambda state, action, next_state: -abs(next_state[..., 0]),
+        terminated=lambda next_state: abs(next_state[..., 0]) > 1e6,
+        reset_noise=lambda key, count: jax.random.uniform(key, (count, 2), minval=-0.5, maxval=0.5),
+        parameters=space,
+        ranges={"normal": space},
+        groups=1,
+        max_episode_steps=200,
+        reference_returns=(-100.0, 0.0),
+        state_from_observation=lambda observation: observation,
+        velocities=1,
     )
 
 

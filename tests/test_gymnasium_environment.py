@@ -12,6 +12,7 @@ import madoc.tasks
 from madoc.errors import MadocError
 from madoc.gymnasium_environment import ROBOTS, CalibratedEnvironment, register
 from madoc.simulation.cpu import CpuSimulator
+from own_robots import CART_SPEC, write_robot
 
 
 @pytest.fixture
@@ -153,3 +154,12 @@ def test_mistakes_are_refused_in_one_sentence(hopper):
         hopper.unwrapped.step(np.zeros(4))
     with pytest.raises(MadocError, match="expected 3 finite values per action for hopper, got"):
         hopper.unwrapped.step(np.array([0.0, np.nan, 0.0]))
+
+
+def test_a_robot_of_ones_own_by_its_path(tmp_path):
+    environment = CalibratedEnvironment(write_robot(tmp_path, CART_SPEC), parameters={"body_mass.cart": 2.0})
+    observation, _ = environment.reset(seed=0)
+    np.testing.assert_array_equal(observation, [0.0, 0.0])
+    observation, reward, *_ = environment.step(np.array([0.4]))  # 4 N on 2 kg for two steps of 0.01 s
+    np.testing.assert_allclose(observation, [0.0006, 0.04], atol=1e-15)
+    assert reward == 0.0

@@ -1,6 +1,7 @@
 """Parameters: the map between [-1, 1] and physical values, and what is refused."""
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,14 +107,36 @@ def test_a_range_must_be_finite_and_ordered(low, high):
 
 @pytest.mark.parametrize("field", [name for name, field in FIELDS.items() if field.minimum == 0.0])
 def test_a_range_below_the_physical_bound_is_refused(field):
-    with pytest.raises(MadocError, match=rf"range of {field}.x starts at -0.1 .*, below its physical bound 0.0"):
-        Parameter(field, "x", -0.1, 1.0)
+    element = "x" if FIELDS[field].element else ""
+    with pytest.raises(MadocError, match=rf"range of {field}(.x)? starts at -0.1 .*, below its physical bound 0.0"):
+        Parameter(field, element, -0.1, 1.0)
 
 
-@pytest.mark.parametrize("field", ["gravity", "actuator_gain"])
-def test_only_gravity_and_gain_may_be_negative(field):
-    assert FIELDS[field].minimum == -np.inf
-    assert [name for name, kind in FIELDS.items() if kind.minimum == -np.inf] == ["gravity", "actuator_gain"]
+def test_only_gravity_gain_and_bias_may_be_negative():
+    found = [name for name, kind in FIELDS.items() if kind.minimum == -np.inf]
+    assert found == ["gravity", "actuator_gain", "signal_bias"]
+
+
+def test_a_value_shared_by_elements():
+    shared = Parameter("dof_damping", ("left_knee", "right_knee"), 0.0, 2.0)
+    assert shared.elements == ("left_knee", "right_knee")
+    assert shared.name == "dof_damping.left_knee+right_knee"
+    assert replace(shared, label="knee_damping").name == "knee_damping"
+    assert Parameter("dof_damping", "left_knee", 0.0, 2.0).elements == ("left_knee",)
+    assert Parameter("gravity", "", -10.0, 0.0).elements == ()
+
+
+def test_a_unit_of_its_own():
+    assert Parameter("dof_damping", "rail", 0.0, 2.0, measured_in="N·s/m").unit == "N·s/m"
+    with pytest.raises(MadocError, match=r"starts at -1.0 N·s/m, below its physical bound 0.0"):
+        Parameter("dof_damping", "rail", -1.0, 2.0, measured_in="N·s/m")
+
+
+def test_an_element_shared_with_itself_is_refused():
+    with pytest.raises(MadocError, match=r"dof_damping.knee\+knee names an element twice"):
+        Parameter("dof_damping", ("knee", "knee"), 0.0, 2.0)
+    with pytest.raises(MadocError, match="takes the name of a joint"):
+        Parameter("dof_damping", (), 0.0, 2.0)
 
 
 def test_an_empty_space_and_a_repeated_name_are_refused():

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from madoc import calibration, data, policies, simulation, tasks
+    from madoc import calibration, data, policies, robots, simulation, tasks
     from madoc.calibration import CalibrationProblem, CalibrationResult, Madoc
     from madoc.calibration.calibrate import calibrate
     from madoc.data import Dataset
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from madoc.policies.behaviours import record_quality as record
     from madoc.run_folder import RunFolder
 
-_ROOMS = ("calibration", "data", "policies", "simulation", "tasks")
+_ROOMS = ("calibration", "data", "policies", "robots", "simulation", "tasks")
 
 _PLACES = {
     "CalibrationProblem": "calibration",
@@ -66,6 +66,7 @@ __all__ = [
     "load_policy",
     "policies",
     "record",
+    "robots",
     "run_all",
     "save_policy",
     "simulation",

@@ -13,11 +13,16 @@ from tyro.conf import subcommand
 
 from madoc.commands.answer import EXIT_CODES, Answer, Command
 from madoc.commands.calibrate import Calibrate
+from madoc.commands.check import Check
 from madoc.commands.evaluate import Evaluate
+from madoc.commands.export import Export
 from madoc.commands.learn import Learn
 from madoc.commands.lists import Methods, Tasks
 from madoc.commands.record import Record
+from madoc.commands.report import Report
 from madoc.commands.run import Run
+from madoc.commands.selftest import Selftest
+from madoc.commands.spec import Init, Spec
 from madoc.errors import MadocError
 from madoc.files import json_text
 
@@ -31,8 +36,14 @@ Commands = (
     Annotated[Run, subcommand("run")]
     | Annotated[Record, subcommand("record")]
     | Annotated[Calibrate, subcommand("calibrate")]
+    | Annotated[Selftest, subcommand("selftest")]
     | Annotated[Learn, subcommand("learn")]
     | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Init, subcommand("init")]
+    | Annotated[Spec, subcommand("spec")]
+    | Annotated[Check, subcommand("check")]
+    | Annotated[Report, subcommand("report")]
+    | Annotated[Export, subcommand("export")]
     | Annotated[Tasks, subcommand("tasks")]
     | Annotated[Methods, subcommand("methods")]
 )

@@ -42,26 +42,28 @@ class Returns:
 def evaluate(
     policy: Policy,
     simulator: Simulator,
-    parameters: Float[np.ndarray, " parameters"],
+    parameters: Float[np.ndarray, "*systems parameters"],
     *,
     key: PRNGKeyArray,
     episodes: int = 10,
     deterministic: bool = True,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> Returns:
-    """Returns of whole episodes in one system, all episodes at a time; an episode that explodes ends there.
+    """Returns of whole episodes, all of them at a time; an episode that explodes ends there.
 
-    `advance` is told how many of the task's `max_episode_steps` have passed.
+    Parameters of several systems share the episodes out among them, as evenly as whole episodes allow: at least one
+    each. `advance` is told how many of the task's `max_episode_steps` have passed.
     """
     task = simulator.task
     of_start, of_action = jax.random.split(key)
-    system = simulator.bind(np.asarray(parameters)[None])
-    state = reset_states(simulator)(of_start, episodes)[None]
-    alive = np.ones((1, episodes), dtype=bool)
-    total, length = np.zeros((1, episodes)), np.zeros((1, episodes))
+    system = simulator.bind(np.atleast_2d(parameters))
+    rows = -(-episodes // system.count)
+    state = reset_states(simulator)(of_start, system.count * rows).reshape(system.count, rows, -1)
+    alive = np.ones((system.count, rows), dtype=bool)
+    total, length = np.zeros(alive.shape), np.zeros(alive.shape)
     for step in range(task.max_episode_steps):
         stream = None if deterministic else of_action
-        action = np.asarray(act(policy, task.observe(state), stream, np.int32(step)), dtype=np.float64)
+        action = np.asarray(act(policy, system.observe(state), stream, np.int32(step)), dtype=np.float64)
         next_state = system.step(state, action)
         alive &= np.isfinite(next_state).all(-1)
         next_state = np.where(alive[..., None], next_state, state)
@@ -73,7 +75,8 @@ def evaluate(
             advance(task.max_episode_steps - step)
             break
         advance(1)
-    return Returns(total[0], length[0], normalized_score(total[0], task))
+    returns = total.reshape(-1)
+    return Returns(returns, length.reshape(-1), normalized_score(returns, task))
 
 
 def normalized_score(returns: Float[np.ndarray, " episodes"], task: Task) -> Float[np.ndarray, " episodes"]:

@@ -6,6 +6,7 @@ Gymnasium 1.0 dropped plugin entry points, so somebody has to import it; the id 
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 import madoc.tasks
+from madoc import robots
 from madoc.errors import MadocError
 from madoc.simulation.cpu import CpuSimulator
 from madoc.simulation.rollout import reset_states
@@ -34,16 +36,16 @@ class CalibratedEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     at its last good state and `info["failed"]` is true. Nothing is rendered.
 
     Args:
-        task: A task, or the name of one.
+        task: A task, the name of one, or the path of a robot's spec file.
         parameters: Physical values by name, as a vector in the task's order, or None for mid-range.
-        physics: `legacy` or `modern`, for a task given by name.
+        physics: `legacy` or `modern`, for a task given by name; None is `legacy`.
 
     Raises:
         MadocError: No such task or physics; a parameter is unknown, missing, not finite or below its bound.
     """
 
-    def __init__(self, task: Task | str, *, parameters: Parameters = None, physics: str = "legacy") -> None:
-        self.task = madoc.tasks.make(task, physics) if isinstance(task, str) else task
+    def __init__(self, task: Task | str | Path, *, parameters: Parameters = None, physics: str | None = None) -> None:
+        self.task = task if isinstance(task, Task) else robots.resolve(task, physics)
         self.parameters = _vector(self.task, parameters)
         simulator = CpuSimulator(self.task, threads=1)
         self._system = simulator.bind(self.parameters[None])
@@ -97,7 +99,7 @@ class CalibratedEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observe(), reward, terminated, failed, {**info, "failed": failed}
 
     def _observe(self) -> np.ndarray:
-        return np.array(self.task.observe(self._state))
+        return np.array(self._system.observe(self._state[None, None])[0, 0])
 
     def _position(self) -> dict[str, Any]:
         return {"x_position": float(self._state[0])} if self.task.name in ROBOTS.values() else {}

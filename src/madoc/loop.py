@@ -90,6 +90,7 @@ def run(
     checkpoint_every: float = 30.0,
     unit: Unit = "control steps",
     spent: Callable[[State], int] | None = None,
+    trace: Callable[[State], Metrics] | None = None,
 ) -> Finished[State]:
     """Run a method until its budget is spent, it has converged, the user stops it, or a NaN appears.
 
@@ -110,6 +111,7 @@ def run(
         checkpoint_every: Seconds between two checkpoints.
         unit: What the budget counts.
         spent: How many of them a state has spent; `method.control_steps` where it is None.
+        trace: More finite scalars of a state, for the log alone.
 
     Raises:
         MadocError: The budget is not positive, there is no folder to resume, the folder holds a run and
@@ -121,7 +123,7 @@ def run(
     with ExitStack() as stack:
         interruption = stack.enter_context(interruptible())
         allowance = _Allowance(budget, unit, spent or method.control_steps)
-        session = _Session(method, allowance, method.init(problem, key), folder, resume)
+        session = _Session(method, allowance, method.init(problem, key), folder, resume, trace)
         if session.ended(interruption.asked) and session.resumed:
             return session.finish()
         session.begin(stack)
@@ -163,8 +165,10 @@ class _Session(Generic[State]):
         state: State,
         folder: RunFolder | None,
         resume: bool,
+        trace: Callable[[State], Metrics] | None,
     ) -> None:
         self.state = state
+        self._trace = trace
         self.resumed = resume and folder is not None and folder.checkpoint.exists()
         self.outcome: tuple[Status, str] | None = None
         self._method = method
@@ -223,7 +227,8 @@ class _Session(Generic[State]):
         self.state = state
         metrics = {name: float(value) for name, value in metrics.items()}
         if self._log:
-            self._log.append(metrics, stage=stage, spent=self.spent, seconds=self._seconds())
+            traced = metrics | (self._trace(state) if self._trace else {})
+            self._log.append(traced, stage=stage, spent=self.spent, seconds=self._seconds())
         for name, value in metrics.items():
             if not math.isfinite(value):
                 self._diverge(f"metric {name} became {value} while {stage}")
@@ -276,7 +281,7 @@ class _Session(Generic[State]):
         return self._earlier + self._stopped - self._started
 
     def _extra(self) -> dict[str, Any]:
-        return {"control_steps": self.control_steps, count_name(self._unit): self.spent, "seconds": self._seconds()}
+        return {count_name(self._unit): self.spent, "control_steps": self.control_steps, "seconds": self._seconds()}
 
 
 def _check_folder(folder: RunFolder | None, resume: bool) -> None:

@@ -11,25 +11,44 @@ from madoc.errors import MadocError
 
 @dataclass(frozen=True)
 class Field:
-    """What may be written into a model: which kind of element it belongs to, its unit and its physical bound."""
+    """What may be calibrated: which kind of element it belongs to, its unit and its physical bound.
+
+    Attributes:
+        element: `body`, `joint`, `geom`, `actuator` or `signal`; None where it belongs to the whole robot.
+        unit: Of a hinge; a slide joint reads N for N·m and m for rad.
+        minimum: No physical value is below it.
+        in_model: It is written into the model. Otherwise the bound system applies it around the model.
+    """
 
     element: str | None
     unit: str
     minimum: float = -np.inf
+    in_model: bool = True
 
 
 FIELDS: dict[str, Field] = {
     "gravity": Field(None, "m/s²"),
     "body_mass": Field("body", "kg", 0.0),
     "body_mass_and_inertia": Field("body", "kg", 0.0),
+    "body_inertia": Field("body", "kg·m²", 0.0),
+    "body_com": Field("body", "m", 0.0),
     "dof_damping": Field("joint", "N·m·s/rad", 0.0),
     "dof_armature": Field("joint", "kg·m²", 0.0),
     "dof_frictionloss": Field("joint", "N·m", 0.0),
     "jnt_stiffness": Field("joint", "N·m/rad", 0.0),
     "geom_friction": Field("geom", "1", 0.0),
     "actuator_gain": Field("actuator", "1"),
+    "action_delay": Field(None, "s", 0.0, in_model=False),
+    "signal_bias": Field("signal", "1", in_model=False),
 }
-"""Every field a parameter can name. Units are those of a hinge; a slide joint reads N for N·m and m for rad."""
+"""Every field a parameter can name.
+
+`body_mass` leaves the inertia as it is (the paper's meaning), `body_mass_and_inertia` scales the inertia with the mass.
+`body_inertia` is the largest moment of inertia about the centre of mass, the others keep their ratio to it; `body_com`
+is how far the centre of mass is from the body's origin, in the direction it has. `actuator_gain` of a position or
+velocity servo is its kp or kv, and moves the servo's bias with it. `action_delay` is the time from an action to its
+effect, `signal_bias` what a sensor reads too much.
+"""
 
 
 @dataclass(frozen=True)
@@ -37,42 +56,54 @@ class Parameter:
     """One physical quantity of the simulator that may be calibrated, and the range it is searched in.
 
     Attributes:
-        field: A key of `FIELDS`. `body_mass` leaves the inertia as it is (the paper's meaning);
-            `body_mass_and_inertia` scales the inertia with the mass.
-        element: Name of the body, joint, geom or actuator (a body without a name may be named by its joint);
-            empty for gravity.
+        field: A key of `FIELDS`.
+        element: Name of the body, joint, geom, actuator or signal (a body without a name may be named by its joint);
+            several that share one value as a tuple; empty for what belongs to the whole robot, as gravity.
         low: Lower end of the range, in `unit`.
         high: Upper end of the range, in `unit`.
+        label: Its own name; empty takes `field.element`.
+        measured_in: Its unit where that is not the field's, as of a slide joint or a signal; empty takes the field's.
     """
 
     field: str
-    element: str
+    element: str | tuple[str, ...]
     low: float
     high: float
+    label: str = ""
+    measured_in: str = ""
 
     def __post_init__(self) -> None:
         if self.field not in FIELDS:
             raise MadocError(f"unknown parameter field {self.field!r}; expected one of {', '.join(FIELDS)}")
         kind = FIELDS[self.field]
-        if (kind.element is None) != (self.element == ""):
+        if (kind.element is None) != (self.elements == ()) or "" in self.elements:
             wanted = "no element" if kind.element is None else f"the name of a {kind.element}"
             raise MadocError(f"parameter field {self.field!r} takes {wanted}, got {self.element!r}")
+        if len(set(self.elements)) < len(self.elements):
+            raise MadocError(f"{self.name} names an element twice; a shared value needs each only once")
         if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
             raise MadocError(f"range of {self.name} must be finite with low < high, got [{self.low}, {self.high}]")
         if self.low < kind.minimum:
             raise MadocError(
-                f"range of {self.name} starts at {self.low} {kind.unit}, below its physical bound {kind.minimum}"
+                f"range of {self.name} starts at {self.low} {self.unit}, below its physical bound {kind.minimum}"
             )
 
     @property
+    def elements(self) -> tuple[str, ...]:
+        """The elements that share the value; none of what belongs to the whole robot."""
+        if isinstance(self.element, tuple):
+            return self.element
+        return (self.element,) if self.element else ()
+
+    @property
     def name(self) -> str:
-        """`field.element`, for example `dof_damping.foot_joint`; plain `gravity`."""
-        return f"{self.field}.{self.element}" if self.element else self.field
+        """Its own name, or `field.element`, as `dof_damping.foot_joint`; plain `gravity`. Elements join with `+`."""
+        return self.label or ".".join([self.field, *(["+".join(self.elements)] if self.elements else [])])
 
     @property
     def unit(self) -> str:
         """The physical unit of the value and of its range."""
-        return FIELDS[self.field].unit
+        return self.measured_in or FIELDS[self.field].unit
 
 
 @dataclass(frozen=True)

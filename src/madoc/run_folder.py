@@ -125,9 +125,10 @@ class RunFolder:
         now = _flat({key: value for key, value in spec.items() if key not in _FREE})
         for key in [*then, *now]:
             if key not in then or key not in now or then[key] != now[key]:
+                was, is_now = (_shortened(said.get(key, "not given")) for said in (then, now))
                 raise MadocError(
-                    f"cannot resume {self.path}: {key} was {then.get(key, 'not given')}, is now"
-                    f" {now.get(key, 'not given')}; resume with the same settings or choose another --out"
+                    f"cannot resume {self.path}: {key} was {was}, is now {is_now}; "
+                    "resume with the same settings or choose another --out"
                 )
         changed = [
             f"{name} {self.spec.get('versions', {}).get(name)} (now {version})"
@@ -242,3 +243,8 @@ def _flat(spec: Any, prefix: str = "") -> dict[str, str]:
             for key, value in _flat(child, f"{prefix}.{name}" if prefix else name).items()
         }
     return {prefix: json_text(spec, what=prefix)}
+
+
+def _shortened(text: str) -> str:
+    """A value in a sentence: a robot's whole model would hide the rest."""
+    return text if len(text) <= 80 else f"{text[:77]}..."

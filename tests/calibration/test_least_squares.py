@@ -8,27 +8,29 @@ import pytest
 
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
-from madoc.calibration.least_squares import losses
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.calibration.least_squares.linearisation import (
+from madoc.data import Disturbance, disturb
+from madoc.data.windows import windows_at
+from madoc.errors import MadocError
+from madoc.parameters import Parameter
+from madoc.residuals import losses
+from madoc.residuals.linearisation import (
     DIFFERENCE,
     Linearisation,
     difference_points,
     linearise,
 )
-from madoc.calibration.least_squares.uncertainty import (
+from madoc.residuals.uncertainty import (
+    at_least_noise,
     bread,
     correlated_pairs,
     half_width,
     identifiability,
+    jackknife_meat,
     meat,
     sandwich,
 )
-from madoc.calibration.window_residuals import window_residuals
-from madoc.data import Disturbance, disturb
-from madoc.data.windows import windows_at
-from madoc.errors import MadocError
-from madoc.parameters import Parameter
+from madoc.residuals.window_residuals import window_residuals
 from robots import SPRING_TRUTH, CountingSimulator, recorded, spring
 
 ROBUST = ("huber", "soft-l1", "cauchy")
@@ -152,6 +154,28 @@ def test_the_sandwich_of_a_mean_is_its_standard_error():
     # Σ r² / (n - 1) / n, a tenth of it so that it is below the box's variance.
     assert found.covariance[0, 0] == pytest.approx(0.1 * 5.5 / 3 / 4)
     assert not len(found.unidentified)
+
+
+def test_the_jackknife_of_a_mean_is_its_standard_error():
+    around = at(np.ones((4, 1, 1)), np.array([[1.0], [2.0], [4.0], [-7.0]]))
+    bread = np.array([[4.0]])
+    covariance = sandwich(bread, jackknife_meat(around, 1.0, bread)).covariance
+    # The variance of the values, 70 / 3, over their number.
+    np.testing.assert_allclose(jackknife_meat(around, 1.0, bread) / 16.0, [[70.0 / 3.0 / 4.0]])
+    assert covariance[0, 0] == pytest.approx(1.0 / 3.0)  # wider than the box
+
+
+def test_a_window_that_weighs_much_shows_how_far_it_has_drawn():
+    # Two values at slope 1, one at slope 2: B = 6, g = (1, 1, -2); left out, δ = g / (5, 5, 2).
+    around = at(np.array([[[1.0]], [[1.0]], [[2.0]]]), np.array([[1.0], [1.0], [-1.0]]))
+    found = jackknife_meat(around, 1.0, np.array([[6.0]]))
+    np.testing.assert_allclose(found / 36.0, [[2.0 / 3.0 * (0.04 + 0.04 + 1.0)]])
+
+
+def test_windows_that_scatter_too_little_by_chance():
+    bread, meat_of_windows = np.diag([2.0, 4.0]), np.diag([1.0, 16.0])
+    # C = (1/4, 1) by windows, (1/2, 1/4) by noise.
+    np.testing.assert_allclose(at_least_noise(meat_of_windows, bread, 1.0), np.diag([0.5 * 4.0, 1.0 * 16.0]))
 
 
 def test_values_of_one_window_count_as_one_piece_of_evidence():

@@ -26,12 +26,22 @@ def wait_for(place, process):
 def test_a_run_leaves_everything(whole):
     found = {file.name for file in whole.iterdir()} - {".lock"}
     policies = {"policy-calibrated", "policy-midrange", "policy-truth"}
-    assert found == {"data.npz", "calibration", "evaluation.json", "summary.json", "spec.json"} | policies
+    files = {"data.npz", "evaluation.json", "summary.json", "spec.json", "report.html"}
+    assert found == files | {"calibration"} | policies
     assert all((whole / name / "policy.npz").exists() for name in policies)
     summary = summary_of(whole)
     assert summary["status"] == "finished"
     assert list(summary["evaluation"]["policies"]) == ["calibrated", "midrange", "truth"]
     assert summary["data"]["transitions"] == 1000
+
+
+def test_the_log_of_a_calibration_has_the_estimates_on_their_way(whole):
+    lines = [json.loads(line) for line in (whole / "calibration" / "metrics.jsonl").read_text().splitlines()]
+    assert lines[0]["metrics"]["estimate/gravity"] == pytest.approx(-15.0, abs=0.01)
+    last = json.loads((whole / "calibration" / "result.json").read_text())["parameters"]
+    for name, row in last.items():
+        assert lines[-1]["metrics"][f"estimate/{name}"] == row["estimate"]
+        assert lines[-1]["metrics"][f"std/{name}"] == row["std"]
 
 
 def test_resuming_a_finished_run_only_reads_it(whole, capsys):

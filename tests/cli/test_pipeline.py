@@ -43,7 +43,7 @@ def test_a_target_binds_what_was_not_calibrated():
     truth = {"gravity": -5.0, "body_mass.torso": 3.3}
     task = tasks.hopper().with_parameters(["gravity"])
     check_truth(truth, task, physics="legacy")
-    target = make_target("hopper", "legacy", truth)
+    target = make_target(task, truth)
     model = target.simulator.model(target.parameters)
     assert model.body("torso").mass[0] == 3.3
     assert model.opt.gravity[2] == -5.0
@@ -77,17 +77,18 @@ def test_a_stage_has_ended_when_its_last_file_is_there(tmp_path):
 
 
 def test_physics_is_the_datas_unless_asked_otherwise(recorded):
-    from madoc.pipeline.calibration_stage import CalibrationOrder, _prepare
+    from madoc.pipeline.calibration_stage import CalibrationOrder, prepare
     from madoc.pipeline.data_stage import Source
 
-    source = Source(str(recorded))
+    source = Source((str(recorded),))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        dataset, task = _prepare(CalibrationOrder("hopper", source))
-    assert task.physics == dataset.physics == "legacy"
+        found = prepare(CalibrationOrder("hopper", source))
+    assert found.simulator.task.physics == found.dataset.physics == "legacy"
     with pytest.warns(UserWarning, match="recorded in legacy physics"):
-        assert _prepare(CalibrationOrder("hopper", source, physics="modern"))[1].physics == "modern"
-    assert fingerprint(dataset) == fingerprint(_prepare(CalibrationOrder("hopper", source))[0])
+        asked = prepare(CalibrationOrder("hopper", source, physics="modern"))
+    assert asked.simulator.task.physics == "modern"
+    assert fingerprint(found.dataset) == fingerprint(asked.dataset)
 
 
 def test_few_rows_step_like_many():

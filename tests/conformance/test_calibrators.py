@@ -49,6 +49,9 @@ METHODS = {
     "madoc, replaying": small("madoc", starts="replay"),
     "least-squares": LeastSquares(windows=6, search_windows=3, searches=2, search_epochs=2, tolerance=0.0),
     "least-squares, windows": LeastSquares(horizon=3, windows=4, search_windows=2, search_epochs=1, tolerance=0.0),
+    "least-squares, estimating": LeastSquares(
+        initial_states="estimated", horizon=3, windows=4, search_windows=2, search_epochs=1, tolerance=0.0
+    ),
     "oted": Oted(draws=6, rows=2, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=2, cloning_updates=3),
     "oted, free running": Oted("policy", draws=4, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=0),
     "dropo": Dropo(draws=4, transitions=3),
@@ -282,7 +285,13 @@ def test_logged_starts_without_states_are_refused(method, dataset, starts):
         calibrate(method, problem, key=KEY, budget=BUDGET)
 
 
-@pytest.mark.parametrize("name", ["madoc, free running", "oted, free running", "cma-es, acting", "nominal", "uniform"])
+UNSEEING = (
+    *("madoc", "madoc, free running", "least-squares", "least-squares, estimating", "oted, free running"),
+    *("cma-es, acting", "nominal", "uniform"),
+)
+
+
+@pytest.mark.parametrize("name", UNSEEING)
 def test_hidden_velocities_leave_methods_that_need_no_states(dataset, name):
     whole = replace(two_link_arm(), velocities=2)
     hidden = disturb(dataset, Disturbance(hidden_velocities=True), whole, KEY)

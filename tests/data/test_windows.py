@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from layouts import make_dataset
 
-from madoc.data.windows import first_rows, windows_at
+from madoc.data.windows import apart, first_rows, readings_at, windows_at
 from madoc.errors import MadocError
 
 
@@ -31,3 +31,19 @@ def test_episodes_that_are_too_short_are_refused(hopper):
     dataset = make_dataset(hopper, lengths=(3, 4), falls=())
     with pytest.raises(MadocError, match=r"no stretch of 5 rows .* whose longest episode has 4 rows"):
         first_rows(dataset, np.arange(7), 5)
+
+
+def test_windows_apart_share_no_reading(hopper):
+    dataset = make_dataset(hopper, lengths=(6, 4), falls=())
+    # Of two rows each, three readings: 0-2, 3-5, and, as another episode shares none with it, from its first row.
+    np.testing.assert_array_equal(apart(dataset, np.arange(10), 2), [0, 3, 6])
+    rows = np.array([1, 2, 4, 7])
+    np.testing.assert_array_equal(rows[apart(dataset, rows, 2)], [1, 4, 7])
+
+
+def test_readings_include_the_first(hopper):
+    dataset = make_dataset(hopper, lengths=(3, 4), falls=())
+    found = readings_at(dataset, np.array([0, 4]), 2)
+    assert found.shape == (2, 3, 11)
+    np.testing.assert_array_equal(found[:, 0], dataset.transitions.observation[[0, 4]])
+    np.testing.assert_array_equal(found[1, 1:], dataset.transitions.next_observation[4:6])

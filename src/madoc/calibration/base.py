@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +10,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from madoc.data import Dataset, logged_states
+from madoc.data.dataset import with_pending
+from madoc.data.noise import estimate_noise
+from madoc.data.velocities import moving_states
 from madoc.errors import MadocError
 from madoc.learning.dynamics_ratio import Scaling
+from madoc.learning.window_features import WindowScaling, last_rows, logged_stretch
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import reset_states
+from madoc.simulation.velocities import unseen_positions
 from madoc.types import Metrics
 
 State = Any
@@ -64,6 +69,43 @@ class CalibrationProblem:
         """The actions taken at `logged_states`."""
         return np.asarray(self.dataset.transitions.action)[self.logged_rows]
 
+    @cached_property
+    def approximate_states(self) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
+        """States near those of logged rows, and which rows: rebuilt ones, else as far as observations tell.
+
+        Velocities that are not observed are differences of positions; positions that are not are the model's initial.
+        """
+        task = self.simulator.task
+        if task.state_from_observation is not None or task.posture is None:
+            return self._rebuilt
+        states = moving_states(self.dataset, task)[0]
+        initial = self.simulator.initial_state[: self.physical_size]
+        states = np.where(np.isnan(states), initial, states)
+        return with_pending(self.dataset, task, states, np.arange(len(self.dataset)))
+
+    @property
+    def physical_size(self) -> int:
+        """Values of (qpos, qvel), the first of a state."""
+        return len(self.simulator.initial_state) - self.simulator.task.pending * self.simulator.action_size
+
+    @property
+    def starts_known(self) -> bool:
+        """Whether rollouts can start where the log was: states rebuilt, or all but velocities, which positions tell."""
+        task = self.simulator.task
+        return task.state_from_observation is not None or (task.posture is not None and not unseen_positions(task))
+
+    @property
+    def measured(self) -> int:
+        """How many of an observation's values, the first ones, were measured and not made from others."""
+        task = self.simulator.task
+        made = self.dataset.disturbance.velocities == "differences"
+        return task.observation_size - task.velocities * made
+
+    @cached_property
+    def estimated_noise(self) -> Float[np.ndarray, " observation"]:
+        """Deviation of the sensors' noise, as far as the log alone tells."""
+        return estimate_noise(self.dataset)
+
     @property
     def doubts(self) -> tuple[str, ...]:
         """What is known to keep the simulator from moving as the data does, one sentence each."""
@@ -73,7 +115,8 @@ class CalibrationProblem:
             "the estimate will make up for the difference"
         )
         gaps = () if recorded in ("unknown", simulated) else (gap,)
-        return (*gaps, *self.dataset.disturbance.sentences())
+        told = (finding.sentence for finding in self.dataset.findings if finding.level == "warning")
+        return (*gaps, *self.dataset.disturbance.sentences(), *told)
 
     def require_pairs(self, method: str) -> None:
         """Refuse data in which it is not known which next observation followed which row.
@@ -89,12 +132,15 @@ class CalibrationProblem:
 
     @cached_property
     def probe(self) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
-        """States and actions at which every parameter must matter: logged ones where states can be rebuilt."""
+        """States and actions at which every parameter must matter: logged ones where states can be rebuilt.
+
+        Else where the first logged actions lead from a reset, as at rest many parameters have no say.
+        """
         task = self.simulator.task
         if task.state_from_observation is not None:
             return self.logged_states, self.logged_actions
-        states = reset_states(self.simulator)(jax.random.key(0), 64)
-        return states, np.asarray(self.dataset.transitions.action)[np.arange(64) % len(self.dataset)]
+        actions = np.asarray(self.dataset.transitions.action, dtype=np.float64)[np.arange(64) % len(self.dataset)]
+        return _walked(self.simulator, actions), actions
 
     @cached_property
     def pairs(self) -> tuple[Float[Array, "rows observation"], Float[Array, "rows action"]]:
@@ -118,9 +164,44 @@ class CalibrationProblem:
         """Raw features of the logged rows, on the device."""
         return self._features("raw")
 
+    @cached_property
+    def _windows(self) -> dict[tuple[str, int], tuple[WindowScaling, tuple[Array, Array]]]:
+        return {}
+
+    def windows(self, name: str, length: int) -> tuple[WindowScaling, tuple[Array, Array]]:
+        """How windows of so many logged rows are described, and the features of all there are, on the device.
+
+        Raises:
+            MadocError: No episode is long enough.
+        """
+        if (name, length) not in self._windows:
+            rows, starts = self.dataset.transitions, self.dataset.episode_starts
+            last = last_rows(len(self.dataset), starts, length)
+            if not len(last):
+                raise MadocError(
+                    f"no episode of {self.dataset.origin} has the {length} rows of a window; take a shorter one"
+                )
+            stretch = logged_stretch(rows, last, length)
+            scaling = WindowScaling.of(self.scalings[name], stretch)
+            window, following = scaling.features(stretch)
+            self._windows[name, length] = scaling, (jnp.asarray(window), jnp.asarray(following))
+        return self._windows[name, length]
+
     def _features(self, name: str) -> tuple[Array, Array]:
         pair, following = self.scalings[name].features(self.dataset.transitions)
         return jnp.asarray(pair), jnp.asarray(following)
+
+
+def _walked(simulator: Simulator, actions: Float[np.ndarray, "rows action"]) -> Float[np.ndarray, "rows state"]:
+    """The states that actions are taken at, one after the other from a reset, at mid-range parameters."""
+    system = simulator.bind(simulator.parameters.middle[None])
+    state = first = reset_states(simulator)(jax.random.key(0), 1)[None]
+    passed = []
+    for action in actions:
+        passed.append(state[0, 0])
+        state = system.step(state, action[None, None])
+        state = state if np.isfinite(state).all() else first
+    return np.stack(passed)
 
 
 @dataclass(frozen=True)
@@ -142,6 +223,15 @@ class Estimate:
     warnings: tuple[str, ...] = field(default=())
     covariance: Float[np.ndarray, "d d"] | None = None
     interval: Float[np.ndarray, "d 2"] | None = None
+
+
+@runtime_checkable
+class EmbedsParameters(Protocol):
+    """What a method may have besides: it learns which parameters act alike, and can show it."""
+
+    def embeddings(self, problem: CalibrationProblem, state: State) -> Float[np.ndarray, "d latent"] | None:
+        """One vector a parameter, near for those that act alike; None while nothing is learnt of it."""
+        ...
 
 
 class Calibrator(Protocol):

@@ -4,12 +4,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc import loop
-from madoc.calibration.base import CalibrationProblem, Calibrator, Estimate
+from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
+from madoc.calibration.cautions import told_once
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
+from madoc.files import replacing
 from madoc.parameters import ParameterSpace
 from madoc.run_folder import RunFolder
 from madoc.simulation.sensitivity import refuse_insensitive
@@ -59,6 +62,7 @@ def calibrate(
         description=f"{method.name} on {problem.simulator.task.name}",
         shown=method.shown,
         checkpoint_every=checkpoint_every,
+        trace=lambda state: _trace(space, method.estimate(problem, state)),
     )
     estimate = method.estimate(problem, finished.state)
     result = CalibrationResult(
@@ -71,13 +75,33 @@ def calibrate(
         seed=seed_of(key),
         groups=[[space.names[index] for index in group] for group in estimate.groups],
         parameters=_parameters(space, estimate),
-        warnings=[*estimate.warnings, *problem.doubts],
+        warnings=told_once(estimate.warnings, problem.doubts),
         error=None if known is None else calibration_error(estimate.mean, known, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
     )
     if folder is not None:
+        if isinstance(method, EmbedsParameters):
+            _keep_embeddings(folder, space, method.embeddings(problem, finished.state))
         folder.write_json("result.json", result.to_json())
     return result
+
+
+def _trace(space: ParameterSpace, estimate: Estimate) -> dict[str, float]:
+    """What the log keeps of an estimate on its way."""
+    columns = zip(space.names, estimate.mean.tolist(), estimate.std.tolist(), strict=True)
+    both = {
+        f"{kind}/{name}": value
+        for name, *pair in columns
+        for kind, value in zip(("estimate", "std"), pair, strict=True)
+    }
+    return {name: value for name, value in both.items() if np.isfinite(value)}
+
+
+def _keep_embeddings(folder: RunFolder, space: ParameterSpace, vectors: np.ndarray | None) -> None:
+    """Leave `embeddings.npz`: names of parameters, and what was learnt of which act alike."""
+    if vectors is not None:
+        with replacing(folder.path / "embeddings.npz") as stream:
+            np.savez(stream, allow_pickle=False, names=np.array(space.names), vectors=vectors)
 
 
 def _parameters(space: ParameterSpace, estimate: Estimate) -> dict[str, ParameterEstimate]:

@@ -1,5 +1,7 @@
 """Sentences that any method may have to say of its estimate."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float
 
@@ -21,3 +23,9 @@ def exploded(failures: int, control_steps: int) -> tuple[str, ...]:
         f"{failures} of {control_steps:,} simulated rows exploded and were left out; "
         "the ranges may hold impossible parameters",
     )
+
+
+def told_once(warnings: Iterable[str], doubts: Iterable[str]) -> list[str]:
+    """What a method and what the data's check warn of; what both do only in the method's words."""
+    own = list(dict.fromkeys(warnings))
+    return [*own, *(doubt for doubt in doubts if not any(doubt.endswith(sentence) for sentence in own))]

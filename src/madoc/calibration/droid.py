@@ -20,9 +20,9 @@ from madoc.calibration.population_search import (
     mean_with_failures,
     next_generation,
 )
-from madoc.calibration.window_residuals import window_residuals
 from madoc.data.windows import first_rows
 from madoc.errors import check_at_least
+from madoc.residuals.window_residuals import window_residuals
 from madoc.types import Metrics
 
 

@@ -42,6 +42,8 @@ class CalibrationResult:
         warnings: What to know before trusting it, one sentence each.
         error: Only where the truth was given: `mean_absolute`, `mean_percent_of_range`, `per_parameter`.
         covariance: Rows of the estimates' covariance in physical units, in the task's order, where known.
+        verdict: `word`, `sentence` and `parameters`, where rows were held out to judge it by.
+        holdout: All that those rows said.
     """
 
     method: str
@@ -56,6 +58,8 @@ class CalibrationResult:
     warnings: list[str] = field(default_factory=list)
     error: dict[str, Any] | None = None
     covariance: list[list[float]] | None = None
+    verdict: dict[str, Any] | None = None
+    holdout: dict[str, Any] | None = None
 
     @property
     def mean(self) -> np.ndarray:
@@ -63,15 +67,22 @@ class CalibrationResult:
         return np.array([parameter.estimate for parameter in self.parameters.values()])
 
     @property
+    def interval(self) -> np.ndarray | None:
+        """95 % intervals (d, 2), where the method knows them."""
+        rows = [parameter.interval for parameter in self.parameters.values()]
+        return None if None in rows else np.array(rows)
+
+    @property
     def std(self) -> np.ndarray:
         """Its spread (d,)."""
         return np.array([parameter.std for parameter in self.parameters.values()])
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON; what is not known (`error`, `covariance`, an `interval`) is left out."""
+        """As JSON; what is not known (`error`, `covariance`, an `interval`, the `verdict`) is left out."""
         fields = asdict(self)
+        optional = ("error", "covariance", "interval", "verdict", "holdout")
         for row in (fields, *fields["parameters"].values()):
-            for name in [name for name in ("error", "covariance", "interval") if row.get(name, "") is None]:
+            for name in [name for name in optional if row.get(name, "") is None]:
                 del row[name]
         return fields
 
@@ -118,6 +129,10 @@ class CalibrationResult:
             table.add_row(*cells, *([f"{errors[name]:.2g}"] if errors else []))
         return table
 
+    def verdict_line(self) -> str:
+        """The verdict, to be read before the table; empty where there is none."""
+        return f"{self.verdict['word']}: {self.verdict['sentence']}" if self.verdict else ""
+
     def summary(self) -> str:
         """Status, cost, error and warnings, a line each."""
         lines = [
@@ -135,7 +150,8 @@ class CalibrationResult:
         stream = io.StringIO()
         console = Console(file=stream, width=100)
         console.print(self.table())
-        return stream.getvalue() + self.summary()
+        verdict = f"{self.verdict_line()}\n" if self.verdict else ""
+        return verdict + stream.getvalue() + self.summary()
 
 
 def _span(interval: list[float] | None) -> str:

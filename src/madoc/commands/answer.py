@@ -1,15 +1,30 @@
 """What a command returns, and the options all commands share."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rich.console import RenderableType
 from rich.table import Table
 
-EXIT_CODES: Mapping[str, int] = {"finished": 0, "converged": 0, "diverged": 1, "interrupted": 130}
-"""Exit codes by how a run ended; 2 is a refusal."""
+if TYPE_CHECKING:
+    from madoc.calibration import CalibrationResult
+
+EXIT_CODES: Mapping[str, int] = {
+    "finished": 0,
+    "converged": 0,
+    "diverged": 1,
+    "rejected": 2,
+    "interrupted": 130,
+    "CALIBRATED": 0,
+    "NO_IMPROVEMENT": 10,
+    "NOT_IDENTIFIABLE": 11,
+    "MODEL_MISMATCH": 12,
+    "DATA_REJECTED": 13,
+    "NOT_RECOVERABLE": 14,
+}
+"""Exit codes by how a run ended, or by its verdict where it has one; 2 is a refusal."""
 
 PLACE_NAMES: Mapping[str, str] = {
     "calibrated": "at the calibrated parameters",
@@ -83,6 +98,49 @@ def evaluation_text(evaluation: Mapping[str, Any]) -> tuple[RenderableType, ...]
     return (evaluation_table(evaluation), *line)
 
 
+def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
+    """The verdict, the table, the comparison of methods, and the rest in lines."""
+    verdict = (result.verdict_line(),) if result.verdict else ()
+    rows = (result.holdout or {}).get("candidates")
+    compared = (candidates_table(rows, result),) if rows else ()
+    return (*verdict, result.table(), *compared, result.summary())
+
+
+def candidates_table(rows: Sequence[Mapping[str, Any]], result: "CalibrationResult") -> Table:
+    """What `auto` has tried, a row a method, those it did not run with the reason."""
+    predicted = (result.holdout or {}).get("measure") == "prediction"
+    measure = "error / mid-range's" if predicted else "told apart, area - ½"
+    table = Table(title="methods compared on the hold-out", title_justify="left")
+    table.add_column("method", no_wrap=True)
+    for heading in (measure, "95 %", "control steps", "s"):
+        table.add_column(heading, justify="right")
+    table.add_column("verdict")
+    for row in rows:
+        if "not_run" in row:
+            table.add_row(row["method"], "", "", "", "", row["not_run"])
+            continue
+        kept = " (kept)" if row["method"] == result.method else ""
+        table.add_row(
+            row["method"],
+            f"{row['score']:.3g}",
+            "[{:.3g}, {:.3g}]".format(*row["interval"]),
+            f"{row['control_steps']:,}",
+            f"{row['seconds']:.0f}",
+            row["verdict"] + kept,
+        )
+    return table
+
+
+def calibration_status(result: "CalibrationResult") -> str:
+    """The key of `EXIT_CODES` that a calibration ends with: its verdict, where it has one."""
+    return result.verdict["word"] if result.verdict else result.status
+
+
 def left_behind(path: Path, what: str) -> str:
     """A line on what was left where."""
     return f"{what}: {path}"
+
+
+def page_line(page: Path | None) -> tuple[str, ...]:
+    """Where a run's page is, if it could be written."""
+    return () if page is None else (left_behind(page, "report"),)

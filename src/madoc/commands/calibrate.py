@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
-from madoc.commands.answer import Answer, Output, left_behind
-from madoc.commands.disturbed import Disturbed, disturbance_of
+from madoc.commands.answer import Answer, Output, calibration_status, calibration_text, left_behind, page_line
+from madoc.commands.log import Log
 from madoc.errors import MadocError
 
 Settings = UseAppendAction[tuple[tuple[str, ...], ...]]
@@ -18,32 +18,23 @@ Settings = UseAppendAction[tuple[tuple[str, ...], ...]]
 class Calibrate:
     """Find the parameters under which the simulator moves as the data does.
 
-    Leaves a run folder: result.json, spec.json, metrics.jsonl, TensorBoard events and a checkpoint.
+    Leaves a run folder: result.json, spec.json, metrics.jsonl, TensorBoard events and a checkpoint. With a hold-out
+    the exit code is the verdict's: 0 CALIBRATED, 10 NO_IMPROVEMENT, 11 NOT_IDENTIFIABLE, 12 MODEL_MISMATCH,
+    13 DATA_REJECTED.
     """
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
-    """The robot, as `madoc tasks` lists it."""
-    data: str
-    """The log: a D4RL, NeoRL or Minari file, one of `madoc record`, or a Minari id."""
-    format: str | None = None
-    """Format of the log: d4rl, neorl, minari or madoc. Default: look at its content."""
-    clip_actions: bool = False
-    """Clip actions outside [-1, 1] instead of refusing them."""
-    max_transitions: int = 200_000
-    """Keep at most so many rows, drawn as whole episodes."""
-    disturbed: OmitArgPrefixes[Disturbed] = field(default_factory=Disturbed)
-    physics: Literal["legacy", "modern"] | None = None
-    """Physics to calibrate in. Default: the data's; legacy where it does not say."""
-    level: str = "normal"
-    """Ranges to search: easy, normal or hard."""
-    parameters: tuple[str, ...] = ()
-    """Calibrate only these. Default: all of the robot's."""
-    method: str = "madoc"
-    """A calibrator, as `madoc methods` lists it."""
+    """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
+    log: OmitArgPrefixes[Log]
+    method: str | None = None
+    """A calibrator, as `madoc methods` lists it, or auto: what the data allows, compared on a hold-out. Default: auto
+    for a robot of your own, else madoc."""
+    holdout: float | None = None
+    """Share of the rows that no method sees, to judge the result by. Default: 0.2 for auto, else none."""
     starts: Literal["policy", "logged", "replay"] | None = None
     """Where rollouts start: free running from resets, short ones from logged states, or one step of the log."""
     set: Settings = ()
-    """Hyperparameters of the method as name=value."""
+    """Hyperparameters of the method as name=value; of a method that auto tries as madoc.name=value."""
     budget: int = 300_000
     """Simulated control steps."""
     seed: int = 0
@@ -58,29 +49,27 @@ class Calibrate:
 
     def run(self) -> Answer:
         """Calibrate, and leave the run folder."""
-        from madoc.pipeline import CalibrationOrder, Source, calibrate_in, split_name
+        from madoc.pipeline import AUTO, calibrate_auto_in, calibrate_in, leave_report, split_name
         from madoc.pipeline.data_stage import read_truth
+        from madoc.robots import is_spec_path
 
         if split_name(self.task)[1]:
             raise MadocError(f"expected the name of a robot, got {self.task!r}; the data is given with --data")
-        order = CalibrationOrder(
-            task=self.task,
-            source=Source(
-                self.data, self.format, self.clip_actions, self.max_transitions, disturbance_of(self.disturbed)
-            ),
-            physics=self.physics,
-            level=self.level,
-            parameters=self.parameters,
-            method=self.method,
+        method = self.method or (AUTO if is_spec_path(self.task) else "madoc")
+        order = self.log.order(
+            self.task,
+            method=method,
             changes=changes_of(self.set, self.starts),
             budget=self.budget,
             seed=self.seed,
             truth=None if self.truth is None else read_truth(self.truth),
+            holdout=self.holdout,
         )
-        out = self.out or Path("runs") / f"{self.task}-{self.method}-{self.seed}"
-        result = calibrate_in(out, order, resume=self.resume, quiet=self.output.quiet)
-        lines = (result.table(), result.summary(), left_behind(out, "run folder"))
-        return Answer(result.to_json(), lines, result.status)
+        out = self.out or Path("runs") / f"{Path(self.task).stem}-{method}-{self.seed}"
+        stage = calibrate_auto_in if method == AUTO else calibrate_in
+        result = stage(out, order, resume=self.resume, quiet=self.output.quiet)
+        lines = (*calibration_text(result), left_behind(out, "run folder"), *page_line(leave_report(out)))
+        return Answer(result.to_json(), lines, calibration_status(result))
 
 
 def changes_of(settings: tuple[tuple[str, ...], ...], starts: str | None = None) -> dict[str, str]:

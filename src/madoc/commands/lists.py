@@ -70,7 +70,7 @@ def _task_row(task: Any) -> dict[str, Any]:
     return {
         "name": task.name,
         "observations": task.observation_size,
-        "motors": int(task.compile().nu),
+        "motors": task.action_size,
         "groups": task.groups,
         "physics": list(PHYSICS),
         "parameters": [

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from rich.console import RenderableType
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from madoc.commands.answer import Answer, Output, evaluation_text, left_behind
+from madoc.commands.answer import Answer, Output, evaluation_text, left_behind, page_line
 from madoc.commands.calibrate import Settings, changes_of
 from madoc.commands.disturbed import Disturbed, disturbance_of
 
@@ -68,12 +68,12 @@ class Run:
     def run(self) -> Answer:
         """Do it, and leave the folder."""
         from madoc.calibration import CalibrationResult
-        from madoc.pipeline import Plan, Source, run_all
+        from madoc.pipeline import Plan, Source, leave_report, run_all
         from madoc.pipeline.data_stage import absolute_source, read_truth
 
         plan = Plan(
             name=self.name,
-            data=None if self.data is None else absolute_source(Source(self.data, self.format, self.clip_actions)),
+            data=None if self.data is None else absolute_source(Source((self.data,), self.format, self.clip_actions)),
             transitions=self.transitions,
             disturbance=disturbance_of(self.disturbed),
             physics=self.physics,
@@ -93,7 +93,7 @@ class Run:
         out = self.out or Path("runs") / self.name
         summary = run_all(plan, out, resume=self.resume, quiet=self.output.quiet)
         result = CalibrationResult.from_json(summary["calibration"])
-        lines = (result.table(), result.summary(), *_rest(summary, out))
+        lines = (result.table(), result.summary(), *_rest(summary, out), *page_line(leave_report(out)))
         return Answer(summary | {"folder": str(out)}, lines, summary["status"])
 
 

@@ -8,10 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from madoc.errors import MadocError
+from madoc.findings import Finding
 from madoc.tasks import Task
 from madoc.types import Transitions
 
 Shuffled = Literal["none", "rows", "next_observations"]
+Velocities = Literal["logged", "differences"]
 
 
 @dataclass(frozen=True)
@@ -24,12 +26,14 @@ class Disturbance:
         shuffled: `rows`: rows (s, a, s') stay whole but their order is lost; `next_observations`: which s' belongs
             to which (s, a) is lost as well.
         friction: Of all contacts in the target, as a multiple of the model's: a gap no parameter can close.
+        velocities: `logged`, or `differences` of positions in place of those that are hidden.
     """
 
     noise: float = 0.0
     hidden_velocities: bool = False
     shuffled: Shuffled = "none"
     friction: float = 1.0
+    velocities: Velocities = "logged"
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.noise) and self.noise >= 0):
@@ -44,6 +48,7 @@ class Disturbance:
             hidden_velocities=self.hidden_velocities or other.hidden_velocities,
             shuffled=other.shuffled if self.shuffled == "none" else self.shuffled,
             friction=self.friction * other.friction,
+            velocities=other.velocities if self.velocities == "logged" else self.velocities,
         )
 
     def sentences(self) -> tuple[str, ...]:
@@ -54,7 +59,12 @@ class Disturbance:
                 f"the data carries observation noise of {100 * self.noise:g} % of a step's change: states rebuilt from "
                 "it are not exact, and methods that take them for true are biased"
             )
-        if self.hidden_velocities:
+        if self.velocities == "differences":
+            found.append(
+                "the data's velocities are differences of positions: states rebuilt from them are not exact, and "
+                "methods that take them for true are biased"
+            )
+        elif self.hidden_velocities:
             found.append("the data hides velocities: its states cannot be rebuilt, and a clone acts on positions alone")
         if self.shuffled == "rows":
             found.append("the data's rows are in random order: nothing longer than one row can be replayed")
@@ -80,6 +90,9 @@ class Dataset:
         origin: The file, or a description.
         true_parameters: The target's physical values by parameter name, if known. Only evaluation reads them.
         disturbance: What it is known to suffer from.
+        run_names: The run of each episode, where it was read from a user's logs: episodes of one name are stretches of
+            one run.
+        findings: What reading and checking it told.
     """
 
     transitions: Transitions
@@ -89,6 +102,8 @@ class Dataset:
     origin: str
     true_parameters: dict[str, float] | None = None
     disturbance: Disturbance = field(default_factory=Disturbance)
+    run_names: tuple[str, ...] | None = None
+    findings: tuple[Finding, ...] = ()
 
     def __len__(self) -> int:
         return len(self.transitions)
@@ -133,21 +148,25 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
     rows = np.concatenate([np.arange(starts[episode], ends[episode]) for episode in chosen])[:max_transitions]
     new_starts = np.append(0, filled[: episodes - 1])
     transitions = close_episodes(dataset.transitions.take(rows), new_starts)
-    return replace(dataset, transitions=transitions, episode_starts=new_starts)
+    names = None if dataset.run_names is None else tuple(dataset.run_names[episode] for episode in chosen)
+    return replace(dataset, transitions=transitions, episode_starts=new_starts, run_names=names)
 
 
 def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
     """Simulator states of the rows whose observation determines them, and which rows those are.
 
-    Root positions that never enter the dynamics are 0.
+    Root positions that never enter the dynamics are 0. Pending actions are those of the rows before, so the first rows
+    of an episode have no state where a state carries any. Sensors are taken to have no bias: `System.unbiased`.
 
     Raises:
         MadocError: The task's observation does not determine its state, or no row can be rebuilt.
     """
     if task.state_from_observation is None:
+        wanted = "a state_from_observation" if task.source is None else "signals of every position and velocity"
         raise MadocError(
             f"an observation of {task.name} does not determine its state, so nothing can start at logged "
-            "states; give the task a state_from_observation, or start rollouts from its reset"
+            f"states; give the task {wanted}, take least-squares, which estimates states where positions are known, or "
+            "start rollouts from the task's reset: madoc or oted with starts=policy"
         )
     observation = np.asarray(dataset.transitions.observation, dtype=np.float64)
     rows = np.arange(len(observation))
@@ -159,4 +178,30 @@ def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "stat
             f"observation (every row has a clipped value) in {dataset.origin}; start rollouts from the "
             "task's reset"
         )
-    return np.asarray(task.state_from_observation(observation[rows]), dtype=np.float64), rows
+    rebuilt = np.asarray(task.state_from_observation(observation[rows]), dtype=np.float64)
+    return with_pending(dataset, task, rebuilt, rows)
+
+
+def with_pending(
+    dataset: Dataset, task: Task, states: Float[np.ndarray, "rows physical"], rows: Int[np.ndarray, " rows"]
+) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
+    """(qpos, qvel) of rows with the actions that are pending there, and which rows have so many behind them.
+
+    Raises:
+        MadocError: None has.
+    """
+    known = _age(dataset)[rows] >= task.pending
+    states, rows = states[known], rows[known]
+    if not len(rows):
+        raise MadocError(
+            f"a state of {task.name} carries the {task.pending} actions before it, and no episode of {dataset.origin} "
+            "has so many before a row; give it data with its rows in order, or a shorter action_delay"
+        )
+    action = np.asarray(dataset.transitions.action, dtype=np.float64)
+    return np.concatenate([states, *(action[rows - back] for back in range(1, task.pending + 1))], axis=-1), rows
+
+
+def _age(dataset: Dataset) -> Int[np.ndarray, " rows"]:
+    """How many rows of its episode come before each row."""
+    rows = np.arange(len(dataset))
+    return rows - dataset.episode_starts[np.searchsorted(dataset.episode_starts, rows, side="right") - 1]

@@ -44,8 +44,8 @@ def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
         MadocError: `minari` is not installed, no such dataset here, damaged, not arrays, or refused by
             `validate`.
     """
-    directory = _local_directory(path)
-    episodes, environment = _read_episodes(directory)
+    directory = local_directory(path)
+    episodes, environment = read_episodes(directory)
     if not episodes:
         raise MadocError(f"expected at least one episode for {task.name}, got none in {path}")
     lengths = [len(episode.rewards) for episode in episodes]
@@ -93,7 +93,12 @@ def _data_directory(path: Path) -> Path | None:
     return found[0] if found else None
 
 
-def _local_directory(path: Path) -> Path:
+def local_directory(path: Path) -> Path:
+    """The folder of a dataset's episodes, by its folder or by its id.
+
+    Raises:
+        MadocError: There is none here, or Minari is not installed.
+    """
     directory = _data_directory(path)
     if directory is not None:
         return directory
@@ -113,8 +118,12 @@ def _local_directory(path: Path) -> Path:
     return directory
 
 
-def _read_episodes(directory: Path) -> tuple[list[Any], str]:
-    """All episodes, and the id of their environment (empty if not recorded)."""
+def read_episodes(directory: Path) -> tuple[list[Any], str]:
+    """All episodes, and the id of their environment (empty if not recorded).
+
+    Raises:
+        MadocError: Minari is not installed, or the dataset is damaged.
+    """
     minari = _import_minari()
     try:
         with warnings.catch_warnings():

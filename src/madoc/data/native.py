@@ -22,6 +22,7 @@ from madoc.data.validation import (
 )
 from madoc.errors import MadocError
 from madoc.files import json_text, replacing
+from madoc.findings import Finding
 from madoc.parameters import FIELDS
 from madoc.tasks import Task
 from madoc.types import Transitions
@@ -76,7 +77,9 @@ def load(path: str | os.PathLike) -> Dataset:
         physics=metadata["physics"],
         origin=metadata["origin"],
         true_parameters=metadata["true_parameters"],
-        disturbance=_disturbance(metadata.get("disturbance", {}), source),
+        disturbance=_part(Disturbance, metadata.get("disturbance", {}), source),
+        run_names=_part(tuple[str, ...] | None, metadata.get("run_names"), source),
+        findings=_part(tuple[Finding, ...], metadata.get("findings", ()), source),
     )
 
 
@@ -99,6 +102,8 @@ def _arrays(dataset: Dataset) -> dict[str, np.ndarray]:
         "origin": dataset.origin,
         "true_parameters": None if truth is None else {name: float(value) for name, value in truth.items()},
         "disturbance": asdict(dataset.disturbance),
+        "run_names": dataset.run_names,
+        "findings": [finding.to_json() for finding in dataset.findings],
         "parameter_units": {name: _unit(name) for name in truth or {}},
     }
     arrays = {name: np.asarray(getattr(dataset.transitions, name)) for name in NAMES}
@@ -121,12 +126,12 @@ def _row_numbers(values: np.ndarray, path: Path) -> np.ndarray:
     return values.astype(np.int64)
 
 
-def _disturbance(fields: Any, path: Path) -> Disturbance:
-    """What the file says it suffers from; nothing, where it was written before files said so."""
+def _part(kind: Any, fields: Any, path: Path) -> Any:
+    """A part of the metadata as the type it has."""
     try:
-        return TypeAdapter(Disturbance).validate_python(fields)
+        return TypeAdapter(kind).validate_python(fields)
     except ValidationError as error:
-        raise MadocError(f"the disturbance in the metadata of {path} cannot be read ({error})") from error
+        raise MadocError(f"the metadata of {path} cannot be read ({error})") from error
 
 
 def _metadata(text: np.ndarray, path: Path) -> dict:

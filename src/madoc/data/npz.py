@@ -45,9 +45,13 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise MadocError(f"{path} is not an npz file; pass the --format it has")
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in archive.files}
     except _UNREADABLE as error:
         raise _damaged(path, error) from error
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray):  # NumPy hands on other members of a zip archive as bytes
+            raise MadocError(f"expected only arrays in {path}, got the file {name!r}; this is no log of columns")
+    return arrays
 
 
 def _damaged(path: Path, error: Exception) -> MadocError:

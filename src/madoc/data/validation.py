@@ -148,7 +148,7 @@ def _check_observation_width(values: np.ndarray, task: Task, name: str) -> None:
 
 
 def _check_action_width(values: np.ndarray, task: Task, name: str) -> None:
-    expected, got = task.compile().nu, values.shape[-1]
+    expected, got = task.action_size, values.shape[-1]
     if got != expected:
         raise MadocError(
             f"expected {expected} values per action for {task.name}, got {got} in row 0 of {name}; "

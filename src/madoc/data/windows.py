@@ -64,3 +64,39 @@ def windows_at(
     stretch = rows[:, None] + np.arange(steps)
     logged = dataset.transitions
     return Windows(states, np.asarray(logged.action)[stretch], np.asarray(logged.next_observation)[stretch])
+
+
+def apart(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Int[np.ndarray, " windows"]:
+    """Which of the given rows begin windows of `steps` rows that share no reading, as many as fit one after the other.
+
+    A window reads `steps` + 1 observations; the one after it begins where these end.
+
+    Args:
+        dataset: The log.
+        rows: Rows at which a window may begin, ascending.
+        steps: Rows of a window.
+
+    Returns:
+        Positions in `rows`.
+
+    Raises:
+        MadocError: No episode is long enough.
+    """
+    chosen, free, episode = [], 0, -1
+    possible = first_rows(dataset, rows, steps)
+    episodes = np.searchsorted(dataset.episode_starts, rows[possible], side="right") - 1
+    for position, row, own in zip(possible.tolist(), rows[possible].tolist(), episodes.tolist(), strict=True):
+        if own != episode or row >= free:
+            chosen.append(position)
+            free, episode = row + steps + 1, own
+    return np.array(chosen)
+
+
+def readings_at(
+    dataset: Dataset, rows: Int[np.ndarray, " windows"], steps: int
+) -> Float[np.ndarray, "windows readings observation"]:
+    """All that was observed in the windows that begin at the given rows, at their first rows too."""
+    logged = dataset.transitions
+    first = np.asarray(logged.observation)[rows]
+    following = np.asarray(logged.next_observation)[rows[:, None] + np.arange(steps)]
+    return np.concatenate([first[:, None], following], axis=1)

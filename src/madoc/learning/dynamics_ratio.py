@@ -35,7 +35,7 @@ class Scaling:
         """(s, a) standardised, s' - s divided by its spread; channels that never move are left alone."""
         pair = np.concatenate([rows.observation, rows.action], axis=-1)
         change = np.asarray(rows.next_observation) - rows.observation
-        return cls(pair.mean(0), _spread(pair), _spread(change), difference=True)
+        return cls(pair.mean(0), spread_of(pair), spread_of(change), difference=True)
 
     @classmethod
     def raw(cls, rows: Transitions) -> "Scaling":
@@ -57,8 +57,9 @@ class Scaling:
         )
 
 
-def _spread(column: np.ndarray) -> np.ndarray:
-    spread = column.std(0)
+def spread_of(column: Float[np.ndarray, "*rows values"]) -> Float[np.ndarray, " values"]:
+    """Standard deviation of every channel over all rows; 1 for one that never moves."""
+    spread = column.reshape(-1, column.shape[-1]).std(0)
     return np.where(spread > 1e-8, spread, 1.0)
 
 

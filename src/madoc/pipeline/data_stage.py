@@ -4,11 +4,13 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from madoc import data, simulation, tasks
-from madoc.data import Dataset, Disturbance
+from madoc import data, robots, simulation, tasks
+from madoc.data import Dataset, Disturbance, logs
+from madoc.data.native import recognises as is_recorded
 from madoc.errors import MadocError, unknown_name
 from madoc.files import read_json
 from madoc.pipeline.keys import stage_key
@@ -23,24 +25,30 @@ class Source:
     """Where logged data is and how to read it.
 
     Attributes:
-        path: A file, a Minari directory or a Minari id.
+        paths: A file, a Minari directory or a Minari id; of a robot of one's own also several files or folders.
         format: A name in `data.FORMATS`; None looks at the content.
         clip_actions: Clip actions outside [-1, 1] instead of refusing them.
         max_transitions: Keep at most so many, drawn as whole episodes; None keeps all.
         disturbance: What to put into it once it is read.
     """
 
-    path: str
+    paths: tuple[str, ...]
     format: str | None = None
     clip_actions: bool = False
     max_transitions: int | None = 200_000
     disturbance: Disturbance = field(default_factory=Disturbance)
 
+    @property
+    def words(self) -> str:
+        """The paths as a sentence has them."""
+        return ", ".join(self.paths)
+
 
 def absolute_source(source: Source) -> Source:
     """A source that means the same from any working directory; a Minari id stays what it is."""
-    file = Path(source.path).expanduser()
-    return replace(source, path=str(file.resolve())) if file.exists() else source
+    files = [Path(path).expanduser() for path in source.paths]
+    whole = (str(file.resolve()) if file.exists() else path for file, path in zip(files, source.paths, strict=True))
+    return replace(source, paths=tuple(whole))
 
 
 @dataclass(frozen=True)
@@ -52,11 +60,13 @@ class Target:
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """`hopper-medium-replay` as (`hopper`, `medium-replay`); the quality of a bare `hopper` is empty.
+    """`hopper-medium-replay` as (`hopper`, `medium-replay`); the quality of a bare `hopper` or `arm.yaml` is empty.
 
     Raises:
         MadocError: No such task, or no such quality.
     """
+    if robots.is_spec_path(name):
+        return name, ""
     task_name, _, quality = name.partition("-")
     if task_name not in TASKS:
         raise unknown_name("task", task_name, TASKS)
@@ -99,18 +109,28 @@ def load_source(source: Source, task: Task, *, seed: int) -> Dataset:
     """Read logged data of a robot, and disturb it if the source says so.
 
     Raises:
-        MadocError: As `data.load` and `data.disturb`, or friction is to be changed after the fact.
+        MadocError: As `data.load`, or `logs.read` for a robot of one's own, and `data.disturb`; or friction is to be
+            changed after the fact, or several files are given where one is read.
     """
     if source.disturbance.friction != 1.0:
         raise MadocError("the friction of a target is chosen when it is recorded; pass it to madoc record")
-    dataset = data.load(
-        source.path,
-        task,
-        format=source.format,
-        max_transitions=source.max_transitions,
-        key=stage_key(seed, "subsampling"),
-        clip_actions=source.clip_actions,
-    )
+    key = stage_key(seed, "subsampling")
+    if task.source is not None and source.format is None and not is_recorded(Path(source.paths[0])):
+        robot = robots.restore_robot(task.source)
+        dataset = logs.read(source.paths, robot, clip_actions=source.clip_actions)
+        if source.max_transitions is not None:
+            dataset = data.subsample(dataset, source.max_transitions, key)
+    else:
+        if len(source.paths) != 1:
+            raise MadocError(f"expected one file or dataset of {task.name}, got {len(source.paths)}: {source.words}")
+        dataset = data.load(
+            source.paths[0],
+            task,
+            format=source.format,
+            max_transitions=source.max_transitions,
+            key=key,
+            clip_actions=source.clip_actions,
+        )
     return data.disturb(dataset, source.disturbance, task, stage_key(seed, "disturbing"))
 
 
@@ -143,7 +163,7 @@ def check_truth(truth: Mapping[str, float], task: Task, *, physics: str) -> None
     Raises:
         MadocError: Names the parameter.
     """
-    known = tasks.make(task.name, physics).parameters.names
+    known = robots.remake(task, physics).parameters.names
     for name in truth:
         if name not in known:
             raise unknown_name(f"parameter of {task.name} in the truth", name, known)
@@ -152,8 +172,22 @@ def check_truth(truth: Mapping[str, float], task: Task, *, physics: str) -> None
         raise MadocError(f"the truth has no value for {missing[0]}; add it, or leave it out of --parameters")
 
 
-def make_target(task_name: str, physics: str, truth: Mapping[str, float]) -> Target:
+def make_target(task: Task, truth: Mapping[str, float]) -> Target:
     """The target: all true parameters are bound, also those that were not calibrated."""
-    whole = tasks.make(task_name, physics)
+    whole = robots.remake(task)
     simulator = simulation.make(replace(whole, parameters=whole.parameters.select(list(truth))))
     return Target(simulator, simulator.parameters.vector(dict(truth)))
+
+
+def stored_robot(task: Task) -> dict[str, Any]:
+    """What a run's spec.json keeps of a robot of one's own, so that the folder is complete; nothing of Madoc's."""
+    return {} if task.source is None else {"robot": dict(task.source)}
+
+
+def task_of_spec(spec: Mapping[str, Any]) -> Task:
+    """The robot of a run, from its spec.json alone.
+
+    Raises:
+        MadocError: It names no robot, or keeps one that cannot be made.
+    """
+    return robots.restore(spec["robot"]) if "robot" in spec else tasks.make(spec["task"], spec["physics"])

@@ -7,11 +7,10 @@ from typing import Any
 from madoc.errors import MadocError
 from madoc.evaluation import evaluate
 from madoc.files import read_json, write_json
-from madoc.pipeline.data_stage import check_truth, make_target
+from madoc.pipeline.data_stage import check_truth, make_target, task_of_spec
 from madoc.pipeline.keys import stage_key
 from madoc.policies import load_policy
 from madoc.progress import bar
-from madoc.tasks import make as make_task
 
 
 def evaluate_folder(
@@ -49,9 +48,9 @@ def evaluate_folder(
     known = spec["truth"] if truth is None else dict(truth)
     if known is None:
         raise MadocError(f"the true parameters of {folder} are not known; pass --truth FILE.json")
-    task = make_task(spec["task"], spec["physics"])
+    task = task_of_spec(spec)
     check_truth(known, task.with_parameters(list(spec["parameters"])), physics=task.physics)
-    target = make_target(task.name, task.physics, known)
+    target = make_target(task, known)
     found: dict[str, Any] = {}
     total = len(policies) * task.max_episode_steps
     with bar(f"evaluating on {task.name}", total=total, unit="steps", quiet=quiet) as advance:

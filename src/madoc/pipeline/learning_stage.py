@@ -12,7 +12,7 @@ from madoc.calibration import CalibrationResult
 from madoc.errors import MadocError, unknown_name
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.calibration_stage import Calibrated
-from madoc.pipeline.data_stage import check_truth, load_source, make_target
+from madoc.pipeline.data_stage import check_truth, load_source, make_target, stored_robot
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
@@ -24,6 +24,7 @@ from madoc.policies import (
     PolicyProblem,
     UniformParameters,
     learn_policy,
+    require_reward,
 )
 from madoc.simulation import CpuSimulator
 
@@ -80,6 +81,7 @@ def learn_in(
         raise MadocError(
             f"{order.method} does not learn at given parameters, so --at {order.at} would change nothing; leave it out"
         )
+    require_reward(calibrated.task)
     key = stage_key(order.seed, "learning")
     known = calibrated.truth if truth is None else dict(truth)
     simulator, parameters = _system(calibrated, order.at, known)
@@ -107,7 +109,7 @@ def learn_in(
         "seed": order.seed,
         "budget": order.budget,
         "truth": known,
-    }
+    } | stored_robot(calibrated.task)
     with working_folder(out, spec, resume=resume) as folder:
         # One that an interrupted run left would be taken for the finished policy after a kill.
         (out / "policy.npz").unlink(missing_ok=True)
@@ -133,7 +135,7 @@ def _system(
     if at == "truth":
         if truth is None:
             raise MadocError("the true parameters are not known here; pass --truth FILE.json")
-        target = make_target(calibrated.task.name, calibrated.task.physics, truth)
+        target = make_target(calibrated.task, truth)
         return target.simulator, target.parameters
     simulator = simulation.make(calibrated.task)
     if at == "distribution":

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from madoc import data, tasks
+from madoc import data, robots
 from madoc.calibration import CALIBRATORS, CalibrationResult
 from madoc.data import Disturbance
 from madoc.errors import MadocError
@@ -17,13 +17,13 @@ from madoc.pipeline.calibration_stage import (
     calibration_ended,
     read_calibration,
 )
-from madoc.pipeline.data_stage import Source, load_source, record_named, split_name
+from madoc.pipeline.data_stage import Source, load_source, record_named, split_name, stored_robot
 from madoc.pipeline.evaluation_stage import evaluate_folder
 from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
 from madoc.pipeline.keys import seed_key
 from madoc.pipeline.learning_stage import PolicyOrder, learn_in
 from madoc.pipeline.methods import hyperparameters, make_method
-from madoc.policies import LEARNERS
+from madoc.policies import LEARNERS, require_reward
 
 
 @dataclass(frozen=True)
@@ -111,6 +111,8 @@ def run_all(plan: Plan, out: Path, *, resume: bool = False, quiet: bool = True) 
 def _spec(plan: Plan) -> dict[str, Any]:
     """The plan as `spec.json` keeps it, refused here if any stage would refuse it."""
     task_name, quality = split_name(plan.name)
+    robot = robots.resolve(task_name, plan.physics)
+    require_reward(robot)
     if plan.data is None and not quality:
         raise MadocError(f"expected TASK-QUALITY to record, as {task_name}-medium, or --data FILE to load")
     for what, value in {
@@ -128,7 +130,7 @@ def _spec(plan: Plan) -> dict[str, Any]:
     for kind, changes, entries in (("method", "changes", CALIBRATORS), ("learner", "learner_changes", LEARNERS)):
         method = make_method(entries, fields[kind], fields.pop(changes))
         fields[kind] = {"name": fields[kind], "hyperparameters": hyperparameters(method)}
-    return {"command": "run"} | fields
+    return {"command": "run"} | fields | stored_robot(robot)
 
 
 def _data_stage(plan: Plan, out: Path, *, quiet: bool) -> None:
@@ -147,7 +149,7 @@ def _data_stage(plan: Plan, out: Path, *, quiet: bool) -> None:
         )
     else:
         source = replace(plan.data, max_transitions=plan.transitions, disturbance=plan.disturbance)
-        dataset = load_source(source, tasks.make(split_name(plan.name)[0], physics), seed=plan.seed)
+        dataset = load_source(source, robots.resolve(split_name(plan.name)[0], plan.physics), seed=plan.seed)
     data.save(dataset, out / "data.npz")
 
 
@@ -158,7 +160,7 @@ def _calibration_stage(plan: Plan, out: Path, *, quiet: bool) -> CalibrationResu
         return CalibrationResult.from_json(read_json(folder / "result.json"))
     order = CalibrationOrder(
         task=split_name(plan.name)[0],
-        source=Source(str(out / "data.npz"), max_transitions=None),
+        source=Source((str(out / "data.npz"),), max_transitions=None),
         physics=plan.physics,
         level=plan.level,
         parameters=plan.parameters,

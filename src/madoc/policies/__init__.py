@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from madoc.policies.base import PolicyLearner, PolicyProblem
+from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
 from madoc.policies.bc import BC
 from madoc.policies.cql import CQL
 from madoc.policies.files import load_policy, save_policy
@@ -50,5 +50,6 @@ __all__ = [
     "UniformParameters",
     "learn_policy",
     "load_policy",
+    "require_reward",
     "save_policy",
 ]

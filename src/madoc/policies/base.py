@@ -15,6 +15,7 @@ from madoc.learning.features import Features
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.systems import ParameterDistribution
 from madoc.simulation.base import Simulator
+from madoc.tasks.base import Task
 from madoc.types import Metrics, Unit
 
 State = Any
@@ -122,6 +123,16 @@ def draw_rows(logged: dict[str, Array], key: PRNGKeyArray, batch: int) -> dict[s
     """`batch` logged rows, uniformly with replacement."""
     rows = jax.random.randint(key, (batch,), 0, len(logged["reward"]))
     return {name: column[rows] for name, column in logged.items()}
+
+
+def require_reward(task: Task) -> None:
+    """Refuse a robot that has no reward: nothing could be learnt for it.
+
+    Raises:
+        MadocError: It has none.
+    """
+    if not task.rewarded:
+        raise MadocError(f"{task.name} has no reward, so no policy can be learnt for it; give its spec a reward:")
 
 
 class PolicyLearner(Protocol):

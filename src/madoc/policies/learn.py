@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import PRNGKeyArray
 
 from madoc import loop
-from madoc.policies.base import PolicyLearner, PolicyProblem
+from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
 from madoc.policies.files import save_policy
 from madoc.run_folder import RunFolder
 from madoc.types import Policy, Unit
@@ -53,8 +53,9 @@ def learn_policy(
     With a folder, `policy.npz` is left there: `madoc.numpy_policy` acts from it without JAX.
 
     Raises:
-        MadocError: The method refuses the problem, or `loop.run` refuses.
+        MadocError: The robot has no reward, the method refuses the problem, or `loop.run` refuses.
     """
+    require_reward(problem.simulator.task)
     finished = loop.run(
         method,
         problem,

@@ -1,12 +1,13 @@
 """Soft actor-critic in simulated systems (arXiv 1812.05905); SAC+BC with a cloning term; DR+BC over the whole box."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
 from jaxtyping import Array, PRNGKeyArray
 
 from madoc.errors import check_at_least
+from madoc.evaluation import evaluate
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
 from madoc.learning.networks import scan_updates
@@ -21,10 +22,21 @@ from madoc.types import Metrics, Unit
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SACState:
-    """Everything SAC carries."""
+    """Everything SAC carries.
+
+    Attributes:
+        best: The policy that did best when judged.
+        best_return: Its mean return then.
+        judged: Control steps of learning at the last judgement; 0 before the first.
+        judging_steps: Control steps that judging has cost.
+    """
 
     learner: ActorCritic
     interaction: Interaction
+    best: TanhGaussianPolicy
+    best_return: float
+    judged: int
+    judging_steps: int
     key: PRNGKeyArray
 
 
@@ -48,6 +60,10 @@ class SAC:
             TD3+BC's (Fujimoto & Gu 2021), with its w = 2.5.
         randomize: Draw every environment's parameters anew each epoch, uniformly over the simulator's whole box,
             whatever those of the problem: with `cloning`, the paper's baseline DR+BC.
+        judge_every: Control steps of learning after which the policy acts whole episodes, without noise, in the
+            systems it is learnt in; the best so far is what is handed back, as returns of SAC rise and fall from
+            one thousand updates to the next. 0 hands back the last.
+        judge_episodes: Episodes it is judged by. Their control steps are counted, but not against the budget.
     """
 
     hidden: tuple[int, ...] = (256, 256)
@@ -62,11 +78,13 @@ class SAC:
     replay_capacity: int = 1_000_000
     cloning: float | None = None
     randomize: bool = False
+    judge_every: int = 10_000
+    judge_episodes: int = 10
 
     def __post_init__(self) -> None:
         check_at_least(self, hidden=1, environments=1, batch=1, replay_capacity=1, warmup_steps=0, cloning=0.0)
         check_at_least(self, epoch_steps=self.environments, updates_per_step=0.0, discount=0.0)
-        check_at_least(self, target_rate=0.0, learning_rate=0.0)
+        check_at_least(self, target_rate=0.0, learning_rate=0.0, judge_every=0, judge_episodes=1)
 
     @property
     def name(self) -> str:
@@ -107,11 +125,11 @@ class SAC:
         interaction = start_acting(
             self._place(problem), of_start, environments=self.environments, capacity=self.replay_capacity
         )
-        return SACState(learner, interaction, key)
+        return SACState(learner, interaction, learner.policy, 0.0, 0, 0, key)
 
     def step(self, problem: PolicyProblem, state: SACState) -> tuple[SACState, Metrics]:
-        """Act for `epoch_steps` control steps, then update."""
-        of_acting, of_update, key = jax.random.split(state.key, 3)
+        """Act for `epoch_steps` control steps, then update, then judge the policy where that is due."""
+        of_acting, of_update, of_judging, key = jax.random.split(state.key, 4)
         explores = state.interaction.control_steps < self.warmup_steps
         policy = UniformPolicy(problem.simulator.action_size) if explores else state.learner.policy
         interaction, metrics = act_on(
@@ -123,7 +141,25 @@ class SAC:
             logged = problem.logged if self.needs_data else None
             learner, losses = self._update(learner, interaction.replay, logged, of_update, count)
             metrics |= {name: float(value) for name, value in losses.items()}
-        return SACState(learner, interaction, key), metrics
+        following = replace(state, learner=learner, interaction=interaction, key=key)
+        due = self.judge_every and interaction.control_steps >= state.judged + self.judge_every
+        if due and learner is not state.learner:
+            following, judged = self._judge(problem, following, of_judging)
+            metrics |= judged
+        return following, metrics
+
+    def _judge(self, problem: PolicyProblem, state: SACState, key: PRNGKeyArray) -> tuple[SACState, Metrics]:
+        """Keep the policy if no earlier one's mean return was as high."""
+        of_systems, of_episodes = jax.random.split(key)
+        systems = self._place(problem).systems(of_systems, self.judge_episodes)
+        found = evaluate(
+            state.learner.policy, problem.simulator, systems, key=of_episodes, episodes=self.judge_episodes
+        )
+        mean = float(found.returns.mean())
+        if not state.judged or mean > state.best_return:
+            state = replace(state, best=state.learner.policy, best_return=mean)
+        spent = state.judging_steps + int(found.lengths.sum())
+        return replace(state, judged=state.interaction.control_steps, judging_steps=spent), {"judged_return": mean}
 
     @eqx.filter_jit
     def _update(
@@ -159,15 +195,15 @@ class SAC:
         return PolicyProblem(problem.simulator, UniformParameters(problem.simulator.parameters))
 
     def policy(self, state: SACState) -> TanhGaussianPolicy:
-        """The policy learnt so far; deterministic without a key."""
-        return state.learner.policy
+        """The best policy so far, the latest where none was judged; deterministic without a key."""
+        return state.best if state.judged else state.learner.policy
 
     def control_steps(self, state: SACState) -> int:
-        """Simulated control steps so far."""
-        return state.interaction.control_steps
+        """Simulated control steps so far, those of judging included."""
+        return state.interaction.control_steps + state.judging_steps
 
     def spent(self, state: SACState) -> int:
-        """Its budget is control steps."""
+        """Its budget is control steps to learn from."""
         return state.interaction.control_steps
 
     def stage(self, state: SACState) -> str:

@@ -23,6 +23,14 @@ class System(Protocol):
         """One control step. A row whose simulation failed comes back as NaN; the others are untouched."""
         ...
 
+    def observe(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows observation"]:
+        """What the sensors of these systems show there, with the bias each has; NaN where a state is NaN."""
+        ...
+
+    def unbiased(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows state"]:
+        """States rebuilt from logged observations, corrected for the bias that each system's sensors have."""
+        ...
+
 
 class Simulator(Protocol):
     """A source domain whose parameters can be chosen."""

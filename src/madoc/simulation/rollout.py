@@ -6,6 +6,7 @@ from functools import partial
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -58,6 +59,16 @@ def chosen_states(states: Float[np.ndarray, "logged state"]) -> Starts:
     return draw
 
 
+def unbiased_starts(system: System, starts: Starts) -> Starts:
+    """Starts at states rebuilt from the log, corrected for the bias that the sensors of each system have."""
+
+    def draw(key: PRNGKeyArray, count: int) -> np.ndarray:
+        states = starts(key, count)
+        return system.unbiased(states.reshape(system.count, -1, states.shape[-1])).reshape(states.shape)
+
+    return draw
+
+
 def begin(starts: Starts, key: PRNGKeyArray, *, systems: int, rows: int) -> Walkers:
     """Rows at fresh starts."""
     state = starts(key, systems * rows).reshape(systems, rows, -1)
@@ -93,40 +104,45 @@ def roll(
         Transitions with axes (steps, systems, rows), and where the rows stand now.
     """
     state, age = walkers.state, walkers.age
+    observation = system.observe(state)
     frames = []
     for step in range(steps):
-        observation = task.observe(state)
         action = np.asarray(act(policy, observation, key, np.int32(step)), dtype=np.float64)
         next_state = system.step(state, action)
         valid = np.isfinite(next_state).all(-1)
         safe = np.where(valid[..., None], next_state, state)
         terminated = task.terminated(safe) & valid
         truncated = (age + 1 >= task.max_episode_steps) & ~terminated & valid
+        following = system.observe(safe)
         frame = (
             observation,
             action,
             task.reward(state, action, safe),
-            task.observe(safe),
+            following,
             terminated,
             truncated,
         )
         frames.append((*frame, valid))
-        state, age = safe, age + 1
+        state, age, observation = safe, age + 1, following
         ended = terminated | truncated | ~valid
         if ended.any():
             fresh = starts(jax.random.fold_in(restart_key, step), ended.size)
             state = np.where(ended[..., None], fresh.reshape(state.shape), state)
             age = np.where(ended, 0, age)
+            observation = system.observe(state)
     *columns, valid = (np.stack(column) for column in zip(*frames, strict=True))
     return Rollout(Transitions(*columns), valid), Walkers(state, age)
 
 
 @eqx.filter_jit
 def act(
-    policy: Policy, observation: Float[Array, "*rows observation"], key: PRNGKeyArray | None, step: np.int32
+    policy: Policy,
+    observation: Float[Array | np.ndarray, "*rows observation"],
+    key: PRNGKeyArray | None,
+    step: np.int32,
 ) -> Array:
     """Actions of a policy, jitted; step `step` of the stream `key`, deterministic without a key."""
-    return policy(observation, None if key is None else jax.random.fold_in(key, step))
+    return policy(jnp.asarray(observation), None if key is None else jax.random.fold_in(key, step))
 
 
 @partial(jax.jit, static_argnums=(0, 2))
@@ -145,16 +161,16 @@ def replay_actions(
 ) -> Rollout:
     """One control step from logged states under the actions logged there, `rows` drawn for each system."""
     chosen = np.asarray(jax.random.randint(key, (system.count, rows), 0, len(states)))
-    state, action = states[chosen], actions[chosen]
+    state, action = system.unbiased(states[chosen]), actions[chosen]
     next_state = system.step(state, action)
     valid = np.isfinite(next_state).all(-1)
     safe = np.where(valid[..., None], next_state, state)
     terminated = task.terminated(safe) & valid
     seen = Transitions(
-        task.observe(state),
+        system.observe(state),
         action,
         task.reward(state, action, safe),
-        task.observe(safe),
+        system.observe(safe),
         terminated,
         np.zeros_like(terminated),
     )

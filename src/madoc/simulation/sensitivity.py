@@ -16,7 +16,7 @@ def insensitive(
     key: PRNGKeyArray,
     rows: int = 64,
 ) -> tuple[list[str], int]:
-    """Which parameters change no next state, bit for bit, when they go to either end of their range.
+    """Which parameters change no next state, nor what is seen of it, bit for bit, at either end of their range.
 
     All others stay at mid-range. A row counts only where both simulations succeeded.
 
@@ -39,11 +39,13 @@ def insensitive(
     chosen = np.asarray(jax.random.choice(key, len(states), (count,), replace=False))
     ends = _ends(simulator)
     shape = (len(ends), count, -1)
-    next_states = simulator.bind(ends).step(
-        np.broadcast_to(states[chosen], (len(ends), *states[chosen].shape)).reshape(shape),
+    system = simulator.bind(ends)
+    next_states = system.step(
+        system.unbiased(np.broadcast_to(states[chosen], (len(ends), *states[chosen].shape)).reshape(shape)),
         np.broadcast_to(actions[chosen], (len(ends), *actions[chosen].shape)).reshape(shape),
     )
-    middle, moved = next_states[0], next_states[1:]
+    following = np.concatenate([next_states, system.observe(next_states)], axis=-1)
+    middle, moved = following[0], following[1:]
     if not np.isfinite(middle).all(-1).any():
         raise MadocError(
             f"{simulator.task.name}: the simulation fails in all {count} rows at mid-range parameters; "

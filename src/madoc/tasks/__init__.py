@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from madoc.errors import unknown_name
 from madoc.tasks.ant import ant
-from madoc.tasks.base import Task
+from madoc.tasks.base import ActionChannel, Task
 from madoc.tasks.half_cheetah import half_cheetah
 from madoc.tasks.hopper import hopper
 from madoc.tasks.walker2d import walker2d
@@ -28,4 +28,4 @@ def make(name: str, physics: str = "legacy") -> Task:
     return TASKS[name](physics)
 
 
-__all__ = ["TASKS", "Task", "ant", "half_cheetah", "hopper", "make", "walker2d"]
+__all__ = ["TASKS", "ActionChannel", "Task", "ant", "half_cheetah", "hopper", "make", "walker2d"]

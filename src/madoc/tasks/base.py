@@ -1,6 +1,6 @@
 """What a task is: a model, and pure batched functions between state, observation, reward and end."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -45,10 +45,34 @@ def paper_space(gravity: Span, masses: dict[str, Span], dampings: dict[str, Span
 
 
 @dataclass(frozen=True)
+class ActionChannel:
+    """One value of an action: which actuator it goes to, and what -1 and 1 mean there.
+
+    Attributes:
+        name: What its column is called.
+        actuator: Name of the model's actuator.
+        low: What an action of -1 stands for, in `unit`.
+        high: What an action of 1 stands for, in `unit`.
+        unit: Of `low`, `high` and the log's column.
+        scale: The actuator's control is this many times the value in `unit`.
+        rest: The action that is taken to have come before an episode begins.
+    """
+
+    name: str
+    actuator: str
+    low: float
+    high: float
+    unit: str
+    scale: float = 1.0
+    rest: float = 0.0
+
+
+@dataclass(frozen=True)
 class Task:
     """A robot and what is asked of it, without any truth about the target.
 
-    The state is (qpos, qvel), float64, on the last axis. Functions are pure and batched over leading axes.
+    The state is (qpos, qvel, pending actions), float64, on the last axis. Functions are pure and batched over leading
+    axes.
 
     Attributes:
         name: `hopper`, ...
@@ -56,7 +80,7 @@ class Task:
         spec: Builds the MuJoCo spec, at its nominal parameters.
         frame_skip: Physics steps per control step.
         observation_size: Values per observation.
-        observe: state -> observation.
+        observe: state -> observation, where no sensor needs a system (`System.observe` does it for every robot).
         reward: (state, action, next_state) -> reward.
         terminated: next_state -> whether the task has ended there (a fall).
         reset_noise: (key, count) -> offsets (count, state_size) added to the model's initial state.
@@ -65,9 +89,16 @@ class Task:
         groups: How many groups the paper forms for this robot.
         max_episode_steps: Time limit in control steps; reaching it truncates.
         reference_returns: Returns of (random, expert) for the normalized score, from D4RL.
-        state_from_observation: observation -> state; None where the observation does not determine the state.
+        state_from_observation: observation -> (qpos, qvel); None where the observation does not determine them.
         rebuildable: observation -> whether `state_from_observation` is exact for that row.
         velocities: How many values at the end of an observation are velocities; 0 where they cannot be told apart.
+        pending: How many past actions a state carries behind (qpos, qvel), newest first, each in [-1, 1].
+        actions: What the values of an action mean; empty where they are the model's controls as they are.
+        signals: Names of the observation's values; empty where they have none.
+        sense: (state, sensordata) -> observation, where it reads the model's sensors.
+        rewarded: Whether `reward` says anything; without it nothing can be learnt or judged.
+        source: What makes this task again (`robots.restore`), as JSON; None where its name does.
+        posture: observation -> (qpos, qvel) as far as it tells, NaN elsewhere; None where it tells no position.
     """
 
     name: str
@@ -87,6 +118,18 @@ class Task:
     state_from_observation: Callable[[Batch], Batch] | None = None
     rebuildable: Callable[[Batch], Batch] | None = None
     velocities: int = 0
+    pending: int = 0
+    actions: tuple[ActionChannel, ...] = ()
+    signals: tuple[str, ...] = ()
+    sense: Callable[[Batch, Batch], Batch] | None = None
+    rewarded: bool = True
+    source: Mapping[str, Any] | None = None
+    posture: Callable[[Batch], Batch] | None = None
+
+    @property
+    def action_size(self) -> int:
+        """Values per action."""
+        return len(self.actions) or int(self.compile().nu)
 
     def compile(self) -> mujoco.MjModel:
         """A fresh model at nominal parameters."""

@@ -30,11 +30,11 @@ from madoc.calibration.population_search import (
     mean_with_failures,
     next_generation,
 )
-from madoc.calibration.window_residuals import window_residuals
 from madoc.data.windows import first_rows
 from madoc.errors import check_at_least
 from madoc.learning.cloning import clone
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.residuals.window_residuals import window_residuals
 from madoc.simulation.rollout import Walkers, begin, reset_states, roll
 from madoc.types import Metrics
 
@@ -297,12 +297,12 @@ class CmaEs:
             np.ascontiguousarray(np.broadcast_to(part[chosen], (len(candidates), self._rows, part.shape[-1])))
             for part in (problem.logged_states, problem.logged_actions)
         )
-        following = simulator.bind(simulator.parameters.to_physical(candidates)).step(state, action)
-        before, after = (
-            clouds.of_observations(self._standardised(problem, simulator.task.observe(part)))
-            for part in (state, following)
-        )
-        pairs = np.concatenate([simulator.task.observe(state[0]), action[0]], axis=-1)
+        system = simulator.bind(simulator.parameters.to_physical(candidates))
+        state = system.unbiased(state)
+        following = system.step(state, action)
+        seen, seen_after = system.observe(state), system.observe(following)
+        before, after = (clouds.of_observations(self._standardised(problem, part)) for part in (seen, seen_after))
+        pairs = np.concatenate([seen[0], action[0]], axis=-1)
         covariates = clouds.of_pairs(self._standardised(problem, pairs)) - clouds.pair
         costs = discrepancies(adjusted(after - before, covariates), clouds.change)
         failed = ~np.isfinite(following).all(-1)

@@ -20,9 +20,9 @@ from madoc.calibration.dropo.likelihood import (
     truncated_noise,
 )
 from madoc.calibration.population_search import SearchState, draw_windows, mean_with_failures, next_generation
-from madoc.calibration.window_residuals import window_residuals
 from madoc.data.windows import first_rows
 from madoc.errors import check_at_least
+from madoc.residuals.window_residuals import window_residuals
 from madoc.types import Metrics
 
 DEVIATIONS = (1e-3, 0.5)

@@ -1,92 +1,93 @@
-"""Least squares, assembled: several damped Gauss-Newton searches on few windows, the best refined on many."""
+"""Least squares, assembled: from logged states, with estimated ones, or first the one and then the other."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.cautions import at_end_of_range, exploded
-from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.calibration.least_squares.linearisation import difference_points, linearise
-from madoc.calibration.least_squares.losses import ALL_FAILED, Loss, mean_cost, scale_of
-from madoc.calibration.least_squares.uncertainty import bread, half_width, identifiability, meat, sandwich
-from madoc.calibration.window_residuals import window_residuals
-from madoc.data.windows import Windows, first_rows, windows_at
-from madoc.errors import MadocError, check_at_least
+from madoc.calibration.least_squares.estimated_states import EstimatedState, EstimatedStates
+from madoc.calibration.least_squares.logged_states import LoggedState, LoggedStates
+from madoc.calibration.least_squares.noise import consecutive_residuals, takes_turns
+from madoc.data import Dataset
+from madoc.errors import check_at_least
+from madoc.residuals.losses import Loss
+from madoc.residuals.uncertainty import half_width, identifiability, sandwich
 from madoc.types import Metrics
 
-TRIALS = (1e-2, 1.0, 1e2)
-"""Dampings tried at once, relative to the last that helped; where none helps, the next are a thousand times larger."""
-DAMPING_RANGE = (1e-10, 1e10)
-FIRST_DAMPING = 1e-2
-SETTLED = 0.1
-"""Of its standard error: a step smaller than this changes nothing worth a simulation."""
-_SMALLEST = 1e-100
-"""Keeps a move over a tolerance of 0 finite."""
+InitialStates = Literal["logged", "estimated"]
+LOGGED_HORIZON = 1
+"""Control steps of a window from a logged state: what is taken for true is best left at once."""
+ESTIMATED_HORIZONS = (3, 20)
+"""Of one with an estimated state: fewer tell little besides that state, more are slow."""
+WINDOWS: dict[InitialStates, int] = {"logged": 1000, "estimated": 100}
+SEARCH_WINDOWS: dict[InitialStates, int] = {"logged": 64, "estimated": 24}
+NOISY = 0.25
+"""Of `takes_turns`: noise alone has about a half, a model that is wrong in the same way all along less than nothing."""
+LONG_TAILS = 1.1
+"""Cost of residuals in deviations of the noise; normal noise leaves 0.8 under Cauchy's loss, and 1 under squares."""
+EXACT = 1e-6
+"""Typical changes: smaller residuals are those of states that were logged exactly."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class LeastSquaresState:
-    """Everything least squares carries. Once it calibrates, only the first of the searches goes on.
+    """Everything least squares carries.
 
     Attributes:
-        unit: Where each search stands, in [-1, 1].
-        damping: λ of each.
-        cost: Of each; `ALL_FAILED` before the first epoch.
-        moved: The largest move of each in its last step, over what is worth a step; below 1 it has settled.
-        chosen: Which rebuilt states the windows begin at.
-        bread: Of the best search, where it last linearised.
-        meat: The same.
-        refining: 0 while searching, 1 on all windows.
-        epochs: Done in this stage.
-        control_steps: Simulated.
-        failures: Windows that exploded, each counted once in every system.
+        logged: The search from logged states; None where they cannot be rebuilt.
+        estimated: The search with estimated ones; None where it never comes to that.
+        phase: `estimated` once the latter is under way; `starting` before it, where it is known to come; `undecided`
+            where the data is yet to be asked; `logged` where it never comes.
+        checking: Control steps spent on asking.
     """
 
-    unit: Float[np.ndarray, "searches d"]
-    damping: Float[np.ndarray, " searches"]
-    cost: Float[np.ndarray, " searches"]
-    moved: Float[np.ndarray, " searches"]
-    chosen: Int[np.ndarray, " windows"]
-    bread: Float[np.ndarray, "d d"]
-    meat: Float[np.ndarray, "d d"]
-    refining: int
-    epochs: int
-    control_steps: int
-    failures: int
+    logged: LoggedState | None
+    estimated: EstimatedState | None
+    phase: str
+    checking: int
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Damped Gauss-Newton on differences between simulated and logged observations, from logged states.
+    """Damped Gauss-Newton on differences between simulated and logged observations, over windows of the log.
 
-    Residuals are in units of each channel's typical change in one step. With clean, complete states it is exact;
-    it takes logged states for true, so noise in them biases it.
+    Residuals are in units of each channel's typical change in one step. From `logged` initial states it is exact where
+    they are clean and complete, and biased by noise in them, as it takes them for true. With `estimated` ones each
+    window's initial state is an unknown besides the parameters, the first reading is a reading like the others, and
+    channels weigh by the noise that the fit finds in them. By default states are estimated where they cannot be
+    rebuilt, where the data is known to be noisy, and where residuals of consecutive rows speak of noise: a reading that
+    is too high makes the step to it look too long and the step from it too short.
 
     Attributes:
-        horizon: Control steps replayed from each logged state; the observation after every one of them counts.
+        initial_states: `logged`, `estimated`, or None for the data to choose.
+        horizon: Control steps of a window; the observation after every one of them counts. None takes 1 from logged
+            states; with estimated ones as many as it takes the robot to move from one pose to another (`horizon_of`).
         loss: `linear`, or a robust one (`huber`, `soft-l1`, `cauchy`) whose scale follows the residuals.
-        windows: Logged states it starts from, at most; all there are if fewer.
+        windows: Windows, at most; all there are if fewer. None takes 1000 from logged states, 100 with estimated ones.
         searches: The first begins at mid-range, the others at random places. The best goes on.
-        search_windows: Windows while searching.
+        search_windows: Windows while searching; None takes 64 from logged states, 24 with estimated ones.
         search_epochs: Epochs of searching, at most; it ends once the best search has settled.
         tolerance: Share of each range; a step that moves no parameter by more, nor by a tenth of its standard error,
             is the last.
     """
 
-    horizon: int = 1
+    initial_states: InitialStates | None = None
+    horizon: int | None = None
     loss: Loss = "cauchy"
-    windows: int = 1000
+    windows: int | None = None
     searches: int = 3
-    search_windows: int = 64
+    search_windows: int | None = None
     search_epochs: int = 8
     tolerance: float = 1e-7
 
     def __post_init__(self) -> None:
-        check_at_least(self, horizon=1, windows=1, searches=1, search_windows=1, search_epochs=1, tolerance=0.0)
+        counts = ("horizon", "windows", "searches", "search_windows", "search_epochs")
+        check_at_least(self, **dict.fromkeys(counts, 1), tolerance=0.0)
 
     @property
     def name(self) -> str:
@@ -102,86 +103,44 @@ class LeastSquares:
         """Windows drawn, searches at their starts.
 
         Raises:
-            MadocError: No state can be rebuilt, no episode is long enough, there are fewer values than parameters,
-                or the data's next observations are shuffled.
+            MadocError: No state can be rebuilt and no position is known, no episode is long enough, there are fewer
+                values than unknowns, or the data's next observations are shuffled.
         """
         problem.require_pairs(self.name)
-        of_windows, of_starts = jax.random.split(key)
-        count, task = len(problem.simulator.parameters), problem.simulator.task
-        possible = first_rows(problem.dataset, problem.logged_rows, self.horizon)
-        drawn = min(self.windows, len(possible))
-        if drawn * self.horizon * task.observation_size < count:
-            raise MadocError(
-                f"expected at least as many logged values as parameters, got {drawn} windows of {self.horizon} rows "
-                f"with {task.observation_size} values for {count} parameters; give it more rows or fewer parameters"
-            )
-        order = jax.random.choice(of_windows, len(possible), (drawn,), replace=False)
-        unit = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
-        unit[0] = 0.0
+        phase = self._first_phase(problem)
         return LeastSquaresState(
-            unit=unit,
-            damping=np.full(self.searches, FIRST_DAMPING),
-            cost=np.full(self.searches, ALL_FAILED),
-            moved=np.full(self.searches, 1.0 / _SMALLEST),
-            chosen=possible[np.asarray(order)],
-            bread=np.zeros((count, count)),
-            meat=np.zeros((count, count)),
-            refining=0,
-            epochs=0,
-            control_steps=0,
-            failures=0,
+            logged=None if phase == "estimated" else self._logged(problem).init(problem, key),
+            estimated=None if phase == "logged" else self._estimated(problem).init(problem, jax.random.fold_in(key, 1)),
+            phase=phase,
+            checking=0,
         )
 
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Metrics]:
-        """One damped step of every search under way: two simulations, one of slopes, one of the steps tried."""
-        searching = not state.refining
-        windows = self._windows(problem, state)
-        running = self.searches if searching else 1
-        points = np.stack([difference_points(unit) for unit in state.unit[:running]])
-        around = _simulate_each(problem, windows, points)
-        unit, damping, cost, moved = (getattr(state, name).copy() for name in ("unit", "damping", "cost", "moved"))
-        plans = [self._plan(*row) for row in zip(points, around, damping[:running], strict=True)]
-        tried = _simulate_each(problem, windows, np.stack([plan.tried for plan in plans]))
-        for index, (plan, residuals) in enumerate(zip(plans, tried, strict=True)):
-            costs = [mean_cost(candidate, plan.scale, self.loss) for candidate in residuals]
-            best = int(np.argmin(costs))
-            better = costs[best] < plan.cost
-            factor = TRIALS[best] if better else 1e3
-            chosen = plan.tried[best] if better else unit[index]
-            # Of steps that did not help, the shortest tells how near the search is to the end of what helps.
-            shortest = plan.tried[best if better else -1] - unit[index]
-            moved[index] = float((np.abs(shortest) / self._worthwhile(plan, len(windows))).max())
-            unit[index], cost[index] = chosen, costs[best] if better else plan.cost
-            damping[index] = np.clip(damping[index] * factor, *DAMPING_RANGE)
-        leader = int(np.argmin(cost[:running]))
-        following = replace(
-            state,
-            unit=unit,
-            damping=damping,
-            cost=cost,
-            moved=moved,
-            bread=plans[leader].bread,
-            meat=plans[leader].meat,
-            epochs=state.epochs + 1,
-            control_steps=state.control_steps
-            + windows.steps * len(windows) * running * (points.shape[1] + len(TRIALS)),
-            failures=state.failures + sum(int((~np.isfinite(part).all(-1)).sum()) for part in (around, tried)),
-        )
-        metrics = {"residual": float(np.sqrt(cost[leader])), "moved": float(moved[leader])}
-        if searching and (moved[leader] < 1.0 or following.epochs >= self.search_epochs):
-            following = _refine(following, leader)
+        """One damped step of the search under way: two simulations, one of slopes, one of the steps tried."""
+        if state.phase == "estimated":
+            assert state.estimated is not None
+            estimated, metrics = self._estimated(problem).step(problem, state.estimated)
+            return replace(state, estimated=estimated), metrics
+        assert state.logged is not None
+        logged, metrics = self._logged(problem).step(problem, state.logged)
+        following = replace(state, logged=logged)
+        if state.phase == "undecided" and self._logged(problem).settled(logged):
+            following = self._decide(problem, following)
+        elif state.phase == "starting" and logged.refining:
+            following = _go_on(following)
         return following, metrics
 
     def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:
         """Where the best search stands, with the sandwich covariance and Student's t intervals around it."""
-        space = problem.simulator.parameters
-        unit = state.unit[0 if state.refining else int(np.argmin(state.cost))]
-        found = sandwich(state.bread, state.meat)
+        space, (search, windows) = problem.simulator.parameters, self._search(problem, state)
+        unit = search.unit[0 if search.refining else int(np.argmin(search.cost))]
+        found = sandwich(search.bread, search.meat)
         half = (space.high - space.low) / 2.0
         mean = space.to_physical(unit)
         covariance = half[:, None] * found.covariance * half
-        width = half * half_width(found.covariance, self._window_count(state))
+        width = half * half_width(found.covariance, windows)
         interval = np.clip(np.stack([mean - width, mean + width], axis=-1), space.low[:, None], space.high[:, None])
+        failures = sum(part.failures for part in (state.logged, state.estimated) if part is not None)
         return Estimate(
             mean=mean,
             std=np.sqrt(np.diag(covariance)),
@@ -189,7 +148,8 @@ class LeastSquares:
             warnings=(
                 *identifiability(found, space.names),
                 *at_end_of_range(unit, space.names),
-                *exploded(state.failures, state.control_steps),
+                *exploded(failures, self.control_steps(state)),
+                *self._said_of_states(problem, state),
             ),
             covariance=covariance,
             interval=interval,
@@ -197,75 +157,136 @@ class LeastSquares:
 
     def control_steps(self, state: LeastSquaresState) -> int:
         """Simulated control steps so far."""
-        return state.control_steps
+        parts = (state.logged, state.estimated)
+        return state.checking + sum(part.control_steps for part in parts if part is not None)
+
+    def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:
+        """About how many control steps a run from the beginning takes, as far as the data has chosen already."""
+        steps = 0
+        if state.logged is not None:
+            steps += self._logged(problem).whole_run(state.logged, 0 if state.phase == "starting" else refining_epochs)
+        if state.estimated is not None and state.phase != "undecided":
+            steps += self._estimated(problem).whole_run(problem, state.estimated, refining_epochs)
+        return steps
 
     def stage(self, state: LeastSquaresState) -> str:
         """What the next epoch does."""
-        return "calibrating" if state.refining else "searching"
+        search = state.estimated if state.phase == "estimated" else state.logged
+        return "calibrating" if search is not None and search.refining else "searching"
 
     def progress(self, state: LeastSquaresState, budget: int) -> float:
         """Share of the control steps."""
-        return min(1.0, state.control_steps / budget)
+        return min(1.0, self.control_steps(state) / budget)
 
     def converged(self, state: LeastSquaresState) -> str | None:
         """A sentence once the steps are too small to matter."""
-        if not state.refining or not state.epochs or state.moved[0] >= 1.0:
+        search: LoggedState | EstimatedState | None = None
+        if state.phase == "estimated" and state.estimated is not None:
+            search = state.estimated if EstimatedStates.settled(state.estimated) else None
+        elif state.phase == "logged" and state.logged is not None:
+            search = state.logged if LoggedStates.settled(state.logged) else None
+        if search is None:
             return None
-        return f"after {state.epochs} steps on all windows the next would change nothing worth a simulation"
+        return f"after {search.epochs} steps on all windows the next would change nothing worth a simulation"
 
-    def _window_count(self, state: LeastSquaresState) -> int:
-        return len(state.chosen) if state.refining else min(self.search_windows, len(state.chosen))
+    def _first_phase(self, problem: CalibrationProblem) -> str:
+        """What the first epoch does: `logged`, `estimated`, `starting` from logged for estimated, or `undecided`."""
+        task = problem.simulator.task
+        if self.initial_states == "logged":
+            return "logged"
+        if task.state_from_observation is None and task.posture is not None:
+            return "estimated"
+        known = problem.dataset.disturbance
+        told = self.initial_states == "estimated" or known.noise > 0 or known.velocities == "differences"
+        return "starting" if told else "undecided"
 
-    def _windows(self, problem: CalibrationProblem, state: LeastSquaresState) -> Windows:
-        chosen = state.chosen[: self._window_count(state)]
-        return windows_at(problem.dataset, problem.logged_states[chosen], problem.logged_rows[chosen], self.horizon)
-
-    def _plan(
-        self,
-        points: Float[np.ndarray, "points d"],
-        residuals: Float[np.ndarray, "points windows values"],
-        damping: float,
-    ) -> "_Plan":
-        around = linearise(points, residuals)
-        scale = scale_of(around.residuals, self.loss)
-        factors = triangular_factors(around, scale, self.loss)
-        steps = [damped_step(*factors, points[0], damping * trial) for trial in TRIALS]
-        return _Plan(
-            tried=points[0] + np.stack(steps),
-            scale=scale,
-            cost=mean_cost(residuals[0], scale, self.loss),
-            bread=bread(around, scale, self.loss),
-            meat=meat(around, scale, self.loss),
+    def _logged(self, problem: CalibrationProblem) -> LoggedStates:
+        """A search from logged states; where it only finds a start for the other, short windows mislead least."""
+        starting = self._first_phase(problem) == "starting"
+        return LoggedStates(
+            horizon=LOGGED_HORIZON if starting else self.horizon or LOGGED_HORIZON,
+            loss=self.loss,
+            windows=self.windows or WINDOWS["logged"],
+            searches=self.searches,
+            search_windows=self.search_windows or SEARCH_WINDOWS["logged"],
+            search_epochs=self.search_epochs,
+            tolerance=self.tolerance,
         )
 
-    def _worthwhile(self, plan: "_Plan", windows: int) -> Float[np.ndarray, " d"]:
-        """The smallest move in [-1, 1] that is worth a step, by parameter."""
-        error = np.sqrt(np.diag(sandwich(plan.bread, plan.meat).covariance))
-        return np.maximum(2.0 * max(self.tolerance, _SMALLEST), SETTLED * error)
+    def _estimated(self, problem: CalibrationProblem) -> EstimatedStates:
+        """A search from logged states, where there was one, is where this one starts: it needs no others."""
+        return EstimatedStates(
+            horizon=self.horizon or horizon_of(problem.dataset),
+            loss=self.loss,
+            windows=self.windows or WINDOWS["estimated"],
+            searches=self.searches if self._first_phase(problem) == "estimated" else 1,
+            search_windows=self.search_windows or SEARCH_WINDOWS["estimated"],
+            search_epochs=self.search_epochs,
+            tolerance=self.tolerance,
+        )
+
+    def _search(
+        self, problem: CalibrationProblem, state: LeastSquaresState
+    ) -> tuple[LoggedState | EstimatedState, int]:
+        """The search that has the estimate, and its windows; one with estimated states has it once it has begun."""
+        estimated, logged = state.estimated, state.logged
+        if estimated is not None and (logged is None or estimated.control_steps):
+            return estimated, self._estimated(problem).window_count(estimated)
+        assert logged is not None
+        return logged, self._logged(problem).window_count(logged)
+
+    def _decide(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
+        """Estimate states where residuals of consecutive rows take turns, as noise of the sensors makes them."""
+        assert state.logged is not None
+        if np.sqrt(state.logged.cost[0]) < EXACT:
+            return replace(state, phase="logged")
+        pairs, spent = consecutive_residuals(problem, state.logged.unit[0], state.logged.chosen)
+        state = replace(state, phase="logged", checking=state.checking + spent)
+        return _go_on(state) if takes_turns(*pairs) > NOISY else state
+
+    def _said_of_states(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
+        """That states were estimated, and why, where the data has chosen so."""
+        estimated = state.estimated
+        if state.phase != "estimated" or estimated is None or self.initial_states is not None:
+            return ()
+        noise = problem.dataset.disturbance.noise
+        if problem.simulator.task.state_from_observation is None:
+            why = "states cannot be rebuilt from the data"
+        elif problem.dataset.disturbance.velocities == "differences":
+            why = "velocities are differences of positions, which are what it compares"
+        elif noise:
+            why = "the data is noisy"
+        else:
+            why = "residuals of consecutive rows speak of noise"
+        found = ""
+        if estimated.refining:
+            found = f"; the noise it finds is {100.0 * float(np.median(estimated.deviation)):.2g} % of a step's change"
+        told = f"initial states of windows were estimated with the parameters, as {why}{found}"
+        tails = (
+            "residuals have longer tails than noise has: some windows are not explained by any initial state found, as "
+            "where contacts begin, and the intervals are too narrow"
+        )
+        exact = float(estimated.deviation.max()) < EXACT
+        return (told, tails) if estimated.refining and not exact and estimated.cost[0] > LONG_TAILS else (told,)
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """What the slopes around a point say: steps to try, and the cost and the curvature there."""
+def horizon_of(dataset: Dataset) -> int:
+    """Control steps in which a channel changes by as much as it differs between any two rows, the median over channels.
 
-    tried: Float[np.ndarray, "trials d"]
-    scale: float
-    cost: float
-    bread: Float[np.ndarray, "d d"]
-    meat: Float[np.ndarray, "d d"]
-
-
-def _simulate_each(
-    problem: CalibrationProblem, windows: Windows, points: Float[np.ndarray, "searches points d"]
-) -> Float[np.ndarray, "searches points windows values"]:
-    """Residuals at the points of all searches, in one batch."""
-    scale = problem.scalings["standardised"].next_scale
-    residuals = window_residuals(problem.simulator, windows, points.reshape(-1, points.shape[-1]), scale)
-    return residuals.reshape(*points.shape[:2], *residuals.shape[1:])
+    In shorter windows little happens; in longer ones small errors grow until simulated and logged motion have nothing
+    to do with each other. Within `ESTIMATED_HORIZONS`, and no longer than the episode that the median row is in.
+    """
+    logged = dataset.transitions
+    change = np.asarray(logged.next_observation - logged.observation).std(0)
+    moving = change > 0.0
+    ratio = np.median(np.asarray(logged.observation).std(0)[moving] / change[moving]) if moving.any() else 0.0
+    lengths = dataset.episode_ends - dataset.episode_starts
+    return min(int(np.clip(round(float(ratio)), *ESTIMATED_HORIZONS)), int(np.median(np.repeat(lengths, lengths))))
 
 
-def _refine(state: LeastSquaresState, leader: int) -> LeastSquaresState:
-    """Go on with the best search alone, in the first place."""
-    order = np.argsort(np.arange(len(state.cost)) != leader, kind="stable")
-    searches = {name: getattr(state, name)[order] for name in ("unit", "damping", "cost", "moved")}
-    return replace(state, **searches, refining=1, epochs=0)
+def _go_on(state: LeastSquaresState) -> LeastSquaresState:
+    """With estimated states from where the best search stands."""
+    logged, estimated = state.logged, state.estimated
+    assert logged is not None
+    assert estimated is not None
+    return replace(state, phase="estimated", estimated=replace(estimated, unit=logged.unit[:1].copy()))

@@ -105,12 +105,12 @@ class AgentSettings:
     reward_size: float = 1.0
     blur_rate: float = 3e-3
 
-    def init(self, *, observation: int, action: int, parameters: int, groups: int, key: PRNGKeyArray) -> Agents:
-        """Fresh networks; actors and prior at N(0, 1)."""
+    def init(self, *, window: int, observation: int, parameters: int, groups: int, key: PRNGKeyArray) -> Agents:
+        """Fresh networks; actors and prior at N(0, 1). `window` is the size of what stands for (s, a)."""
         of_discriminators, of_critics = jax.random.split(key)
         discriminators = Discriminators(
             observation,
-            action,
+            window - observation,
             self.hidden,
             key=of_discriminators,
             bound=self.bound,

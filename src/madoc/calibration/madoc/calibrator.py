@@ -10,14 +10,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.madoc import grouping, watch
 from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.agents import BLUR_RANGE, Agents, AgentSettings
-from madoc.calibration.madoc.collection import Features, StartMode, collect, empty_rows, remember, starts_of
+from madoc.calibration.madoc.collection import Features, StartMode, collect, empty_rows, remember, sensed, starts_of
 from madoc.calibration.madoc.grouping import GroupingVAE
+from madoc.calibration.madoc.sensing import noise_deviation, said_of_observations, window_length
 from madoc.calibration.madoc.value_decomposition import Mixing
 from madoc.calibration.madoc.watch import Watch
 from madoc.errors import MadocError, check_at_least
@@ -25,6 +26,7 @@ from madoc.learning import replay
 from madoc.learning.cloning import clone
 from madoc.learning.networks import adam
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.learning.window_features import WindowScaling
 from madoc.simulation.rollout import Walkers, begin
 from madoc.types import Metrics
 
@@ -65,7 +67,12 @@ class Madoc:
         groups: `learned`, `one` agent for all (Madoc-S), or `each` parameter its own (ungrouped).
         group_count: Learned groups; None takes the task's own number.
         starts: `policy` (free running from resets, the paper's), `logged` (short rollouts from logged states
-            under the clone) or `replay` (one step from logged state and action).
+            under the clone; velocities from positions where they are hidden) or `replay` (one step from logged state
+            and action).
+        window: Rows (s, a) that the discriminators see before s'; None takes 1 where an observation determines the
+            state, as the paper does, else 3.
+        sensor_noise: Put on simulated observations, as a share of a step's typical change; None takes what the data
+            says of itself, `estimated` looks for it in the data.
         features: `standardised` (s, a) and s' - s, or `raw` as the paper's.
         hidden: Units per layer of clone and VAE.
         cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
@@ -88,6 +95,8 @@ class Madoc:
     groups: Grouping = "learned"
     group_count: int | None = None
     starts: StartMode = "logged"
+    window: int | None = None
+    sensor_noise: float | Literal["estimated"] | None = None
     features: Features = "standardised"
     hidden: tuple[int, ...] = (128, 128)
     cloning_epochs: int = 40
@@ -106,11 +115,27 @@ class Madoc:
     agents: AgentSettings = field(default_factory=AgentSettings)
 
     def __post_init__(self) -> None:
-        counts = ("group_count", "hidden", "grouping_epochs", "epoch_steps", "updates", "draws", "horizon", "batch")
+        counts = (
+            "group_count",
+            "window",
+            "hidden",
+            "grouping_epochs",
+            "epoch_steps",
+            "updates",
+            "draws",
+            "horizon",
+            "batch",
+        )
         check_at_least(self, **dict.fromkeys((*counts, "cloning_updates", "grouping_updates", "replay_capacity"), 1))
         check_at_least(self, cloning_epochs=0, learning_rate=0.0, patience=0)
         if self.starts == "replay" and self.horizon not in (None, 1):
             raise MadocError(f"starts=replay replays single steps: expected horizon 1 or none, got {self.horizon}")
+        if self.starts == "replay" and self.window not in (None, 1):
+            raise MadocError(f"starts=replay replays single steps: expected window 1 or none, got {self.window}")
+        if isinstance(self.sensor_noise, float | int) and not (
+            np.isfinite(self.sensor_noise) and self.sensor_noise >= 0
+        ):
+            raise MadocError(f"expected sensor_noise of 0 or more, got {self.sensor_noise}")
 
     @classmethod
     def paper(cls, **changes: Any) -> "Madoc":
@@ -171,6 +196,8 @@ class Madoc:
         """
         task, simulator = problem.simulator.task, problem.simulator
         count, observation, action = len(simulator.parameters), task.observation_size, simulator.action_size
+        scaling, _ = self._windows(problem)
+        window, following = scaling.sizes
         groups = self._group_count(problem)
         of_policy, of_vae, of_agents, of_start, key = jax.random.split(key, 5)
         logged = np.asarray(problem.dataset.transitions.observation)
@@ -182,10 +209,10 @@ class Madoc:
             offset=logged.mean(0),
             scale=np.maximum(logged.std(0), 1e-3),
         )
-        vae = GroupingVAE(count, observation + action, observation, self.hidden, key=of_vae)
+        vae = GroupingVAE(count, window, following, self.hidden, key=of_vae)
         agents = self.agents.init(
-            observation=observation,
-            action=action,
+            window=window,
+            observation=following,
             parameters=count,
             groups=groups,
             key=of_agents,
@@ -198,8 +225,8 @@ class Madoc:
             schemes=np.zeros((max(1, self.grouping_epochs // 20), count), dtype=np.int64),
             labels=np.arange(count) if groups == count else np.zeros(count, dtype=np.int64),
             agents=agents,
-            rows=empty_rows(problem, self.replay_capacity),
-            walkers=_out_of_step(self._begin(problem, self._geometry[0], of_start), task.max_episode_steps),
+            rows=empty_rows(problem, scaling, self.replay_capacity),
+            walkers=_out_of_step(self._begin(problem, self._geometry(problem)[0], of_start), task.max_episode_steps),
             watch=watch.begin_watch(agents.average),
             key=key,
             cloned=0,
@@ -222,14 +249,21 @@ class Madoc:
             mean=space.to_physical(unit),
             std=(1.0 - unit**2) * std * (space.high - space.low) / 2.0,
             groups=tuple(tuple(group) for group in groups),
-            warnings=watch.warnings(
-                state.watch,
-                unit,
-                space.names,
-                failures=state.failures,
-                control_steps=state.control_steps,
+            warnings=(
+                *watch.warnings(
+                    state.watch,
+                    unit,
+                    space.names,
+                    failures=state.failures,
+                    control_steps=state.control_steps,
+                ),
+                *said_of_observations(problem, self._window(problem), self._deviation(problem), self.starts),
             ),
         )
+
+    def embeddings(self, problem: CalibrationProblem, state: MadocState) -> np.ndarray | None:
+        """The VAE's embedding of each parameter, once it has been trained."""
+        return np.asarray(state.vae.embeddings(), dtype=np.float64) if state.grouped else None
 
     def control_steps(self, state: MadocState) -> int:
         """Simulated control steps so far, grouping included."""
@@ -256,10 +290,19 @@ class Madoc:
     def _will_clone(self) -> bool:
         return self.starts != "replay"
 
-    @property
-    def _geometry(self) -> tuple[int, int]:
+    def _geometry(self, problem: CalibrationProblem) -> tuple[int, int]:
+        """Draws, and control steps of a row: `horizon` of them end a window."""
         draws, horizon = GEOMETRY[self.starts]
-        return self.draws or draws, self.horizon or horizon
+        return self.draws or draws, (self.horizon or horizon) + self._window(problem) - 1
+
+    def _window(self, problem: CalibrationProblem) -> int:
+        return window_length(problem, self.window, self.starts)
+
+    def _windows(self, problem: CalibrationProblem) -> tuple[WindowScaling, tuple[Array, Array]]:
+        return problem.windows(self.features, self._window(problem))
+
+    def _deviation(self, problem: CalibrationProblem) -> Float[np.ndarray, " observation"]:
+        return noise_deviation(problem, self.sensor_noise)
 
     def _group_count(self, problem: CalibrationProblem) -> int:
         count = len(problem.simulator.parameters)
@@ -267,7 +310,7 @@ class Madoc:
         return min(count, chosen[self.groups])
 
     def _begin(self, problem: CalibrationProblem, systems: int, key: PRNGKeyArray) -> Walkers:
-        rows = max(1, self.epoch_steps // (systems * self._geometry[1]))
+        rows = max(1, self.epoch_steps // (systems * self._geometry(problem)[1]))
         return begin(starts_of(problem, self.starts), key, systems=systems, rows=rows)
 
     def _clone(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Metrics]:
@@ -287,6 +330,7 @@ class Madoc:
     def _group(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Metrics]:
         count = len(problem.simulator.parameters)
         of_draws, of_start, of_action, of_restart, of_batches, key = jax.random.split(state.key, 6)
+        scaling, _ = self._windows(problem)
         draws = grouping.one_at_a_time(of_draws, count)
         rollout, _ = collect(
             problem,
@@ -294,10 +338,11 @@ class Madoc:
             state.policy,
             draws,
             self._begin(problem, count, of_start),
-            steps=self._geometry[1],
+            steps=self._geometry(problem)[1],
             keys=(of_action, of_restart),
         )
-        rows = remember(state.rows, problem, self.features, rollout, draws=draws, identity=np.arange(count))
+        rollout = sensed(rollout, self._deviation(problem), jax.random.fold_in(of_action, 1))
+        rows = remember(state.rows, scaling, rollout, draws=draws, identity=np.arange(count))
         vae, optimiser_state, metrics = grouping.train(
             state.vae,
             state.vae_optimiser,
@@ -328,7 +373,8 @@ class Madoc:
 
     def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Metrics]:
         of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
-        systems, steps = self._geometry
+        systems, steps = self._geometry(problem)
+        scaling, logged = self._windows(problem)
         draws = np.asarray(draw_parameters(state.agents.actors, of_draws, systems)[0], dtype=np.float64)
         fresh = self.starts == "logged"
         rollout, walkers = collect(
@@ -340,11 +386,12 @@ class Madoc:
             steps=steps,
             keys=(of_action, of_restart),
         )
-        rows = remember(state.rows, problem, self.features, rollout, draws=draws, identity=np.zeros(systems, np.int64))
+        rollout = sensed(rollout, self._deviation(problem), jax.random.fold_in(of_action, 1))
+        rows = remember(state.rows, scaling, rollout, draws=draws, identity=np.zeros(systems, np.int64))
         agents, device_metrics = self.agents.update(
             state.agents,
             rows,
-            problem.raw_features if self.features == "raw" else problem.standardised_features,
+            logged,
             jnp.asarray(grouping.members(state.labels, self._group_count(problem))),
             of_updates,
             mixing=self.mixing,

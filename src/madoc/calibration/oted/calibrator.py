@@ -25,7 +25,7 @@ from madoc.learning import replay
 from madoc.learning.cloning import clone
 from madoc.learning.networks import Network
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
-from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll
+from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll, unbiased_starts
 from madoc.types import Metrics
 
 
@@ -219,8 +219,11 @@ class Oted:
         starts, reached = self._starts(problem)
         fresh = begin(starts, of_start, systems=self._systems, rows=self.rows)
         anew = self.starts == "logged"
+        system = simulator.bind(simulator.parameters.to_physical(draws))
+        if anew:
+            starts, fresh = unbiased_starts(system, starts), replace(fresh, state=system.unbiased(fresh.state))
         rollout, walkers = roll(
-            simulator.bind(simulator.parameters.to_physical(draws)),
+            system,
             simulator.task,
             state.policy,
             fresh if anew else state.walkers,

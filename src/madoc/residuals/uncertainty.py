@@ -6,10 +6,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import t
 
-from madoc.calibration.least_squares.linearisation import Linearisation
-from madoc.calibration.least_squares.losses import Loss, loss_curvature, loss_slope
+from madoc.residuals.linearisation import Linearisation
+from madoc.residuals.losses import Loss, loss_curvature, loss_slope
 
 CONFIDENCE = 0.95
+SETTLED = 0.1
+"""Of its standard error: a step smaller than this changes nothing worth a simulation."""
 BOX_VARIANCE = 1.0 / 3.0
 """Of a uniform distribution over [-1, 1]: what is known of a direction that the data says nothing of."""
 _BLIND = 1e-12
@@ -50,6 +52,47 @@ def meat(around: Linearisation, scale: float, loss: Loss) -> Float[np.ndarray, "
     slope = loss_slope((around.residuals / scale) ** 2, loss) * around.residuals
     scores = np.einsum("wv,wvd->wd", slope, around.jacobian)
     return scores.T @ scores * windows / max(1, windows - count)
+
+
+def jackknife_meat(around: Linearisation, share: float, bread: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
+    """B C B of the covariance C that leaving out one window at a time has: (n - 1) / n Σ δ δᵀ, δ = (B - B_w)⁻¹ g_w.
+
+    g_w is the slope of the window's cost and B_w its part of the bread B. In `meat` a window that weighs much hides how
+    far it has drawn the estimate towards itself; left out, it shows (Bell and McCaffrey 2002, the CR3 of MacKinnon
+    and White 1985). It matters where windows are few and unlike.
+
+    Args:
+        around: Of a linear problem, weights included.
+        share: How much of its squared slopes the bread is.
+        bread: Their sum.
+    """
+    windows = len(around.jacobian)
+    scores = np.einsum("wv,wvd->wd", around.residuals, around.jacobian)
+    parts = share * np.einsum("wvd,wve->wde", around.jacobian, around.jacobian)
+    others = bread - parts
+    alone = np.linalg.eigvalsh(others)[:, 0] <= _BLIND * np.trace(bread)
+    others[alone] += parts[alone]  # nothing is known without it: it counts as it does in `meat`
+    influence = np.einsum("wde,we->wd", np.linalg.pinv(others, rcond=_BLIND, hermitian=True), scores) @ bread
+    return influence.T @ influence * (windows - 1) / max(1, windows)
+
+
+def at_least_noise(
+    meat: Float[np.ndarray, "d d"], bread: Float[np.ndarray, "d d"], ratio: float
+) -> Float[np.ndarray, "d d"]:
+    """The meat, widened where noise that is alike in all windows would scatter the estimate more than windows do.
+
+    Few windows may scatter less than they should by chance; that the noise is what the residuals say is then surer.
+
+    Args:
+        meat: B C B of a covariance C.
+        bread: B.
+        ratio: Variance of what a reading pulls with over the mean curvature of its cost: noise alone has ratio B⁻¹.
+    """
+    inverse = np.linalg.pinv(bread, rcond=_BLIND, hermitian=True)
+    covariance = inverse @ meat @ inverse
+    by_windows, by_noise = np.diag(covariance), ratio * np.diag(inverse)
+    wider = np.sqrt(np.maximum(1.0, by_noise / np.maximum(by_windows, np.finfo(float).tiny)))
+    return bread @ (wider[:, None] * covariance * wider) @ bread
 
 
 def sandwich(bread: Float[np.ndarray, "d d"], meat: Float[np.ndarray, "d d"]) -> Uncertainty:

@@ -56,6 +56,17 @@ def loss_curvature(z: Residuals, loss: Loss) -> Residuals:
     return (1.0 - z) / (1.0 + z) ** 2
 
 
+def curvature_share(z: Residuals, loss: Loss) -> float:
+    """Mean of ψ' over the mean of ρ': what the curvature of the loss is of the one its weights have.
+
+    One number for all residuals, as their slopes do not depend on how large they are (Huber 1981, section 7.6). Not
+    below a tenth: past that Cauchy's tails prevail, and residuals are no longer noise.
+    """
+    if loss == "linear" or not z.size:
+        return 1.0
+    return max(0.1, float(loss_curvature(z, loss).mean() / loss_slope(z, loss).mean()))
+
+
 def scale_of(residuals: Residuals, loss: Loss) -> float:
     """c: the tuning constant times the standard deviation that the median |residual| speaks of; 1 for `linear`."""
     if loss == "linear" or not residuals.size:

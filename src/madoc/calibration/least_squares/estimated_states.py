@@ -1,0 +1,325 @@
+"""Least squares on windows whose initial states are estimated with the parameters: for noisy and partial readings."""
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
+
+from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
+from madoc.calibration.least_squares.elimination import WindowSlopes, eliminate
+from madoc.calibration.least_squares.noise import channel_deviation
+from madoc.calibration.least_squares.readings import Readings, slopes_at
+from madoc.data.windows import apart
+from madoc.errors import MadocError
+from madoc.residuals.losses import (
+    ALL_FAILED,
+    TUNING,
+    Loss,
+    curvature_share,
+    loss_slope,
+    loss_value,
+)
+from madoc.residuals.uncertainty import SETTLED, at_least_noise, bread, jackknife_meat, sandwich
+from madoc.types import Metrics
+
+TRIALS = (1e-2, 1.0, 1e2)
+"""Dampings of the parameters' step tried at once; where none helps, the next are a thousand times larger."""
+DAMPING_RANGE = (1e-10, 1e10)
+STATE_DAMPING_RANGE = (1e-9, 1e6)
+FIRST_DAMPING = 1e-2
+LITTLE = 5e-3
+"""A share of the cost: a step that saves less has found the states too."""
+ROUNDING = 1e-8
+"""Of a channel's typical change: residuals as small as this are those of exact readings, and cannot become smaller."""
+FOLLOWED = (1.0, 0.3, 0.0)
+"""Shares of a state's step that every window chooses from: at contacts the whole of it often leads too far."""
+STATES_FIRST = 2
+"""Epochs on all windows in which parameters wait: states of windows that are new begin at their readings."""
+FAILED_WINDOW = 1e6
+"""Cost of a window that failed, in squared deviations of the noise; a state holds no infinity."""
+_SMALLEST = 1e-100
+"""Keeps a move over a tolerance of 0 finite."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class EstimatedState:
+    """Everything the search carries. Once it refines, only the first of the searches goes on.
+
+    Attributes:
+        unit: Parameters where each search stands, in [-1, 1].
+        states: Initial state of every window there.
+        damping: λ of the parameters' step.
+        state_damping: λ of every window's.
+        cost: Mean squared residual in deviations of the noise; `ALL_FAILED` before the first epoch.
+        moved: The largest move of the last step over what is worth one; below 1 the search has settled.
+        rows: Where the windows begin.
+        deviation: Noise of each channel, in its typical changes.
+        bread: Of the best search, where it last linearised.
+        meat: The same.
+        refining: 0 while searching on few windows, 1 on all.
+        epochs: Done in this stage.
+        control_steps: Simulated.
+        failures: Windows that exploded, each counted once an epoch.
+    """
+
+    unit: Float[np.ndarray, "searches d"]
+    states: Float[np.ndarray, "searches windows state"]
+    damping: Float[np.ndarray, " searches"]
+    state_damping: Float[np.ndarray, "searches windows"]
+    cost: Float[np.ndarray, " searches"]
+    moved: Float[np.ndarray, " searches"]
+    rows: Int[np.ndarray, " windows"]
+    deviation: Float[np.ndarray, " channels"]
+    bread: Float[np.ndarray, "d d"]
+    meat: Float[np.ndarray, "d d"]
+    refining: int
+    epochs: int
+    control_steps: int
+    failures: int
+
+
+@dataclass(frozen=True)
+class EstimatedStates:
+    """Damped Gauss-Newton on all readings of windows, each window's initial state unknown; as `LeastSquares` says."""
+
+    horizon: int
+    loss: Loss
+    windows: int
+    searches: int
+    search_windows: int
+    search_epochs: int
+    tolerance: float
+
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> EstimatedState:
+        """Windows that share no reading drawn, searches at their starts, states as near as the log tells.
+
+        Raises:
+            MadocError: No position is known, no episode is long enough, or there are fewer readings than unknowns.
+        """
+        of_windows, of_starts = jax.random.split(key)
+        count, channels = len(problem.simulator.parameters), problem.measured
+        guessed, rows = problem.approximate_states
+        possible = apart(problem.dataset, rows, self.horizon)
+        drawn = min(self.windows, len(possible))
+        readings, unknowns = drawn * (self.horizon + 1) * channels, count + drawn * problem.physical_size
+        if readings < unknowns:
+            raise MadocError(
+                f"expected at least as many readings as unknowns, got {drawn} windows of {self.horizon} rows with "
+                f"{readings} readings for {unknowns} parameters and initial states; take a longer horizon"
+            )
+        chosen = possible[np.asarray(jax.random.choice(of_windows, len(possible), (drawn,), replace=False))]
+        unit = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
+        unit[0] = 0.0
+        return EstimatedState(
+            unit=unit,
+            states=np.repeat(guessed[chosen][None], self.searches, axis=0),
+            damping=np.full(self.searches, FIRST_DAMPING),
+            state_damping=np.full((self.searches, drawn), FIRST_DAMPING),
+            cost=np.full(self.searches, ALL_FAILED),
+            moved=np.full(self.searches, 1.0 / _SMALLEST),
+            rows=rows[chosen],
+            deviation=np.ones(channels),
+            bread=np.zeros((count, count)),
+            meat=np.zeros((count, count)),
+            refining=0,
+            epochs=0,
+            control_steps=0,
+            failures=0,
+        )
+
+    def step(self, problem: CalibrationProblem, state: EstimatedState) -> tuple[EstimatedState, Metrics]:
+        """One damped step of every search under way: slopes in one simulation, the steps tried in another."""
+        running, windows = 1 if state.refining else self.searches, self.window_count(state)
+        readings = Readings.at(problem, state.rows[:windows], self.horizon)
+        unit, states = state.unit[:running], state.states[:running, :windows]
+        slopes = slopes_at(problem.simulator, readings, unit, states)
+        plans = [
+            self._plan(
+                around, point, damping, own[:windows], by_channel=bool(state.refining), channels=len(readings.scale)
+            )
+            for around, point, damping, own in zip(slopes, unit, state.damping, state.state_damping, strict=False)
+        ]
+        residuals = _tried(problem, readings, plans, states)
+        waiting = bool(state.refining) and state.epochs < STATES_FIRST
+        moves = [self._best(*parts, waiting=waiting) for parts in zip(plans, residuals, strict=True)]
+        carried = ("unit", "states", "damping", "state_damping", "cost", "moved")
+        new = {name: getattr(state, name).copy() for name in carried}
+        for index, (plan, move) in enumerate(zip(plans, moves, strict=True)):
+            new["unit"][index] = np.clip(unit[index] + plan.steps[move.trial], -1.0, 1.0)
+            steps = move.followed[:, None] * plan.state_steps[move.trial]
+            new["states"][index, :windows] += readings.moved(steps, states.shape[2])
+            new["damping"][index] = np.clip(state.damping[index] * move.factor, *DAMPING_RANGE)
+            factor = np.select([move.followed == 1.0, move.followed > 0.0], [0.1, 1.0], 10.0)
+            new["state_damping"][index, :windows] = np.clip(
+                state.state_damping[index, :windows] * factor, *STATE_DAMPING_RANGE
+            )
+            new["cost"][index], new["moved"][index] = move.cost, move.moved
+        leader = int(np.argmin(new["cost"][:running]))
+        following = replace(
+            state,
+            **new,
+            deviation=plans[leader].deviation,
+            bread=plans[leader].bread,
+            meat=plans[leader].meat,
+            epochs=state.epochs + 1,
+            control_steps=state.control_steps + self._epoch_steps(problem, state),
+            failures=state.failures + sum(int((~around.whole).sum()) for around in slopes),
+        )
+        metrics = {
+            "residual": float(np.sqrt(new["cost"][leader])),
+            "moved": float(new["moved"][leader]),
+            "noise": float(np.median(plans[leader].deviation)),
+        }
+        if not state.refining and (new["moved"][leader] < 1.0 or following.epochs >= self.search_epochs):
+            order = np.argsort(np.arange(self.searches) != leader, kind="stable")
+            following = replace(following, **{name: new[name][order] for name in carried}, refining=1, epochs=0)
+        return following, metrics
+
+    @staticmethod
+    def settled(state: EstimatedState) -> bool:
+        """Whether the next step would change nothing worth a simulation."""
+        return bool(state.refining) and state.epochs > STATES_FIRST and float(state.moved[0]) < 1.0
+
+    def window_count(self, state: EstimatedState) -> int:
+        """Windows of the stage."""
+        return len(state.rows) if state.refining else min(self.search_windows, len(state.rows))
+
+    def whole_run(self, problem: CalibrationProblem, state: EstimatedState, refining_epochs: int) -> int:
+        """Control steps of a search as long as it may be, and so many epochs on all windows."""
+        searching, refining = (self._epoch_steps(problem, replace(state, refining=stage)) for stage in (0, 1))
+        return searching * self.search_epochs + refining * refining_epochs
+
+    def _epoch_steps(self, problem: CalibrationProblem, state: EstimatedState) -> int:
+        """Control steps of an epoch of the stage: central differences by parameters and states, and the steps tried."""
+        running, parameters = 1 if state.refining else self.searches, state.unit.shape[1]
+        columns = 1 + 2 * parameters + 2 * problem.physical_size + len(FOLLOWED) * (len(TRIALS) + 1)
+        return running * self.window_count(state) * columns * self.horizon
+
+    def _plan(
+        self,
+        slopes: WindowSlopes,
+        unit: Float[np.ndarray, " d"],
+        damping: float,
+        state_damping: Float[np.ndarray, " windows"],
+        *,
+        by_channel: bool,
+        channels: int,
+    ) -> "_Plan":
+        """What the slopes say: the noise, the steps to try, the curvature; channels weigh by their noise, or alike."""
+        least = np.full(len(state_damping), STATE_DAMPING_RANGE[0])
+        spare = eliminate(slopes, np.ones_like(slopes.residuals), least).spare
+        deviation = _deviation(slopes, spare, channels)
+        deviation = deviation if by_channel else np.full(channels, np.median(deviation))
+        slopes = slopes.over(np.tile(deviation, slopes.residuals.shape[1] // channels))
+        z = (slopes.residuals / TUNING[self.loss]) ** 2
+        weights = loss_slope(z, self.loss) * slopes.whole[:, None]
+        damped = eliminate(slopes, weights, state_damping)
+        factors = triangular_factors(damped.reduced, 1.0, "linear")
+        steps = [*(damped_step(*factors, unit, damping * trial) for trial in TRIALS), np.zeros_like(unit)]
+        exact = eliminate(slopes, weights, least).reduced
+        exact = replace(exact, residuals=exact.residuals[slopes.whole], jacobian=exact.jacobian[slopes.whole])
+        share = curvature_share(z[slopes.whole], self.loss)
+        curved = share * bread(exact, 1.0, "linear")
+        ratio = _noise_ratio(slopes, weights, share, float(spare[slopes.whole].sum()) - len(unit))
+        return _Plan(
+            unit=unit,
+            residuals=slopes.residuals,
+            whole=slopes.whole,
+            deviation=deviation,
+            steps=np.stack(steps),
+            state_steps=np.stack([damped.states_step(step) for step in steps]),
+            bread=curved,
+            meat=at_least_noise(jackknife_meat(exact, share, curved), curved, ratio),
+        )
+
+    def _best(
+        self, plan: "_Plan", residuals: Float[np.ndarray, "trials ways windows values"], *, waiting: bool
+    ) -> "_Move":
+        """Which step of the parameters helps most, each window's state following as far as fits it best."""
+        before = np.where(plan.whole, self._costs(plan.residuals), FAILED_WINDOW).mean()
+        costs = self._costs(residuals)
+        totals = costs.min(1).mean(-1)
+        trial = len(TRIALS) if waiting else int(np.argmin(totals))
+        better = trial < len(TRIALS)
+        saved = 1.0 - float(totals[trial]) / max(float(before), _SMALLEST)
+        # Of steps that did not help, the shortest tells how near the search is to the end of what helps.
+        shortest = np.abs(plan.steps[trial if better else len(TRIALS) - 1])
+        error = np.sqrt(np.diag(sandwich(plan.bread, plan.meat).covariance))
+        worthwhile = np.maximum(2.0 * max(self.tolerance, _SMALLEST), SETTLED * error)
+        exact = float(plan.deviation.max()) < ROUNDING
+        return _Move(
+            trial=trial,
+            followed=np.array(FOLLOWED)[costs[trial].argmin(0)],
+            factor=TRIALS[trial] if better else 1.0 if waiting else 1e3,
+            cost=float(totals[trial]),
+            moved=max(float((shortest / worthwhile).max()), 0.0 if exact else saved / LITTLE),
+        )
+
+    def _costs(self, residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray, "*windows"]:
+        """Mean loss of each window."""
+        scale = TUNING[self.loss]
+        with np.errstate(invalid="ignore", over="ignore"):
+            cost = scale**2 * loss_value((residuals / scale) ** 2, self.loss).mean(-1)
+        return np.where(np.isfinite(cost), np.minimum(cost, FAILED_WINDOW), FAILED_WINDOW)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What the slopes around a point say; residuals in deviations of the noise. The last step moves states alone."""
+
+    unit: Float[np.ndarray, " d"]
+    residuals: Float[np.ndarray, "windows values"]
+    whole: np.ndarray
+    deviation: Float[np.ndarray, " channels"]
+    steps: Float[np.ndarray, "trials d"]
+    state_steps: Float[np.ndarray, "trials windows state"]
+    bread: Float[np.ndarray, "d d"]
+    meat: Float[np.ndarray, "d d"]
+
+
+@dataclass(frozen=True)
+class _Move:
+    """The step taken, and how far each window's state followed it."""
+
+    trial: int
+    followed: Float[np.ndarray, " windows"]
+    factor: float
+    cost: float
+    moved: float
+
+
+def _deviation(slopes: WindowSlopes, spare: np.ndarray, channels: int) -> Float[np.ndarray, " channels"]:
+    """Each channel's noise in the windows that did not fail."""
+    shape = (int(slopes.whole.sum()), slopes.residuals.shape[1] // channels, channels)
+    return channel_deviation(slopes.residuals[slopes.whole].reshape(shape), spare[slopes.whole].reshape(shape))
+
+
+def _noise_ratio(
+    slopes: WindowSlopes, weights: Float[np.ndarray, "windows values"], share: float, freedom: float
+) -> float:
+    """Variance of what a reading pulls with, ψ, over ψ', its mean curvature; 1 for squares of deviations."""
+    pull = ((weights * slopes.residuals)[slopes.whole] ** 2).sum() / max(1.0, freedom)
+    curvature = share * weights[slopes.whole].sum() / max(1, weights[slopes.whole].size)
+    return float(pull / max(curvature, _SMALLEST))
+
+
+def _tried(
+    problem: CalibrationProblem,
+    readings: Readings,
+    plans: list[_Plan],
+    states: Float[np.ndarray, "searches windows state"],
+) -> list[Float[np.ndarray, "trials ways windows values"]]:
+    """Residuals after every step of every search, the windows' states moved along all the way, in part, or not."""
+    ways = np.array(FOLLOWED)[:, None, None]
+    starts = [
+        state + ways * readings.moved(plan.state_steps, states.shape[2])[:, None]
+        for plan, state in zip(plans, states, strict=True)
+    ]
+    flat = np.concatenate(starts).reshape(-1, len(FOLLOWED) * len(readings), states.shape[2])
+    units = np.concatenate([plan.unit + plan.steps for plan in plans])
+    found = readings.residuals(problem.simulator, units, flat)
+    found = found.reshape(len(plans), -1, *found.shape[1:])
+    return [part / np.tile(plan.deviation, readings.steps + 1) for part, plan in zip(found, plans, strict=True)]

@@ -1,0 +1,77 @@
+"""How noisy each channel's sensor is, from what a fit leaves of its readings; and whether it is noise that is left."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from madoc.calibration.base import CalibrationProblem
+from madoc.data.windows import windows_at
+from madoc.residuals.window_residuals import window_residuals
+
+_NORMAL_MAD = 1.4826
+"""Standard deviations in a median absolute deviation, for normal noise."""
+_LEAST_SPARE = 0.05
+"""Readings that their window's state explains by more than the rest say nothing of the noise."""
+_LEAST_SHARE = 1e-3
+"""Of the noisiest channel's deviation: no channel counts for more than a million times another."""
+_SMALLEST = 1e-12
+"""In units of a channel's typical change; below this it is rounding."""
+
+
+def channel_deviation(
+    residuals: Float[np.ndarray, "windows readings channels"], spare: Float[np.ndarray, "windows readings channels"]
+) -> Float[np.ndarray, " channels"]:
+    """Each channel's noise, from what a fit that absorbed part of it leaves: median |r| / √(1 - leverage).
+
+    A residual's variance is σ² (1 - leverage), whatever was fitted; without the division short windows would look
+    less noisy than they are.
+    """
+    told = spare > _LEAST_SPARE
+    free = np.where(told, residuals / np.sqrt(np.where(told, spare, 1.0)), np.nan)
+    columns = np.abs(free).reshape(-1, free.shape[-1])
+    deviation = np.array(
+        [np.median(column[np.isfinite(column)]) if np.isfinite(column).any() else 0.0 for column in columns.T]
+    )
+    deviation = _NORMAL_MAD * deviation
+    return np.maximum(deviation, max(_LEAST_SHARE * float(deviation.max()), _SMALLEST))
+
+
+Residuals = Float[np.ndarray, "pairs channels"]
+
+
+def consecutive_residuals(
+    problem: CalibrationProblem, unit: Float[np.ndarray, " d"], chosen: Int[np.ndarray, " states"]
+) -> tuple[tuple[Residuals, Residuals], int]:
+    """One-step residuals from logged states and from those a row later, and the control steps spent on them.
+
+    Args:
+        problem: Data and simulator.
+        unit: Parameters in [-1, 1].
+        chosen: Which logged states to take; those without one a row later are left out.
+    """
+    rows, dataset = problem.logged_rows, problem.dataset
+    inner = np.ones(len(dataset) + 1, dtype=bool)
+    inner[dataset.episode_starts] = False
+    first = chosen[chosen + 1 < len(rows)]
+    first = first[(rows[first + 1] == rows[first] + 1) & inner[rows[first] + 1]]
+    both = np.concatenate([first, first + 1])
+    windows = windows_at(dataset, problem.logged_states[both], rows[both], 1)
+    scale = problem.scalings["standardised"].next_scale
+    residuals = window_residuals(problem.simulator, windows, unit[None], scale)[0]
+    whole = np.isfinite(residuals).all(-1).reshape(2, -1).all(0)
+    before, after = residuals.reshape(2, len(first), -1)[:, whole]
+    return (before, after), len(both)
+
+
+def takes_turns(before: Residuals, after: Residuals) -> float:
+    """Minus the correlation of a channel's residual with the next row's, the mean over channels; 0 without pairs.
+
+    Of noise e alone a residual is about e' - e, as the reading it starts at carries noise as well as the one it ends
+    at: the next one is e'' - e', and they correlate by -1/2. What a model does wrong it does wrong in the next row too.
+    Residuals count up to five times the median, so that contacts do not decide.
+    """
+    if not len(before):
+        return 0.0
+    most = 5.0 * _NORMAL_MAD * np.maximum(np.median(np.abs(before), axis=0), _SMALLEST)
+    first, second = (np.clip(part, -most, most) for part in (before, after))
+    power = np.sqrt((first**2).mean(0) * (second**2).mean(0))
+    return float(np.mean(-(first * second).mean(0) / np.maximum(power, _SMALLEST**2)))

@@ -1,0 +1,121 @@
+"""CSV, TSV and their kin: a line of names, then a line a row."""
+
+import csv
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from madoc.data.logs.tables import Run, Table
+from madoc.errors import MadocError
+
+SEPARATORS = (",", ";", "\t")
+
+
+def read(path: Path, wanted: Collection[str]) -> list[Run]:
+    """One run. A comma, semicolon or tab separates, whichever the header has most of; `#` begins a comment.
+
+    A header may itself begin with `#`, as NumPy writes it. Cells stay text where not all of the file is numbers.
+
+    Raises:
+        MadocError: No text, no header, names twice, no rows, or a line of another number of cells.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            names, separator, first = _header(file, path)
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise MadocError(f"expected each column of {path.name} named once, got {twice!r} twice; rename one of them")
+        table = _all_numbers(path, names, separator, first) or _cells(path, names, separator, first)
+    except UnicodeDecodeError as error:
+        raise MadocError(f"{path.name} is not text in UTF-8 ({error.reason}); save it as CSV again") from error
+    except csv.Error as error:
+        raise MadocError(f"cannot read {path.name} as CSV ({error}); save it as CSV again") from error
+    return [Run(path.name, (table,))]
+
+
+def _header(file: TextIO, path: Path) -> tuple[list[str], str, int]:
+    """Names, the separator, and the line after the header, counted from 0."""
+    comment = ""
+    for line, text in enumerate(file):
+        bare = text.strip()
+        if not bare:
+            continue
+        if bare.startswith("#"):
+            comment = bare.lstrip("# ")
+            continue
+        separator = max(SEPARATORS, key=bare.count)
+        cells = _split(bare, separator)
+        if not any(map(_is_number, cells)):
+            return cells, separator, line + 1
+        names = _split(comment, max(SEPARATORS, key=comment.count)) if comment else []
+        if len(names) == len(cells):
+            return names, separator, line
+        raise MadocError(
+            f"expected the names of the columns in the first line of {path.name}, got {bare[:40]!r}; add a header"
+        )
+    raise MadocError(f"expected a header and rows in {path.name}, got no line with anything in it; record it again")
+
+
+def _split(line: str, separator: str) -> list[str]:
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _all_numbers(path: Path, names: list[str], separator: str, first: int) -> Table | None:
+    """The quick way, for files that hold numbers alone; None for others, and for those without rows."""
+    with path.open(encoding="utf-8-sig") as file:
+        lines = [number for number, text in enumerate(file, 1) if number > first and _is_row(text)]
+    if not lines:
+        return None
+    try:
+        values = np.loadtxt(
+            path, delimiter=separator, skiprows=first, ndmin=2, encoding="utf-8-sig", comments="#", quotechar='"'
+        )
+    except ValueError:
+        return None
+    if values.shape != (len(lines), len(names)):
+        return None
+    return Table(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), lines=np.array(lines))
+
+
+def _is_row(text: str) -> bool:
+    bare = text.strip()
+    return bool(bare) and not bare.startswith("#")
+
+
+def _cells(path: Path, names: list[str], separator: str, first: int) -> Table:
+    """Cells as text."""
+    rows, lines = [], []
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        for line, cells in _rows(file, separator):
+            if line <= first:
+                continue
+            if len(cells) != len(names):
+                raise MadocError(
+                    f"expected {len(names)} cells in every line of {path.name}, as in its header, got {len(cells)} in "
+                    f"line {line}; was the file cut short there?"
+                )
+            rows.append(cells)
+            lines.append(line)
+    if not rows:
+        raise MadocError(f"expected rows below the header of {path.name}, got none; record it again")
+    columns = {
+        name: np.array(column, dtype=object) for name, column in zip(names, zip(*rows, strict=True), strict=True)
+    }
+    return Table(columns, lines=np.array(lines))
+
+
+def _rows(file: TextIO, separator: str) -> Iterator[tuple[int, list[str]]]:
+    reader = csv.reader(file, delimiter=separator)
+    for cells in reader:
+        if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#"):
+            yield reader.line_num, cells

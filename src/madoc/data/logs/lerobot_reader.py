@@ -1,0 +1,65 @@
+"""LeRobot's local format (Cadene et al. 2024), versions 2 and 3: Parquet files and meta/info.json, without torch."""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from madoc.data.logs.parquet_reader import read_columns
+from madoc.data.logs.tables import Run, tables_of
+from madoc.errors import MadocError
+from madoc.files import read_json
+
+CLOCK = "timestamp"
+
+
+def recognises(path: Path) -> bool:
+    """Whether a folder is such a dataset."""
+    return (path / "meta" / "info.json").is_file()
+
+
+def read(path: Path, wanted: Collection[str]) -> list[Run]:
+    """A run an episode. Elements of `observation.state` are `observation.state[0]`, ...
+
+    Where meta/info.json names them, they are `observation.state[shoulder]` as well.
+
+    Raises:
+        MadocError: pyarrow is missing, no data, damaged, or a file without episode_index.
+    """
+    information = read_json(path / "meta" / "info.json")
+    features = information.get("features") if isinstance(information, dict) else None
+    files = sorted((path / "data").rglob("*.parquet"))
+    if not isinstance(features, dict) or not files:
+        what = "no features in meta/info.json" if files else "no Parquet file in its folder data"
+        raise MadocError(f"{path.name} is no whole LeRobot dataset: {what}; download or record it again")
+    episodes: dict[int, list[dict[str, np.ndarray]]] = {}
+    for file in files:
+        columns = read_columns(file)
+        if "episode_index" not in columns:
+            raise MadocError(f"no column episode_index in {path.name}/{file.relative_to(path)}; is it of this dataset?")
+        index = columns["episode_index"]
+        for episode in np.unique(index):
+            chosen = np.flatnonzero(index == episode)
+            part = {name: values[chosen] for name, values in columns.items() if len(values) == len(index)}
+            episodes.setdefault(int(episode), []).append(part)
+    return [_run(path, episode, parts, features) for episode, parts in sorted(episodes.items())]
+
+
+def _run(path: Path, episode: int, parts: list[dict[str, np.ndarray]], features: Mapping[str, Any]) -> Run:
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    named: dict[str, np.ndarray] = {}
+    for name, values in arrays.items():
+        elements = _element_names(features.get(name))
+        named[name] = values
+        if values.ndim == 2 and len(elements) == values.shape[1]:
+            named.update({f"{name}[{element}]": values[:, at] for at, element in enumerate(elements)})
+    return Run(f"{path.name}/episode_{episode}", tables_of(named, clock=CLOCK))
+
+
+def _element_names(feature: Any) -> list[str]:
+    """Names of a feature's elements: a list, or one in a dictionary (`{"motors": [...]}`)."""
+    names = feature.get("names") if isinstance(feature, dict) else None
+    if isinstance(names, dict):
+        names = next(iter(names.values()), None)
+    return [str(name) for name in names] if isinstance(names, list) else []

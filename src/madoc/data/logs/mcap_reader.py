@@ -1,0 +1,159 @@
+"""MCAP: topics of JSON or ROS 2 messages, each with a clock of its own."""
+
+import json
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from madoc.data.logs.tables import Run, Table
+from madoc.errors import MadocError
+
+CLOCK = "log_time"
+EXTRA = 'pip install "madoc-calibration[logs]"'
+
+
+@dataclass
+class _Topic:
+    """Messages of one topic, flattened: one dictionary a message."""
+
+    log_times: list[int] = field(default_factory=list)
+    publish_times: list[int] = field(default_factory=list)
+    stamps: list[int | None] = field(default_factory=list)
+    rows: list[dict[str, float]] = field(default_factory=list)
+    decode: Callable[[bytes], Any] | None = None
+
+
+def read(path: Path, wanted: Collection[str]) -> list[Run]:
+    """One run, a table a topic. A field is called by topic and path: `/joints.position[0]`.
+
+    Where a message names its elements, as sensor_msgs/JointState does in `name`, these stand in the brackets:
+    `/joints.position[shoulder]`. Each topic has `log_time`, `publish_time` and, where it is stamped, `header.stamp`, in
+    s since the first message of the file. Only topics that a wanted column is of are decoded whole; of the others one
+    message, so that their columns are known.
+
+    Raises:
+        MadocError: The library is missing, the file is damaged or cut short, or no topic can be decoded.
+    """
+    topics: dict[str, _Topic] = {}
+    unknown: dict[str, str] = {}
+    for channel, schema, message in _messages(path):
+        topic = topics.get(channel.topic)
+        if topic is None:
+            decode = _decoder(channel, schema)
+            if decode is None:
+                unknown[channel.topic] = channel.message_encoding or "no"
+                continue
+            topic = topics[channel.topic] = _Topic(decode=decode)
+        if topic.rows and not any(_of_topic(name, channel.topic) for name in wanted):
+            continue
+        assert topic.decode is not None
+        try:
+            content = topic.decode(message.data)
+        except Exception as error:  # decoders raise anything from KeyError to struct.error on a damaged message
+            raise MadocError(
+                f"cannot decode message {len(topic.rows)} of {channel.topic} in {path.name} ({error}); it is damaged, "
+                "record it again"
+            ) from error
+        topic.rows.append(dict(_flat(channel.topic, content)))
+        topic.log_times.append(message.log_time)
+        topic.publish_times.append(message.publish_time)
+        topic.stamps.append(_stamp(content))
+    if not topics:
+        what = ", ".join(f"{topic} ({encoding} encoding)" for topic, encoding in unknown.items()) or "no messages"
+        raise MadocError(f"expected topics of JSON or ROS 2 messages in {path.name}, got {what}; convert it to CSV")
+    others = {topic: f"a topic of {encoding} encoding" for topic, encoding in unknown.items()}
+    origin = min(topic.log_times[0] for topic in topics.values())
+    return [Run(path.name, tuple(_table(name, topic, origin, others) for name, topic in topics.items()))]
+
+
+def _messages(path: Path) -> Iterator[tuple[Any, Any, Any]]:
+    try:
+        from mcap.exceptions import McapError
+        from mcap.reader import make_reader
+    except ImportError as error:
+        raise MadocError(f"MCAP logs need the library mcap: {EXTRA} ({error})") from error
+    try:
+        with path.open("rb") as file:
+            for schema, channel, message in make_reader(file).iter_messages():
+                yield channel, schema, message
+    except MadocError:
+        raise
+    except (McapError, OSError, ValueError, EOFError, KeyError, RuntimeError) as error:
+        raise MadocError(
+            f"cannot read {path.name} as MCAP ({type(error).__name__}: {error}); it is damaged or was cut short, "
+            "`mcap recover` may save it"
+        ) from error
+
+
+def _decoder(channel: Any, schema: Any) -> Callable[[bytes], Any] | None:
+    """What decodes the messages of a channel; None where nothing here does."""
+    if channel.message_encoding == "json":
+        return json.loads
+    if channel.message_encoding == "cdr" and schema is not None:
+        try:
+            from mcap_ros2.decoder import DecoderFactory
+        except ImportError as error:
+            raise MadocError(f"topic {channel.topic} holds ROS 2 messages, which need: {EXTRA} ({error})") from error
+        return DecoderFactory().decoder_for(channel.message_encoding, schema)
+    return None
+
+
+def _of_topic(column: str, topic: str) -> bool:
+    return column.startswith((f"{topic}.", f"{topic}[")) or column == topic
+
+
+def _flat(name: str, value: Any, elements: list[str] | None = None) -> Iterator[tuple[str, float]]:
+    """Numbers in a message, by path; text and what is empty is left out."""
+    if isinstance(value, bool | int | float):
+        yield name, float(value)
+    elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        labels = elements if elements is not None and len(elements) == len(value) else range(len(value))
+        for label, part in zip(labels, value, strict=True):
+            yield from _flat(f"{name}[{label}]", part)
+    elif not isinstance(value, str | bytes):
+        parts = _parts(value)
+        names = parts.get("name")
+        known = names if isinstance(names, list) and all(isinstance(text, str) for text in names) else None
+        for key, part in parts.items():
+            if key == "stamp" and {"sec", "nanosec"} <= _parts(part).keys():
+                continue  # in whole nanoseconds, by `_stamp`
+            yield from _flat(f"{name}.{key}", part, known)
+
+
+def _parts(value: Any) -> dict[str, Any]:
+    """Fields of a decoded message."""
+    if value is None:
+        return {}
+    if isinstance(value, Mapping):
+        return {str(key): part for key, part in value.items()}
+    slots: Any = getattr(value, "__slots__", ())
+    fields = getattr(value, "__dict__", None) or {key: getattr(value, key) for key in slots}
+    return {key: part for key, part in fields.items() if not key.startswith("_")}
+
+
+def _stamp(content: Any) -> int | None:
+    """When a ROS message says it was measured, in ns."""
+    stamp = _parts(_parts(content).get("header")).get("stamp")
+    parts = _parts(stamp)
+    if not {"sec", "nanosec"} <= parts.keys():
+        return None
+    return int(parts["sec"]) * 1_000_000_000 + int(parts["nanosec"])
+
+
+def _table(name: str, topic: _Topic, origin: int, others: Mapping[str, str]) -> Table:
+    """Rows as columns, NaN where a message lacks a field; in the order they were logged in."""
+    names = list(dict.fromkeys(key for row in topic.rows for key in row))
+    columns = {key: np.array([row.get(key, np.nan) for row in topic.rows]) for key in names}
+    clocks: dict[str, Sequence[int | None]] = {
+        CLOCK: topic.log_times,
+        "publish_time": topic.publish_times,
+        "header.stamp": topic.stamps,
+    }
+    for clock, times in clocks.items():
+        known = [time for time in times if time is not None]
+        if len(known) == len(times):
+            columns[clock] = (np.array(known, dtype=np.int64) - origin) / 1e9
+    return Table(columns, CLOCK, others=others)

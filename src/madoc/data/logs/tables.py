@@ -1,0 +1,148 @@
+"""What every reader of logs yields: runs, each of tables of named columns."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from madoc.errors import MadocError
+
+Column = np.ndarray
+"""One value a row: numbers, flags, times (datetime64), or text that may be numbers."""
+
+WIDEST = 1000
+"""Values a row from which an array is a picture, not a vector."""
+
+_MISSING = frozenset(("", "nan", "na", "n/a", "none", "null", "-"))
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns that were written together, row by row.
+
+    Attributes:
+        columns: By name, all equally long.
+        clock: The column with the format's own time, in s; None where the format keeps none.
+        lines: The line of each row in a text file; None elsewhere.
+        others: Columns that are not one number a row, and what they are.
+    """
+
+    columns: Mapping[str, Column]
+    clock: str | None = None
+    lines: Int[np.ndarray, " rows"] | None = None
+    others: Mapping[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def place(self, row: int) -> str:
+        """A row in words."""
+        return f"row {row}" if self.lines is None else f"line {self.lines[row]}"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One recording without a break that its recorder knew of: a file, or an episode in one.
+
+    Attributes:
+        name: The file, and the episode in it.
+        tables: Those of one clock each. Most formats have one; MCAP has one a topic.
+        timed: Whether the format keeps times at all; where not, rows are one control step apart by its definition.
+    """
+
+    name: str
+    tables: tuple[Table, ...]
+    timed: bool = True
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all columns that can be read."""
+        return list(dict.fromkeys(name for table in self.tables for name in table.columns))
+
+
+def tables_of(arrays: Mapping[str, np.ndarray], *, clock: str | None = None) -> tuple[Table, ...]:
+    """Arrays as tables, those of equal length together; a vector a row becomes columns `name[0]`, `name[1]`, ...
+
+    Scalars, pictures and objects are kept as what they are called only.
+    """
+    grouped: dict[int, dict[str, Column]] = {}
+    others: dict[str, str] = {}
+    for name, array in arrays.items():
+        flat = array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else array
+        what = _unreadable(flat)
+        if what:
+            others[name] = what
+            continue
+        columns = grouped.setdefault(len(flat), {})
+        if flat.ndim == 1:
+            columns[name] = flat
+        else:
+            columns.update({f"{name}[{index}]": flat[:, index] for index in range(flat.shape[1])})
+    tables = [
+        Table(columns, clock if clock in columns else None, others=others) for columns in grouped.values() if columns
+    ]
+    return tuple(tables) or (Table({}, others=others),)
+
+
+def _unreadable(array: np.ndarray) -> str:
+    """What an array is, if it is not numbers, flags, times or text by row."""
+    if array.ndim == 0:
+        return "a single value"
+    if array.ndim > 2 or (array.ndim == 2 and array.shape[1] > WIDEST):
+        return f"an array of shape {array.shape}"
+    return "" if array.dtype.kind in "fiubMmUSO" else f"of type {array.dtype}"
+
+
+def as_numbers(table: Table, name: str, run: str) -> Float[np.ndarray, " rows"]:
+    """A column as float64; an empty cell, `nan` or `null` is NaN, times are s since the first row.
+
+    Raises:
+        MadocError: A cell holds text; the sentence names its place.
+    """
+    values = table.columns[name]
+    if values.dtype.kind in "fiub":
+        return values.astype(np.float64)
+    if values.dtype.kind in "Mm":
+        return _seconds(values)
+    return np.array([_number(cell, table, name, run, row) for row, cell in enumerate(values)], dtype=np.float64)
+
+
+def _seconds(values: np.ndarray) -> Float[np.ndarray, " rows"]:
+    """Times as s since the first that is there; whole nanoseconds are subtracted before anything is rounded."""
+    kind = "datetime64[ns]" if values.dtype.kind == "M" else "timedelta64[ns]"
+    known = ~np.isnat(values)
+    whole = values.astype(kind).astype(np.int64)
+    first = whole[known][0] if known.any() else 0
+    return np.where(known, (whole - first) / 1e9, np.nan)
+
+
+def _number(cell: object, table: Table, name: str, run: str, row: int) -> float:
+    text = cell.decode(errors="replace") if isinstance(cell, bytes) else "" if cell is None else str(cell)
+    bare = text.strip()
+    if bare.lower() in _MISSING:
+        return np.nan
+    try:
+        if "_" not in bare:  # Python reads 1_000
+            return float(bare)
+    except ValueError:
+        pass
+    shown = bare if len(bare) <= 30 else bare[:27] + "..."
+    raise MadocError(f"expected a number in column {name!r} of {run}, got {shown!r} in {table.place(row)}{_hint(bare)}")
+
+
+def _hint(text: str) -> str:
+    """What may be wrong with a cell that is no number."""
+    if text.count(",") == 1 and text.replace(",", "").lstrip("+-").isdigit():
+        return "; a decimal comma? write numbers with a point"
+    if text[:4].isdigit() and (":" in text or text[4:5] == "-"):
+        return "; a date? write times as seconds"
+    return "; leave the cell empty where the value is missing"
+
+
+def listed(names: Iterable[str], most: int = 12) -> str:
+    """Names for a sentence, cut short."""
+    known = list(names)
+    if not known:
+        return "none"
+    return ", ".join(known[:most]) + (f" and {len(known) - most} more" if len(known) > most else "")

@@ -1,0 +1,147 @@
+"""Time in a log: whether rows are a control step apart, where it has gaps, and other rates brought to ours if asked."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from madoc.data.logs.tables import Table
+from madoc.errors import MadocError
+from madoc.findings import Finding
+
+Resample = Literal["hold", "linear"]
+
+GAP = 3.0
+"""Times the usual time step: where a log that is resampled has no row for so long, it has a gap."""
+_FACTORS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}
+_ROUNDING = 1e-6
+"""Of a control step: two times closer than this are the same."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """Columns of one run that share their rows, without those whose time is unknown.
+
+    Attributes:
+        time: s.
+        values: Signals, then actions, as the robot orders those that are in this table.
+        table: Where they come from.
+        rows: Their rows there.
+        run: Of what.
+    """
+
+    time: Float[np.ndarray, " rows"]
+    values: Float[np.ndarray, "rows columns"]
+    table: Table
+    rows: np.ndarray
+    run: str
+
+    def place(self, row: int) -> str:
+        """A row in words."""
+        return self.table.place(int(self.rows[row]))
+
+
+def check_ascending(series: Series) -> None:
+    """Refuse time that stands still or goes back.
+
+    Raises:
+        MadocError: It does; the sentence names the first place.
+    """
+    back = np.flatnonzero(np.diff(series.time) <= 0)
+    if not len(back):
+        return
+    before, after = series.time[back[0]], series.time[back[0] + 1]
+    if before == after:
+        what, remedy = f"the time {after:.9g} twice", "keep one of the rows"
+    else:
+        what = f"{after:.9g} after {before:.9g}"
+        remedy = "sort the rows, or write each run to a file of its own"
+    raise MadocError(
+        f"expected time to go forward in {series.run}, got {what} in {series.place(int(back[0]) + 1)} "
+        f"({len(back)} such rows); {remedy}"
+    )
+
+
+def steady_links(
+    series: Series, control_step: float, tolerance: float
+) -> tuple[Bool[np.ndarray, " links"], list[Finding]]:
+    """Whether each row is one control step after the one before it, and what is to be said of where it is not.
+
+    Raises:
+        MadocError: Most rows are not: the log has another rate, or its time another unit.
+    """
+    steps = np.diff(series.time)
+    steady = np.abs(steps - control_step) <= tolerance * control_step + _ROUNDING * control_step
+    if len(steps) and steady.mean() < 0.5:
+        raise _wrong_rate(series, control_step, tolerance)
+    odd = np.flatnonzero(~steady)
+    if not len(odd):
+        return steady, []
+    at = int(odd[np.argmax(np.abs(steps[odd] - control_step))])
+    finding = Finding(
+        "warning",
+        f"{len(odd)} of {len(steps):,} time steps are more than {100 * tolerance:g} % off the control step of "
+        f"{control_step:g} s, the farthest {steps[at]:.4g} s before {series.place(at + 1)}: the run is cut there",
+        series.run,
+        "nothing if the recorder paused; for a recorder whose clock jitters raise log: tolerance, or ask for "
+        "log: resample",
+    )
+    return steady, [finding]
+
+
+def _wrong_rate(series: Series, control_step: float, tolerance: float) -> MadocError:
+    usual = float(np.median(np.diff(series.time)))
+    for factor, unit in _FACTORS.items():
+        if abs(usual / control_step / factor - 1.0) < 0.3:
+            return MadocError(
+                f"expected time in s in {series.run}, got steps of {usual:g} where the control step is "
+                f"{control_step:g} s; is it in {unit}? divide it by {factor:g}"
+            )
+    mean = float(np.mean(np.diff(series.time)))
+    if min(abs(usual / control_step - 1.0), abs(mean / control_step - 1.0)) <= tolerance:
+        return MadocError(
+            f"most time steps of {series.run} are more than {100 * tolerance:g} % off the control step of "
+            f"{control_step:g} s, though they are {mean:.4g} s on average; raise log: tolerance, or ask for log: "
+            "resample: hold or linear"
+        )
+    return MadocError(
+        f"expected rows {control_step:g} s apart in {series.run}, as control_step says, got {usual:.6g} s (median); "
+        "set control_step to that, or ask for log: resample: hold or linear"
+    )
+
+
+def common_grid(parts: list[Series], control_step: float) -> Float[np.ndarray, " grid"]:
+    """Times a control step apart over the stretch in which all of them have rows.
+
+    Raises:
+        MadocError: There is no such stretch of two steps.
+    """
+    start, end = max(part.time[0] for part in parts), min(part.time[-1] for part in parts)
+    count = int(np.floor((end - start) / control_step + _ROUNDING)) + 1
+    if count < 2:
+        raise MadocError(
+            f"expected all columns of {parts[0].run} to be logged at the same time for at least {control_step:g} s, "
+            f"got {max(0.0, end - start):.4g} s; record them together"
+        )
+    return start + control_step * np.arange(count)
+
+
+def on_grid(
+    series: Series, grid: Float[np.ndarray, " grid"], how: Resample
+) -> tuple[Float[np.ndarray, "grid columns"], Bool[np.ndarray, " grid"]]:
+    """Values at the times of a grid, and whether each lies in no gap.
+
+    `hold` takes the last row before, `linear` the line between two.
+    """
+    steps = np.diff(series.time)
+    before = np.searchsorted(series.time, grid + _ROUNDING * (grid[1] - grid[0]), side="right") - 1
+    before = np.clip(before, 0, len(series.time) - 1)
+    if how == "hold":
+        values = series.values[before]
+    else:
+        values = np.stack([np.interp(grid, series.time, column) for column in series.values.T], axis=-1)
+    usual = max(float(np.median(steps)), grid[1] - grid[0]) if len(steps) else np.inf
+    wide = np.append(steps > GAP * usual, False)
+    exact = np.abs(series.time[before] - grid) < _ROUNDING * (grid[1] - grid[0])
+    return values, ~wide[before] | exact

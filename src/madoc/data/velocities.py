@@ -1,0 +1,74 @@
+"""Velocities that a log does not hold, from positions: central differences within an episode."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from madoc.data.dataset import Dataset
+from madoc.errors import MadocError
+from madoc.simulation.velocities import missing_velocities, velocities_between, with_velocities
+from madoc.tasks import Task
+
+
+def moving_states(
+    dataset: Dataset, task: Task
+) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows state"]]:
+    """(qpos, qvel) before and after every row: positions as observed, velocities too, else by differences of positions.
+
+    A reading's velocity leads from the reading before it to the one after it, over two control steps; at the ends of
+    an episode from or to the reading itself, over one. Of motion at constant acceleration the former is exact, the
+    latter off by half a control step's worth. Positions that are not observed are NaN, and their velocities 0.
+
+    Raises:
+        MadocError: The task's observation determines none of its positions.
+    """
+    posture = task.posture
+    if posture is None:
+        raise MadocError(
+            f"an observation of {task.name} determines none of its positions, so nothing can start at logged "
+            "states; take a method that starts rollouts from the task's reset: madoc with starts=policy"
+        )
+    logged = dataset.transitions
+    here, there = (
+        np.asarray(posture(np.asarray(part, np.float64))) for part in (logged.observation, logged.next_observation)
+    )
+    first = np.zeros(len(dataset), dtype=bool)
+    first[dataset.episode_starts] = True
+    last = np.append(first[1:], True)
+    before = np.where(first[:, None], here, np.roll(here, 1, axis=0))
+    beyond = np.where(last[:, None], there, np.roll(there, -1, axis=0))
+    return (
+        with_velocities(task, here, velocities_between(task, before, there, 2.0 - first)),
+        with_velocities(task, there, velocities_between(task, here, beyond, 2.0 - last)),
+    )
+
+
+def show_velocities(task: Task) -> Task:
+    """The same robot seen with the velocities that its signals do not tell, behind them: a state can then be rebuilt.
+
+    Raises:
+        MadocError: Its signals tell no position.
+    """
+    posture, observe, sense = task.posture, task.observe, task.sense
+    if posture is None:
+        raise MadocError(f"an observation of {task.name} determines none of its positions, so no velocities are added")
+    size, missing = task.observation_size, missing_velocities(task)
+
+    def rebuild(observation: np.ndarray) -> np.ndarray:
+        state = np.asarray(posture(observation[..., :size])).copy()
+        state[..., missing] = observation[..., size:]
+        return state
+
+    def both(shown: np.ndarray, state: np.ndarray) -> np.ndarray:
+        return np.concatenate([shown, state[..., missing]], axis=-1)
+
+    return replace(
+        task,
+        observation_size=size + len(missing),
+        observe=lambda state: both(observe(state), state),
+        sense=None if sense is None else lambda state, sensordata: both(sense(state, sensordata), state),
+        signals=(*task.signals, *(f"qvel[{address - task.compile().nq}]" for address in missing)),
+        state_from_observation=rebuild,
+        velocities=len(missing),
+    )

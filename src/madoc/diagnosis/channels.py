@@ -1,0 +1,225 @@
+"""What the log alone tells of its channels: which move, which stand at a limit, which contradict each other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from madoc.data import Dataset
+from madoc.errors import MadocError
+from madoc.findings import Finding
+from madoc.robots import Robot
+from madoc.simulation import CpuSimulator
+from madoc.tasks import Task
+
+AT_LIMIT = 1.0 - 1e-6
+"""Size in [-1, 1] from which an action stands at its limit."""
+MANY_AT_LIMIT = 0.1
+FEW_ROWS = 100
+_STILL = 1e-9
+"""Spread, relative to the size of the values, below which a channel never moves."""
+_KNOWN_RATIOS = {
+    180.0 / np.pi: "one in degrees, the other in radians",
+    np.pi / 180.0: "one in degrees, the other in radians",
+    1000.0: "one in thousandths (mm, ms) of the other",
+    1e-3: "one in thousandths (mm, ms) of the other",
+    100.0: "one in cm, the other in m",
+    0.01: "one in cm, the other in m",
+    2.0 * np.pi: "one in turns, the other in radians",
+    0.5 / np.pi: "one in turns, the other in radians",
+    30.0 / np.pi: "a speed in rpm",
+    np.pi / 30.0: "a speed in rpm",
+    -1.0: "one of them with its sign reversed",
+}
+_TRUSTED = 0.5
+"""Squared correlation of a position's changes with its speed from which their ratio is believed."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A signal or an action over the whole log, in its own unit.
+
+    Attributes:
+        name: As the spec has it.
+        kind: `signal` or `action`.
+        unit: Of the numbers here; empty where it is not known.
+        low: Smallest value.
+        high: Largest value.
+        step: Deviation of its changes from row to row.
+        at_limits: Share of rows in which an action stands at an end of its range; 0 for signals.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    low: float
+    high: float
+    step: float
+    at_limits: float = 0.0
+
+    @property
+    def moves(self) -> bool:
+        """Whether it ever changes."""
+        return self.high - self.low > _STILL * max(abs(self.low), abs(self.high), 1e-300)
+
+
+def signal_names(task: Task) -> tuple[str, ...]:
+    """Names of an observation's values."""
+    return task.signals or tuple(f"observation[{index}]" for index in range(task.observation_size))
+
+
+def action_names(task: Task) -> tuple[str, ...]:
+    """Names of an action's values."""
+    if task.actions:
+        return tuple(channel.name for channel in task.actions)
+    return tuple(f"action[{index}]" for index in range(task.action_size))
+
+
+def channels_of(dataset: Dataset, task: Task, robot: Robot | None = None) -> tuple[Channel, ...]:
+    """Signals, then actions."""
+    logged = dataset.transitions
+    observation, following = np.asarray(logged.observation), np.asarray(logged.next_observation)
+    both = np.stack([np.minimum(observation, following).min(0), np.maximum(observation, following).max(0)])
+    change = (following - observation).std(0)
+    units = [signal.unit or "" for signal in robot.signals] if robot else []
+    units += [""] * (task.observation_size - len(units))  # of velocities made from positions too
+    signals = [
+        Channel(name, "signal", unit, float(low), float(high), float(step))
+        for name, unit, low, high, step in zip(signal_names(task), units, *both, change, strict=True)
+    ]
+    unit_action = np.asarray(logged.action)
+    physical = _physical(unit_action, task)
+    within = _not_last(dataset)
+    step = np.diff(physical, axis=0)[within].std(0) if within.any() else np.zeros(task.action_size)
+    units = [channel.unit for channel in task.actions] or [""] * task.action_size
+    limits = (np.abs(unit_action) >= AT_LIMIT).mean(0)
+    columns = zip(action_names(task), units, physical.min(0), physical.max(0), step, limits, strict=True)
+    actions = [Channel(name, "action", unit, *map(float, numbers)) for name, unit, *numbers in columns]
+    return (*signals, *actions)
+
+
+def channel_findings(dataset: Dataset, simulator: CpuSimulator, channels: tuple[Channel, ...]) -> list[Finding]:
+    """Too few rows, channels that never move, actions at their limits, positions that contradict their speeds."""
+    found = _size_findings(dataset, len(simulator.parameters))
+    for kind in ("signal", "action"):
+        still = [channel for channel in channels if channel.kind == kind and not channel.moves]
+        everything = len(still) == sum(channel.kind == kind for channel in channels)
+        level = "fatal" if everything and kind == "signal" else "warning"
+        for channel in still:
+            what = f"it never moves: {channel.low + 0.0:g} in all {len(dataset):,} rows"
+            remedy = "a dead sensor, or the wrong column?" if kind == "signal" else "is it the column of the command?"
+            found.append(Finding(level, what, channel.name, remedy))  # type: ignore[arg-type]
+    for index, channel in enumerate(channel for channel in channels if channel.kind == "action"):
+        if channel.moves:
+            found += _limit_findings(channel, np.asarray(dataset.transitions.action)[:, index])
+    return found + _speed_findings(dataset, simulator)
+
+
+def _size_findings(dataset: Dataset, parameters: int) -> list[Finding]:
+    rows = len(dataset)
+    if rows < parameters:
+        what = f"{rows} rows for {parameters} parameters"
+        return [Finding("fatal", what, dataset.origin, "record more, or calibrate fewer")]
+    if rows < FEW_ROWS:
+        return [Finding("warning", f"only {rows} rows", dataset.origin, "record a minute or more")]
+    return []
+
+
+def _limit_findings(channel: Channel, unit_action: Float[np.ndarray, " rows"]) -> list[Finding]:
+    if channel.at_limits > MANY_AT_LIMIT:
+        return [
+            Finding(
+                "warning",
+                f"it stands at an end of its range in {100 * channel.at_limits:.0f} % of the rows",
+                channel.name,
+                "if the driver clips there, log what it applied and not what was asked for",
+            )
+        ]
+    largest = float(np.abs(unit_action).max())
+    if largest < 0.05:
+        what = f"it stays within {100 * largest:.2g} % of its range"
+        return [
+            Finding("warning", what, channel.name, "is the log's unit that of the spec? Else excite the robot more")
+        ]
+    return []
+
+
+def _speed_findings(dataset: Dataset, simulator: CpuSimulator) -> list[Finding]:
+    """Positions that do not change by their speeds times the control step: another unit or sign, wrapped angles."""
+    task = simulator.task
+    if task.state_from_observation is None:
+        return []
+    model = task.compile()
+    if model.nq != model.nv:
+        return []
+    logged = dataset.transitions
+    before, after = (
+        np.asarray(task.state_from_observation(np.asarray(part, np.float64)))[:, : 2 * model.nv]
+        for part in (logged.observation, logged.next_observation)
+    )
+    names = _names_of_states(task, 2 * model.nv)
+    found = []
+    for dof in range(model.nv):
+        position, speed = names[dof], names[model.nv + dof]
+        if position is None or speed is None:
+            continue
+        change = after[:, dof] - before[:, dof]
+        expected = 0.5 * (before[:, model.nv + dof] + after[:, model.nv + dof]) * simulator.control_step
+        turned = np.abs(np.abs(change) - 2.0 * np.pi) < 0.1 * 2.0 * np.pi
+        turned &= np.abs(change - expected) > np.pi
+        if turned.any():
+            what = f"it jumps by a whole turn in {int(turned.sum())} rows"
+            found.append(Finding("warning", what, position, "unwrap the angle where it is logged"))
+        found += _ratio_findings(change[~turned], expected[~turned], position, speed)
+    return found
+
+
+def _ratio_findings(change: np.ndarray, expected: np.ndarray, position: str, speed: str) -> list[Finding]:
+    power = float(expected @ expected)
+    if power == 0.0 or not np.any(change):
+        return []
+    together = float(change @ expected)
+    if together**2 < _TRUSTED * power * float(change @ change):
+        return []
+    ratio = together / power
+    if 0.8 < ratio < 1.25:
+        return []
+    known = [text for factor, text in _KNOWN_RATIOS.items() if abs(ratio / factor - 1.0) < 0.1]
+    what = f"it changes {ratio:.3g} times as fast as {speed} says" + (f": {known[0]}?" if known else "")
+    return [Finding("warning", what, position, "look at units and signs in the spec and at control_step")]
+
+
+def _names_of_states(task: Task, size: int) -> list[str | None]:
+    """The signal that each value of (qpos, qvel) is rebuilt from; None where that is none of them alone."""
+    assert task.state_from_observation is not None
+    names, width = signal_names(task), task.observation_size
+    base = np.asarray(task.state_from_observation(np.zeros((1, width))))[:, :size]
+    moved = np.asarray(task.state_from_observation(np.eye(width)))[:, :size] - base
+    sources = [np.flatnonzero(np.abs(moved[:, column]) > 1e-12) for column in range(size)]
+    return [names[source[0]] if len(source) == 1 else None for source in sources]
+
+
+def _physical(unit_action: Float[np.ndarray, "rows action"], task: Task) -> Float[np.ndarray, "rows action"]:
+    if not task.actions:
+        return unit_action
+    low, high = (np.array([getattr(channel, end) for channel in task.actions]) for end in ("low", "high"))
+    return low + (unit_action + 1.0) / 2.0 * (high - low)
+
+
+def _not_last(dataset: Dataset) -> np.ndarray:
+    """Whether a row's successor is of the same episode."""
+    within = np.ones(len(dataset), dtype=bool)
+    within[dataset.episode_ends - 1] = False
+    return within[:-1]
+
+
+def refuse_fatal(findings: tuple[Finding, ...]) -> None:
+    """Stop what a fatal finding makes pointless.
+
+    Raises:
+        MadocError: There is one; it is the sentence.
+    """
+    fatal = [finding for finding in findings if finding.level == "fatal"]
+    if fatal:
+        more = f" (and {len(fatal) - 1} more: madoc check tells)" if len(fatal) > 1 else ""
+        raise MadocError(f"the data is refused: {fatal[0].sentence}{more}")

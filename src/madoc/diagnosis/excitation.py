@@ -1,0 +1,201 @@
+"""How well a log could tell each parameter, from slopes of residuals: expected intervals, and what goes together."""
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
+from scipy.optimize import lsq_linear
+
+from madoc.data import Dataset
+from madoc.data.windows import Windows, windows_at
+from madoc.findings import Finding
+from madoc.residuals.linearisation import Linearisation, difference_points, linearise
+from madoc.residuals.uncertainty import bread, correlated_pairs, half_width, identifiability, meat, sandwich
+from madoc.residuals.window_residuals import window_residuals
+from madoc.simulation import CpuSimulator
+from madoc.simulation.rollout import reset_states
+
+HORIZONS = (5, 25)
+"""Control steps of a stretch: long ones tell more where sensors are noisy, short ones where the robot is chaotic."""
+WINDOWS = {5: 200, 25: 60}
+ROUNDS = 3
+"""Times the slopes are taken: from the best draw, the residual falls to what no parameter explains within two steps."""
+INSIDE = 0.98
+"""Slopes are taken no nearer to an end of [-1, 1]."""
+WIDE = 0.25
+"""Of its range: an expected interval with a larger half width says little."""
+_UNSEEN = 25
+"""Control steps simulated from the reset where no state can be rebuilt."""
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """What the log could say of each parameter, at best.
+
+    Attributes:
+        effect: How far half of its range moves what is seen, in units of what no parameter explains; NaN where no
+            state can be rebuilt and nothing is known of that.
+        half_width: Of the expected 95 % interval, in physical units; NaN likewise.
+        pairs: Parameters whose estimates would go together: names and correlation.
+        sentences: What cannot be told apart, or at all.
+        control_steps: Simulated.
+    """
+
+    effect: Float[np.ndarray, " d"]
+    half_width: Float[np.ndarray, " d"]
+    pairs: tuple[tuple[str, str, float], ...]
+    sentences: tuple[str, ...]
+    control_steps: int
+
+
+def excite(
+    dataset: Dataset,
+    simulator: CpuSimulator,
+    states: Float[np.ndarray, "states state"],
+    rows: Int[np.ndarray, " states"],
+    *,
+    start: Float[np.ndarray, " d"],
+    key: PRNGKeyArray,
+) -> Excitation:
+    """Slopes of residuals over stretches of the log that do not overlap, near the best fit that is quickly had.
+
+    A few Gauss-Newton steps within the box go to where the residual is what no parameter explains; it is the noise
+    that the expected intervals assume. Of short and long stretches, those that tell more count.
+
+    Args:
+        dataset: The log.
+        simulator: The model.
+        states: Rebuilt from the log.
+        rows: The rows they were rebuilt from.
+        start: Parameters in [-1, 1] that explain the log well already.
+        key: Draws the stretches.
+    """
+    of_length = [
+        _excited(dataset, simulator, states, rows, start=start, horizon=horizon, key=key) for horizon in HORIZONS
+    ]
+    spent = sum(found.control_steps for found in of_length)
+    spans = simulator.parameters.high - simulator.parameters.low
+    widths = [np.nan_to_num(found.half_width / spans, nan=1.0).mean() for found in of_length]
+    return replace(of_length[int(np.argmin(widths))], control_steps=spent)
+
+
+def _excited(
+    dataset: Dataset,
+    simulator: CpuSimulator,
+    states: Float[np.ndarray, "states state"],
+    rows: Int[np.ndarray, " states"],
+    *,
+    start: Float[np.ndarray, " d"],
+    horizon: int,
+    key: PRNGKeyArray,
+) -> Excitation:
+    """As `excite`, over stretches of one length."""
+    space = simulator.parameters
+    chosen, steps, available = _apart(dataset, rows, horizon, key)
+    windows = windows_at(dataset, states[chosen], rows[chosen], steps)
+    scale = _typical_change(dataset)
+    unit, best, spent = np.clip(start, -0.9 * INSIDE, 0.9 * INSIDE), None, 0
+    for _ in range(ROUNDS):
+        points = difference_points(unit)
+        around = linearise(points, window_residuals(simulator, windows, points, scale))
+        spent += len(points) * len(windows) * steps
+        if not len(around.residuals):
+            break
+        if best is None or (around.residuals**2).mean() < (best.residuals**2).mean():
+            best = around
+        unit = _bounded_step(around, unit)
+    if best is None:
+        nothing = np.full(len(space), np.nan)
+        sentence = f"the simulation fails in all {len(windows)} stretches tried; look at the ranges and the states"
+        return Excitation(nothing, nothing, (), (sentence,), spent)
+    half = (space.high - space.low) / 2.0
+    more = max(1.0, available / len(best.residuals))  # of such stretches are in the whole log
+    found = sandwich(more * bread(best, 1.0, "linear"), more * meat(best, 1.0, "linear"))
+    noise = max(float(np.sqrt((best.residuals**2).mean())), np.finfo(float).tiny)
+    slopes = np.sqrt((best.jacobian**2).mean((0, 1)))
+    return Excitation(
+        effect=slopes / noise,
+        half_width=half * half_width(found.covariance, available),
+        pairs=tuple(correlated_pairs(found.correlation, space.names)),
+        sentences=identifiability(found, space.names),
+        control_steps=spent,
+    )
+
+
+def excite_unseen(dataset: Dataset, simulator: CpuSimulator, *, key: PRNGKeyArray) -> Excitation:
+    """What goes together, from the model's own reset under stretches of the log's actions: no state can be rebuilt."""
+    of_rows, of_starts = jax.random.split(key)
+    space, task = simulator.parameters, simulator.task
+    steps = int(min(_UNSEEN, (dataset.episode_ends - dataset.episode_starts).max()))
+    rows = np.arange(len(dataset))
+    ends = dataset.episode_ends[np.searchsorted(dataset.episode_starts, rows, side="right") - 1]
+    possible = np.flatnonzero(rows + steps <= ends)
+    chosen = possible[np.asarray(jax.random.permutation(of_rows, len(possible)))[: WINDOWS[_UNSEEN]]]
+    starts = reset_states(simulator)(of_starts, len(chosen))
+    actions = np.asarray(dataset.transitions.action)[chosen[:, None] + np.arange(steps)]
+    windows = Windows(starts, actions, np.zeros((len(chosen), steps, task.observation_size)))
+    points = difference_points(np.zeros(len(space)))
+    around = linearise(points, window_residuals(simulator, windows, points, _typical_change(dataset)))
+    found = sandwich(bread(around, 1.0, "linear"), np.zeros((len(space), len(space))))
+    unknown = np.full(len(space), np.nan)
+    return Excitation(
+        effect=unknown,
+        half_width=unknown,
+        pairs=tuple(correlated_pairs(found.correlation, space.names)),
+        sentences=identifiability(found, space.names),
+        control_steps=len(points) * len(windows) * steps,
+    )
+
+
+def excitation_findings(found: Excitation, simulator: CpuSimulator) -> list[Finding]:
+    """A warning for each parameter that the log would leave open, and for those it cannot tell apart."""
+    space = simulator.parameters
+    findings = [Finding("warning", sentence, "parameters") for sentence in found.sentences]
+    told = " ".join(found.sentences)
+    for parameter, width in zip(space.parameters, found.half_width, strict=True):
+        share = width / (parameter.high - parameter.low)
+        if not share > WIDE or parameter.name in told:
+            continue
+        findings.append(
+            Finding(
+                "warning",
+                f"the log says little of it: expect ± {width:.2g} {parameter.unit} (95 %), {100 * share:.0f} % of its "
+                f"range",
+                parameter.name,
+                "excite it more, record longer, or leave it out",
+            )
+        )
+    return findings
+
+
+def _bounded_step(around: Linearisation, unit: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+    """The Gauss-Newton step that stays clear of the box's ends, where a mass of 0 or the like has no slope."""
+    count = len(unit)
+    jacobian, residuals = around.jacobian.reshape(-1, count), around.residuals.reshape(-1)
+    factor = np.linalg.qr(np.column_stack([jacobian, residuals]), mode="r")
+    padded = np.zeros((max(count, len(factor)), count + 1))
+    padded[: len(factor)] = factor
+    step = lsq_linear(padded[:, :count], -padded[:, count], bounds=(-INSIDE - unit, INSIDE - unit)).x
+    return np.clip(unit + step, -INSIDE, INSIDE)
+
+
+def _apart(
+    dataset: Dataset, rows: Int[np.ndarray, " states"], horizon: int, key: PRNGKeyArray
+) -> tuple[Int[np.ndarray, " windows"], int, int]:
+    """Positions in `rows` of stretches that do not overlap, their length, and how many there are in the whole log."""
+    episode = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
+    start, end = dataset.episode_starts[episode], dataset.episode_ends[episode]
+    steps = int(min(horizon, (end - rows).max()))
+    possible = np.flatnonzero(((rows - start) % steps == 0) & (rows + steps <= end))
+    if not len(possible):
+        possible = np.flatnonzero(rows + steps <= end)
+    picked = np.asarray(jax.random.permutation(key, len(possible)))[: WINDOWS[horizon]]
+    return possible[np.sort(picked)], steps, len(possible)
+
+
+def _typical_change(dataset: Dataset) -> Float[np.ndarray, " observation"]:
+    """Deviation of each signal's change in a step; 1 for those that never move."""
+    logged = dataset.transitions
+    spread = (np.asarray(logged.next_observation) - np.asarray(logged.observation)).std(0)
+    return np.where(spread > 1e-8, spread, 1.0)

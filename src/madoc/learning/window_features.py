@@ -1,0 +1,110 @@
+"""Several rows as one: what a discriminator is shown where a single observation does not determine the state.
+
+Not in the paper, whose robots show all of their state. Where velocities are hidden, (s, a) says little of s'; the last
+few observations and actions say as much as a state does.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from madoc.learning.dynamics_ratio import Scaling, spread_of
+from madoc.types import Transitions
+
+Stretch = tuple[
+    Float[np.ndarray, "length *rows observation"],
+    Float[np.ndarray, "length *rows action"],
+    Float[np.ndarray, "length *rows observation"],
+]
+"""Observations, actions, next observations of consecutive rows, the earliest first."""
+
+
+@dataclass(frozen=True)
+class WindowScaling:
+    """How windows of rows become features of order one; a window of one row is described as `Scaling` does.
+
+    The last row is (s, a), earlier ones are (s' - s, a): on a grid of small steps two positions alone would look the
+    same. What follows is described by how far it is from going on as in the step before, (s' - s) - (s - s₋₁).
+
+    Attributes:
+        scaling: Of one row.
+        length: Rows of a window.
+        next_scale: Of what describes the observation after the window.
+    """
+
+    scaling: Scaling
+    length: int
+    next_scale: Float[np.ndarray, " observation"]
+
+    @classmethod
+    def of(cls, scaling: Scaling, stretch: Stretch) -> "WindowScaling":
+        """As the logged windows have it."""
+        plain = cls(scaling, len(stretch[0]), scaling.next_scale)
+        if plain.length == 1 or not scaling.difference:
+            return plain
+        return replace(plain, next_scale=spread_of(turn(stretch)))
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Values of a described window, and of what follows it."""
+        return self.length * len(self.scaling.pair_offset), len(self.next_scale)
+
+    def features(
+        self, stretch: Stretch
+    ) -> tuple[Float[np.ndarray, "*rows window"], Float[np.ndarray, "*rows observation"]]:
+        """Features of the window and of what follows it, float32."""
+        each = [self.scaling.features(_row(*parts)) for parts in zip(*stretch, strict=True)]
+        pair, following = each[-1]
+        if self.length == 1:
+            return pair, following
+        if not self.scaling.difference:
+            return np.concatenate([pair for pair, _ in each], axis=-1), following
+        size = following.shape[-1]
+        earlier = [part for pair, change in each[-2::-1] for part in (change, pair[..., size:])]
+        return np.concatenate([pair, *earlier], axis=-1), (turn(stretch) / self.next_scale).astype(np.float32)
+
+
+def turn(stretch: Stretch) -> Float[np.ndarray, "*rows observation"]:
+    """The last change less the one before it."""
+    observation, _, following = stretch
+    return (following[-1] - observation[-1]) - (following[-2] - observation[-2])
+
+
+def logged_stretch(rows: Transitions, last: Int[np.ndarray, " windows"], length: int) -> Stretch:
+    """The windows of the log that end in the given rows."""
+    stretch = last - np.arange(length)[::-1, None]
+    return tuple(np.asarray(part)[stretch] for part in (rows.observation, rows.action, rows.next_observation))  # type: ignore[return-value]
+
+
+def last_rows(count: int, episode_starts: Int[np.ndarray, " episodes"], length: int) -> Int[np.ndarray, " windows"]:
+    """Rows that end a window of their own episode."""
+    rows = np.arange(count)
+    episode = np.searchsorted(episode_starts, rows, side="right") - 1
+    return rows[rows - episode_starts[episode] >= length - 1]
+
+
+def rolled_stretch(rows: Transitions, length: int) -> Stretch:
+    """The windows of a rollout, time first, that end in each of its steps but the first `length` - 1."""
+    ends = len(rows.observation) - length + 1
+    return tuple(  # type: ignore[return-value]
+        np.stack([np.asarray(part)[first : first + ends] for first in range(length)])
+        for part in (rows.observation, rows.action, rows.next_observation)
+    )
+
+
+def unbroken(
+    valid: Bool[np.ndarray, "steps *rows"], ended: Bool[np.ndarray, "steps *rows"], length: int
+) -> Bool[np.ndarray, "windows *rows"]:
+    """Which of those windows hold no failed row and no start in between."""
+    ends = len(valid) - length + 1
+    whole = np.ones((ends, *valid.shape[1:]), dtype=bool)
+    for first in range(length):
+        part = slice(first, first + ends)
+        whole &= valid[part] if first == length - 1 else valid[part] & ~ended[part]
+    return whole
+
+
+def _row(observation: np.ndarray, action: np.ndarray, following: np.ndarray) -> Transitions:
+    none = np.zeros(observation.shape[:-1])
+    return Transitions(observation, action, none, following, none, none)

@@ -1,0 +1,101 @@
+"""Export as a stage: a finished calibration as files for others' tools."""
+
+from pathlib import Path
+from typing import Any
+
+from madoc import simulation
+from madoc.errors import MadocError
+from madoc.export import Found, Provenance, save_onnx, save_patch, save_randomization, save_sysid_parameters
+from madoc.files import read_json
+from madoc.numpy_policy import NumpyPolicy
+from madoc.pipeline.calibration_stage import Calibrated, read_calibration
+from madoc.pipeline.evaluation_stage import find_policies
+from madoc.simulation import CpuSimulator
+from madoc.simulation.mjcf import save_mjcf
+from madoc.simulation.write import nominal_values
+
+
+def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dict[str, Path]:
+    """Leave a finished calibration as MJCF, patch, randomization ranges and parameters for `mujoco.sysid`.
+
+    Args:
+        run: A run folder of `madoc calibrate` or `madoc run`.
+        out: Folder for the files; None takes `export` in the run folder.
+        onnx: Write the run's policies as ONNX too.
+
+    Returns:
+        The files by what they are.
+
+    Raises:
+        MadocError: There is no finished calibration, no policy where `onnx` wants one, or a file cannot be written.
+    """
+    calibrated = read_calibration(run)
+    policies = find_policies(run) if onnx else {}
+    folder = (out or run / "export").expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MadocError(f"could not make the folder {folder}: {error.strerror or error}") from error
+    simulator, result = simulation.make(calibrated.task), calibrated.result
+    provenance = provenance_of(calibrated)
+    model = calibrated.task.compile()
+    found = [
+        Found(parameter, result.parameters[parameter.name], nominal_values(model, parameter))
+        for parameter in simulator.parameters.parameters
+    ]
+    files = {
+        "model": folder / "model.xml",
+        "patch": folder / "patch.yaml",
+        "randomization ranges": folder / "randomization.yaml",
+        "mujoco.sysid parameters": folder / "sysid_parameters.yaml",
+    }
+    changes = save_mjcf(simulator, result.mean, files["model"])
+    save_patch(files["patch"], found, provenance, changes=changes, stepping=_stepping(simulator))
+    save_randomization(files["randomization ranges"], found, provenance, result.covariance)
+    save_sysid_parameters(files["mujoco.sysid parameters"], found)
+    for name, file in policies.items():
+        target = folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx")
+        save_onnx(NumpyPolicy.load(file), target)
+        files[f"policy {name}"] = target
+    return files
+
+
+def provenance_of(calibrated: Calibrated) -> Provenance:
+    """Where an estimate comes from, as its run folder remembers it."""
+    folder = calibrated.folder
+    spec: dict[str, Any] = read_json(folder / "spec.json") if (folder / "spec.json").exists() else {}
+    known = spec.get("data") or {}
+    result = read_json(folder / "result.json") if (folder / "result.json").exists() else {}
+    whole = folder.resolve()
+    return Provenance(
+        run=whole.parent.name if whole.name == "calibration" else whole.name,
+        method=calibrated.result.method,
+        seed=calibrated.seed,
+        data={name: known[name] for name in ("paths", "rows", "fingerprint") if name in known},
+        versions=spec.get("versions", {}),
+        verdict=result.get("verdict"),
+        warnings=calibrated.result.warnings,
+    )
+
+
+def _stepping(simulator: CpuSimulator) -> dict[str, Any]:
+    """How the model is stepped to move as it was calibrated to."""
+    task, steps = simulator.task, simulator.task.frame_skip
+    channels = [
+        {
+            "name": channel.name,
+            "actuator": channel.actuator,
+            "low": channel.low,
+            "high": channel.high,
+            "unit": channel.unit,
+            "control_per_unit": channel.scale,
+        }
+        for channel in task.actions
+    ]
+    held = "held for a control step; the solver starts cold (qacc_warmstart = 0) at each"
+    return {
+        "control_step_s": simulator.control_step,
+        "physics_steps_per_control_step": steps,
+        "timestep_s": simulator.control_step / steps,
+        "controls": f"values of the channels, {held}" if channels else f"actions in [-1, 1], {held}",
+    } | ({"channels": channels} if channels else {})

@@ -1,0 +1,87 @@
+"""How long methods would take on this machine, from a second of each."""
+
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import jax
+
+from madoc.calibration import CalibrationProblem, LeastSquares, Madoc
+from madoc.errors import MadocError
+
+REFINING_EPOCHS = 6
+"""Steps on all windows that least squares usually takes."""
+BESIDES = 1.15
+"""Cloning and grouping, over calibrating: measured with the defaults on Hopper."""
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """A method's time, or why it would refuse.
+
+    Attributes:
+        method: Its name.
+        seconds: Expected; None where it refuses.
+        control_steps: It would simulate, at most.
+        refusal: A sentence; empty where it does not refuse.
+    """
+
+    method: str
+    seconds: float | None
+    control_steps: int
+    refusal: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Its fields."""
+        return asdict(self)
+
+    @property
+    def sentence(self) -> str:
+        """In words."""
+        if self.seconds is None:
+            return f"{self.method} would refuse: {self.refusal}"
+        return f"{self.method}: about {_duration(self.seconds)} for {self.control_steps:,} control steps"
+
+
+def forecast(problem: CalibrationProblem, *, budget: int) -> tuple[Forecast, ...]:
+    """Forecasts of least squares and of Madoc with their defaults.
+
+    Least squares takes one step of its search, Madoc two epochs, the first of which compiles.
+    """
+    return (_least_squares(problem), _madoc(problem, budget))
+
+
+def _least_squares(problem: CalibrationProblem) -> Forecast:
+    method = LeastSquares()
+    try:
+        state = method.init(problem, jax.random.key(0))
+    except MadocError as error:
+        return Forecast(method.name, None, 0, str(error))
+    started = time.monotonic()
+    state, _ = method.step(problem, state)
+    seconds = time.monotonic() - started
+    total = method.whole_run(problem, state, refining_epochs=REFINING_EPOCHS)
+    return Forecast(method.name, seconds / method.control_steps(state) * total, total)
+
+
+def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
+    starts: Any = "logged" if problem.starts_known else "policy"
+    method = Madoc(groups="one", starts=starts, cloning_epochs=0)
+    name = Madoc().name
+    try:
+        state = method.init(problem, jax.random.key(0))
+        times = []
+        for _ in range(2):
+            started = time.monotonic()
+            state, _ = method.step(problem, state)
+            times.append(time.monotonic() - started)
+    except MadocError as error:
+        return Forecast(name, None, 0, str(error))
+    epochs = budget / method.epoch_steps
+    return Forecast(name, times[0] + BESIDES * epochs * times[1], budget)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{max(1.0, seconds):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,252 @@
+"""The first spec of a robot: written from its model, with comments that explain every part, and loadable as it is."""
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from madoc.errors import MadocError
+from madoc.files import replacing
+from madoc.robots.model import ModelFiles, compiled, is_single, is_slide, joint_kind, names_of
+from madoc.tasks import TASKS
+
+_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z]+)?|(position|velocity)\([A-Za-z_][A-Za-z0-9_]*\)")
+_WORDS = ("null", "true", "false", "y", "n", "yes", "no", "on", "off")
+_USUAL_STEP = 0.02
+"""s. Fifty actions a second."""
+_ACTIVE = 16
+"""Parameters proposed at once; more are written as comments."""
+_OF_FREE = (("x", "y", "z", "qw", "qx", "qy", "qz"), ("vx", "vy", "vz", "wx", "wy", "wz"))
+Fields = dict[str, str | float]
+_OF_BALL = (("qw", "qx", "qy", "qz"), ("wx", "wy", "wz"))
+
+
+def write_spec(model: Path, out: Path) -> None:
+    """Write the spec of a model's robot to a new file.
+
+    Raises:
+        MadocError: The file is there already, the folder is not, or the model cannot be used.
+    """
+    from madoc.robots import load
+
+    if out.exists():
+        raise MadocError(f"{out} exists already; choose another --out, or delete it")
+    if not out.parent.is_dir():
+        raise MadocError(f"there is no folder {out.parent} to write {out.name} into; make it first")
+    text = spec_text(model, out)
+    with replacing(out) as stream:
+        stream.write(text.encode())
+    try:
+        load(out)
+    except MadocError as error:
+        out.unlink()
+        raise MadocError(f"no spec can be made of {model}: {error}") from error
+
+
+def spec_text(model: Path, out: Path) -> str:
+    """The commented spec of a model's robot, for a file at `out`.
+
+    Raises:
+        MadocError: The model cannot be read, or nothing in it has a name.
+    """
+    files = ModelFiles.read(model)
+    made = compiled(files.spec(), files.main)
+    joints = names_of(made, mujoco.mjtObj.mjOBJ_JOINT, made.njnt)
+    if not joints:
+        raise MadocError(f"no joint of {model} has a name, and a spec reads joints by name; name them in the model")
+    signals = list(_signals(made, joints))
+    actions = list(_actions(made, joints, {name for name, *_ in signals}))
+    if not actions:
+        raise MadocError(f"no actuator of {model} has a name, and a spec drives them by name; name them in the model")
+    timestep = float(made.opt.timestep)
+    step = timestep * max(1, round(_USUAL_STEP / timestep))
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", model.stem).strip("_-") or "robot"
+    lines = [
+        f"# A robot for Madoc, written from {model.name} by `madoc init`. What it means: madoc spec {out.name}",
+        "madoc: 1",
+        f"name: {_quoted('my_' + name if name in TASKS else name)}",
+        f"model: {_quoted(_relative(model, out.parent))}  # MJCF or URDF, relative to this file",
+        f"control_step: {step:.12g}  # s between two actions; a multiple of the model's timestep, {timestep:.12g} s",
+        "",
+        "# The observation: one number a line. Each reads position(JOINT), velocity(JOINT) or sensor(NAME), one of",
+        "# several values as sensor(NAME)[2], or an expression of them with + - * / **, sin cos tan sqrt abs and pi:",
+        '#   {name: height, reads: "sensor(tip)[2] * 1000", unit: mm}',
+        "# Take out what your log does not have. With every position and velocity, states can be rebuilt from the log.",
+        "signals:",
+        *(f"  - {_mapping(name=name, reads=reads, unit=unit)}" for name, reads, unit in signals),
+        *_sensors(made),
+        *_unnamed(made),
+        "",
+        "# The action: what the log's action columns mean, and their limits. An `actuator` is one of the model's and",
+        "# gets the value as its control. A `joint` gets a new one: means: torque (of a slide, force); means: position",
+        "# with kp: and kd:; means: velocity with kd:. Units deg, deg/s, mm, mm/s, cm and mN·m are converted.",
+        "actions:",
+        *(f"  - {_mapping(**fields)}{comment}" for fields, comment in actions),
+        "",
+        "# What is calibrated, each within its range: wide enough to hold the truth, and only what matters.",
+        "# One value for several: {field: dof_damping, elements: [left, right], name: damping, low: 0, high: 1}",
+        "parameters:",
+        *_parameters(made, joints),
+        f"  # - {{field: action_delay, low: 0, high: {2 * step:.6g}}}  # s from an action to its effect",
+        f"  # - {_mapping(field='signal_bias', element=signals[0][0], low=-0.1, high=0.1)}  # what it reads too much",
+        "",
+        "# How a log is laid out, where it is not as above.",
+        "# log:",
+        "#   time: time            # column of timestamps, s",
+        f"#   columns: {{{_quoted(signals[0][0])}: my_column}}  # our name -> the log's",
+        "#   resample: null        # hold or linear: bring another rate to control_step",
+        "#   tolerance: 0.1        # how far a time step may be from control_step, as a share",
+        "",
+        "# What a policy should want, for `madoc learn`: an expression of signals (after the step) and actions.",
+        "# reward: null",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _signals(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[str, str, str]]:
+    """Name, expression and unit of every position, then of every velocity."""
+    for kind in ("position", "velocity"):
+        for joint in joints:
+            place = joint_kind(model, model.joint(joint).id)
+            speed = kind == "velocity"
+            reads = f"{kind}({joint if joint.isidentifier() else json.dumps(joint, ensure_ascii=False)})"
+            parts = {mujoco.mjtJoint.mjJNT_FREE: _OF_FREE, mujoco.mjtJoint.mjJNT_BALL: _OF_BALL}.get(place)
+            if parts is None:
+                unit = "m" if place == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+                yield (f"{joint}_speed", reads, f"{unit}/s") if speed else (joint, reads, unit)
+                continue
+            for index, part in enumerate(parts[speed]):
+                unit = "1" if part[0] == "q" else {"v": "m/s", "w": "rad/s"}.get(part[0], "m")
+                yield f"{joint}_{part}", f"{reads}[{index}]", unit
+
+
+def _sensors(model: mujoco.MjModel) -> Iterator[str]:
+    """The model's sensors, as comments: a log seldom has them all."""
+    for sensor in names_of(model, mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor):
+        name = sensor if sensor.isidentifier() else json.dumps(sensor, ensure_ascii=False)
+        size = int(model.sensor_dim[model.sensor(sensor).id])
+        for index in range(size):
+            label, part = (sensor, "") if size == 1 else (f"{sensor}_{index}", f"[{index}]")
+            yield f"  # - {_mapping(name=label, reads=f'sensor({name}){part}')}"
+
+
+def _unnamed(model: mujoco.MjModel) -> Iterator[str]:
+    """What cannot be used because it has no name."""
+    counts = {
+        "joint": (mujoco.mjtObj.mjOBJ_JOINT, model.njnt),
+        "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu),
+        "sensor": (mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor),
+    }
+    for what, (kind, count) in counts.items():
+        missing = count - len(names_of(model, kind, count))
+        if missing:
+            yield f"  # {missing} {what}{'s' * (missing > 1)} of the model cannot be used here: give each a name there."
+
+
+def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Iterator[tuple[Fields, str]]:
+    """The model's actuators; a torque on every joint where it has none."""
+    for actuator in names_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu):
+        index = model.actuator(actuator).id
+        name = f"{actuator}_command" if actuator in taken else actuator
+        limited = bool(model.actuator_ctrllimited[index])
+        low, high = model.actuator_ctrlrange[index] if limited else (-1.0, 1.0)
+        comment = "" if limited else "  # the model has no ctrlrange: write its limits"
+        yield {"name": name, "actuator": actuator, "low": float(low), "high": float(high)}, comment
+    if model.nu:
+        return
+    for joint in joints:
+        index = model.joint(joint).id
+        if not is_single(model, index):
+            continue
+        slide = is_slide(model, index)
+        limited = bool(model.jnt_actfrclimited[index])
+        low, high = model.jnt_actfrcrange[index] if limited else (-1.0, 1.0)
+        means, unit = ("force", "N") if slide else ("torque", "N·m")
+        comment = "" if limited else f"  # the model has no limit: write the motor's largest {means}"
+        fields = {"name": f"{joint}_{means}", "joint": joint, "means": means}
+        yield {**fields, "low": float(low), "high": float(high), "unit": unit}, comment
+
+
+def _parameters(model: mujoco.MjModel, joints: list[str]) -> Iterator[str]:
+    """Masses, stiffness, damping and friction; friction, and all past the first few, as comments."""
+    found = [*_masses(model), *_stiffness(model, joints), *_of_joints(model, joints)]
+    active = 0
+    for fields, comment, wanted in found:
+        active += wanted
+        yield f"  {'' if wanted and active <= _ACTIVE else '# '}- {_mapping(**fields)}  # {comment}"
+
+
+def _masses(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
+    bodies = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
+    for body in range(1, model.nbody):
+        mass = float(model.body_mass[body])
+        if mass <= 0.0 or model.body_weldid[body] == 0:
+            continue
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body)
+        if not name and model.body_jntnum[body]:
+            joint = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, model.body_jntadr[body])
+            name = joint if joint and joint not in bodies else ""
+        if name:
+            fields: Fields = {"field": "body_mass", "element": name, "low": _round(mass / 2), "high": _round(mass * 2)}
+            yield fields, f"kg; the model has {mass:.4g}", True
+
+
+def _stiffness(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
+    """Of joints that have a spring."""
+    for joint in joints:
+        index = model.joint(joint).id
+        value = float(np.atleast_1d(model.jnt_stiffness[index])[0])
+        if value > 0 and is_single(model, index):
+            unit = "N/m" if is_slide(model, index) else "N·m/rad"
+            fields: Fields = {
+                "field": "jnt_stiffness",
+                "element": joint,
+                "low": _round(value / 2),
+                "high": _round(value * 2),
+            }
+            yield fields, f"{unit}; the model has {value:.4g}", True
+
+
+def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
+    for field, wanted in (("dof_damping", True), ("dof_frictionloss", False)):
+        for joint in joints:
+            index = model.joint(joint).id
+            if joint_kind(model, index) == mujoco.mjtJoint.mjJNT_FREE:
+                continue
+            dof = model.jnt_dofadr[index]
+            value = float(getattr(model, field)[dof])
+            # Where the model says nothing: what would stop the joint, and all that hangs on it, in 0.1 s.
+            high = 2 * value if value > 0 else 10 * float(model.dof_M0[dof])
+            slide = is_slide(model, index)
+            units = ("N·s/m", "N") if slide else ("N·m·s/rad", "N·m")
+            unit = units[field == "dof_frictionloss"]
+            fields: Fields = {"field": field, "element": joint, "low": 0.0, "high": _round(high)}
+            yield fields, f"{unit}; the model has {value:.4g}", wanted
+
+
+def _round(value: float) -> float:
+    """Two digits: a range is no measurement."""
+    return float(np.format_float_positional(value, precision=2, fractional=False)) if value > 0 else value
+
+
+def _mapping(**fields: str | float) -> str:
+    """A YAML mapping on one line."""
+    return "{" + ", ".join(f"{key}: {_quoted(value)}" for key, value in fields.items()) + "}"
+
+
+def _quoted(value: str | float) -> str:
+    """Text or a number as YAML reads it back."""
+    if not isinstance(value, str):
+        return f"{value:.12g}"
+    plain = _PLAIN.fullmatch(value) and value.lower() not in _WORDS
+    file = re.fullmatch(r"[A-Za-z_.][A-Za-z0-9_./-]*[A-Za-z]", value) and value.lower() not in _WORDS
+    return value if plain or file else json.dumps(value, ensure_ascii=False)
+
+
+def _relative(model: Path, folder: Path) -> str:
+    """The model's path as seen from the spec's folder."""
+    return Path(os.path.relpath(model.resolve(), folder.resolve())).as_posix()

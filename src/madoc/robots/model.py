@@ -1,0 +1,218 @@
+"""The model of a robot: its files, read once and whole, and a MuJoCo spec made of them with the spec's actuators."""
+
+import base64
+import re
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from madoc.errors import MadocError
+
+_MESH = re.compile(r"""<mesh[^>]*\bfilename\s*=\s*["']([^"']+)["']""")
+
+
+@dataclass(frozen=True)
+class ModelFiles:
+    """A model file and all that it includes.
+
+    Attributes:
+        main: Name of the model file.
+        contents: By path from the model file's folder, or as the model names it.
+    """
+
+    main: str
+    contents: Mapping[str, bytes]
+
+    @classmethod
+    def read(cls, path: Path) -> "ModelFiles":
+        """Read a model file and everything that it refers to.
+
+        Raises:
+            MadocError: A file is missing or cannot be read.
+        """
+        contents = {path.name: _read(path)}
+        if is_urdf(contents[path.name]):
+            for name in dict.fromkeys(_MESH.findall(contents[path.name].decode(errors="replace"))):
+                contents[name] = _read(_mesh_path(name, path))
+            return cls(path.name, contents)
+        try:
+            found = mujoco.mju_getXMLDependencies(str(path))
+        except (ValueError, mujoco.FatalError):
+            found = []  # compiling it tells better what is wrong
+        for file in map(Path, found):
+            if file != path and file.resolve() != path.resolve():
+                contents[_from(file, path.parent)] = _read(file, path.name)
+        return cls(path.name, contents)
+
+    def to_json(self) -> dict[str, Any]:
+        """Text as text, anything else compressed."""
+        return {"main": self.main, "contents": {name: _stored(content) for name, content in self.contents.items()}}
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> "ModelFiles":
+        """What `to_json` made."""
+        return cls(stored["main"], {name: _restored(content) for name, content in stored["contents"].items()})
+
+    def spec(self) -> mujoco.MjSpec:
+        """A MuJoCo spec of it, in which what has no name of its own is named by what it belongs to.
+
+        A joint takes the name of its body, where it is the only one there, and an actuator that of its joint.
+
+        Raises:
+            MadocError: MuJoCo does not take it; the sentence is MuJoCo's.
+        """
+        try:
+            text = self.contents[self.main].decode()
+        except UnicodeDecodeError as error:
+            raise MadocError(f"model {self.main} is not text; expected MJCF or URDF") from error
+        others = {name: content for name, content in self.contents.items() if name != self.main}
+        includes = {name: content for name, content in others.items() if PurePosixPath(name).suffix == ".xml"}
+        assets = {name: content for name, content in others.items() if name not in includes}
+        try:
+            spec = mujoco.MjSpec.from_string(text, include=includes, assets=assets)
+        except (ValueError, mujoco.FatalError) as error:
+            raise MadocError(f"model {self.main} cannot be read: {_one_line(error)}") from error
+        _name_by_owner(
+            [(joint, joint.parent.name) for joint in spec.joints if len(joint.parent.joints) == 1], spec.joints
+        )
+        of_joint = [part for part in spec.actuators if part.trntype == mujoco.mjtTrn.mjTRN_JOINT]
+        _name_by_owner([(actuator, actuator.target) for actuator in of_joint], spec.actuators)
+        return spec
+
+
+@dataclass(frozen=True)
+class AddedActuator:
+    """An actuator that a spec adds to a joint: force = gain · control + bias of position and velocity.
+
+    Attributes:
+        name: Of the action channel.
+        joint: What it drives.
+        gain: Of the control.
+        stiffness: What the force falls by per position.
+        damping: What the force falls by per velocity.
+        limit: Largest force; None is unlimited.
+    """
+
+    name: str
+    joint: str
+    gain: float = 1.0
+    stiffness: float = 0.0
+    damping: float = 0.0
+    limit: float | None = None
+
+
+def make_model(
+    base: mujoco.MjSpec, added: tuple[AddedActuator, ...] = (), timestep: float | None = None
+) -> mujoco.MjSpec:
+    """A copy of a spec with actuators of its own, and another timestep if one is given."""
+    spec = base.copy()
+    if timestep is not None:
+        spec.option.timestep = timestep
+    for actuator in added:
+        new = spec.add_actuator(name=actuator.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=actuator.joint)
+        new.gainprm[0] = actuator.gain
+        if actuator.stiffness or actuator.damping:
+            new.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+            new.biasprm[1:3] = -actuator.stiffness, -actuator.damping
+        if actuator.limit is not None:
+            new.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            new.forcerange = np.array([-actuator.limit, actuator.limit])
+    return spec
+
+
+def compiled(spec: mujoco.MjSpec, file: str) -> mujoco.MjModel:
+    """The model.
+
+    Raises:
+        MadocError: It does not compile; the sentence is MuJoCo's.
+    """
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise MadocError(f"model {file} does not compile: {_one_line(error)}") from error
+
+
+def is_urdf(content: bytes) -> bool:
+    """Whether a model file is URDF: its first element is `robot`."""
+    first = re.search(rb"<\s*([A-Za-z_][\w.-]*)", re.sub(rb"<!--.*?-->|<\?.*?\?>", b"", content, flags=re.DOTALL))
+    return first is not None and first[1] == b"robot"
+
+
+def joint_kind(model: mujoco.MjModel, joint: int) -> mujoco.mjtJoint:
+    """Hinge, slide, ball or free."""
+    return mujoco.mjtJoint(int(model.jnt_type[joint]))
+
+
+def is_slide(model: mujoco.MjModel, joint: int) -> bool:
+    """Whether a joint slides; what turns has other units."""
+    return joint_kind(model, joint) == mujoco.mjtJoint.mjJNT_SLIDE
+
+
+def is_single(model: mujoco.MjModel, joint: int) -> bool:
+    """Whether a joint is a hinge or a slide, with one position and one velocity."""
+    return joint_kind(model, joint) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def names_of(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[str]:
+    """Names of all elements of a kind that have one."""
+    return [name for index in range(count) if (name := mujoco.mj_id2name(model, kind, index))]
+
+
+def _name_by_owner(owned: list[tuple[Any, str]], everything: Any) -> None:
+    """Name what has no name by its owner, unless that name is taken or would be given twice."""
+    taken = [part.name for part in everything]
+    wanted = [owner for part, owner in owned if not part.name]
+    for part, owner in owned:
+        if not part.name and owner and owner not in taken and wanted.count(owner) == 1:
+            part.name = owner
+
+
+def _read(path: Path, owner: str = "") -> bytes:
+    if not path.is_file():
+        refers = f"{owner} refers to {path}, which is" if owner else f"there is no model file {path}: it is"
+        raise MadocError(f"{refers} {'a directory' if path.is_dir() else 'missing'}; check the path")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise MadocError(f"could not read {path}: {error.strerror or error}") from error
+
+
+def _mesh_path(name: str, model: Path) -> Path:
+    """Where a URDF's mesh lies: beside the model, or in the package that the model is part of."""
+    bare = re.sub(r"^(package|file)://", "", name)
+    inside = PurePosixPath(bare).parts[1:] if name.startswith("package://") else PurePosixPath(bare).parts
+    candidates = [model.parent / bare, *(folder.joinpath(*inside) for folder in model.parents[:3])]
+    candidates.append(model.parent / PurePosixPath(bare).name)
+    found = [path for path in candidates if path.is_file()]
+    if not found:
+        raise MadocError(
+            f"{model.name} refers to {name}, which is neither beside it nor in its package; check the path"
+        )
+    return found[0]
+
+
+def _from(file: Path, folder: Path) -> str:
+    try:
+        return file.relative_to(folder).as_posix()
+    except ValueError:
+        return file.as_posix()
+
+
+def _stored(content: bytes) -> str | dict[str, str]:
+    try:
+        return content.decode()
+    except UnicodeDecodeError:
+        return {"zlib_base64": base64.b64encode(zlib.compress(content)).decode()}
+
+
+def _restored(stored: str | Mapping[str, str]) -> bytes:
+    return stored.encode() if isinstance(stored, str) else zlib.decompress(base64.b64decode(stored["zlib_base64"]))
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

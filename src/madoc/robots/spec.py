@@ -1,0 +1,251 @@
+"""The spec file of a robot: what may stand in it, checked before any model is read."""
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from madoc.errors import MadocError
+from madoc.parameters import FIELDS, Parameter
+from madoc.robots.document import Document, Place, nearest, read_document
+from madoc.tasks import TASKS
+
+VERSION = 1
+
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]+$")]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class Part(BaseModel):
+    """Strict: no unknown key, and no value is converted into another type."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class SignalSpec(Part):
+    """One number of an observation."""
+
+    name: Name = Field(description="What a log's column is called, unless `log: columns:` says otherwise.")
+    reads: str = Field(
+        description="position(JOINT), velocity(JOINT), sensor(NAME), one value of several as sensor(NAME)[2], or an "
+        "expression of them: + - * / **, sin cos tan asin acos atan atan2 sqrt abs exp, pi."
+    )
+    unit: str | None = Field(None, description="For people. Default: that of the joint, where `reads` is one.")
+
+
+class ActionSpec(Part):
+    """One number of an action: what the log's column means."""
+
+    name: Name
+    joint: Name | None = Field(None, description="The joint it drives; an actuator is added to the model.")
+    actuator: Name | None = Field(None, description="The model's own actuator that gets it as its control.")
+    means: Literal["torque", "force", "position", "velocity"] | None = Field(
+        None, description="With `joint`: torque (N·m; of a slide, force in N), or the target of a servo."
+    )
+    low: Finite | None = Field(None, description="Smallest value, in `unit`. Default: the actuator's ctrlrange.")
+    high: Finite | None = Field(None, description="Largest value, in `unit`. Default: the actuator's ctrlrange.")
+    kp: Positive | None = Field(None, description="Stiffness of a position servo, N·m/rad (of a slide, N/m).")
+    kd: Finite | None = Field(None, ge=0, description="Damping of a servo, N·m·s/rad (of a slide, N·s/m).")
+    limit: Positive | None = Field(None, description="Largest torque or force of a servo, N·m (of a slide, N).")
+    unit: str | None = Field(
+        None, description="Of low, high and the log: deg, deg/s, mm, mm/s, cm, mN·m are converted, others are SI's."
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "ActionSpec":
+        _refuse(not _one(self.joint, self.actuator), "expected either joint: or actuator:, got both or neither")
+        if self.actuator is not None:
+            for key in ("means", "kp", "kd", "limit"):
+                given = getattr(self, key) is not None
+                _refuse(given, f"{key}: belongs to joint:, the actuator {self.actuator!r} has its own in the model")
+        else:
+            _refuse(self.means is None, "expected means: torque, force, position or velocity beside joint:")
+            _refuse(self.low is None or self.high is None, "expected low: and high: beside joint:")
+            _refuse(self.means == "position" and self.kp is None, "expected kp: of a position servo")
+            _refuse(self.means == "velocity" and not self.kd, "expected kd: above 0 of a velocity servo")
+            _refuse(self.means != "position" and self.kp is not None, f"kp: means nothing beside means: {self.means}")
+            servo = self.means in ("position", "velocity")
+            for key in ("kd", "limit"):
+                given = getattr(self, key) is not None
+                _refuse(given and not servo, f"{key}: means nothing beside means: {self.means}")
+        _refuse(not _one(self.low, self.high) and self.low is None, "")
+        _refuse(_one(self.low, self.high), "expected both low: and high:, got one of them")
+        if self.low is not None and self.high is not None:
+            _refuse(self.low >= self.high, f"expected low below high, got {self.low:g} and {self.high:g}")
+        return self
+
+
+class ParameterSpec(Part):
+    """One value to calibrate, and the range it is searched in."""
+
+    field: str = Field(description=f"One of: {', '.join(FIELDS)}.", json_schema_extra={"enum": list(FIELDS)})
+    element: Name | None = Field(None, description="Name of the body, joint, geom, actuator or signal.")
+    elements: list[Name] | None = Field(None, min_length=1, description="Several that share one value.")
+    name: Name | None = Field(None, description="Its own name. Default: field.element.")
+    low: Finite
+    high: Finite
+
+    @field_validator("field")
+    @classmethod
+    def _known(cls, field: str) -> str:
+        near = nearest(field, list(FIELDS))
+        hint = f"nearest: {', '.join(near)}" if near else f"there are: {', '.join(FIELDS)}"
+        _refuse(field not in FIELDS, f"expected a field that can be calibrated, got {field!r}; {hint}")
+        return field
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "ParameterSpec":
+        _refuse(self.element is not None and self.elements is not None, "expected element: or elements:, got both")
+        try:
+            self.parameter()
+        except MadocError as error:
+            raise ValueError(str(error)) from error
+        return self
+
+    def parameter(self, unit: str = "") -> Parameter:
+        """The parameter, in its field's unit or another.
+
+        Raises:
+            MadocError: It is none.
+        """
+        element = tuple(self.elements) if self.elements else self.element or ""
+        return Parameter(self.field, element, self.low, self.high, self.name or "", unit)
+
+
+class LogSpec(Part):
+    """How a log of this robot is laid out."""
+
+    time: Name = Field("time", description="Column of timestamps, s.")
+    columns: dict[Name, Name] = Field({}, description="Our names of signals and actions -> the log's columns.")
+    resample: Literal["hold", "linear"] | None = Field(
+        None,
+        description="Bring other rates to control_step: hold the last value, or interpolate signals. Only if asked.",
+    )
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(
+        0.1, description="How far a time step may be from control_step, as a share of it."
+    )
+
+
+class RobotSpec(Part):
+    """A robot of one's own, as Madoc's spec file describes it."""
+
+    madoc: Literal[1] = Field(description="Version of this format.")
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$", max_length=60)] = Field(
+        description="Letters, digits, _ . and -."
+    )
+    model: Name = Field(description="MJCF or URDF, relative to this file.")
+    control_step: Positive = Field(description="Time between two actions, s; a whole multiple of the timestep.")
+    timestep: Positive | None = Field(None, description="Of the physics, s. Default: the model's.")
+    signals: list[SignalSpec] = Field(min_length=1, description="The observation, in this order.")
+    actions: list[ActionSpec] = Field(min_length=1, description="The action, in this order.")
+    parameters: list[ParameterSpec] = Field(min_length=1, description="What can be calibrated.")
+    groups: Annotated[int, Field(ge=1)] | None = Field(None, description="Groups Madoc forms. Default: min(4, d).")
+    log: LogSpec = Field(default_factory=lambda: LogSpec.model_validate({}))
+    reward: str | None = Field(
+        None, description="An expression of signals, after the step, and actions, by name; needed to learn a policy."
+    )
+    max_episode_steps: Annotated[int, Field(ge=1)] = Field(1000, description="Control steps of a simulated episode.")
+
+    @field_validator("name")
+    @classmethod
+    def _new(cls, name: str) -> str:
+        _refuse(name in TASKS, f"{name!r} is a robot of Madoc's own; choose another name")
+        return name
+
+
+def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
+    """A spec and the lines of its parts.
+
+    Raises:
+        MadocError: One sentence on the first thing that is wrong, with its line.
+    """
+    document = read_document(content, file)
+    if not isinstance(document.data, dict):
+        raise document.error((), "expected keys and values, as `name: my_robot`; write one with: madoc init MODEL")
+    try:
+        return RobotSpec.model_validate(document.data), document
+    except ValidationError as error:
+        # What is missing may be there under a misspelt name, which says more.
+        details = sorted(
+            error.errors(), key=lambda detail: (detail["type"] == "missing", document.line(_place(detail)))
+        )
+        more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+        place = _place(details[0])
+        raise document.error(place, _sentence(details[0], place) + more) from error
+
+
+def _refuse(wrong: bool, sentence: str) -> None:
+    """Pydantic takes ValueErrors of validators."""
+    if wrong and sentence:
+        raise ValueError(sentence)
+
+
+def _one(first: object, second: object) -> bool:
+    return (first is None) != (second is None)
+
+
+def _place(detail: Any) -> Place:
+    """Where in the document; pydantic marks keys of a dictionary in a way of its own."""
+    return tuple(part for part in detail["loc"] if part != "[key]")
+
+
+def _sentence(detail: Any, place: Place) -> str:
+    kind, got = detail["type"], detail["input"]
+    what = ".".join(str(part) for part in place if not isinstance(part, int))
+    if kind == "missing":
+        *whole, key = place
+        return f"expected {key}: {'here' if not whole else 'in this part of ' + str(whole[0])}"
+    if kind == "extra_forbidden":
+        known = _keys_at(place[:-1])
+        near = nearest(str(place[-1]), known)
+        hint = f"nearest: {', '.join(near)}" if near else f"there are: {', '.join(known)}"
+        return f"unknown key {place[-1]!r}; {hint}"
+    if kind == "value_error":
+        return str(detail["ctx"]["error"])
+    if kind == "string_type" and isinstance(got, int | float):
+        return f"expected text in {what}, got {got!r}; put it in quotes"
+    expected = detail["msg"].removeprefix("Input should ").removeprefix("be ").removeprefix("have ")
+    expected = {
+        "string_pattern_mismatch": "a name of letters, digits, _ . and -" if place == ("name",) else "a printable name",
+        "too_short": "at least one item",
+        "float_type": "a number",
+        "float_parsing": "a number",
+        "model_type": "keys and values",
+        "dict_type": "keys and values",
+        "list_type": "a list",
+        "int_type": "a whole number",
+        "string_type": "text",
+    }.get(kind, expected)
+    return f"expected {expected} in {what}, got {_shown(got)}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    text = (
+        {dict: "keys and values", type(None): "nothing"}.get(type(value), repr(value))
+        if value != []
+        else "an empty list"
+    )
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _keys_at(place: Place) -> list[str]:
+    """The keys that a part of the spec may have."""
+    part: type[BaseModel] = RobotSpec
+    for key in place:
+        if isinstance(key, str) and key in part.model_fields:
+            inner = next(_models_in(part.model_fields[key].annotation), None)
+            if inner is None:
+                return []
+            part = inner
+    return list(part.model_fields)
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models_in(inner)

@@ -1,0 +1,188 @@
+"""From a spec and a model to a task."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from madoc.errors import MadocError
+from madoc.robots.actions import action_channel, added_actuator, idle_actuators
+from madoc.robots.document import Document
+from madoc.robots.draft import Draft
+from madoc.robots.expressions import ExpressionError, Read, parse
+from madoc.robots.model import ModelFiles, compiled, make_model
+from madoc.robots.sensing import Signals, quiet_arithmetic
+from madoc.robots.signals import read_signals, signal_unit
+from madoc.robots.space import parameter_space
+from madoc.robots.spec import RobotSpec
+from madoc.simulation.cpu import CpuSimulator
+from madoc.tasks.base import ActionChannel, Batch, Task
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One value of an observation: its name, its unit, and the expression it is."""
+
+    name: str
+    unit: str
+    reads: str
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A task and what it was made of, for people to look at."""
+
+    task: Task
+    signals: tuple[Signal, ...]
+    undetermined: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def make_task(spec: RobotSpec, document: Document, files: ModelFiles, source: dict[str, Any]) -> Parts:
+    """The task that a spec describes.
+
+    Raises:
+        MadocError: Spec and model do not fit; the sentence names the line of the spec.
+    """
+    try:
+        base = files.spec()
+        draft = Draft(spec, document, files, base, compiled(base.copy(), files.main))
+    except MadocError as error:
+        raise document.error(("model",), str(error)) from error
+    _check_names(draft)
+    added = tuple(found for found in map(partial(added_actuator, draft), range(len(spec.actions))) if found is not None)
+    factory = partial(make_model, base, added, spec.timestep)
+    try:
+        model = compiled(factory(), files.main)
+    except MadocError as error:
+        raise document.error(("actions",), str(error)) from error
+    signals = read_signals(draft, model)
+    actions = tuple(action_channel(draft, model, index) for index in range(len(spec.actions)))
+    space, frame_skip = parameter_space(draft, model), _frame_skip(draft, model)
+    delays = [row.high for row in space.parameters if row.field == "action_delay"]
+    pending = max([int(np.ceil(high / spec.control_step - 1e-9)) for high in delays], default=0)
+    if signals.read_sensors & signals.layout.accelerating:
+        pending = max(pending, 1)  # such a sensor shows the force of the last action
+    names = tuple(signal.name for signal in spec.signals)
+    task = Task(
+        name=spec.name,
+        physics="modern",
+        spec=factory,
+        frame_skip=frame_skip,
+        observation_size=len(names),
+        observe=partial(_needs_a_system, spec.name) if signals.read_sensors else signals.observe,
+        reward=_reward(draft, signals, actions),
+        terminated=_never,
+        reset_noise=partial(_no_noise, size=model.nq + model.nv + pending * len(actions)),
+        parameters=space,
+        ranges={"normal": space},
+        groups=spec.groups or min(4, len(space)),
+        max_episode_steps=spec.max_episode_steps,
+        reference_returns=(0.0, 100.0),
+        state_from_observation=signals.rebuild(),
+        posture=signals.posture(),
+        pending=pending,
+        actions=actions,
+        signals=names,
+        sense=signals.sense if signals.read_sensors else None,
+        rewarded=spec.reward is not None,
+        source=source,
+    )
+    try:
+        CpuSimulator(task, threads=1)
+    except MadocError as error:
+        raise document.error(("model",), str(error)) from error
+    shown = tuple(
+        Signal(given.name, signal_unit(draft, expression, index), expression.text)
+        for index, (given, expression) in enumerate(zip(spec.signals, signals.expressions, strict=True))
+    )
+    return Parts(task, shown, signals.undetermined(), idle_actuators(model, actions))
+
+
+def _check_names(draft: Draft) -> None:
+    """No two signals or actions of one name, and no log column for something that is not there."""
+    names: dict[str, tuple[str, int]] = {}
+    for kind in ("signals", "actions"):
+        for index, part in enumerate(getattr(draft.spec, kind)):
+            place = (kind, index, "name")
+            if part.name in names:
+                line = draft.document.line((*names[part.name], "name"))
+                raise draft.document.error(place, f"the name {part.name!r} is taken by line {line}; choose another")
+            names[part.name] = (kind, index)
+    for name in draft.spec.log.columns:
+        if name not in names:
+            raise draft.document.unknown(("log", "columns", name), "the name of a signal or an action", name, names)
+
+
+def _frame_skip(draft: Draft, model: mujoco.MjModel) -> int:
+    """Physics steps of a control step."""
+    timestep, wanted = float(model.opt.timestep), draft.spec.control_step
+    steps = round(wanted / timestep)
+    if steps < 1 or abs(steps * timestep - wanted) > 1e-6 * wanted:
+        near = max(1, steps) * timestep
+        raise draft.document.error(
+            ("control_step",),
+            f"expected control_step as a whole multiple of the timestep {timestep:g} s, got {wanted:g} s; "
+            f"nearest: {near:g}, or give a timestep: that divides it",
+        )
+    return steps
+
+
+def _reward(
+    draft: Draft, signals: Signals, actions: tuple[ActionChannel, ...]
+) -> Callable[[Batch, Batch, Batch], Batch]:
+    """(state, action, next state) -> reward: the spec's expression, or 0."""
+    if draft.spec.reward is None:
+        return _no_reward
+    of_signals = {signal.name: index for index, signal in enumerate(draft.spec.signals)}
+    of_actions = {channel.name: index for index, channel in enumerate(actions)}
+    place = ("reward",)
+    try:
+        expression = parse(draft.spec.reward, names=[*of_signals, *of_actions])
+        expression.value(lambda _: np.zeros(1), np)
+    except ExpressionError as error:
+        raise draft.document.error(place, str(error)) from error
+    except ArithmeticError as error:
+        raise draft.document.error(place, f"expected an expression with a value, got {draft.spec.reward!r}") from error
+    for read in expression.reads:
+        inside = signals.expressions[of_signals[read.name]].reads if read.name in of_signals else ()
+        if any(part.kind == "sensor" for part in inside):
+            raise draft.document.error(
+                place, f"a reward is a function of state and action, and the signal {read.name!r} reads a sensor"
+            )
+
+    def reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
+        namespace = next_state.__array_namespace__()
+
+        def look_up(read: Read) -> Batch:
+            if read.name in of_signals:
+                return signals._stacked([signals.expressions[of_signals[read.name]]], next_state, None)[..., 0]
+            channel = actions[of_actions[read.name]]
+            middle, half = (channel.low + channel.high) / 2.0, (channel.high - channel.low) / 2.0
+            return middle + half * action[..., of_actions[read.name]]
+
+        with quiet_arithmetic():
+            return expression.value(look_up, namespace)
+
+    return reward
+
+
+def _no_reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
+    return 0.0 * next_state[..., 0]
+
+
+def _never(next_state: Batch) -> Batch:
+    return next_state.__array_namespace__().zeros(next_state.shape[:-1], dtype=bool)
+
+
+def _no_noise(key: PRNGKeyArray, count: int, *, size: int) -> jax.Array:
+    return jax.numpy.zeros((count, size))
+
+
+def _needs_a_system(name: str, state: Batch) -> Batch:
+    raise MadocError(f"an observation of {name} reads sensors of its model, so only a bound system can make it")

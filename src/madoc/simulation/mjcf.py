@@ -1,0 +1,293 @@
+"""A bound model as MJCF that compiles to the same model, bit for bit, wherever it is loaded."""
+
+import ctypes
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from madoc.errors import MadocError
+from madoc.files import replacing
+from madoc.simulation.base import Simulator
+
+DIGITS = 17
+"""Significant digits that give back every float64; MuJoCo writes 6 of its own accord."""
+
+ASSETS = "assets"
+"""Folder of meshes, height fields and textures beside a written model."""
+
+_LONG_NUMBER = re.compile(r'(?<=["\s])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?=["\s])')
+
+
+@dataclass(frozen=True)
+class Change:
+    """One attribute that a bound model has otherwise than the robot's own.
+
+    Attributes:
+        element: Kind and name, as `joint foot_joint`; `option` for what belongs to no element.
+        attribute: As MJCF calls it.
+        old: Before, one value or several.
+        new: After.
+    """
+
+    element: str
+    attribute: str
+    old: list[float]
+    new: list[float]
+
+
+def spec_at(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> tuple[mujoco.MjSpec, list[Change]]:
+    """The robot's spec with physical values written into it, and what that changed.
+
+    Where an inertia changes, all are made explicit: what geoms, total masses or bounds would have made of them
+    when compiled is then already in the numbers.
+
+    Raises:
+        MadocError: A value changes something of the model that this does not know to write.
+    """
+    spec = simulator.task.spec()
+    nominal = _compiled(spec)
+    bound = bound_model(simulator, values)
+    changes: list[Change] = []
+    for group, write in _GROUPS.items():
+        changes += write(spec, group, nominal, bound)
+    _refuse_difference(bound, _compiled(spec), "written into its spec")
+    return spec, changes
+
+
+def bound_model(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
+    """The compiled model that a bound system steps."""
+    models = getattr(simulator.bind(np.asarray(values, dtype=np.float64)[None]), "models", None)
+    if models is None:
+        raise MadocError(f"{type(simulator).__name__} steps no MuJoCo model that could be written as MJCF")
+    model: mujoco.MjModel = models[0]
+    return model
+
+
+def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], path: Path) -> list[Change]:
+    """Write the calibrated model as MJCF, its assets in a folder beside it, and check it by loading it again.
+
+    Args:
+        simulator: The robot.
+        values: Physical values, one a parameter.
+        path: The file; its folder exists.
+
+    Returns:
+        What the model has otherwise than the robot's own.
+
+    Raises:
+        MadocError: The file cannot be written, an asset is missing, or what was written is not the bound model.
+    """
+    spec, changes = spec_at(simulator, values)
+    _gather_assets(spec, path.parent)
+    _compiled(spec)  # MuJoCo writes what was compiled last
+    with _precision(DIGITS):
+        text = shortest_numbers(spec.to_xml())
+    with replacing(path) as stream:
+        stream.write(text.encode())
+    try:
+        read_back = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise MadocError(f"MuJoCo does not read back the model it wrote to {path}: {error}") from error
+    _refuse_difference(bound_model(simulator, values), read_back, f"read back from {path}")
+    return changes
+
+
+def shortest_numbers(text: str) -> str:
+    """XML with every number as short as it can be and still be the same float64: `0.05`, not `0.050000000000000003`."""
+
+    def shorten(found: re.Match[str]) -> str:
+        written = found.group()
+        return repr(float(written)) if len(written) > DIGITS else written
+
+    return _LONG_NUMBER.sub(shorten, text)
+
+
+def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise MadocError(f"the robot's model no longer compiles: {' '.join(str(error).split())}") from error
+
+
+def _refuse_difference(wanted: mujoco.MjModel, got: mujoco.MjModel, where: str) -> None:
+    """Refuse a model that is not the bound one in every number (to the last bits of derived constants)."""
+    for name in _float_fields(wanted):
+        ours, theirs = np.asarray(getattr(wanted, name)), np.asarray(getattr(got, name))
+        if ours.shape != theirs.shape:
+            raise MadocError(f"the model {where} has {name} of shape {theirs.shape}, the bound one {ours.shape}")
+        tolerance = 1e-12 * max(1.0, float(np.abs(ours).max(initial=0.0)))
+        difference = float(np.abs(ours - theirs).max(initial=0.0))
+        if not difference <= tolerance:
+            raise MadocError(
+                f"the model {where} differs from the bound one in {name} by {difference:.3g}; "
+                "this parameter, or this version of MuJoCo, cannot be written as MJCF exactly"
+            )
+    for name in ("timestep", "gravity"):
+        if not np.array_equal(getattr(wanted.opt, name), getattr(got.opt, name)):
+            raise MadocError(f"the model {where} differs from the bound one in the option {name}")
+
+
+def _float_fields(model: mujoco.MjModel) -> list[str]:
+    """Names of the arrays of numbers of a model, but for what only colours and places it in a picture."""
+    drawn = ("bvh", "cam_", "geom_rgba", "light_", "mat_", "mesh_", "oct_", "site_rgba", "skin_", "tex_")
+    names = [name for name in dir(model) if not name.startswith(("_", *drawn))]
+    arrays = {name: getattr(model, name) for name in names}
+    return [name for name, value in arrays.items() if isinstance(value, np.ndarray) and value.dtype.kind == "f"]
+
+
+@contextmanager
+def _precision(digits: int) -> Iterator[None]:
+    """Have MuJoCo write numbers with so many digits.
+
+    Its library exports the setting without a binding in Python. Where a build has none, what is written is
+    rounded, and the check that follows every writing refuses it.
+    """
+    files = sorted(Path(mujoco.__file__).parent.glob(f"*mujoco*{mujoco.__version__}*")) or sorted(
+        Path(mujoco.__file__).parent.glob("mujoco*.dll")
+    )
+    library = ctypes.CDLL(str(files[0])) if files else None
+    setter = getattr(library, "_mjPRIVATE__set_xml_precision", None)
+    getter = getattr(library, "_mjPRIVATE__get_xml_precision", None)
+    if setter is None or getter is None:
+        yield
+        return
+    before = getter()
+    setter(digits)
+    try:
+        yield
+    finally:
+        setter(before)
+
+
+def _gather_assets(spec: mujoco.MjSpec, folder: Path) -> None:
+    """Copy the files a model is made of beside it, and name them from there."""
+    files: dict[str, str] = {}
+    owners = [*spec.meshes, *spec.hfields, *spec.textures, *spec.skins]
+    for owner in owners:
+        own_folder = owner.compiler.texturedir if isinstance(owner, mujoco.MjsTexture) else owner.compiler.meshdir
+        if owner.file:
+            owner.file = _gathered(spec, owner.file, own_folder, folder, files)
+        for side, file in enumerate(getattr(owner, "cubefiles", ())):
+            if file:
+                owner.cubefiles[side] = _gathered(spec, file, own_folder, folder, files)
+    if files:
+        for owner in owners:
+            owner.compiler.meshdir = owner.compiler.texturedir = ASSETS
+        spec.compiler.meshdir = spec.compiler.texturedir = ASSETS
+        spec.modelfiledir = str(folder)
+
+
+def _gathered(spec: mujoco.MjSpec, file: str, own_folder: str, folder: Path, files: dict[str, str]) -> str:
+    """The name, in the folder of assets, of a copy of a file of the model."""
+    wanted = str(Path(own_folder) / file)
+    if wanted not in files:
+        name = Path(file).name
+        taken = set(files.values())
+        while name in taken:
+            name = f"_{name}"
+        (folder / ASSETS).mkdir(exist_ok=True)
+        inside = spec.assets.get(wanted, spec.assets.get(file, spec.assets.get(Path(file).name)))
+        if inside is not None:
+            (folder / ASSETS / name).write_bytes(inside if isinstance(inside, bytes) else inside.encode())
+        else:
+            source = Path(spec.modelfiledir or ".") / wanted
+            try:
+                shutil.copyfile(source, folder / ASSETS / name)
+            except OSError as error:
+                raise MadocError(f"could not copy {source}, which the model needs: {error.strerror}") from error
+        files[wanted] = name
+    return files[wanted]
+
+
+_Writer = Callable[[mujoco.MjSpec, str, mujoco.MjModel, mujoco.MjModel], list[Change]]
+
+
+def _write_gravity(spec: mujoco.MjSpec, _: str, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
+    old, new = nominal.opt.gravity, bound.opt.gravity
+    if np.array_equal(old, new):
+        return []
+    spec.option.gravity = new
+    return [Change("option", "gravity", old.tolist(), new.tolist())]
+
+
+def _write_inertia(spec: mujoco.MjSpec, _: str, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
+    names = {"body_mass": "mass", "body_inertia": "diaginertia", "body_ipos": "pos", "body_iquat": "quat"}
+    changes = [
+        Change(f"inertial of body {_body_name(bound, index)}", attribute, _row(nominal, name, index), new)
+        for index in range(1, bound.nbody)
+        for name, attribute in names.items()
+        if (new := _row(bound, name, index)) != _row(nominal, name, index)
+    ]
+    if changes:
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+        spec.compiler.settotalmass = -1.0
+        spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
+        spec.compiler.balanceinertia = False
+        for body in spec.bodies[1:]:
+            body.explicitinertial = bool(bound.body_mass[body.id] > 0.0)
+            body.mass = bound.body_mass[body.id]
+            body.ipos = bound.body_ipos[body.id]
+            body.iquat = bound.body_iquat[body.id]
+            body.inertia = bound.body_inertia[body.id]
+            body.fullinertia = np.full(6, np.nan)
+    return changes
+
+
+def _write_rows(spec: mujoco.MjSpec, group: str, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
+    """Attributes of elements that stand one to one in a row of an array of the model."""
+    kind, attribute, array = group.split()
+    changes = []
+    for element in getattr(spec, f"{kind}s" if kind != "body" else "bodies"):
+        index = bound.jnt_dofadr[element.id] if array.startswith("dof_") else element.id
+        old, new = _row(nominal, array, index), _row(bound, array, index)
+        if old != new:
+            _assign(element, attribute, new)
+            changes.append(Change(f"{kind} {element.name or element.id}", attribute, old, new))
+    return changes
+
+
+def _assign(element: Any, attribute: str, new: list[float]) -> None:
+    """Set an attribute of an element: a number, or the first numbers of an array."""
+    if np.ndim(getattr(element, attribute)):
+        getattr(element, attribute)[: len(new)] = new
+    else:
+        setattr(element, attribute, new[0])
+
+
+def _row(model: mujoco.MjModel, array: str, index: int) -> list[float]:
+    return [float(value) for value in np.atleast_1d(getattr(model, array)[index])]
+
+
+def _body_name(model: mujoco.MjModel, index: int) -> str:
+    """A body's name, or that of its first joint."""
+    body = model.body(index)
+    joint = model.body_jntadr[index]
+    return body.name or (model.joint(joint).name if joint >= 0 else "") or str(index)
+
+
+_GROUPS: dict[str, _Writer] = {
+    "option gravity": _write_gravity,
+    "inertia": _write_inertia,
+    "body pos body_pos": _write_rows,
+    "body quat body_quat": _write_rows,
+    "joint damping dof_damping": _write_rows,
+    "joint armature dof_armature": _write_rows,
+    "joint frictionloss dof_frictionloss": _write_rows,
+    "joint stiffness jnt_stiffness": _write_rows,
+    "joint pos jnt_pos": _write_rows,
+    "geom friction geom_friction": _write_rows,
+    "geom size geom_size": _write_rows,
+    "geom pos geom_pos": _write_rows,
+    "site pos site_pos": _write_rows,
+    "actuator gainprm actuator_gainprm": _write_rows,
+    "actuator biasprm actuator_biasprm": _write_rows,
+}
+"""What of a model a parameter may change, and how that is written into a spec."""

@@ -1,0 +1,79 @@
+"""Velocities from positions: what a joint's quaternion or angle did within so many seconds."""
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, Int
+
+from madoc.errors import MadocError
+from madoc.tasks.base import Task
+
+
+def velocities_between(
+    task: Task,
+    before: Float[np.ndarray, "rows state"],
+    after: Float[np.ndarray, "rows state"],
+    steps: Float[np.ndarray, " rows"],
+) -> Float[np.ndarray, "rows velocity"]:
+    """The constant velocities that lead from the positions of one state to those of another.
+
+    Args:
+        task: The robot.
+        before: States of which only the positions count.
+        after: The same, later.
+        steps: Control steps between them, at least 1.
+    """
+    model = task.compile()
+    seconds = steps * task.frame_skip * model.opt.timestep
+    start, end = before[:, : model.nq], after[:, : model.nq]
+    if model.nq == model.nv:
+        return (end - start) / seconds[:, None]
+    found = np.zeros((len(start), model.nv))
+    for velocity, *row in zip(found, seconds, start, end, strict=True):
+        mujoco.mj_differentiatePos(model, velocity, *row)
+    return found
+
+
+def with_velocities(
+    task: Task, states: Float[np.ndarray, "rows state"], velocities: Float[np.ndarray, "rows velocity"]
+) -> Float[np.ndarray, "rows state"]:
+    """(qpos, qvel) with the given velocities where it has none (NaN)."""
+    positions = task.compile().nq
+    padded = np.concatenate([states[:, :positions], np.nan_to_num(velocities)], axis=-1)
+    return np.where(np.isnan(states), padded, states)
+
+
+def missing_velocities(task: Task) -> Int[np.ndarray, " velocities"]:
+    """Where in a state the velocities stand that an observation does not tell, of a task with a `posture`."""
+    assert task.posture is not None
+    unknown = np.isnan(np.asarray(task.posture(np.zeros(task.observation_size))))
+    positions = task.compile().nq
+    return positions + np.flatnonzero(unknown[positions:])
+
+
+def unseen_positions(task: Task) -> tuple[str, ...]:
+    """Joints of which an observation does not show every coordinate, so that their velocity is not in its changes."""
+    if task.posture is None:
+        return ()
+    model = task.compile()
+    blind = np.isnan(np.asarray(task.posture(np.zeros((1, task.observation_size)))))[0, : model.nq]
+    if task.sense is None:
+        state = np.concatenate([model.qpos0, np.zeros(model.nv)])
+        moved = state + 1e-3 * np.eye(len(state))[: model.nq]
+        blind |= (np.asarray(task.observe(moved)) == np.asarray(task.observe(state))).all(-1)
+    starts = [*model.jnt_qposadr, model.nq]
+    names = [model.joint(index).name or f"joint {index}" for index in range(model.njnt)]
+    return tuple(name for name, *span in zip(names, starts, starts[1:], strict=False) if blind[slice(*span)].any())
+
+
+def refuse_unseen_positions(task: Task) -> None:
+    """Refuse velocities from positions where some positions are not observed.
+
+    Raises:
+        MadocError: Names the joints.
+    """
+    joints = unseen_positions(task)
+    if joints:
+        raise MadocError(
+            f"an observation of {task.name} does not show the position of {', '.join(joints)}, so its velocity cannot "
+            "be had from positions; take least-squares, which estimates it, or madoc with starts=policy"
+        )

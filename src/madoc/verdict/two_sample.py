@@ -1,0 +1,278 @@
+"""A classifier two-sample test: can anything tell logged from simulated rows (Lopez-Paz and Oquab 2017)?"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from sklearn.ensemble import HistGradientBoostingClassifier
+from sklearn.linear_model import RidgeCV
+from sklearn.model_selection import StratifiedKFold
+from threadpoolctl import threadpool_limits
+
+from madoc.data import Dataset
+from madoc.data.dataset import starts_after
+from madoc.learning.cloning import clone
+from madoc.learning.dynamics_ratio import Scaling
+from madoc.learning.networks import adam
+from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.simulation.base import Simulator
+from madoc.simulation.rollout import begin, reset_states, roll
+from madoc.types import Transitions
+from madoc.verdict.prediction import Replays, evenly
+from madoc.verdict.statistics import area_under_curve, interval_of
+
+MOST_ROWS = 1000
+"""Of either kind: an area under the curve of so many is known to ±0.025."""
+RESOLUTION = 0.1
+"""Of the typical change of motion. Without noise a classifier would tell parameters a millionth off."""
+_FITTED = 5000
+"""Rows that the line goes through."""
+FOLDS = 5
+TREES = 40
+LEAVES = 8
+BINS = 32
+"""Small trees, and few: some hundred rows hold no more."""
+ODDS_LIMIT = 10.0
+"""Rows count at most so unequally; past this there is no overlap to speak of."""
+CLONING = (20, 200, 256, 1e-3)
+"""Epochs, updates in each, rows an update, Adam's rate."""
+_RESAMPLES = 200
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Rows as a classifier sees them.
+
+    Attributes:
+        before: What was seen and done up to a moment: one row, or two where one observation is not the state.
+        after: What followed, less what was seen before.
+        episodes: The episode of each.
+    """
+
+    before: Float[np.ndarray, "rows before"]
+    after: Float[np.ndarray, "rows observation"]
+    episodes: Int[np.ndarray, " rows"]
+
+    def __len__(self) -> int:
+        return len(self.before)
+
+    def take(self, rows: np.ndarray) -> "Sample":
+        """Only these."""
+        return Sample(self.before[rows], self.after[rows], self.episodes[rows])
+
+
+@dataclass(frozen=True)
+class Told:
+    """How well logged and simulated rows are told apart: the area under the curve and its 95 % interval."""
+
+    area: float
+    low: float
+    high: float
+    rows: int
+
+
+def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Told:
+    """Cross-validated area under the curve of rows that the classifier has not seen.
+
+    Args:
+        real: Logged rows.
+        simulated: Others.
+        overlap: Whether they come from different places. Simulated ones are then weighed by how likely a second
+            classifier finds what came before them in the log, so that only what followed is compared.
+    """
+    real, simulated = (part.take(evenly(np.arange(len(part)), MOST_ROWS)) for part in (real, simulated))
+    label = np.repeat([True, False], [len(real), len(simulated)])
+    before = np.concatenate([real.before, simulated.before])
+    after = np.concatenate([real.after, simulated.after])
+    weight = None
+    if overlap:
+        likely = np.clip(_unseen(before, label, None), 0.01, 0.99)
+        odds = np.clip(likely / (1.0 - likely), 1.0 / ODDS_LIMIT, ODDS_LIMIT)
+        weight = np.where(label, 1.0, odds / odds[~label].mean())
+    scores = _unseen(np.concatenate([before, after], axis=1), label, weight)
+    area = area_under_curve(scores, label, weight)
+    return Told(area, *_interval(scores, label, weight), len(label))
+
+
+def replayed(
+    replays: Replays,
+    scaling: Scaling,
+    residuals: Float[np.ndarray, "windows steps observation"],
+    noise: Float[np.ndarray, "windows steps observation"],
+) -> tuple[Sample, Sample]:
+    """A random half of the windows as they were logged, the others as simulated with what noise does to them.
+
+    What came before is where a window starts and its mean action, what followed is how far it leads.
+
+    Args:
+        replays: The windows.
+        scaling: How observations and actions become features.
+        residuals: Simulated less logged observations, in steps' changes.
+        noise: What noise alone would leave, in the same unit.
+    """
+    windows, episodes = replays.windows, replays.episodes
+    start, end = replays.observation, windows.following[:, -1]
+    simulated = end + (residuals[:, -1] + noise[:, -1]) * replays.scale
+    order = np.random.default_rng(0).permutation(len(windows))
+    real, other = order[::2], order[1::2]
+    other = other[np.isfinite(simulated[other]).all(-1)]
+    pair = np.concatenate([start, windows.actions.mean(1)], axis=1)
+    before = (pair - scaling.pair_offset) / scaling.pair_scale
+    logged, led = ((after - start) / replays.scale for after in (end, simulated))
+    return Sample(before[real], logged[real], episodes[real]), Sample(before[other], led[other], episodes[other])
+
+
+def behaviour(kept: Dataset, key: PRNGKeyArray) -> TanhGaussianPolicy:
+    """A clone of who acted in the log, to act in the simulator where logged states cannot be rebuilt."""
+    epochs, updates, batch, rate = CLONING
+    logged = kept.transitions
+    of_policy, of_batches = jax.random.split(key)
+    observation = np.asarray(logged.observation)
+    policy = TanhGaussianPolicy(
+        observation.shape[1],
+        logged.action.shape[1],
+        (64, 64),
+        key=of_policy,
+        offset=observation.mean(0),
+        scale=np.maximum(observation.std(0), 1e-3),
+    )
+    optimiser = adam(rate)
+    state = optimiser.init(eqx.filter(policy, eqx.is_array))
+    pairs = jnp.asarray(logged.observation, jnp.float32), jnp.asarray(logged.action, jnp.float32)
+    for epoch in range(epochs):
+        policy, state, _ = clone(
+            policy,
+            state,
+            pairs,
+            jax.random.fold_in(of_batches, epoch),
+            optimiser=optimiser,
+            batch=batch,
+            count=updates,
+        )
+    return policy
+
+
+def rolled(
+    policy: TanhGaussianPolicy,
+    simulator: Simulator,
+    parameters: Float[np.ndarray, " d"],
+    *,
+    length: int,
+    key: PRNGKeyArray,
+    noise: Float[np.ndarray, " observation"],
+) -> Dataset:
+    """Episodes from the task's reset under a clone, as long as those of the log, with the sensors' noise."""
+    task = simulator.task
+    rows = max(1, -(-2 * MOST_ROWS // length))
+    of_start, of_action, of_restart = jax.random.split(key, 3)
+    starts = reset_states(simulator)
+    rollout, _ = roll(
+        simulator.bind(parameters[None]),
+        task,
+        policy,
+        begin(starts, of_start, systems=1, rows=rows),
+        steps=length,
+        starts=starts,
+        key=of_action,
+        restart_key=of_restart,
+    )
+    flat, valid = jax.tree.map(
+        lambda column: np.swapaxes(column[:, 0], 0, 1).reshape(-1, *column.shape[3:]),
+        (rollout.transitions, rollout.valid),
+    )
+    ends = flat.terminated | flat.truncated
+    ends[length - 1 :: length] = True
+    ends[:-1] |= ~valid[1:]
+    flat, ends = flat.take(valid), ends[valid]
+    same = np.random.default_rng(0).standard_normal((len(flat) + 1, len(noise))) * noise
+    noisy = Transitions(
+        flat.observation + same[:-1],
+        flat.action,
+        flat.reward,
+        flat.next_observation + same[1:],
+        flat.terminated,
+        ends & ~flat.terminated,
+    )
+    return Dataset(noisy, starts_after(ends), task.name, task.physics, "a clone in the simulator")
+
+
+@dataclass(frozen=True)
+class WindowView:
+    """How rows are shown to the classifier where one observation is not the state; made from the rows kept.
+
+    What came before is what was seen and done in two rows that follow each other (in one, where none do), what followed
+    is how the motion changed, `RESOLUTION` of it blurred, and what of that a line through the rows kept does not say.
+
+    Attributes:
+        scaling: Of observations and actions.
+        spread: Of the change of motion.
+        line: From what came before to how the motion changed.
+    """
+
+    scaling: Scaling
+    spread: Float[np.ndarray, " observation"]
+    line: RidgeCV
+
+    @classmethod
+    def of(cls, kept: Dataset, scaling: Scaling) -> "WindowView":
+        """The view of a log."""
+        before, after, _ = _change_of_motion(kept, scaling)
+        spread = np.where(after.std(0) > 1e-8, after.std(0), 1.0)
+        chosen = evenly(np.arange(len(before)), _FITTED)
+        line = RidgeCV(np.logspace(-4, 2, 7)).fit(before[chosen], after[chosen] / spread)
+        return cls(scaling, spread, line)
+
+    def sample(self, dataset: Dataset) -> Sample:
+        """The rows of a dataset."""
+        before, after, episodes = _change_of_motion(dataset, self.scaling)
+        after = after / self.spread
+        after = after + RESOLUTION * np.random.default_rng(len(after)).standard_normal(after.shape)
+        unsaid = after - np.reshape(self.line.predict(before), after.shape)
+        return Sample(before, np.concatenate([after, unsaid], axis=1), episodes)
+
+
+def _change_of_motion(dataset: Dataset, scaling: Scaling) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What came before, how the motion changed after it, and the episode of each window."""
+    logged = dataset.transitions
+    second = np.setdiff1d(np.arange(len(dataset)), dataset.episode_starts)
+    rows = second if len(second) else np.arange(len(dataset))
+    pair, moved = scaling.features(logged.take(rows))
+    episodes = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
+    if not len(second):
+        return pair.astype(np.float64), moved.astype(np.float64), episodes
+    earlier, moved_before = scaling.features(logged.take(second - 1))
+    action = earlier[:, moved.shape[1] :]
+    before = np.concatenate([pair, moved_before, action], axis=1).astype(np.float64)
+    return before, moved.astype(np.float64) - moved_before, episodes
+
+
+def _unseen(
+    features: Float[np.ndarray, "rows features"],
+    label: Bool[np.ndarray, " rows"],
+    weight: Float[np.ndarray, " rows"] | None,
+) -> Float[np.ndarray, " rows"]:
+    """How likely each row is a logged one, by a classifier that has not seen it."""
+    scores = np.empty(len(label))
+    with threadpool_limits(1):  # the same bits on any number of cores, and no threads that wait for each other
+        for seen, unseen in StratifiedKFold(FOLDS, shuffle=True, random_state=0).split(features, label):
+            trees = HistGradientBoostingClassifier(
+                max_iter=TREES, max_leaf_nodes=LEAVES, max_bins=BINS, early_stopping=False, random_state=0
+            )
+            trees.fit(features[seen], label[seen], None if weight is None else weight[seen])
+            scores[unseen] = trees.predict_proba(features[unseen])[:, 1]
+    return scores
+
+
+def _interval(scores: np.ndarray, label: np.ndarray, weight: np.ndarray | None) -> tuple[float, float]:
+    """Percentiles over resampled rows of each kind."""
+    rng = np.random.default_rng(0)
+    kinds = [np.flatnonzero(label), np.flatnonzero(~label)]
+    draws = []
+    for _ in range(_RESAMPLES):
+        rows = np.concatenate([rng.choice(kind, len(kind)) for kind in kinds])
+        draws.append(area_under_curve(scores[rows], label[rows], None if weight is None else weight[rows]))
+    low, high = interval_of(np.array(draws))
+    return float(low), float(high)

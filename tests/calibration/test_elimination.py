@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+
+from madoc.calibration.least_squares.elimination import WindowSlopes, eliminate
+
+NOTHING = np.zeros(1)
+
+
+def slopes_of(residuals, by_parameters, by_states):
+    parts = (np.asarray(part, np.float64) for part in (residuals, by_parameters, by_states))
+    return WindowSlopes(*parts, whole=np.ones(len(residuals), dtype=bool))
+
+
+def test_what_a_state_explains_is_taken_out():
+    # One window of two readings, one state value that moves both alike: what is left is their difference, and a
+    # parameter that moved both alike is left without a say.
+    slopes = slopes_of([[3.0, 1.0]], [[[1.0, 2.0], [0.0, 2.0]]], [[[1.0], [1.0]]])
+    found = eliminate(slopes, np.ones((1, 2)), NOTHING)
+    np.testing.assert_allclose(found.reduced.residuals[0, :2], [1.0, -1.0], atol=1e-12)
+    np.testing.assert_allclose(found.reduced.jacobian[0, :2], [[0.5, 0.0], [-0.5, 0.0]], atol=1e-12)
+    np.testing.assert_allclose(found.spare, [[0.5, 0.5]], atol=1e-12)
+    # The state makes up for the mean of the residuals, 2, and for what the parameters' step has moved it by.
+    np.testing.assert_allclose(found.states_step(np.zeros(2)), [[-2.0]], atol=1e-12)
+    np.testing.assert_allclose(found.states_step(np.array([1.0, 1.0])), [[-4.5]], atol=1e-12)
+
+
+def test_eliminated_and_joint_solutions_are_the_same():
+    random = np.random.default_rng(0)
+    windows, values, count, states = 5, 8, 3, 2
+    slopes = slopes_of(
+        random.normal(size=(windows, values)),
+        random.normal(size=(windows, values, count)),
+        random.normal(size=(windows, values, states)),
+    )
+    weights = random.uniform(0.5, 2.0, (windows, values))
+    found = eliminate(slopes, weights, np.zeros(windows))
+    reduced = found.reduced.jacobian.reshape(-1, count)
+    step = np.linalg.lstsq(reduced, -found.reduced.residuals.reshape(-1), rcond=None)[0]
+    whole = np.zeros((windows * values, count + windows * states))
+    whole[:, :count] = slopes.by_parameters.reshape(-1, count)
+    for window in range(windows):
+        own = slice(count + window * states, count + (window + 1) * states)
+        whole[window * values : (window + 1) * values, own] = slopes.by_states[window]
+    root = np.sqrt(weights).reshape(-1)
+    joint = np.linalg.lstsq(root[:, None] * whole, -root * slopes.residuals.reshape(-1), rcond=None)[0]
+    np.testing.assert_allclose(step, joint[:count], atol=1e-10)
+    np.testing.assert_allclose(found.states_step(step), joint[count:].reshape(windows, states), atol=1e-10)
+
+
+def test_a_state_that_nothing_shows_stays_where_it_is():
+    slopes = slopes_of([[3.0, 1.0]], [[[1.0], [0.0]]], [[[1.0, 0.0], [1.0, 0.0]]])
+    found = eliminate(slopes, np.ones((1, 2)), np.full(1, 1e-9))
+    np.testing.assert_allclose(found.states_step(np.zeros(1)), [[-2.0, 0.0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("damping", [1e-3, 1.0, 1e3])
+def test_damping_shortens_a_states_step(damping):
+    slopes = slopes_of([[3.0, 1.0]], [[[1.0], [0.0]]], [[[1.0], [1.0]]])
+    found = eliminate(slopes, np.ones((1, 2)), np.array([damping]))
+    np.testing.assert_allclose(found.states_step(np.zeros(1)), [[-4.0 / (2.0 + 2.0 * damping)]])

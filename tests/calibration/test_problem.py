@@ -1,0 +1,32 @@
+"""What a calibrator is given: states at which every parameter has a say, also where none can be rebuilt."""
+
+import jax
+import numpy as np
+
+from madoc import robots, simulation
+from madoc.calibration import CalibrationProblem
+from madoc.simulation.sensitivity import insensitive
+from own_robots import CART, CART_SPEC, write_robot
+from robots import recorded
+
+SWINGING = CART.replace('type="slide" axis="1 0 0"', 'type="hinge" axis="0 1 0"').replace(
+    'mass="1"', 'pos="0 0 -1" mass="1"'
+)
+
+
+def test_without_states_it_probes_where_logged_actions_lead(tmp_path):
+    # One physics step a control step: at rest, hanging, gravity would pull at nothing.
+    spec = CART_SPEC.replace("control_step: 0.02", "control_step: 0.01").replace("force", "torque")
+    spec = spec.replace("  - {name: speed, reads: velocity(rail)}\n", "") + "  - {field: gravity, low: -15, high: -5}\n"
+    task = robots.load(write_robot(tmp_path, spec, cart=SWINGING)).task
+    truth = {"body_mass.cart": 1.0, "gravity": -9.81}
+    log = recorded(task, truth, 100, jax.random.key(0))
+    problem = CalibrationProblem(log, simulation.make(task, threads=1))
+    states, actions = problem.probe
+    np.testing.assert_array_equal(states[0], [0.0, 0.0])
+    np.testing.assert_array_equal(actions, log.transitions.action[:64])
+    system = problem.simulator.bind(task.parameters.middle[None])
+    np.testing.assert_array_equal(system.step(states[None, :63], actions[None, :63])[0], states[1:])
+    assert insensitive(problem.simulator, states, actions, key=jax.random.key(0))[0] == []
+    resting = np.zeros((64, 2))
+    assert insensitive(problem.simulator, resting, actions, key=jax.random.key(0))[0] == ["gravity"]

@@ -1,0 +1,101 @@
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from madoc import simulation
+from madoc.calibration import CalibrationProblem, LeastSquares, Madoc
+from madoc.calibration.least_squares.calibrator import horizon_of
+from madoc.calibration.madoc.collection import sensed
+from madoc.calibration.madoc.sensing import noise_deviation, said_of_observations, window_length
+from madoc.data import Disturbance, disturb, observed_task
+from madoc.errors import MadocError
+from madoc.simulation.rollout import Rollout
+from madoc.types import Transitions
+from robots import ARM_TRUTH, recorded, two_link_arm
+
+KEY = jax.random.key(0)
+WHOLE = replace(two_link_arm(), velocities=2)
+
+
+@pytest.fixture(scope="module")
+def log():
+    return recorded(WHOLE, ARM_TRUTH, 300, KEY)
+
+
+def problem_of(log, **disturbance):
+    shown = disturb(log, Disturbance(**disturbance), WHOLE, KEY)
+    return CalibrationProblem(shown, simulation.make(observed_task(WHOLE, shown), threads=1))
+
+
+def test_windows_are_as_long_as_the_observation_wants(log):
+    seen, hidden = problem_of(log), problem_of(log, hidden_velocities=True)
+    assert [window_length(problem, None, "logged") for problem in (seen, hidden)] == [1, 3]
+    assert window_length(hidden, 5, "logged") == 5
+    assert window_length(hidden, None, "replay") == 1
+    with pytest.raises(MadocError, match=r"no episode .* has the 301 rows of a window; take a shorter one"):
+        seen.windows("standardised", 301)
+
+
+def test_simulated_readings_carry_the_noise_that_the_data_says_it_has(log):
+    clean, noisy = problem_of(log), problem_of(log, noise=0.1)
+    assert not noise_deviation(clean, None).any()
+    change = clean.scalings["standardised"].next_scale
+    np.testing.assert_allclose(noise_deviation(noisy, None), 0.1 * change, rtol=0.05)
+    np.testing.assert_allclose(noise_deviation(noisy, "estimated"), 0.1 * change, rtol=0.3)
+    (told,) = said_of_observations(noisy, 1, noise_deviation(noisy, None), "logged")
+    assert told == "simulated observations were given sensor noise of 9.9 % of a step's change"
+    assert said_of_observations(clean, 1, noise_deviation(clean, None), "logged") == ()
+
+
+def test_a_reading_that_ends_a_row_begins_the_next():
+    places = np.zeros((4, 2, 3, 1))
+    rows = Transitions(places, places, places[..., 0], places, places[..., 0], places[..., 0])
+    rollout = Rollout(rows, np.ones((4, 2, 3), dtype=bool))
+    seen = sensed(rollout, np.array([2.0]), KEY).transitions
+    np.testing.assert_array_equal(seen.next_observation[:-1], seen.observation[1:])
+    assert seen.observation.std() == pytest.approx(2.0, rel=0.5)
+    assert sensed(rollout, np.zeros(1), KEY) is rollout
+
+
+def test_horizons_follow_how_fast_a_robot_moves(log):
+    walk = np.cumsum(np.random.default_rng(0).normal(size=(301, 4)), axis=0)
+    slow = replace(log, transitions=replace(log.transitions, observation=walk[:-1], next_observation=walk[1:]))
+    expected = round(float(np.median(walk[:-1].std(0) / np.diff(walk, axis=0).std(0))))
+    assert horizon_of(slow) == min(20, expected)
+    jumps = np.random.default_rng(0).normal(size=(300, 4))
+    fast = replace(log, transitions=replace(log.transitions, observation=jumps, next_observation=jumps[::-1]))
+    assert horizon_of(fast) == 3
+
+
+def test_initial_states_are_estimated_where_the_data_asks_for_it(log):
+    phases = {
+        "undecided": {},
+        "starting": {"noise": 0.1},
+        "estimated": {"hidden_velocities": True},
+    }
+    for phase, disturbance in phases.items():
+        assert LeastSquares().init(problem_of(log, **disturbance), KEY).phase == phase
+    assert LeastSquares(initial_states="logged").init(problem_of(log, noise=0.1), KEY).phase == "logged"
+    with pytest.raises(MadocError, match="does not determine its state"):
+        LeastSquares(initial_states="logged").init(problem_of(log, hidden_velocities=True), KEY)
+
+
+def test_too_few_readings_for_the_states_are_refused(log):
+    hidden = problem_of(log, hidden_velocities=True)
+    with pytest.raises(MadocError, match=r"got .* windows of 1 rows with .* take a longer horizon"):
+        LeastSquares(horizon=1).init(hidden, KEY)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"window": 0}, "window"),
+        ({"window": 2, "starts": "replay"}, "expected window 1 or none, got 2"),
+        ({"sensor_noise": -0.1}, "expected sensor_noise of 0 or more"),
+    ],
+)
+def test_impossible_windows_and_noise_are_refused(wrong, sentence):
+    with pytest.raises(MadocError, match=sentence):
+        Madoc(**wrong)

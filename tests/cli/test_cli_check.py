@@ -1,0 +1,67 @@
+"""`madoc check`, as a user types it."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from madoc.cli import main
+
+sys.path.append(str(Path(__file__).parents[1] / "data"))
+from logged_arm import arm_of, columns_of, write_csv
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("arm")
+    robot = arm_of(folder)
+    for seed in (0, 1):
+        write_csv(folder / "logs" / f"{seed}.csv", columns_of(robot, 150, seed=seed))
+    return folder
+
+
+def test_tables_to_read(arm, capsys):
+    assert main(["check", str(arm / "arm.yaml"), "--data", str(arm / "logs"), "--no-forecast"]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("298 rows in 2 runs (2 stretches without a break), 0.02 s apart: 6.0 s\n")
+    for words in ("shoulder_speed", "rad/s", "'nothing changes'", "body_mass.upper", "× noise", "nothing to warn of"):
+        assert words in told
+
+
+def test_json_and_a_forecast(arm, capsys):
+    files = [str(arm / "logs" / f"{seed}.csv") for seed in (0, 1)]
+    assert main(["check", str(arm / "arm.yaml"), "--json", "--data", *files]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["rows"], told["runs"], told["fatal"], told["findings"]) == (298, 2, False, [])
+    assert set(told["parameters"]) == {"body_mass.upper", "body_mass.fore", "dof_damping.shoulder", "dof_damping.elbow"}
+    assert told["explanation"]["horizons"] == [1, 5, 25]
+    quick, madoc = told["forecast"]
+    assert quick["method"] == "least-squares"
+    assert 0.0 < quick["seconds"] < madoc["seconds"]
+    assert madoc["control_steps"] == 300_000
+
+
+def test_what_is_fatal_is_told_and_ends_with_code_2(arm, tmp_path, capsys):
+    columns = columns_of(arm_of(tmp_path), 20)
+    file = write_csv(tmp_path / "log.csv", {name: values for name, values in columns.items() if name != "elbow"})
+    assert main(["check", str(arm / "arm.yaml"), "--json", "--data", str(file)]) == 2
+    (finding,) = json.loads(capsys.readouterr().out)["findings"]
+    assert finding["level"] == "fatal"
+    assert finding["what"].startswith("no column 'elbow' in log.csv; nearest: elbow_speed")
+    assert main(["check", str(arm / "arm.yaml"), "--data", str(file)]) == 2
+    assert capsys.readouterr().out.startswith("fatal: no column 'elbow'")
+
+
+def test_a_calibration_of_a_log_goes_with_its_warnings_and_stops_at_what_is_fatal(arm, tmp_path, capsys):
+    columns = columns_of(arm_of(tmp_path), 150)
+    late = write_csv(tmp_path / "late.csv", columns | {"time": columns["time"] + (columns["time"] > 1.0)})
+    words = ["calibrate", str(arm / "arm.yaml"), "--method", "least-squares", "--quiet", "--json"]
+    assert main([*words, "--data", str(late), "--out", str(tmp_path / "run"), "--budget", "100000"]) == 0
+    warnings = json.loads(capsys.readouterr().out)["warnings"]
+    assert any("late.csv: 1 of 149 time steps are more than 10 % off" in warning for warning in warnings)
+    dead = {name: values if name == "time" or "torque" in name else 0 * values for name, values in columns.items()}
+    file = write_csv(tmp_path / "dead.csv", dead)
+    assert main([*words, "--data", str(file), "--out", str(tmp_path / "other")]) == 2
+    assert "the data is refused: shoulder: it never moves: 0 in all 149 rows" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()

@@ -1,0 +1,45 @@
+import json
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from command_line import asked_for_json
+
+from madoc.cli import main
+from madoc.pipeline import read_calibration
+from madoc.simulation import make
+
+
+def test_a_run_is_exported_beside_itself(whole, tmp_path, capsys):
+    told, code = asked_for_json(capsys, ["export", whole, "--out", tmp_path / "out"])
+    assert code == 0
+    names = ["model.xml", "patch.yaml", "randomization.yaml", "sysid_parameters.yaml"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
+    assert told["files"]["model"] == str(tmp_path / "out" / "model.xml")
+    calibrated = read_calibration(whole)
+    written = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml"))
+    np.testing.assert_array_equal(written.body_mass, make(calibrated.task).model(calibrated.result.mean).body_mass)
+    patch = yaml.safe_load((tmp_path / "out" / "patch.yaml").read_text())
+    spec = json.loads((whole / "calibration" / "spec.json").read_text())
+    assert patch["provenance"]["data"]["fingerprint"] == spec["data"]["fingerprint"]
+    assert patch["stepping"]["physics_steps_per_control_step"] == 4
+    assert [row["new"] for row in patch["parameters"]] == calibrated.result.mean.tolist()
+
+
+def test_policies_go_along_as_onnx_when_asked(whole, tmp_path):
+    pytest.importorskip("onnx", reason="onnx is not installed")
+    assert main(["export", str(whole), "--out", str(tmp_path), "--onnx"]) == 0
+    assert sorted(path.name for path in tmp_path.glob("*.onnx")) == [
+        "policy-calibrated.onnx",
+        "policy-midrange.onnx",
+        "policy-truth.onnx",
+    ]
+
+
+@pytest.mark.parametrize("words", [["nowhere"], ["{whole}/policy-calibrated"]])
+def test_what_is_no_calibration_is_refused_and_nothing_written(whole, tmp_path, capsys, words):
+    asked = [word.format(whole=whole) for word in words]
+    assert main(["export", *asked, "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()

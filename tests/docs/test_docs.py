@@ -1,0 +1,139 @@
+"""Every code block of the documentation runs, page by page, in an empty folder with the examples beside it."""
+
+import importlib.util
+import os
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from madoc import robots
+from madoc.cli import main
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PENDULUM = Path(os.environ.get("MADOC_PENDULUM", ROOT.parent / "shared" / "data" / "dfki_simple_pendulum"))
+SLOW = {
+    "real-pendulum.md",
+    "how-to/compare-methods.md",
+    "how-to/export.md",
+    "how-to/partial-observation.md",
+    "how-to/resume.md",
+}
+
+BLOCK = re.compile(r"^```(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+PAGES = [str(page.relative_to(DOCS)) for page in sorted(DOCS.rglob("*.md")) if "```" in page.read_text()]
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else []) for page in PAGES]
+)
+def test_the_blocks_run(page, tmp_path, monkeypatch):
+    text = (DOCS / page).read_text()
+    if "$PENDULUM" in text and not PENDULUM.is_dir():
+        pytest.skip("the logs of the DFKI pendulum are not here; name their folder in MADOC_PENDULUM")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PENDULUM", str(PENDULUM))
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    names = {}
+    for language, block in BLOCK.findall(text):
+        RUN[language](block, names)
+
+
+def run_shell(block, _):
+    for line in block.splitlines():
+        words = shlex.split(os.path.expandvars(line))
+        if words[0] == "madoc":
+            given = [*words[1:], "--quiet"]
+            assert main(given) == 0, line
+        elif words[0] == "python":
+            run_script(words[1:])
+        else:
+            subprocess.run(["bash", "-euc", line], check=True, stdout=subprocess.DEVNULL)
+
+
+def run_script(words):
+    before, sys.argv = sys.argv, words
+    try:
+        runpy.run_path(words[0], run_name="__main__")
+    finally:
+        sys.argv = before
+
+
+def run_python(block, names):
+    exec(compile(block, "block", "exec"), names)
+
+
+def load_spec(block, _):
+    """A part of a spec takes that part's place in the arm's, whose motors make way for actuators of its own."""
+    whole = yaml.safe_load(Path("examples/arm/arm.yaml").read_text()) | yaml.safe_load(block)
+    for channel, default in zip(whole["signals"], ("shoulder", "elbow"), strict=False):
+        whole.setdefault("log", {}).setdefault("columns", {}).setdefault(channel["name"], default)
+    model = Path("examples/arm/arm.xml").read_text().splitlines()
+    driven = [channel["joint"] for channel in whole["actions"] if "joint" in channel]
+    Path("part.xml").write_text(
+        "\n".join(
+            line for line in model if not any("<motor" in line and f'joint="{joint}"' in line for joint in driven)
+        )
+    )
+    whole["model"] = "part.xml"
+    Path("part.yaml").write_text(yaml.safe_dump(whole))
+    robots.load("part.yaml")
+
+
+RUN = {"shell": run_shell, "python": run_python, "yaml": load_spec}
+
+
+def test_measured_tables_are_there():
+    hooks = load_hooks()
+    page = (DOCS / "concepts" / "which-method.md").read_text()
+    assert "| least-squares |" in hooks.on_page_markdown(page)
+    with pytest.raises(KeyError):
+        hooks.measured("No such heading")
+
+
+def test_equations_become_mathml():
+    told = load_hooks().on_page_content(r'<p><span class="arithmatex">\(a &lt; b\)</span></p>')
+    assert told.startswith("<p><math")
+    assert "<mi>a</mi>" in told
+    assert "arithmatex" not in told
+
+
+def test_no_equation_keeps_a_command_that_was_not_understood():
+    hooks = load_hooks()
+    equations = re.findall(r"\$\$(.*?)\$\$", (DOCS / "concepts" / "equations.md").read_text(), re.DOTALL)
+    assert equations
+    for equation in equations:
+        assert "\\" not in hooks.on_page_content(rf'<div class="arithmatex">\[{equation}\]</div>'), equation
+
+
+def load_hooks():
+    pytest.importorskip("latex2mathml", reason="the extra docs is not installed")
+    spec = importlib.util.spec_from_file_location("hooks", DOCS / "hooks.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+def test_the_site_is_built_and_fetches_nothing(tmp_path):
+    pytest.importorskip("mkdocs", reason="the extra docs is not installed")
+    site = tmp_path / "site"
+    subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", site],
+        cwd=ROOT,
+        check=True,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+    )
+    pages = list(site.rglob("*.html"))
+    assert len(pages) >= len(list(DOCS.rglob("*.md")))
+    fetched = re.compile(
+        r"<(?:script|img|iframe)[^>]*src=\"https?:|<link[^>]*rel=\"(?:stylesheet|preconnect)\"[^>]*https?:"
+    )
+    assert not [page.name for page in pages if fetched.search(page.read_text())]
+    assert "<math" in (site / "concepts" / "equations.html").read_text()

@@ -1,0 +1,93 @@
+"""Robots as a user would describe them: spec files of the two small robots, and of a cart that floats freely."""
+
+from robots import ARM, PENDULUM, SPRING
+
+ARM_SPEC = """\
+madoc: 1
+name: two_link_arm
+model: arm.xml
+control_step: 0.02
+signals:
+  - {name: shoulder_angle, reads: position(shoulder), unit: rad}
+  - {name: elbow_angle, reads: position(elbow)}
+  - {name: shoulder_speed, reads: velocity(shoulder)}
+  - {name: elbow_speed, reads: velocity(elbow)}
+actions:
+  - {name: shoulder_motor, actuator: shoulder, low: -1, high: 1}
+  - {name: elbow_motor, actuator: elbow, low: -1, high: 1}
+parameters:
+  - {field: gravity, low: -15, high: -5}
+  - {field: body_mass, element: upper, low: 0.5, high: 2}
+  - {field: body_mass, element: fore, low: 0.2, high: 1}
+  - {field: dof_damping, element: shoulder, low: 0, high: 1}
+  - {field: dof_damping, element: elbow, low: 0, high: 0.5}
+groups: 2
+"""
+
+SPRING_SPEC = """\
+madoc: 1
+name: spring
+model: spring.xml
+control_step: 0.02
+signals:
+  - {name: place, reads: position(slide)}
+  - {name: speed, reads: velocity(slide)}
+actions:
+  - {name: push, actuator: push, low: -1, high: 1}
+parameters:
+  - {field: jnt_stiffness, element: slide, low: 1, high: 9}
+  - {field: dof_damping, element: slide, low: 0, high: 2}
+  - {field: body_mass, element: cart, low: 1, high: 3}
+"""
+
+CART = """
+<mujoco>
+  <option timestep="0.01" gravity="0 0 0"/>
+  <worldbody>
+    <body name="cart"><joint name="rail" type="slide" axis="1 0 0"/><geom type="box" size=".1 .1 .1" mass="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+"""One kilogram that nothing holds: a double integrator."""
+
+CART_SPEC = """\
+madoc: 1
+name: cart
+model: cart.xml
+control_step: 0.02
+signals:
+  - {name: place, reads: position(rail)}
+  - {name: speed, reads: velocity(rail)}
+actions:
+  - {name: push, joint: rail, means: force, low: -10, high: 10}
+parameters:
+  - {field: body_mass, element: cart, low: 0.5, high: 2}
+"""
+
+PENDULUM_SPEC = """\
+madoc: 1
+name: pendulum
+model: pendulum.xml
+control_step: 0.02
+signals:
+  - {name: angle, reads: position(pivot), unit: rad}
+actions:
+  - {name: torque, actuator: pivot, low: -1, high: 1}
+parameters:
+  - {field: body_mass, element: rod, low: 0.5, high: 2}
+  - {field: dof_damping, element: pivot, low: 0, high: 0.5}
+  - {field: actuator_gain, element: pivot, low: 1, high: 3}
+max_episode_steps: 200
+"""
+"""An encoder alone."""
+
+MODELS = {"arm.xml": ARM, "spring.xml": SPRING, "cart.xml": CART, "pendulum.xml": PENDULUM}
+
+
+def write_robot(folder, spec, file="robot.yaml", **models):
+    """A spec file beside the models it may name; where it lies."""
+    for name, text in (MODELS | {f"{name}.xml": text for name, text in models.items()}).items():
+        (folder / name).write_text(text)
+    path = folder / file
+    path.write_text(spec)
+    return path

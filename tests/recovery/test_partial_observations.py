@@ -1,0 +1,92 @@
+"""Robots of one's own that measure positions alone, and not exactly: states are estimated, or windows compared."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from test_madoc_recovers import quick
+
+from madoc import robots, simulation
+from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
+from madoc.data import Disturbance, disturb
+from own_robots import ARM_SPEC, PENDULUM_SPEC, write_robot
+from robots import recorded
+
+ARM = {"body_mass.fore": 0.4, "dof_damping.shoulder": 0.3, "dof_damping.elbow": 0.35}
+LEFT_OUT = ("velocity(", "gravity", "element: upper")
+EXACT = 1e-4
+"""% of its range that least squares may be off on exact readings."""
+NEAR = 10.0
+"""And Madoc, in seconds."""
+
+
+@pytest.fixture
+def arm(tmp_path):
+    """The arm with encoders alone."""
+    lines = [line for line in ARM_SPEC.splitlines() if not any(part in line for part in LEFT_OUT)]
+    return robots.load(write_robot(tmp_path, "\n".join(lines))).task
+
+
+@pytest.fixture
+def pendulum(tmp_path):
+    return robots.load(write_robot(tmp_path, PENDULUM_SPEC)).task
+
+
+def problem_of(task, truth, *, rows, noise=0.0, seed=100):
+    log = recorded(task, truth, rows, jax.random.key(seed))
+    if noise:
+        log = replace(disturb(log, Disturbance(noise=noise), task, jax.random.key(seed + 1)), disturbance=Disturbance())
+    return CalibrationProblem(log, simulation.make(task, threads=1))
+
+
+def off(result, task, truth):
+    space = task.parameters
+    return 100.0 * np.abs(result.mean - space.vector(truth)) / (space.high - space.low)
+
+
+def test_least_squares_is_exact_on_exact_encoders(arm):
+    assert arm.state_from_observation is None
+    method = LeastSquares(windows=40, search_windows=12)
+    result = calibrate(method, problem_of(arm, ARM, rows=1000), key=jax.random.key(0), budget=400_000)
+    assert (off(result, arm, ARM) < EXACT).all(), off(result, arm, ARM)
+    assert result.status == "converged"
+    assert result.warnings[0].startswith(
+        "initial states of windows were estimated with the parameters, as states cannot be rebuilt from the data"
+    )
+
+
+DELAYED = """\
+  - {field: action_delay, low: 0, high: 0.04}
+  - {field: signal_bias, element: angle, low: -0.2, high: 0.2}
+"""
+
+
+def test_a_delay_and_a_bias_are_found_with_the_states(tmp_path):
+    spec = PENDULUM_SPEC.replace("max_episode", DELAYED + "max_episode")
+    task = robots.load(write_robot(tmp_path, spec)).task
+    truth = dict(zip(task.parameters.names, (1.2, 0.15, 1.6, 0.013, 0.07), strict=True))
+    method = LeastSquares(windows=40, search_windows=12, searches=2)
+    result = calibrate(method, problem_of(task, truth, rows=1000), key=jax.random.key(0), budget=400_000)
+    assert (off(result, task, truth) < 0.1).all(), off(result, task, truth)
+
+
+@pytest.mark.slow
+def test_madoc_compares_windows_of_encoders(arm):
+    method = quick("madoc", patience=0)
+    result = calibrate(method, problem_of(arm, ARM, rows=5000), key=jax.random.key(0), budget=80_000)
+    assert (off(result, arm, ARM) < NEAR).all(), off(result, arm, ARM)
+    assert any("windows of 3 rows" in warning for warning in result.warnings)
+
+
+@pytest.mark.slow
+def test_intervals_cover_planted_truths(pendulum):
+    space, inside = pendulum.parameters, []
+    for seed in range(30):
+        truth = space.to_physical(np.random.default_rng(seed).uniform(-0.7, 0.7, len(space)))
+        problem = problem_of(pendulum, dict(zip(space.names, truth, strict=True)), rows=1000, noise=0.05, seed=seed)
+        result = calibrate(LeastSquares(), problem, key=jax.random.key(0), budget=10**6)
+        low, high = np.array([row.interval for row in result.parameters.values()]).T
+        inside.append((low <= truth) & (truth <= high))
+    # 95 % of 30, less and more two deviations of a binomial: 26.1 to 30.
+    assert (np.sum(inside, axis=0) >= 26).all(), np.mean(inside, axis=0)

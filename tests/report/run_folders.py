@@ -1,0 +1,145 @@
+"""Run folders as the stages leave them, small, and with everything in them that a page can show."""
+
+import json
+
+import numpy as np
+
+PARAMETERS = {
+    "gravity": (-9.9, 0.2, -30.0, 0.0, "m/s²", -9.81),
+    "body_mass.torso": (3.4, 0.1, 3.0, 5.0, "kg", 3.53),
+    "body_mass.leg": (2.7, 0.1, 2.0, 4.0, "kg", 2.71),
+    "dof_damping.leg_joint": (1.2, 0.3, 0.0, 3.0, "N·m·s/rad", 1.0),
+}
+SIGNALS = ("height", "speed")
+
+
+def write_json(path, value):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(value, ensure_ascii=False))
+
+
+def spec(**changes):
+    """What the calibration was asked."""
+    return {
+        "command": "calibrate",
+        "task": "hopper",
+        "physics": "legacy",
+        "parameters": {name: [row[2], row[3]] for name, row in PARAMETERS.items()},
+        "method": "madoc",
+        "data": {"paths": ["../data.npz"], "rows": 5000, "fingerprint": "8c66c3a4"},
+        "seed": 0,
+        "budget": 3000,
+        "truth": {name: row[5] for name, row in PARAMETERS.items()},
+        "versions": {"madoc": "0.1.0", "mujoco": "3.17.0"},
+    } | changes
+
+
+def result(**changes):
+    """How it ended."""
+    rows = {
+        name: {"estimate": at, "std": std, "low": low, "high": high, "unit": unit, "interval": [at - std, at + std]}
+        for name, (at, std, low, high, unit, _) in PARAMETERS.items()
+    }
+    deviation = np.array([row[1] for row in PARAMETERS.values()])
+    correlation = np.eye(4)
+    correlation[1, 2] = correlation[2, 1] = -0.9
+    errors = [
+        {"horizon": steps, "error": error, "interval": [error / 2, error * 2]} for steps, error in ((1, 0.01), (5, 0.1))
+    ]
+    return {
+        "method": "madoc",
+        "task": "hopper",
+        "status": "finished",
+        "sentence": "the budget of 3,000 control steps is spent",
+        "control_steps": 3128,
+        "seconds": 83.4,
+        "seed": 0,
+        "groups": [["gravity"], ["body_mass.torso", "body_mass.leg"], ["dof_damping.leg_joint"]],
+        "parameters": rows,
+        "warnings": ["the data carries <noise> & more"],
+        "error": {"mean_absolute": 0.1, "mean_percent_of_range": 4.5, "per_parameter": {}},
+        "covariance": (correlation * np.outer(deviation, deviation)).tolist(),
+        "verdict": {"word": "CALIBRATED", "sentence": "the hold-out is predicted", "parameters": []},
+        "holdout": {
+            "split": "1 of 5 episodes is held out",
+            "rows": 1000,
+            "episodes": 1,
+            "measure": "prediction",
+            "relative": 0.04,
+            "relative_interval": [0.03, 0.05],
+            "horizons": [1, 5],
+            "prediction": dict.fromkeys(("mid-range", "estimate", "nearby best", "noise"), errors),
+            "interval_share_of_range": dict.fromkeys(PARAMETERS, 0.1),
+            "two_sample": {
+                "mid-range": {"area": 0.9, "interval": [0.8, 0.95]},
+                "estimate": {"area": 0.52, "interval": [0.45, 0.6]},
+            },
+            "candidates": [
+                {
+                    "method": "madoc",
+                    "score": 0.04,
+                    "interval": [0.03, 0.05],
+                    "verdict": "CALIBRATED",
+                    "control_steps": 3128,
+                    "seconds": 83.4,
+                },
+                {"method": "oted", "not_run": "the budget is spent"},
+            ],
+        },
+    } | changes
+
+
+def metrics():
+    """Two epochs of cloning, then three of calibration."""
+    lines = [
+        {"control_steps": 0, "seconds": 1.0 + epoch, "stage": "cloning", "metrics": {"cloning_loss": 1.0 - epoch}}
+        for epoch in range(2)
+    ]
+    for epoch in (1, 2, 3):
+        values = {"accuracy_sa": 0.6, "accuracy_sas": 0.7, "reward": -0.5, "reward_size": 1.0, "mismatch": 0.1 / epoch}
+        values |= {f"estimate/{name}": row[0] + 1 / epoch for name, row in PARAMETERS.items()}
+        values |= {f"std/{name}": row[1] for name, row in PARAMETERS.items()}
+        lines.append(
+            {"control_steps": 1000 * epoch, "seconds": 2.0 + 10 * epoch, "stage": "calibrating", "metrics": values}
+        )
+    return "".join(json.dumps(line) + "\n" for line in lines)
+
+
+def evidence():
+    """Two stretches of two signals, three times each."""
+    measured = np.arange(12.0).reshape(2, 3, 2)
+    return {
+        "signals": np.array(SIGNALS),
+        "scale": np.array([2.0, 4.0]),
+        "time": np.array([0.0, 0.01, 0.02]),
+        "measured": measured,
+        "before": measured + 1.0,
+        "after": measured + 0.1,
+        "residual_before": np.array([[1.0, -2.0], [-1.0, 2.0], [np.nan, np.nan]]),
+        "residual_after": np.array([[0.1, 0.0], [0.1, 0.0], [0.1, 0.0]]),
+    }
+
+
+def whole_folder(path):
+    """A run of `madoc run` that has everything."""
+    write_json(path / "spec.json", {"command": "run", "name": "hopper-medium"})
+    folder = path / "calibration"
+    write_json(folder / "spec.json", spec())
+    write_json(folder / "result.json", result())
+    (folder / "metrics.jsonl").write_text(metrics())
+    np.savez(folder / "evidence.npz", **evidence())
+    vectors = np.random.default_rng(0).normal(size=(4, 16))
+    np.savez(folder / "embeddings.npz", names=np.array(list(PARAMETERS)), vectors=vectors)
+    policy = {"return": 900.0, "return_std": 20.0, "normalized": 28.0, "length": 400.0}
+    write_json(path / "evaluation.json", {"episodes": 3, "policies": {"calibrated": policy, "truth": policy}})
+    return path
+
+
+def bare_folder(path, **changes):
+    """A run that has ended, with nothing but its spec and its result."""
+    kept = {
+        name: value for name, value in result().items() if name not in ("verdict", "holdout", "covariance", "error")
+    }
+    write_json(path / "spec.json", spec(truth=None))
+    write_json(path / "result.json", kept | {"groups": [list(PARAMETERS)], "warnings": []} | changes)
+    return path

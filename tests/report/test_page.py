@@ -1,0 +1,156 @@
+"""Pages of runs: what they say, and that a browser shows them without a word to the network or of complaint."""
+
+import re
+
+import pytest
+from browser import CHROMIUM, chromium
+from run_folders import PARAMETERS, bare_folder, spec, write_json
+
+from madoc.errors import MadocError
+from madoc.report import write_comparison, write_report
+from madoc.report.page import run_context, verdict_of
+from madoc.report.reading import read_run
+from madoc.report.sections import ALL
+from madoc.report.sections.estimates import estimates
+from madoc.report.sections.holdout import residuals
+
+IDS = [section.__name__ for section in ALL]
+
+
+def section(run, wanted):
+    """One section of a run's page."""
+    return next(each for each in run_context(read_run(run))["sections"] if each.id == wanted)
+
+
+def test_a_page_has_every_section_of_a_whole_run(whole):
+    text = write_report(whole).read_text()
+    assert [id for id in IDS if f'<section id="{id}">' not in text] == []
+    assert "Not in this run" not in text
+    assert "The data carries &lt;noise&gt; &amp; more." in text
+
+
+def test_a_page_says_what_a_bare_run_lacks(bare):
+    text = write_report(bare).read_text()
+    present = [id for id in IDS if f'<section id="{id}">' in text]
+    assert present == ["estimates", "cost", "asked"]
+    assert [id for id in IDS if f'<div id="{id}">' not in text and id not in present] == []
+    assert "NO VERDICT" in text and "Nothing was held out" in text
+
+
+def test_an_estimate_stands_where_it_belongs_in_its_range(whole):
+    row = next(row for row in estimates(read_run(whole)).data["rows"] if row["name"] == "body_mass.torso")
+    # 3.4 ± 0.1 of 3 to 5, the truth at 3.53
+    assert (row["at"], row["from"], row["to"], row["truth_at"]) == (20.0, 15.0, 25.0, 26.5)
+    assert (row["estimate"], row["spread"], row["off_percent"]) == ("3.4", "3.3 to 3.5", "6.5")
+
+
+def test_residuals_are_shares_of_a_steps_change(whole):
+    rows = residuals(read_run(whole)).data["rows"]
+    # height: ±1 of 2, then 0.1 of 2; speed: ±2 of 4, then 0; the row that failed does not count
+    assert [(row["name"], row["before"], row["after"]) for row in rows] == [
+        ("height", "50 %", "5 %"),
+        ("speed", "50 %", "0 %"),
+    ]
+    assert rows[0]["factor"] == "10 times less"
+
+
+def test_the_strongest_correlation_is_told(whole):
+    assert section(whole, "correlations").data["told"] == ["leg mass and torso mass: −0.9"]
+
+
+def test_time_is_told_by_stage(whole):
+    stages = section(whole, "cost").data["stages"]
+    assert [(stage["name"], stage["words"]) for stage in stages] == [
+        ("cloning", "2.0 s, 0 control steps"),
+        ("calibrating", "30 s, 3 000 control steps"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "word", "tone"),
+    [
+        ({"verdict": {"word": "MODEL_MISMATCH", "sentence": "s"}}, "MODEL MISMATCH", "bad"),
+        ({"verdict": {"word": "NO_IMPROVEMENT", "sentence": "s"}}, "NO IMPROVEMENT", "doubtful"),
+        ({}, "NO VERDICT", "neutral"),
+        ({"status": "diverged"}, "DIVERGED", "bad"),
+        ({"status": "interrupted"}, "INTERRUPTED", "doubtful"),
+    ],
+)
+def test_the_word_on_top_is_the_verdicts_or_how_it_ended(tmp_path, change, word, tone):
+    verdict = verdict_of(read_run(bare_folder(tmp_path / "run", **change)))
+    assert (verdict["word"], verdict["tone"]) == (word, tone)
+
+
+def test_a_run_that_has_not_ended_says_so(whole):
+    (whole / "calibration" / "result.json").unlink()
+    text = write_report(whole).read_text()
+    assert "NOT ENDED" in text and "The run has not ended." in text and '<section id="trace">' in text
+
+
+def test_a_page_is_written_again_but_nothing_else_is_written_over(bare, tmp_path):
+    assert write_report(bare) == write_report(bare) == bare / "report.html"
+    with pytest.raises(MadocError, match=r"result.json exists and is no page of madoc report"):
+        write_report(bare, bare / "result.json")
+    with pytest.raises(MadocError, match="is a folder; name a file"):
+        write_report(bare, tmp_path)
+
+
+def test_nothing_from_a_folder_becomes_markup(tmp_path):
+    evil = "<img src=x onerror=alert(1)>"
+    folder = bare_folder(tmp_path / "run", sentence=evil, warnings=[evil], method=evil)
+    write_json(folder / "spec.json", spec(task=evil, versions={evil: evil}))
+    assert evil not in write_report(folder).read_text()
+
+
+def test_a_page_asks_for_nothing_outside_of_itself(whole):
+    text = write_report(whole).read_text()
+    assert re.findall(r"(?:https?:)?//[a-z0-9]", text) == []
+    assert re.findall(r"<link[^>]*>|<script[^>]+>|url\([^)]*\)|@import", text) == ['<link rel="icon" href="data:,">']
+
+
+def test_a_comparison_puts_estimates_side_by_side(whole, bare):
+    page = write_comparison([whole, bare], whole.parent / "both.html")
+    text = page.read_text()
+    assert text.count('class="lane-name">whole') == text.count('class="lane-name">bare') == len(PARAMETERS)
+    assert "CALIBRATED" in text and "NO VERDICT" in text
+
+
+def test_runs_of_one_name_are_told_apart(tmp_path):
+    runs = [bare_folder(tmp_path / parent / "run") for parent in ("first", "second")]
+    text = write_comparison(runs, tmp_path / "both.html").read_text()
+    assert "first/run" in text and "second/run" in text
+
+
+def test_runs_on_different_data_are_said_to_be(tmp_path):
+    runs = [bare_folder(tmp_path / name) for name in ("one", "other")]
+    write_json(runs[1] / "spec.json", spec(data={"rows": 1, "fingerprint": "00000000"}))
+    assert "calibrated to different data" in write_comparison(runs, tmp_path / "both.html").read_text()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; Debian's package chromium has it")
+def test_a_browser_shows_pages_without_complaint_or_network(whole, bare, tmp_path):
+    pages = {
+        write_report(whole): ["verdict", "warnings", *IDS],
+        write_report(bare): ["verdict", "warnings", *IDS],
+        write_comparison([whole, bare], tmp_path / "both.html"): ["runs", "estimates", "errors", "costs", "doubts"],
+    }
+    with chromium() as page:
+        for file, ids in pages.items():
+            for width, scheme in ((1200, "light"), (390, "dark")):
+                page.open(file, width=width, scheme=scheme)
+                shown = (
+                    "(id => (e => e !== null && e.getBoundingClientRect().height > 15)(document.getElementById(id)))"
+                )
+                assert page.ask_script(f"{ids!r}.filter(id => !{shown}(id))") == []
+                assert page.ask_script("document.documentElement.scrollWidth") <= width, "wider than the window"
+                small = "[...document.querySelectorAll('svg text')].filter(e => e.getBoundingClientRect().height < 9)"
+                assert page.ask_script(f"{small}.length") == 0, "words too small to read"
+        page.open(write_report(whole))
+        point = "(box => [box.x + box.width - 20, box.y + box.height / 2])"
+        chart = "document.querySelector('#signals svg')"
+        page.ask_script(f"document.documentElement.style.scrollBehavior = 'auto'; {chart}.scrollIntoView()")
+        page.move_pointer(*page.ask_script(f"{point}({chart}.getBoundingClientRect())"))
+        told = page.ask_script("document.querySelector('.told').innerText")
+        assert "measured" in told and "calibrated" in told
+        assert set(page.requests) == {file.resolve().as_uri() for file in pages}
+        assert page.complaints == []

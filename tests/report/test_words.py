@@ -1,0 +1,54 @@
+import math
+
+import pytest
+
+from madoc.report.words import count, duration, number, parameter_title, short_count
+
+
+@pytest.mark.parametrize(
+    ("value", "written"),
+    [
+        (0.0, "0"),
+        (-9.862981, "−9.863"),
+        (61088.4, "61 088"),
+        (1234.6, "1 235"),
+        (0.00012345, "0.0001234"),
+        (1.43e-15, "1.43·10⁻¹⁵"),
+        (-2.5e8, "−2.50·10⁸"),
+        (math.nan, "–"),
+        (None, "–"),
+    ],
+)
+def test_numbers_have_their_digits_and_a_real_minus(value, written):
+    assert number(value) == written
+
+
+@pytest.mark.parametrize(
+    ("seconds", "written"),
+    [(0.84, "0.8 s"), (42.4, "42 s"), (59.7, "1 min 0 s"), (106.3, "1 min 46 s"), (7801, "2 h 10 min")],
+)
+def test_durations_are_read_at_a_glance(seconds, written):
+    assert duration(seconds) == written
+
+
+def test_counts_keep_thousands_apart():
+    assert (count(1_500_000), short_count(1_500_000), short_count(20_000), short_count(500)) == (
+        "1 500 000",
+        "1.5M",
+        "20k",
+        "500",
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [
+        ("gravity", "gravity"),
+        ("body_mass.torso", "torso mass"),
+        ("dof_damping.left+right", "left+right damping"),
+        ("knee_damping", "knee damping"),
+        ("site_size.tip", "tip site size"),
+    ],
+)
+def test_parameters_are_called_by_element_and_quantity(name, title):
+    assert parameter_title(name) == title

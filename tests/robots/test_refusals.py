@@ -1,0 +1,318 @@
+"""Every mistake in a spec: one sentence with file, line, what was expected, what is there, the nearest names."""
+
+import pytest
+
+from madoc import robots
+from madoc.errors import MadocError
+from own_robots import ARM_SPEC, CART, CART_SPEC, write_robot
+
+ACTION = "  - {name: shoulder_motor, actuator: shoulder, low: -1, high: 1}"
+DAMPING = "  - {field: dof_damping, element: elbow, low: 0, high: 0.5}"
+SIGNAL = "  - {name: elbow_angle, reads: position(elbow)}"
+
+
+def line_of(text, spec=ARM_SPEC):
+    return max(number for number, line in enumerate(spec.splitlines(), 1) if text in line)
+
+
+CHANGES = [
+    # What stands in the file.
+    ("madoc: 1", "madoc: 2", "expected 1 in madoc, got 2"),
+    ("madoc: 1\n", "", "expected madoc: here"),
+    ("model: arm.xml\n", "", "expected model: here"),
+    ("control_step", "control_stp", "unknown key 'control_stp'; nearest: control_step"),
+    ("control_step: 0.02", "control_step: fast", "expected a number in control_step, got 'fast'"),
+    ("control_step: 0.02", "control_step: -0.02", "expected greater than 0 in control_step, got -0.02"),
+    ("control_step: 0.02", "control_step: .nan", "expected .* in control_step, got nan"),
+    ("control_step: 0.02", "control_step: true", "expected a number in control_step, got True"),
+    (
+        "control_step: 0.02",
+        "control_step: 0.025",
+        "a whole multiple of the timestep 0.01 s, got 0.025 s; nearest: 0.02",
+    ),
+    (
+        "control_step: 0.02",
+        "control_step: 0.004",
+        "a whole multiple of the timestep 0.01 s, got 0.004 s; nearest: 0.01",
+    ),
+    ("name: two_link_arm", "name: two link arm", "expected a name of letters, digits, _ . and -"),
+    ("name: two_link_arm", "name: 12", "expected text in name, got 12; put it in quotes"),
+    ("name: two_link_arm", "name: hopper", "'hopper' is a robot of Madoc's own; choose another name"),
+    ("groups: 2", "groups: two", "expected a whole number in groups, got 'two'"),
+    ("groups: 2", "groups: 0", "expected greater than or equal to 1 in groups, got 0"),
+    ("groups: 2", "groups: 2\ngroups: 3", r"'groups' is given twice, first on line 19; keep one"),
+    # Signals.
+    (SIGNAL, "  - {name: elbow_angle}", "expected reads: in this part of signals"),
+    (SIGNAL, "  - elbow_angle", "expected keys and values in signals, got 'elbow_angle'"),
+    (SIGNAL, "  - {name: elbow_angle, read: position(elbow)}", "unknown key 'read'; nearest: reads"),
+    (SIGNAL, "  - {name: shoulder_angle, reads: position(elbow)}", "the name 'shoulder_angle' is taken by line 6"),
+    (SIGNAL, "  - {name: elbow_motor, reads: position(elbow)}", None),
+    (SIGNAL, "  - {name: e, reads: position(elbo)}", "the model has no joint 'elbo'; nearest: elbow"),
+    (SIGNAL, "  - {name: e, reads: position(elbow}", "which does not parse"),
+    (SIGNAL, "  - {name: e, reads: position(elbow) +}", "which does not parse"),
+    (SIGNAL, "  - {name: e, reads: elbow}", r"'elbow' alone reads nothing; write position\(elbow\)"),
+    (SIGNAL, "  - {name: e, reads: 1 + 1}", "is 2 whatever the robot does; read a joint or a sensor"),
+    (SIGNAL, "  - {name: e, reads: 3}", "expected text in signals.reads, got 3; put it in quotes"),
+    (SIGNAL, "  - {name: e, reads: sensor(tip)}", "the model has no sensor 'tip'; it names no sensor"),
+    (SIGNAL, '  - {name: e, reads: "position(elbow)[1]"}', r"position\(elbow\)\[1\] does not exist: it has 1 value,"),
+    (SIGNAL, "  - {name: e, reads: position(elbow) * (1 / 0)}", "expected an expression with a value"),
+    (SIGNAL, "  - {name: e, reads: position(elbow), unit: deg}", r"is in rad, not in deg; write reads: .* \* 180 / pi"),
+    # Actions.
+    (
+        ACTION,
+        "  - {name: m, actuator: shoulde, low: -1, high: 1}",
+        "the name of an actuator, got 'shoulde'; nearest: shoulder",
+    ),
+    (ACTION, "  - {name: m, actuator: shoulder, low: 1, high: -1}", "expected low below high, got 1 and -1"),
+    (ACTION, "  - {name: m, actuator: shoulder, low: -1}", "expected both low: and high:, got one of them"),
+    (
+        ACTION,
+        "  - {name: m, actuator: shoulder}",
+        "expected low: and high:, as the actuator 'shoulder' has no ctrlrange",
+    ),
+    (ACTION, "  - {name: m, low: -1, high: 1}", "expected either joint: or actuator:, got both or neither"),
+    (ACTION, "  - {name: m, actuator: elbow, low: -1, high: 1}", None),
+    (
+        ACTION,
+        "  - {name: m, actuator: shoulder, kp: 3, low: -1, high: 1}",
+        "kp: belongs to joint:, the actuator 'shoulder'",
+    ),
+    (ACTION, "  - {name: m, joint: shoulder, low: -1, high: 1}", "expected means: torque, force, position or velocity"),
+    (
+        ACTION,
+        "  - {name: m, joint: shoulder, means: push, low: -1, high: 1}",
+        "expected 'torque', 'force', .* got 'push'",
+    ),
+    (ACTION, "  - {name: m, joint: shoulder, means: torque}", "expected low: and high: beside joint:"),
+    (ACTION, "  - {name: m, joint: shoulder, means: position, low: -1, high: 1}", "expected kp: of a position servo"),
+    (
+        ACTION,
+        "  - {name: m, joint: shoulder, means: velocity, low: -1, high: 1}",
+        "expected kd: above 0 of a velocity servo",
+    ),
+    (
+        ACTION,
+        "  - {name: m, joint: shoulder, means: torque, kp: 1, low: -1, high: 1}",
+        "kp: means nothing beside means: torque",
+    ),
+    (
+        ACTION,
+        "  - {name: m, joint: shoulder, means: torque, low: -1, high: 1}",
+        "the joint 'shoulder' has an actuator 'shoulder' in the model; drive that with actuator: shoulder",
+    ),
+    (
+        ACTION,
+        "  - {name: m, joint: shouldr, means: torque, low: -1, high: 1}",
+        "the name of a joint, got 'shouldr'; nearest",
+    ),
+    # Parameters.
+    (DAMPING, "  - {field: dof_dampng, element: elbow, low: 0, high: 1}", "got 'dof_dampng'; nearest: dof_damping"),
+    (
+        DAMPING,
+        "  - {field: dof_damping, element: elbw, low: 0, high: 1}",
+        "the name of a joint, got 'elbw'; nearest: elbow",
+    ),
+    (
+        DAMPING,
+        "  - {field: dof_damping, element: elbow, low: 1, high: 0}",
+        r"must be finite with low < high, got \[1.0, 0.0\]",
+    ),
+    (DAMPING, "  - {field: dof_damping, element: elbow, low: 1, high: 1}", "must be finite with low < high"),
+    (DAMPING, "  - {field: dof_damping, element: elbow, low: -1, high: 1}", "below its physical bound 0.0"),
+    (
+        DAMPING,
+        "  - {field: dof_damping, element: elbow, low: 0, high: .inf}",
+        "expected .* in parameters.high, got inf",
+    ),
+    (DAMPING, "  - {field: dof_damping, element: elbow, low: 0}", "expected high: in this part of parameters"),
+    (DAMPING, "  - {field: dof_damping, low: 0, high: 1}", "'dof_damping' takes the name of a joint, got ''"),
+    (DAMPING, "  - {field: gravity, element: elbow, low: -9, high: 1}", "'gravity' takes no element, got 'elbow'"),
+    (
+        DAMPING,
+        "  - {field: dof_damping, elements: [], low: 0, high: 1}",
+        "expected at least one item in parameters.elements",
+    ),
+    (DAMPING, "  - {field: dof_damping, elements: [elbow, elbow], low: 0, high: 1}", "names an element twice"),
+    (
+        DAMPING,
+        "  - {field: dof_damping, element: a, elements: [b], low: 0, high: 1}",
+        "expected element: or elements:, got both",
+    ),
+    (
+        DAMPING,
+        "  - {field: dof_damping, element: shoulder, low: 0, high: 1}",
+        "dof_damping.shoulder is on line 17 already",
+    ),
+    (
+        DAMPING,
+        "  - {field: dof_damping, elements: [elbow, shoulder], low: 0, high: 1}",
+        "dof_damping of 'shoulder' is calibrated by line 17 already",
+    ),
+    (
+        DAMPING,
+        "  - {field: gravity, name: g, low: -9, high: -8}",
+        "gravity and gravity of line 14 are one thing; keep one",
+    ),
+    (
+        DAMPING,
+        "  - {field: body_mass_and_inertia, element: fore, low: 1, high: 2}",
+        "and body_mass of line 16 are one thing",
+    ),
+    (
+        DAMPING,
+        "  - {field: signal_bias, element: elbow, low: -1, high: 1}",
+        "a signal, got 'elbow'; nearest: elbow_angle",
+    ),
+    (DAMPING, "  - {field: action_delay, low: -1, high: 1}", "below its physical bound 0.0"),
+    # The rest.
+    (
+        "groups: 2",
+        "log: {columns: {elbow: q2}}",
+        "the name of a signal or an action, got 'elbow'; nearest: elbow_angle",
+    ),
+    ("groups: 2", "log: {resample: nearest}", "expected 'hold' or 'linear' in log.resample, got 'nearest'"),
+    ("groups: 2", "log: {tolerance: 2}", "expected less than 1 in log.tolerance, got 2"),
+    ("groups: 2", "log: {tme: t}", "unknown key 'tme'; nearest: time"),
+    ("groups: 2", "reward: elbow_angel", "unknown name 'elbow_angel'; nearest: elbow_angle"),
+    ("groups: 2", "reward: position(elbow)", "unknown function 'position'"),
+]
+
+
+@pytest.mark.parametrize(("before", "after", "sentence"), [row for row in CHANGES if row[2]])
+def test_a_mistake_is_answered_on_its_line(tmp_path, before, after, sentence):
+    assert before in ARM_SPEC
+    spec = ARM_SPEC.replace(before, after, 1)
+    with pytest.raises(MadocError, match=sentence) as refusal:
+        robots.load(write_robot(tmp_path, spec))
+    told = str(refusal.value)
+    assert "\n" not in told
+    missing = after in ("", "\n")
+    line = 1 if missing else line_of(after.splitlines()[-1], spec)
+    assert told.startswith(f"robot.yaml, line {line}: ")
+
+
+def test_a_name_is_taken_across_signals_and_actions(tmp_path):
+    spec = ARM_SPEC.replace(SIGNAL, "  - {name: elbow_motor, reads: position(elbow)}")
+    with pytest.raises(MadocError, match="line 12: the name 'elbow_motor' is taken by line 7; choose another"):
+        robots.load(write_robot(tmp_path, spec))
+    spec = ARM_SPEC.replace(ACTION, "  - {name: m, actuator: elbow, low: -1, high: 1}")
+    with pytest.raises(MadocError, match="line 12: the actuator 'elbow' is driven by line 11 already"):
+        robots.load(write_robot(tmp_path, spec))
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"", "robot.yaml is empty; write one with: madoc init MODEL"),
+        (b"# nothing\n", "robot.yaml is empty"),
+        (b"just words", "line 1: expected keys and values"),
+        (b"[1, 2]", "line 1: expected keys and values"),
+        (b"a: 1\n\tb: 2", "line 2: this is not YAML"),
+        (b"a: [1, 2", "line 1: this is not YAML"),
+        (b"a: &x 1\nb: *x", "line 1: anchors and aliases"),
+        (b"a: !!python/object:os.system {}", "line 1: expected a plain value, got the tag"),
+        (b"a: !mine 1", "line 1: expected a plain value, got the tag !mine"),
+        (b"a: 1\n---\nb: 2", "line 2: this is not YAML"),
+        (b"? [a]\n: 1", "line 1: expected a word before the colon"),
+        (b"name: caf\xe9\n", "line 1: expected text in UTF-8, got byte 0xe9"),
+        (b"\n\na: \x00", "this is not YAML"),
+        (b"[" * 5000, "line 1: nested more than 20 deep"),
+        (b"a: " + b"[" * 30 + b"]" * 30, "line 1: nested more than 20 deep"),
+        (b"#" * 200_001, "has 200,001 bytes, a robot's spec at most 200,000"),
+    ],
+)
+def test_what_is_no_yaml_of_ours(tmp_path, content, sentence):
+    path = tmp_path / "robot.yaml"
+    path.write_bytes(content)
+    with pytest.raises(MadocError, match=sentence) as refusal:
+        robots.load(path)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("model", "sentence"),
+    [
+        (None, r"line 3: there is no model file .*cart.xml: it is missing; check the path"),
+        ("", "line 3: model cart.xml cannot be read"),
+        ("hello", "line 3: model cart.xml cannot be read: XML parse error"),
+        ("<mujoco><wordbody/></mujoco>", "line 3: model cart.xml cannot be read: .*wordbody"),
+        (
+            '<mujoco><worldbody><body name="cart"><joint name="rail"/></body></worldbody></mujoco>',
+            "line 3: model cart.xml does not compile: .*mass and inertia",
+        ),
+        (CART.replace("</mujoco>", '<include file="rest.xml"/></mujoco>'), "line 3: .*rest.xml"),
+        (
+            CART.replace(
+                "</mujoco>", '<actuator><intvelocity name="a" joint="rail" kp="1" actrange="-1 1"/></actuator></mujoco>'
+            ),
+            "line 9: the joint 'rail' has an actuator 'a' in the model",
+        ),
+    ],
+)
+def test_what_is_no_model(tmp_path, model, sentence):
+    path = write_robot(tmp_path, CART_SPEC)
+    (tmp_path / "cart.xml").unlink()
+    if model is not None:
+        (tmp_path / "cart.xml").write_text(model)
+    with pytest.raises(MadocError, match=sentence) as refusal:
+        robots.load(path)
+    assert "\n" not in str(refusal.value)
+
+
+def test_models_that_cannot_be_stepped_yet_are_refused(tmp_path):
+    actuator = '<actuator><intvelocity name="a" joint="rail" kp="1" actrange="-1 1"/></actuator></mujoco>'
+    path = write_robot(
+        tmp_path,
+        CART_SPEC.replace("joint: rail, means: force", "actuator: a"),
+        cart=CART.replace("</mujoco>", actuator),
+    )
+    with pytest.raises(
+        MadocError, match="line 3: cart: models with actuator activations or mocap bodies are not supported"
+    ):
+        robots.load(path)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "sentence"),
+    [
+        ("means: force", "means: torque", "line 9: expected means: force of the slide 'rail'"),
+        ("name: push,", "name: rail_push, unit: mm,", None),
+        (
+            "actions:\n",
+            "actions:\n  - {name: twice, joint: rail, means: force, low: -1, high: 1}\n",
+            "is driven by line 9",
+        ),
+        ("reads: position(rail)", "reads: position(rail), unit: mm", r"is in m, not in mm; write reads: .* \* 1000"),
+    ],
+)
+def test_slides_are_no_hinges(tmp_path, before, after, sentence):
+    path = write_robot(tmp_path, CART_SPEC.replace(before, after))
+    if sentence is None:
+        assert robots.load(path).task.actions[0].scale == 1e-3
+        return
+    with pytest.raises(MadocError, match=sentence):
+        robots.load(path)
+
+
+def test_a_value_in_two_units_is_not_shared(tmp_path):
+    model = CART.replace(
+        "</body>", '<body name="b"><joint name="turn" type="hinge"/><geom size=".1" mass="1"/></body></body>'
+    )
+    shared = "  - {field: dof_damping, elements: [rail, turn], low: 0, high: 1}\n"
+    with pytest.raises(
+        MadocError, match=r"line 12: one value cannot be in N·m·s/rad and in N·s/m; make it two parameters"
+    ):
+        robots.load(write_robot(tmp_path, CART_SPEC + shared, cart=model))
+
+
+def test_several_mistakes_are_counted(tmp_path):
+    spec = ARM_SPEC.replace("low: 0,", "low: no,").replace("groups: 2", "groups: x")
+    with pytest.raises(MadocError, match=r"line 17: expected a number in parameters.low, got 'no' \(and 2 more\)"):
+        robots.load(write_robot(tmp_path, spec))
+
+
+def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path):
+    spec = CART_SPEC.replace("low: 0.5, high: 2", "low: 5e-1, high: 2E+0").replace("name: place", "name: on")
+    task = robots.load(write_robot(tmp_path, spec)).task
+    assert task.signals == ("on", "speed")
+    assert (task.parameters.low, task.parameters.high) == (0.5, 2.0)

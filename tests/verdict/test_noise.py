@@ -1,0 +1,82 @@
+import jax
+import numpy as np
+import pytest
+
+from madoc import simulation
+from madoc.data import Dataset, Disturbance, disturb
+from madoc.types import Transitions
+from madoc.verdict.noise import clipped, consecutive, difference_noise, noise_deviation, own_slopes
+from robots import SPRING_TRUTH, recorded, spring
+
+SPRING = spring(max_episode_steps=100)
+
+
+def test_the_noise_of_two_steps_by_hand():
+    # r_t r_{t+1} = -2 and -4 with slopes 1 and 1: σ² = (2 + 4) / 2.
+    first, second, slopes = (np.array([[a], [b]]) for a, b in ((1.0, 2.0), (-2.0, -2.0), (1.0, 1.0)))
+    assert noise_deviation(first, second, slopes) == pytest.approx(np.sqrt(3.0))
+
+
+def test_a_slope_divides_what_it_carries_on():
+    # A = ½: r_t r_{t+1} = -½ σ² = -2, so σ = 2.
+    assert noise_deviation(np.array([[1.0]]), np.array([[-2.0]]), np.array([[0.5]])) == pytest.approx(2.0)
+
+
+def test_what_does_not_alternate_is_no_noise():
+    same = np.ones((10, 1))
+    assert noise_deviation(same, same, same) == 0.0
+    assert noise_deviation(same, -same, np.zeros((10, 1))) == 0.0
+
+
+def test_noise_is_told_from_a_line_with_noisy_readings():
+    rng = np.random.default_rng(0)
+    noise = 0.3 * rng.standard_normal((4000, 1))
+    residuals = 0.9 * noise[:-1] - noise[1:]
+    found = noise_deviation(residuals[:-1], residuals[1:], np.full((3998, 1), 0.9))
+    assert found == pytest.approx(0.3, rel=0.05)
+
+
+def test_an_outlier_counts_as_five_deviations():
+    residuals = np.array([[1.0], [-1.0], [1.0], [-1.0], [100.0], [np.nan]])
+    assert clipped(residuals)[:, 0].tolist() == [1, -1, 1, -1, pytest.approx(5 * 1.4826), 0]
+
+
+def line_of(observation, episodes=(0,)):
+    nothing = np.zeros(len(observation) - 1)
+    flags = nothing.astype(bool)
+    seen = Transitions(observation[:-1], nothing[:, None], nothing, observation[1:], flags, flags)
+    return Dataset(seen, np.array(episodes), "spring", "modern", "a test")
+
+
+def test_second_differences_tell_noise_from_motion():
+    rng = np.random.default_rng(0)
+    time = np.linspace(0, 20, 5000)[:, None]
+    noise = 0.01 * rng.standard_normal(time.shape)
+    force = rng.standard_normal(time.shape)
+    # A force held over each step moves a mass by half of it in that step and by half in the next.
+    pushed = np.cumsum(np.cumsum(0.02 * (force + np.roll(force, 1)), axis=0), axis=0)
+    assert difference_noise(line_of(np.sin(time))) < 1e-4
+    assert difference_noise(line_of(pushed)) == 0.0
+    assert difference_noise(line_of(np.sin(time) + noise, (0, 2500))) == pytest.approx(0.01, rel=0.05)
+    assert difference_noise(line_of(noise)) == pytest.approx(0.01, rel=0.05)
+    assert difference_noise(line_of(noise[:4])) == 0.0
+
+
+def test_the_slopes_of_the_spring_by_itself():
+    # One control step of 0.02 s: x' by x is 1 - k/m h², less the damping's share; v' by v is 1 - c/m h.
+    log = recorded(SPRING, SPRING_TRUTH, 200, jax.random.key(0))
+    simulator = simulation.make(SPRING, threads=1)
+    unit = SPRING.parameters.to_unit(SPRING.parameters.vector(SPRING_TRUTH))
+    slopes = own_slopes(simulator, log, unit, np.array([3, 17]), np.array([0.1, 0.1]))
+    h, stiffness, damping, mass = 0.02, 6.5, 0.6, 1.5
+    assert slopes[:, 0] == pytest.approx(1 - stiffness / mass * h**2 * 0.75, abs=1e-3)
+    assert slopes[:, 1] == pytest.approx(1 - damping / mass * h, abs=2e-3)
+    assert slopes[0] == pytest.approx(slopes[1], abs=1e-9)  # a spring is linear
+
+
+def test_rows_that_follow_each_other_lie_in_one_episode():
+    log = recorded(spring(max_episode_steps=4), SPRING_TRUTH, 12, jax.random.key(0))
+    assert consecutive(log, np.arange(12)).tolist() == [0, 1, 2, 4, 5, 6, 8, 9, 10]
+    assert consecutive(log, np.array([0, 2, 3, 4])).tolist() == [2]
+    lost = disturb(log, Disturbance(shuffled="rows"), spring(), jax.random.key(0))
+    assert not len(consecutive(lost, np.arange(12)))

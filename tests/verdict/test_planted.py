@@ -1,0 +1,110 @@
+"""Planted situations end in the verdict that is true of them."""
+
+import jax
+import numpy as np
+import pytest
+from planted import FEWER, ROBOTS, at_rest, bench, log_of, shuffled, verdict
+
+from calibrating import madoc
+from madoc.calibration import CmaEs, Droid, LeastSquares
+from madoc.data import Disturbance, disturb
+from madoc.errors import MadocError
+from madoc.verdict import assess, judge
+
+EVERY = pytest.mark.parametrize("robot", ["spring", pytest.param("arm", marks=pytest.mark.slow)])
+NOISES = pytest.mark.parametrize("noise", [0.0, 0.1, pytest.param(0.3, marks=pytest.mark.slow)])
+
+
+@EVERY
+@NOISES
+def test_a_model_that_can_is_calibrated_and_its_noise_is_told(robot, noise):
+    task, _ = ROBOTS[robot]
+    log = log_of(robot, rows=2000, noise=noise)
+    said, found = verdict(log, task)
+    assert said.word == "CALIBRATED", said.sentence
+    change = (log.transitions.next_observation - log.transitions.observation).std(0)
+    assert np.array(list(found.report["noise"].values())) / change == pytest.approx(noise, rel=0.2, abs=1e-6)
+    for at, error in found.errors["estimate"].items():
+        assert error == pytest.approx(found.errors["noise"][at], rel=0.25, abs=1e-6)
+
+
+@EVERY
+@pytest.mark.parametrize(
+    "noise", [0.0, pytest.param(0.1, marks=pytest.mark.slow), pytest.param(0.3, marks=pytest.mark.slow)]
+)
+def test_a_wrong_fixed_parameter_is_a_mismatch(robot, noise):
+    task, _ = ROBOTS[robot]
+    said, _ = verdict(log_of(robot, rows=2000, noise=noise), task.with_parameters(FEWER[robot]))
+    assert said.word == "MODEL_MISMATCH", said.sentence
+
+
+@pytest.mark.parametrize("noise", [0.0, pytest.param(0.05, marks=pytest.mark.slow)])
+def test_without_forces_only_ratios_are_told(noise):
+    task, _ = ROBOTS["spring"]
+    log = disturb(at_rest("spring"), Disturbance(noise=noise), task, jax.random.key(0))
+    said, _ = verdict(log, task)
+    assert said.word == "NOT_IDENTIFIABLE"
+    assert {"jnt_stiffness.slide", "body_mass.cart"} <= set(said.parameters)
+
+
+def test_mid_range_and_an_estimate_that_is_no_better_are_no_improvement():
+    task, truth = ROBOTS["spring"]
+    judged = bench(log_of("spring"), task)
+    for mean in (task.parameters.middle, task.parameters.to_physical([-0.9, 0.9, 0.9])):
+        said = judge(assess(judged, mean))
+        assert said.word == "NO_IMPROVEMENT", said.sentence
+    assert judge(assess(judged, task.parameters.vector(truth))).word == "CALIBRATED"
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("how", ["next", "rows"])
+def test_shuffled_next_observations_are_rejected_whatever_the_estimate(robot, how):
+    task, truth = ROBOTS[robot]
+    judged = bench(shuffled(log_of(robot), how), task)
+    assert judge(assess(judged, task.parameters.vector(truth))).word == "DATA_REJECTED"
+
+
+METHODS = {
+    "least-squares": LeastSquares(),
+    "least-squares of windows": LeastSquares(horizon=5),
+    "droid": Droid(),
+    "cma-es": CmaEs(),
+    "cma-es-distribution": CmaEs("distribution"),
+    "madoc": madoc(),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("how", ["next", "rows", "episode", "labelled"])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("seed", range(3))
+def test_shuffled_next_observations_are_never_calibrated(robot, how, method, seed):
+    task, _ = ROBOTS[robot]
+    log = log_of(robot, noise=0.1 * (seed % 2), seed=seed)
+    if how == "labelled":
+        log = disturb(log, Disturbance(shuffled="next_observations"), task, jax.random.key(seed))
+    else:
+        log = shuffled(log, how, seed)
+    try:
+        said, _ = verdict(log, task, METHODS[method], budget=20_000, seed=seed)
+    except MadocError as refusal:
+        assert how == "labelled", refusal
+        return
+    # Within short episodes next observations stay near: a mismatch is as true.
+    assert said.word in {"DATA_REJECTED", *(["MODEL_MISMATCH", "NOT_IDENTIFIABLE"] if how == "episode" else [])}, said
+
+
+def test_whole_rows_in_a_random_order_are_as_good():
+    task, _ = ROBOTS["spring"]
+    log = disturb(log_of("spring"), Disturbance(shuffled="rows"), task, jax.random.key(0))
+    said, found = verdict(log, task)
+    assert said.word == "CALIBRATED", said.sentence
+    assert list(found.errors["estimate"]) == [1]
+
+
+def test_the_same_estimate_gives_the_same_bits():
+    task, _ = ROBOTS["spring"]
+    log = log_of("spring", rows=300, noise=0.1)
+    first, again = (assess(bench(log, task), task.parameters.middle).report for _ in range(2))
+    assert first == again

@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+
+from madoc.verdict.statistics import area_under_curve, better_than_chance, interval_of, resampled
+
+
+def test_the_area_by_hand():
+    # Of the four pairs (3, 1), (3, 2), (2, 1), (2, 2) the real score is above in three, and equal in one.
+    scores, real = np.array([3.0, 2.0, 1.0, 2.0]), np.array([True, True, False, False])
+    assert area_under_curve(scores, real) == pytest.approx(3.5 / 4)
+
+
+def test_the_weighted_area_by_hand():
+    # The simulated 2 counts three times the 1: (3·(1 + 3) + 2·1 half of 3 ...) = (4 + 1 + 1.5) / (2 · 4).
+    scores, real = np.array([3.0, 2.0, 1.0, 2.0]), np.array([True, True, False, False])
+    weights = np.array([1.0, 1.0, 1.0, 3.0])
+    assert area_under_curve(scores, real, weights) == pytest.approx((4 + 1 + 1.5) / 8)
+    assert area_under_curve(scores, real, np.ones(4)) == pytest.approx(area_under_curve(scores, real))
+
+
+def test_swapping_the_kinds_mirrors_the_area():
+    rng = np.random.default_rng(0)
+    scores, real = rng.integers(0, 5, 50).astype(float), rng.random(50) < 0.5
+    assert area_under_curve(scores, real) + area_under_curve(scores, ~real) == pytest.approx(1.0)
+
+
+def test_the_interval_of_a_mean_is_as_wide_as_its_standard_error_says():
+    values = np.random.default_rng(1).standard_normal(400)
+    low, high = interval_of(resampled(values, np.arange(400)))
+    assert high - low == pytest.approx(2 * 1.96 / 20, rel=0.15)
+
+
+def test_rows_of_one_episode_are_resampled_together():
+    # Forty rows of each of ten episodes say no more than the ten.
+    level = np.random.default_rng(1).standard_normal(10)
+    rows, episodes = np.repeat(level, 40), np.repeat(np.arange(10), 40)
+    together, apart = (np.diff(interval_of(resampled(rows, groups)))[0] for groups in (episodes, np.arange(400)))
+    assert together == pytest.approx(np.sqrt(40) * apart, rel=0.3)
+
+
+def test_few_episodes_are_resampled_by_window():
+    values = np.random.default_rng(2).standard_normal((30, 2))
+    assert (resampled(values, np.repeat([0, 1, 2], 10)) == resampled(values, np.arange(30))).all()
+
+
+def test_right_predictions_are_better_than_chance_and_shuffled_ones_are_not():
+    rng = np.random.default_rng(3)
+    followed = rng.standard_normal((200, 2))
+    groups = np.repeat(np.arange(4), 50)
+    right = better_than_chance(followed + 0.1 * rng.standard_normal((200, 2)), followed, groups)
+    assert right["p"] == pytest.approx(1 / 500)
+    assert right["skill"] > 0.8
+    wrong = better_than_chance(rng.permutation(followed), followed, groups)
+    assert wrong["p"] > 0.01
+    assert abs(wrong["skill"]) < 0.1
+
+
+def test_telling_one_run_from_another_is_no_skill():
+    level = np.repeat(np.arange(4.0), 50)[:, None]
+    noise = 0.01 * np.random.default_rng(4).standard_normal((2, 200, 1))
+    found = better_than_chance(level + noise[0], level + noise[1], np.repeat(np.arange(4), 50))
+    assert found["p"] > 0.01
+
+
+def test_rows_of_their_own_are_exchanged_with_any():
+    followed = np.random.default_rng(5).standard_normal((60, 1))
+    assert better_than_chance(followed, followed, np.arange(60))["skill"] == 1.0

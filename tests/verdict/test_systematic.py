@@ -1,0 +1,47 @@
+import numpy as np
+import pytest
+
+from madoc.verdict.systematic import autocorrelation, explained
+
+PAIRS = np.random.default_rng(0).standard_normal((300, 3))
+NOISE = np.random.default_rng(1).standard_normal((300, 2))
+
+
+@pytest.mark.parametrize(
+    "residuals",
+    [
+        PAIRS @ np.array([[1.0, 0.5], [0.0, 2.0], [-1.0, 0.0]]),
+        np.where(PAIRS[:, :1] > 0.5, [[3.0, -3.0]], 0.0),
+        np.full((300, 2), 0.7),
+    ],
+    ids=["a line", "a contact", "a constant"],
+)
+def test_what_follows_from_state_and_action_is_explained(residuals):
+    share, said = explained(PAIRS, residuals)
+    assert share > 0.9
+    assert np.abs(said - residuals).mean() < 0.3 * np.abs(residuals).mean()
+
+
+def test_noise_is_not_explained():
+    assert explained(PAIRS, NOISE)[0] < 0.05
+
+
+def test_half_noise_is_half_explained():
+    line = PAIRS[:, :1] * np.sqrt(1.0)
+    assert explained(PAIRS, line + NOISE[:, :1])[0] == pytest.approx(0.5, abs=0.1)
+
+
+def test_nothing_and_too_little_are_not_explained():
+    assert explained(PAIRS, np.zeros((300, 2)))[0] == 0.0
+    assert explained(PAIRS[:5], NOISE[:5])[0] == 0.0
+
+
+def test_the_autocorrelation_by_hand():
+    # (1·2 + 2·1) / √(5 · 5)
+    assert autocorrelation(np.array([[1.0], [2.0]]), np.array([[2.0], [1.0]])) == pytest.approx(0.8)
+    assert autocorrelation(np.zeros((3, 1)), np.ones((3, 1))) == 0.0
+
+
+def test_sensor_noise_alternates():
+    residuals = NOISE[:-1] - NOISE[1:]
+    assert autocorrelation(residuals[:-1], residuals[1:]) == pytest.approx(-0.5, abs=0.08)
