@@ -28,7 +28,7 @@ RESULTS = Path(__file__).parent / "results" / "planted"
 EXAMPLES = Path(__file__).parents[1] / "examples"
 HOPPER = {
     "madoc": 1,
-    "name": "hopper",
+    "name": "user_hopper",
     "model": str(Path(gymnasium.__file__).parent / "envs/mujoco/assets/hopper.xml"),
     "control_step": 0.008,
     "signals": [

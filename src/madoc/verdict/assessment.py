@@ -17,6 +17,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
 from madoc.tasks import Task
 from madoc.verdict import noise as sensors
+from madoc.verdict.fitted_starts import FITTED, FittedReplays, fitted_replays_of
 from madoc.verdict.identifiability import half_widths, told_shares
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, evenly, nearby_best, replays_of
 from madoc.verdict.statistics import better_than_chance, interval_of, resampled
@@ -58,13 +59,25 @@ class Bench:
 
     @property
     def measure(self) -> str:
-        """`prediction` where states can be rebuilt, else `two-sample`."""
-        return "two-sample" if self.simulator.task.state_from_observation is None else "prediction"
+        """`prediction` where windows can be replayed, else `two-sample`."""
+        return "prediction" if self.rebuilds or self.fitted is not None else "two-sample"
+
+    @property
+    def rebuilds(self) -> bool:
+        """Whether an observation tells the state."""
+        return self.simulator.task.state_from_observation is not None
 
     @cached_property
     def replays(self) -> Replays:
         """Windows of the hold-out."""
         return replays_of(self.split.held, self.simulator, self.scaling.next_scale)
+
+    @cached_property
+    def fitted(self) -> FittedReplays | None:
+        """Windows of the hold-out whose starts are to be fitted: where velocities are hidden, and no more than that."""
+        if self.rebuilds or not self.problem.starts_known or self.split.held.disturbance.shuffled != "none":
+            return None
+        return fitted_replays_of(CalibrationProblem(self.split.held, self.simulator), self.scaling.next_scale)
 
     @cached_property
     def clone(self) -> TanhGaussianPolicy:
@@ -85,7 +98,7 @@ class Bench:
     def judged_rows(self) -> Int[np.ndarray, " rows"]:
         """Rows of the hold-out at which single steps are looked at: in pairs that follow each other, if there are."""
         held = self.split.held
-        if self.measure == "two-sample":
+        if not self.rebuilds:
             return evenly(np.arange(len(held)), MOST_WINDOWS)
         rows = logged_states(held, self.simulator.task)[1]
         pairs = sensors.consecutive(held, rows)
@@ -173,7 +186,7 @@ def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
 
     Where states can be rebuilt, it is that of the best parameters near mid-range.
     """
-    if bench.measure == "two-sample":
+    if not bench.rebuilds:
         return sensors.difference_noise(bench.split.kept)
     middle = np.zeros((1, len(bench.simulator.parameters)))
     points = np.concatenate([middle, nearby_best(bench.replays, middle[0])[0]])
@@ -189,7 +202,9 @@ def assess(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.ndarr
         MadocError: No state of the hold-out can be rebuilt though the robot's observations determine it.
     """
     unit = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
-    return (_by_prediction if bench.measure == "prediction" else _by_rows)(bench, unit, interval)
+    if bench.rebuilds:
+        return _by_prediction(bench, unit, interval)
+    return _by_rows(bench, unit, interval) if bench.fitted is None else _by_fit(bench, bench.fitted, unit, interval)
 
 
 def _by_prediction(bench: Bench, unit: np.ndarray, interval: np.ndarray | None) -> Assessment:
@@ -277,6 +292,68 @@ def _what_is_left(bench: Bench, unit: np.ndarray) -> _Left:
         deviation = sensors.noise_deviation((single - said)[first], (single - said)[first + 1], slopes)
         spent += len(first) * (1 + len(scale))
     return _Left(size, share, autocorrelation(single[first], single[first + 1]), deviation, spent)
+
+
+def _by_fit(bench: Bench, replays: FittedReplays, unit: np.ndarray, interval: np.ndarray | None) -> Assessment:
+    """Where velocities are hidden: starts fitted to one stretch under each estimate, the next stretch predicted."""
+    simulator, space = bench.simulator, bench.simulator.parameters
+    points = np.stack([np.zeros(len(unit)), unit])
+    residuals = replays.residuals(points, replays.starts(points))
+    size = replays.magnitudes(residuals)
+    deviation = replays.deviation(residuals[1])
+    alone = replays.with_noise_alone(unit, residuals[1], deviation, jax.random.fold_in(bench.key, 2))
+    floor = replays.magnitudes(alone)[:, 0]
+    low, high = interval_of(_over_first(resampled(size.mean(-1), replays.episodes))[:, 1])
+    relative = float(_over_first(size.mean((0, -1)))[1])
+    half, probing = half_widths(bench.problem, unit, np.maximum(deviation, NEGLIGIBLE))
+    named = {"mid-range": size[:, 0], "estimate": size[:, 1], "nearby best": size[:, 1], "noise": floor}
+    signals = signal_names(simulator.task)
+    return _assembled(
+        bench,
+        unit,
+        relative=(relative, (float(low), float(high))),
+        best=relative,
+        errors={
+            name: dict(zip(replays.horizons, kind.mean((0, -1)).tolist(), strict=True)) for name, kind in named.items()
+        },
+        explained_share=_said_of_the_last(replays, residuals[1]),
+        correlation=0.0,
+        shares=told_shares(half, interval, space.high - space.low),
+        follows={"the simulator at the estimate": _follows_behind(replays, residuals[1]), **bench.model_free},
+        areas={},
+        more={
+            "horizons": list(replays.horizons),
+            "windows": len(replays.readings),
+            "fitted_steps": FITTED,
+            "failed_windows": int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
+            "prediction": {name: _by_horizon(kind, replays, signals) for name, kind in named.items()},
+            "noise": dict(zip(signals, (deviation * bench.scaling.next_scale).tolist(), strict=True)),
+        },
+        spent=3 * replays.fit_cost + residuals[..., 0].size + alone[..., 0].size + probing,
+    )
+
+
+def _said_of_the_last(replays: FittedReplays, residuals: Float[np.ndarray, "windows readings channels"]) -> float:
+    """The share of the last residuals that readings of the start and actions say."""
+    done = np.isfinite(residuals).all((1, 2))
+    last = sensors.clipped(residuals[done, -1])
+    if not done.any() or np.sqrt((last**2).mean(0)).max() <= _ROUNDING:
+        return 0.0
+    readings = replays.readings
+    known = [readings.observed[:, 0], readings.observed[:, 1], readings.actions.reshape(len(done), -1)]
+    return explained(np.concatenate(known, axis=1)[done], last)[0]
+
+
+def _follows_behind(
+    replays: FittedReplays, residuals: Float[np.ndarray, "windows readings channels"]
+) -> dict[str, float]:
+    """How far the readings right behind the fitted stretch are predicted better than chance would."""
+    observed, scale = replays.readings.observed, replays.readings.scale
+    spread = np.maximum(observed.std((0, 1)), 1e-8)
+    followed = observed[:, FITTED + 1]
+    ahead = residuals[:, FITTED + 1]
+    guess = np.where(np.isfinite(ahead), followed + ahead * scale, observed[:, FITTED])
+    return better_than_chance(guess / spread, followed / spread, replays.episodes)
 
 
 def _by_rows(bench: Bench, unit: np.ndarray, interval: np.ndarray | None) -> Assessment:
@@ -375,7 +452,7 @@ def _simulated(bench: Bench, unit: np.ndarray) -> Float[np.ndarray, "rows observ
 
 
 def _by_horizon(
-    size: Float[np.ndarray, "windows horizons observation"], replays: Replays, signals: tuple[str, ...]
+    size: Float[np.ndarray, "windows horizons observation"], replays: Replays | FittedReplays, signals: tuple[str, ...]
 ) -> Any:
     """Mean errors of one point: at each horizon with its interval, and of each signal."""
     draws = resampled(size.mean(-1), replays.episodes)

@@ -34,7 +34,7 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     """
     held = bench.split.held
     names = {"signals": np.array(signal_names(bench.simulator.task)), "scale": bench.scaling.next_scale}
-    if bench.measure == "two-sample":
+    if not bench.rebuilds:
         rows = np.arange(len(held))
         stretch, first = _stretches(bench, rows)
         measured = _measured(bench, first, stretch)

@@ -82,7 +82,7 @@ def replays_of(held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " o
         MadocError: No state of them can be rebuilt.
     """
     states, rows = logged_states(held, simulator.task)
-    starts = {horizon: _starts(held, rows, horizon) for horizon in HORIZONS}
+    starts = {horizon: window_starts(held, rows, horizon) for horizon in HORIZONS}
     enough = min(FEWEST_WINDOWS, len(starts[1]))
     horizons = tuple(horizon for horizon in HORIZONS if len(starts[horizon]) >= enough)
     chosen = evenly(starts[horizons[-1]], MOST_WINDOWS)
@@ -127,7 +127,7 @@ def evenly(positions: Int[np.ndarray, " positions"], count: int) -> Int[np.ndarr
     return positions[np.linspace(0, len(positions) - 1, count).round().astype(np.int64)]
 
 
-def _starts(held: Dataset, rows: Int[np.ndarray, " states"], horizon: int) -> Int[np.ndarray, " windows"]:
+def window_starts(held: Dataset, rows: Int[np.ndarray, " states"], horizon: int) -> Int[np.ndarray, " windows"]:
     """As `first_rows`; none where no stretch is long enough."""
     try:
         return first_rows(held, rows, horizon)
