@@ -76,6 +76,13 @@ def test_the_scale_is_the_deviation_that_the_median_speaks_of():
     assert losses.scale_of(np.zeros(4), "huber") > 0.0
 
 
+def test_where_most_residuals_are_zero_the_largest_tenth_speaks():
+    size = np.concatenate([np.zeros(80), np.full(20, 0.5)])
+    assert losses.robust_deviation(size) == pytest.approx(0.2 * 0.5 / 1.644854)
+    assert losses.robust_deviation(1e6 * size) == pytest.approx(0.2 / 1.644854)  # no noise is larger than a step
+    assert losses.robust_deviation(np.full(10, 2.0)) == pytest.approx(1.4826 * 2.0)
+
+
 def test_a_window_that_failed_costs_as_much_as_the_worst():
     residuals = np.array([[1.0, 1.0], [2.0, 2.0], [np.nan, 0.0]])
     assert losses.mean_cost(residuals, 1.0, "linear") == pytest.approx((1.0 + 4.0 + 4.0) / 3.0)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -25,9 +27,7 @@ def numbers(dataset):
     return dataset.transitions.observation[:, 0].astype(int).tolist()
 
 
-@pytest.mark.parametrize(
-    "lengths", [(10,) * 10, (3, 50, 7, 7, 33), (1,) * 40, (5, 900), (900, 5), (1000, 1000, 1000, 10)]
-)
+@pytest.mark.parametrize("lengths", [(10,) * 10, (3, 50, 7, 7, 33), (1,) * 40, (5, 90), (90, 5), (50,) * 30])
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.5, 0.95])
 def test_whole_episodes_on_both_sides_and_every_row_on_one(lengths, share):
     whole = log(*lengths)
@@ -66,7 +66,7 @@ def test_stretches_of_one_long_episode_are_held_out():
     split = hold_out(whole, 0.2, KEY)
     assert sorted(numbers(split.kept) + numbers(split.held)) == numbers(whole)
     assert len(split.held) == 200
-    assert split.sentence.startswith("2 of 10 stretches of the only episode are held out, 200 of 1,000 rows")
+    assert split.sentence.startswith("2 of 10 stretches are held out, 200 of 1,000 rows: the only episode is cut")
     for part in (split.kept, split.held):
         for start, end in zip(part.episode_starts, part.episode_ends, strict=True):
             rows = numbers(part)[start:end]
@@ -74,6 +74,26 @@ def test_stretches_of_one_long_episode_are_held_out():
             assert rows[0] % 100 == 0
             assert part.transitions.truncated[end - 1]
     assert numbers(split.held) != numbers(hold_out(whole, 0.2, jax.random.key(1)).held)
+
+
+@pytest.mark.parametrize("lengths", [(5000, 30), (30, 5000), (990, 10), (500, 500), (1000, 1000, 10)])
+def test_uneven_episodes_are_cut_until_the_share_is_near(lengths):
+    whole = log(*lengths)
+    split = hold_out(whole, 0.2, KEY)
+    assert sorted(numbers(split.kept) + numbers(split.held)) == numbers(whole)
+    assert 0.1 * len(whole) <= len(split.held) <= 0.4 * len(whole)
+    assert "long episodes are cut" in split.sentence
+    for part in (split.kept, split.held):
+        rows = np.array(numbers(part))
+        for start, end in zip(part.episode_starts, part.episode_ends, strict=True):
+            assert (np.diff(rows[start:end]) == 1).all()
+
+
+def test_names_of_runs_go_with_them():
+    whole = replace(log(*(10,) * 10), run_names=tuple("abcdefghij"))
+    split = hold_out(whole, 0.2, KEY)
+    for part in (split.kept, split.held):
+        assert [whole.run_names[row // 10] for row in numbers(part)[::10]] == list(part.run_names)
 
 
 def test_two_rows_leave_one_on_each_side():

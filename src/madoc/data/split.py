@@ -33,9 +33,10 @@ class Split:
 def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
     """Hold out about `share` of the rows: whole episodes drawn at random, at least one on each side.
 
-    An episode joins those held out where that brings their rows nearer to the share. A log of one episode is cut into
-    stretches, and some of them are held out: its end alone may not be like the rest, a robot that has come to its goal.
-    One too short for that has its last rows held out.
+    An episode joins those held out where that brings their rows nearer to the share. A log of one episode, or of some
+    so uneven that whole ones come to less than half or more than twice the share, is cut into stretches, and some of
+    them are held out: the end alone of a run may not be like the rest, of a robot that has come to its goal. A log of
+    one episode too short for that has its last rows held out.
 
     Raises:
         MadocError: The share is not between 0 and 1, or there are fewer than 2 rows.
@@ -56,20 +57,27 @@ def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
             f"the last {rows - cut:,} of {rows:,} rows are held out: there is only one episode, so they directly "
             "follow those calibrated to",
         )
-    held = _drawn(dataset.episode_ends - starts, share, np.asarray(jax.random.permutation(key, len(starts))))
+    lengths = dataset.episode_ends - starts
+    held = _drawn(lengths, share, np.asarray(jax.random.permutation(key, len(starts))))
+    fits = 0.5 <= lengths[held].sum() / (share * rows) <= 2.0
+    if not fits and rows >= STRETCHES * _SHORTEST and lengths.max() > 1.5 * rows / STRETCHES:
+        return _stretches(dataset, share, key)
     kept, rest = (episodes_of(dataset, np.flatnonzero(side)) for side in (~held, held))
     sentence = f"{int(held.sum()):,} of {len(starts):,} episodes are held out, {len(rest):,} of {rows:,} rows"
     return Split(kept, rest, sentence)
 
 
 def _stretches(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
-    """A log of one episode, as if each of its stretches were one."""
-    starts = np.linspace(0, len(dataset), STRETCHES, endpoint=False).astype(np.int64)
-    split = hold_out(_part(dataset, np.arange(len(dataset)), starts), share, key)
+    """A log of few or uneven episodes, none longer than a tenth of it: as if each stretch of a longer one were one."""
+    rows, spans = len(dataset), zip(dataset.episode_starts, dataset.episode_ends, strict=True)
+    cuts = [np.linspace(start, end, -(-STRETCHES * (end - start) // rows), endpoint=False) for start, end in spans]
+    starts = np.concatenate(cuts).astype(np.int64)
+    split = hold_out(_part(replace(dataset, run_names=None), np.arange(rows), starts), share, key)
     held = len(split.held.episode_starts)
+    few = "the only episode is" if len(dataset.episode_starts) == 1 else "long episodes are"
     sentence = (
-        f"{held} of {STRETCHES} stretches of the only episode are held out, {len(split.held):,} of {len(dataset):,} "
-        "rows; they lie beside those calibrated to"
+        f"{held} of {len(starts)} stretches are held out, {len(split.held):,} of {rows:,} rows: {few} cut, so they "
+        "lie beside those calibrated to"
     )
     return replace(split, sentence=sentence)
 
@@ -77,6 +85,8 @@ def _stretches(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
 def episodes_of(dataset: Dataset, episodes: Int[np.ndarray, " episodes"]) -> Dataset:
     """A dataset of only the given episodes, in the order given."""
     starts, ends = dataset.episode_starts[episodes], dataset.episode_ends[episodes]
+    names = None if dataset.run_names is None else tuple(dataset.run_names[episode] for episode in episodes)
+    dataset = replace(dataset, run_names=names)
     rows = np.concatenate([np.arange(*span) for span in zip(starts, ends, strict=True)])
     return _part(dataset, rows, np.cumsum([0, *(ends - starts)[:-1]]))
 

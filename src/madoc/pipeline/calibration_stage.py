@@ -24,6 +24,8 @@ from madoc.tasks import Task
 from madoc.verdict import Assessment, Bench, assess, judge
 from madoc.verdict.evidence import evidence, save_evidence
 
+FEWEST_HELD = 10
+"""Rows of which no verdict can be made: perfect predictions of fewer are no surer than chance."""
 HOLDOUT = 0.2
 """Share of the rows held out where nothing else is asked: as cross-validation in five folds."""
 
@@ -80,6 +82,11 @@ class Prepared:
         """What results are judged on."""
         seed, share = self.order.seed, self.order.holdout or HOLDOUT
         split = hold_out(self.dataset, share, stage_key(seed, "hold-out"))
+        if len(split.held) < FEWEST_HELD:
+            raise MadocError(
+                f"expected at least {FEWEST_HELD} rows held out to judge a result by, got {len(split.held)} of "
+                f"{len(self.dataset)}; log more, or hold out a larger share with --holdout"
+            )
         return Bench(split, self.simulator, stage_key(seed, "verdict"))
 
     @cached_property

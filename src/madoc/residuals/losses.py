@@ -13,6 +13,8 @@ Loss = Literal["linear", "huber", "soft-l1", "cauchy"]
 
 TUNING: dict[Loss, float] = {"linear": 1.0, "huber": 1.345, "soft-l1": 1.345, "cauchy": 2.385}
 """c in standard deviations: 95 % efficient under normal noise (Holland and Welsch 1977); soft-l1 as Huber's."""
+_NORMAL_90 = 1.644854
+_SHARE_OF_TAIL = 0.2
 _NORMAL_MAD = 1.4826
 """Standard deviations in a median absolute deviation, for normal noise."""
 _SMALLEST_SCALE = 1e-12
@@ -68,10 +70,20 @@ def curvature_share(z: Residuals, loss: Loss) -> float:
 
 
 def scale_of(residuals: Residuals, loss: Loss) -> float:
-    """c: the tuning constant times the standard deviation that the median |residual| speaks of; 1 for `linear`."""
+    """c: the tuning constant times the standard deviation of residuals that are noise; 1 for `linear`."""
     if loss == "linear" or not residuals.size:
         return 1.0
-    return TUNING[loss] * max(_NORMAL_MAD * float(np.median(np.abs(residuals))), _SMALLEST_SCALE)
+    return TUNING[loss] * max(robust_deviation(np.abs(residuals)), _SMALLEST_SCALE)
+
+
+def robust_deviation(size: Float[np.ndarray, "*values"]) -> float:
+    """The standard deviation that the median of |residuals|, in typical changes of a step, speaks of.
+
+    Where a robot rests and its sensors are coarse, most residuals are 0 and speak of nothing: not below a fifth of what
+    the largest tenth says, as far as that is less than a step's change and so may be noise.
+    """
+    tail = min(float(np.percentile(size, 90)), 1.0)
+    return max(_NORMAL_MAD * float(np.median(size)), _SHARE_OF_TAIL * tail / _NORMAL_90)
 
 
 def mean_cost(residuals: Float[np.ndarray, "windows values"], scale: float, loss: Loss) -> float:

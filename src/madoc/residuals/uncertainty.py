@@ -91,6 +91,8 @@ def at_least_noise(
     inverse = np.linalg.pinv(bread, rcond=_BLIND, hermitian=True)
     covariance = inverse @ meat @ inverse
     by_windows, by_noise = np.diag(covariance), ratio * np.diag(inverse)
+    if (by_windows <= _BLIND * by_noise).any():  # as of a single window: it scatters against nothing
+        return ratio * bread
     wider = np.sqrt(np.maximum(1.0, by_noise / np.maximum(by_windows, np.finfo(float).tiny)))
     return bread @ (wider[:, None] * covariance * wider) @ bread
 

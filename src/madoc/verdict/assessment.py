@@ -237,7 +237,7 @@ def _by_prediction(bench: Bench, unit: np.ndarray, interval: np.ndarray | None) 
         shares=told_shares(half, interval, space.high - space.low),
         follows={
             "the simulator at mid-range": bench.follows(_simulated(bench, points[0])),
-            "the simulator at the estimate": bench.follows(_simulated(bench, points[best])),
+            "the simulator at the best parameters nearby": bench.follows(_simulated(bench, points[best])),
             **bench.model_free,
         },
         areas={

@@ -138,8 +138,14 @@ def _open(found: Assessment) -> Verdict | None:
 def _no_better(found: Assessment) -> Verdict | None:
     if found.measure == "two-sample":
         told, before = found.areas["estimate"], found.areas["mid-range"]
-        if told.area < before.area and told.low < before.low and told.high < before.high:
+        if told.high < before.area and told.area < before.low and told.area <= TOLD_APART:
             return None
+        if before.area <= TOLD_APART:
+            return Verdict(
+                "NO_IMPROVEMENT",
+                f"mid-range is as good: a classifier hardly tells its rows from those held out, {_area(before)}, nor "
+                f"those of the estimate, {_area(told)} (0.5 is chance)",
+            )
         return Verdict(
             "NO_IMPROVEMENT",
             f"a classifier tells rows of the simulator from those held out as well as at mid-range: {_area(told)} "

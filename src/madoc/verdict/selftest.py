@@ -156,6 +156,10 @@ def selftest(
         problem = CalibrationProblem(plant(dataset, simulator, truth, noise=noise, key=of_plant), simulator)
         method = _first_willing(methods, problem, of_method)
         result = calibrate(method, problem, key=of_method, budget=budget, quiet=quiet)
+        if result.status == "interrupted":
+            raise KeyboardInterrupt  # what was broken off says nothing of the data
+        if result.status == "diverged":
+            raise MadocError(f"truth {index} could not be looked for: {result.sentence}")
         name, spent = result.method, spent + result.control_steps
         found += _rows(result, truth, index)
     worst = {

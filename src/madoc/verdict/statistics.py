@@ -12,6 +12,8 @@ CONFIDENCE = 0.95
 FEWEST_EPISODES = 5
 """With fewer, episodes say little of how they differ, and windows are resampled in their place."""
 SHUFFLES = 499
+_CAPPING = 20
+"""Random pairings that say what hardly any pair exceeds."""
 """The smallest p-value is then 1 / 500."""
 
 
@@ -72,8 +74,11 @@ def better_than_chance(
     Rows are exchanged within their group where groups have several rows on average, else among all: what only tells
     one run from another is no dynamics.
 
+    Errors are means, each row's cut off at what hardly any random pair exceeds: a median would only speak of the rows
+    at rest where those are most.
+
     Returns:
-        `skill`, 1 - median error over the median error at random, and `p`, how often chance does as well.
+        `skill`, 1 - error over the median error at random, and `p`, how often chance does as well.
     """
     rng = np.random.default_rng(seed)
     _, member, sizes = np.unique(groups, return_inverse=True, return_counts=True)
@@ -81,15 +86,21 @@ def better_than_chance(
         member = np.zeros_like(member)
     home = np.argsort(member, kind="stable")
 
-    def error(of: np.ndarray) -> float:
-        return float(np.median(np.abs(predicted - of).mean(-1)))
+    def sizes_of(of: np.ndarray) -> np.ndarray:
+        return np.abs(predicted - of).mean(-1)
 
-    paired = error(followed)
-    chance = np.empty(SHUFFLES)
-    for index in range(SHUFFLES):
+    def shuffled() -> np.ndarray:
         order = np.empty(len(member), np.int64)
         order[home] = np.lexsort((rng.random(len(member)), member))
-        chance[index] = error(followed[order])
+        return followed[order]
+
+    cap = np.percentile(np.concatenate([sizes_of(shuffled()) for _ in range(_CAPPING)]), 95)
+
+    def error(of: np.ndarray) -> float:
+        return float(np.minimum(sizes_of(of), cap).mean())
+
+    paired = error(followed)
+    chance = np.array([error(shuffled()) for _ in range(SHUFFLES)])
     typical = float(np.median(chance))
     return {
         "skill": 0.0 if typical == 0.0 else 1.0 - paired / typical,

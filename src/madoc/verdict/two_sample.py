@@ -77,6 +77,8 @@ class Told:
 def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Told:
     """Cross-validated area under the curve of rows that the classifier has not seen.
 
+    Too few rows for that tell nothing: an area of 0.5, its interval from 0 to 1.
+
     Args:
         real: Logged rows.
         simulated: Others.
@@ -84,6 +86,11 @@ def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Told:
             classifier finds what came before them in the log, so that only what followed is compared.
     """
     real, simulated = (part.take(evenly(np.arange(len(part)), MOST_ROWS)) for part in (real, simulated))
+    count = len(real) + len(simulated)
+    if not len(simulated):
+        return Told(1.0, 1.0, 1.0, count)  # nothing of the simulator is left to compare: it is no robot at all
+    if min(len(real), len(simulated)) < FOLDS:
+        return Told(0.5, 0.0, 1.0, count)
     label = np.repeat([True, False], [len(real), len(simulated)])
     before = np.concatenate([real.before, simulated.before])
     after = np.concatenate([real.after, simulated.after])

@@ -180,8 +180,9 @@ class EstimatedStates:
 
     @staticmethod
     def settled(state: EstimatedState) -> bool:
-        """Whether the next step would change nothing worth a simulation."""
-        return bool(state.refining) and state.epochs > STATES_FIRST and float(state.moved[0]) < 1.0
+        """Whether the next step would change nothing worth a simulation; not where every window fails."""
+        moves = float(state.moved[0]) >= 1.0 or float(state.cost[0]) >= FAILED_WINDOW
+        return bool(state.refining) and state.epochs > STATES_FIRST and not moves
 
     def window_count(self, state: EstimatedState) -> int:
         """Windows of the stage."""

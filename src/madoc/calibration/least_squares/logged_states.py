@@ -8,7 +8,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.data.windows import Windows, first_rows, windows_at
+from madoc.data.windows import Windows, apart, first_rows, windows_at
 from madoc.errors import MadocError
 from madoc.residuals.linearisation import difference_points, linearise
 from madoc.residuals.losses import ALL_FAILED, Loss, mean_cost, scale_of
@@ -76,7 +76,9 @@ class LoggedStates:
         """
         of_windows, of_starts = jax.random.split(key)
         count, task = len(problem.simulator.parameters), problem.simulator.task
-        possible = first_rows(problem.dataset, problem.logged_rows, self.horizon)
+        # Windows that share readings are not independent, and intervals take them to be.
+        starts = first_rows if self.horizon == 1 else apart
+        possible = starts(problem.dataset, problem.logged_rows, self.horizon)
         drawn = min(self.windows, len(possible))
         if drawn * self.horizon * task.observation_size < count:
             raise MadocError(
@@ -141,8 +143,9 @@ class LoggedStates:
 
     @staticmethod
     def settled(state: LoggedState) -> bool:
-        """Whether the next step would change nothing worth a simulation."""
-        return bool(state.refining and state.epochs) and float(state.moved[0]) < 1.0
+        """Whether the next step would change nothing worth a simulation; not where every window fails."""
+        moves = float(state.moved[0]) >= 1.0 or float(state.cost[0]) >= ALL_FAILED
+        return bool(state.refining and state.epochs) and not moves
 
     def window_count(self, state: LoggedState) -> int:
         """Windows of the stage."""

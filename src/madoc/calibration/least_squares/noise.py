@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.data.windows import windows_at
+from madoc.residuals.losses import robust_deviation
 from madoc.residuals.window_residuals import window_residuals
 
 _NORMAL_MAD = 1.4826
@@ -28,10 +29,8 @@ def channel_deviation(
     told = spare > _LEAST_SPARE
     free = np.where(told, residuals / np.sqrt(np.where(told, spare, 1.0)), np.nan)
     columns = np.abs(free).reshape(-1, free.shape[-1])
-    deviation = np.array(
-        [np.median(column[np.isfinite(column)]) if np.isfinite(column).any() else 0.0 for column in columns.T]
-    )
-    deviation = _NORMAL_MAD * deviation
+    known = (column[np.isfinite(column)] for column in columns.T)
+    deviation = np.array([robust_deviation(column) if column.size else 0.0 for column in known])
     return np.maximum(deviation, max(_LEAST_SHARE * float(deviation.max()), _SMALLEST))
 
 
