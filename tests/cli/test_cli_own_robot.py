@@ -9,7 +9,7 @@ from command_line import asked_for_json, without_seconds
 
 from madoc import data, robots
 from madoc.cli import main
-from own_robots import ARM_SPEC, PENDULUM_SPEC, write_robot
+from own_robots import ARM_SPEC, PENDULUM_SPEC, SPRING_SPEC, write_robot
 from robots import ARM, ARM_TRUTH, recorded
 
 FIT = ["--method", "least-squares", "--budget", "100000", "--quiet", "--set", "windows=100"]
@@ -149,3 +149,13 @@ def test_learn_needs_a_reward(arm, tmp_path, capsys):
     assert main(["run", str(spec), "--data", str(log), "--out", str(tmp_path / "all")]) == 2
     assert "has no reward" in capsys.readouterr().err
     assert not (tmp_path / "all").exists()
+
+
+def test_a_run_folder_that_holds_the_logs_is_refused(tmp_path, capsys):
+    spec = write_robot(tmp_path, SPRING_SPEC)
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    (logs / "0.csv").write_text("time,place,speed,push\n0,0,0,0\n0.02,0,0,0\n")
+    assert main(["calibrate", str(spec), "--data", str(logs), "--out", str(logs), "--quiet"]) == 2
+    assert "holds the log" in capsys.readouterr().err
+    assert [file.name for file in logs.iterdir()] == ["0.csv"]

@@ -316,3 +316,9 @@ def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path):
     task = robots.load(write_robot(tmp_path, spec)).task
     assert task.signals == ("on", "speed")
     assert (task.parameters.low, task.parameters.high) == (0.5, 2.0)
+
+
+def test_a_unit_that_nobody_knows(tmp_path):
+    changed = ARM_SPEC.replace(ACTION, ACTION.replace("high: 1}", "high: 1, unit: degrees}"))
+    with pytest.raises(MadocError, match=r"line 11: expected a unit that is known, got 'degrees'; nearest: deg"):
+        robots.load(write_robot(tmp_path, changed))

@@ -14,6 +14,7 @@ from madoc.pipeline.calibration_stage import (
     Prepared,
     calibrate_prepared,
     check_order,
+    check_place,
     prepare,
     spec_of,
 )
@@ -50,6 +51,8 @@ def calibrate_auto_in(
 ) -> CalibrationResult:
     """Try the candidates within the budget, each in a folder of its own, and keep what predicts the hold-out best.
 
+    What is left of the budget is shared by a candidate and those after it.
+
     The first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and so does a
     verdict on the data itself. Killed at any moment and resumed, the result has the same bits but for its seconds.
 
@@ -61,6 +64,7 @@ def calibrate_auto_in(
     """
     order = order if order.holdout is not None else replace(order, holdout=HOLDOUT)
     check_order(order)
+    check_place(out, order)
     prepared = prepare(order)
     methods = candidates_for(prepared, order.changes)
     spec = spec_of(order, prepared, out) | {
@@ -78,7 +82,8 @@ def calibrate_auto_in(
             if why_not:
                 rows.append({"method": name, "not_run": why_not})
                 continue
-            part = replace(order, method=name, changes={}, budget=order.budget - spent)
+            others = len(methods) - len(rows)  # it and those that may follow it
+            part = replace(order, method=name, changes={}, budget=max(1, (order.budget - spent) // others))
             place = out / name
             result, assessment = calibrate_prepared(place, part, prepared, method, resume=holds_run(place), quiet=quiet)
             if assessment is None:  # interrupted or diverged

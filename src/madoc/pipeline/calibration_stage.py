@@ -129,6 +129,7 @@ def calibrate_in(out: Path, order: CalibrationOrder, *, resume: bool = False, qu
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
     check_order(order)
+    check_place(out, order)
     method = make_method(CALIBRATORS, order.method, order.changes)
     return calibrate_prepared(out, order, prepare(order), method, resume=resume, quiet=quiet)[0]
 
@@ -144,6 +145,19 @@ def check_order(order: CalibrationOrder) -> None:
         raise MadocError(f"expected a budget of at least 1 control step, got {order.budget}")
     if order.holdout is not None and not 0.0 < order.holdout < 1.0:
         raise MadocError(f"expected a share of the rows to hold out between 0 and 1, got {order.holdout}")
+
+
+def check_place(out: Path, order: CalibrationOrder) -> None:
+    """Refuse a run folder that holds the logs: a run's files among them would hide them.
+
+    Raises:
+        MadocError: Names both.
+    """
+    folder = out.expanduser().resolve()
+    for path in order.source.paths:
+        log = Path(path).expanduser().resolve()
+        if log == folder or (log.exists() and log.is_relative_to(folder) and not (folder / "spec.json").exists()):
+            raise MadocError(f"the run folder {out} holds the log {path}; choose another --out")
 
 
 def prepare(order: CalibrationOrder) -> Prepared:

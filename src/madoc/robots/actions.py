@@ -8,6 +8,9 @@ from madoc.robots.model import AddedActuator, is_single, is_slide, names_of
 from madoc.robots.spec import ActionSpec
 from madoc.tasks.base import ActionChannel
 
+KNOWN_UNITS = (*SCALES, "N·m", "Nm", "N", "rad", "rad/s", "m", "m/s", "V", "A", "%", "1")
+"""Those of `SCALES` are converted; the others are the control's own, and only said."""
+
 
 def _joint(draft: Draft, index: int) -> int:
     """The joint that an action names; a hinge or a slide."""
@@ -69,6 +72,8 @@ def action_channel(draft: Draft, model: mujoco.MjModel, index: int) -> ActionCha
             ("actions", index, "actuator"), f"the actuator {name!r} is driven by line {line} already"
         )
     unit = action.unit or _action_unit(action, model, actuator)
+    if unit and unit not in KNOWN_UNITS:
+        raise draft.document.unknown(("actions", index, "unit"), "a unit that is known", unit, KNOWN_UNITS)
     scale = SCALES.get(unit, 1.0)
     gain, stiffness = model.actuator_gainprm[actuator, 0], -model.actuator_biasprm[actuator, 1]
     length = model.actuator_length0[actuator] if gain else 0.0
