@@ -47,7 +47,7 @@ PAPER_RETURN = {
 
 def main() -> None:
     parts = ["# Measured\n\nMade by `python benchmarks/tables.py` from the files beside it.\n"]
-    parts += [calibration(), disturbed(), policies(), speed(), not_run()]
+    parts += [calibration(), disturbed(), policies(), planted(), pendulum(), fuzz(), speed(), not_run()]
     text = "\n".join(part for part in parts if part)
     (RESULTS / "README.md").write_text(text)
     print(text)
@@ -162,6 +162,65 @@ def speed() -> str:
     return f"## Speed\n\n`python benchmarks/speed.py`\n\n```json\n{path.read_text()}```\n"
 
 
+def planted() -> str:
+    """What `planted.py` found: a verdict and the estimates of each robot and situation, and how intervals cover."""
+    rows = [json.loads(path.read_text()) for path in sorted((RESULTS / "planted").glob("*-[0-9].json"))]
+    if not rows:
+        return ""
+    lines = [
+        "## Planted truths in robots of one's own\n",
+        "`python benchmarks/planted.py`. `madoc calibrate SPEC --data LOGS`, all defaults. Covered: 95 % intervals "
+        "that hold the truth; where readings are exact these are as narrow as rounding. Worst: % of its range that a "
+        "parameter is off.\n",
+        "| robot | situation | verdict | expected | method | covered | worst, % | s | commit |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        found = list(row["parameters"].values())
+        covered = f"{sum(part['covered'] for part in found)} of {len(found)}" if found[0]["interval"] else "-"
+        worst = max(part["percent_of_range"] for part in found)
+        cells = (row["robot"], row["situation"], row["verdict"]["word"], row["expected"], row["method"])
+        lines.append(f"| {' | '.join(cells)} | {covered} | {worst:.2g} | {row['seconds']:.0f} | {row['commit']} |")
+    for path in sorted((RESULTS / "planted").glob("*-coverage-*.json")):
+        told = json.loads(path.read_text())
+        lines.append(
+            f"\nOf {told['problems']} problems planted on the pendulum (least squares, noise of {told['noise']:g} of "
+            f"each signal's spread), {100 * told['covered']:.1f} % of 95 % intervals cover the truth ({told['commit']})."
+        )
+    return "\n".join(lines) + "\n"
+
+
+def pendulum() -> str:
+    """What `real_pendulum.py` found."""
+    path = RESULTS / "real_pendulum.json"
+    if not path.exists():
+        return ""
+    told = json.loads(path.read_text())
+    lines = [
+        "## A pendulum of hardware\n",
+        f"`python benchmarks/real_pendulum.py --data FOLDER`; {told['unit']}. Calibrated to the run under iLQR; commit "
+        f"{told['commit']}.\n",
+        "| run | ours | the best published set for that run | mid-range |",
+        "|---|---|---|---|",
+    ]
+    for run, errors in told["errors"].items():
+        others = {name: error for name, error in errors.items() if name not in ("madoc", "mid-range")}
+        best = min(others, key=lambda name: others[name])
+        middle = f"{errors['mid-range']:.3f}" if "mid-range" in errors else "-"
+        lines.append(f"| {run} | {errors['madoc']:.3f} | {others[best]:.3f} ({best}) | {middle} |")
+    return "\n".join(lines) + "\n"
+
+
+def fuzz() -> str:
+    """What `fuzz.py` found."""
+    path = RESULTS / "fuzz.json"
+    if not path.exists():
+        return ""
+    told = json.loads(path.read_text())
+    counts = ", ".join(f"{name} {count:,}" for name, count in told.items() if isinstance(count, int) and name != "seed")
+    return f"## Fuzzing\n\n`python benchmarks/fuzz.py --minutes {told['minutes']:g}`: {counts} ({told['commit']}).\n"
+
+
 POLICIES = [
     ("sac", ("calibrated", "truth", "midrange"), 300_000),
     ("sac", ("uniform", "distribution"), 300_000),
@@ -192,6 +251,10 @@ def policies_not_run() -> list[str]:
     return lines
 
 
+CALIBRATORS = ("dropo", "e-dropo", "droid", "oted", "cma-es", "cma-es-distribution", "least-squares", "nominal")
+"""Besides Madoc, with the paper's budget."""
+
+
 def not_run() -> str:
     """What the tables should hold and do not, each with the command that runs it."""
     lines = []
@@ -205,6 +268,15 @@ def not_run() -> str:
                     f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --starts {starts} "
                     f"--seeds {' '.join(map(str, seeds))}`"
                 )
+    for method, robot in product(CALIBRATORS, ("hopper", "halfcheetah")):
+        found = [row for row in calibrations() if (row.get("method"), row["robot"]) == (method, robot)]
+        done = {row["seed"] for row in found if row["data"] == "clean"}
+        seeds = [str(seed) for seed in range(3) if seed not in done]
+        if seeds:
+            lines.append(
+                f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --budget 1000000 "
+                f"--seeds {' '.join(seeds)}`"
+            )
     lines += policies_not_run()
     if not (RESULTS / "speed.json").exists():
         lines.append("- `python benchmarks/speed.py`")
