@@ -185,7 +185,8 @@ def planted() -> str:
         told = json.loads(path.read_text())
         lines.append(
             f"\nOf {told['problems']} problems planted on the pendulum (least squares, noise of {told['noise']:g} of "
-            f"each signal's spread), {100 * told['covered']:.1f} % of 95 % intervals cover the truth ({told['commit']})."
+            f"each signal's spread), {100 * told['covered']:.1f} % of 95 % intervals cover the truth "
+            f"({told['commit']})."
         )
     return "\n".join(lines) + "\n"
 
