@@ -121,6 +121,9 @@ def test_a_servo_pulls_to_its_target(tmp_path):
     np.testing.assert_allclose(end[:, 0, 1], [0.5 + 0.01 * 5 / 2, 0.5 + 0.01 * 2 / 2], rtol=1e-12)
     assert task.parameters.parameters[1].unit == "N/m"
     assert (task.actions[0].unit, task.actions[0].scale) == ("mm", 1e-3)
+    model = simulator.model(np.array([2.0, 100.0]))
+    assert model.actuator_ctrllimited.all()
+    np.testing.assert_allclose(model.actuator_ctrlrange, [[-0.2, 0.2]])
 
 
 def test_a_velocity_servo_and_its_limit(tmp_path):

@@ -44,12 +44,15 @@ def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
             f"the model has an actuator {action.name!r}; drive it with actuator: {action.name}, or choose another name",
         )
     _check_free(draft, index, joint)
+    scale = SCALES.get(action.unit or "", 1.0)
+    assert action.low is not None and action.high is not None  # the spec has seen to it
+    ends = action.low * scale, action.high * scale
     if action.means in ("torque", "force"):
-        return AddedActuator(action.name, action.joint)
+        return AddedActuator(action.name, action.joint, *ends)
     gain = action.kp if action.means == "position" else action.kd
     assert gain is not None  # the spec has seen to it
     return AddedActuator(
-        action.name, action.joint, gain, stiffness=action.kp or 0.0, damping=action.kd or 0.0, limit=action.limit
+        action.name, action.joint, *ends, gain, stiffness=action.kp or 0.0, damping=action.kd or 0.0, limit=action.limit
     )
 
 

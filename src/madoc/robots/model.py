@@ -92,6 +92,8 @@ class AddedActuator:
     Attributes:
         name: Of the action channel.
         joint: What it drives.
+        low: Smallest control; the simulation never leaves the range, and an exported model says it.
+        high: Largest.
         gain: Of the control.
         stiffness: What the force falls by per position.
         damping: What the force falls by per velocity.
@@ -100,6 +102,8 @@ class AddedActuator:
 
     name: str
     joint: str
+    low: float
+    high: float
     gain: float = 1.0
     stiffness: float = 0.0
     damping: float = 0.0
@@ -116,6 +120,8 @@ def make_model(
     for actuator in added:
         new = spec.add_actuator(name=actuator.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=actuator.joint)
         new.gainprm[0] = actuator.gain
+        new.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        new.ctrlrange = np.array([actuator.low, actuator.high])
         if actuator.stiffness or actuator.damping:
             new.biastype = mujoco.mjtBias.mjBIAS_AFFINE
             new.biasprm[1:3] = -actuator.stiffness, -actuator.damping
