@@ -14,19 +14,31 @@ SWINGING = CART.replace('type="slide" axis="1 0 0"', 'type="hinge" axis="0 1 0"'
 )
 
 
-def test_without_states_it_probes_where_logged_actions_lead(tmp_path):
-    # One physics step a control step: at rest, hanging, gravity would pull at nothing.
+def swinging(folder, hidden):
+    """A pendulum without one of its signals, and a log of it; one physics step a control step."""
     spec = CART_SPEC.replace("control_step: 0.02", "control_step: 0.01").replace("force", "torque")
-    spec = spec.replace("  - {name: speed, reads: velocity(rail)}\n", "") + "  - {field: gravity, low: -15, high: -5}\n"
-    task = robots.load(write_robot(tmp_path, spec, cart=SWINGING)).task
-    truth = {"body_mass.cart": 1.0, "gravity": -9.81}
-    log = recorded(task, truth, 100, jax.random.key(0))
-    problem = CalibrationProblem(log, simulation.make(task, threads=1))
+    spec = "\n".join(line for line in spec.splitlines() if f"name: {hidden}," not in line)
+    spec += "\n  - {field: gravity, low: -15, high: -5}\n"
+    task = robots.load(write_robot(folder, spec, cart=SWINGING)).task
+    log = recorded(task, {"body_mass.cart": 1.0, "gravity": -9.81}, 100, jax.random.key(0))
+    return task, log, CalibrationProblem(log, simulation.make(task, threads=1))
+
+
+def test_where_velocities_are_hidden_it_probes_near_the_log(tmp_path):
+    _, log, problem = swinging(tmp_path, "speed")
+    states, actions = problem.probe
+    np.testing.assert_array_equal(states[:, 0], log.transitions.observation[:, 0])
+    np.testing.assert_array_equal(actions, log.transitions.action)
+    assert insensitive(problem.simulator, states, actions, key=jax.random.key(0))[0] == []
+
+
+def test_where_positions_are_hidden_it_probes_where_logged_actions_lead(tmp_path):
+    task, log, problem = swinging(tmp_path, "place")
     states, actions = problem.probe
     np.testing.assert_array_equal(states[0], [0.0, 0.0])
     np.testing.assert_array_equal(actions, log.transitions.action[:64])
     system = problem.simulator.bind(task.parameters.middle[None])
     np.testing.assert_array_equal(system.step(states[None, :63], actions[None, :63])[0], states[1:])
     assert insensitive(problem.simulator, states, actions, key=jax.random.key(0))[0] == []
-    resting = np.zeros((64, 2))
+    resting = np.zeros((64, 2))  # hanging, gravity pulls at nothing
     assert insensitive(problem.simulator, resting, actions, key=jax.random.key(0))[0] == ["gravity"]

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from logged_arm import SPEC, TRUTH, arm_of, columns_of, write_csv
 
-from madoc import simulation
+from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
 from madoc.data import logged_states, logs
 from madoc.diagnosis import check, refuse_fatal
 from madoc.diagnosis.excitation import excite
 from madoc.errors import MadocError
 from madoc.findings import Finding
+from madoc.simulation.sensitivity import refuse_insensitive
 from robots import ARM
 
 ROWS = 300
@@ -220,3 +221,49 @@ def test_findings_go_with_a_calibration(robot, columns, tmp_path):
         dataset, findings=(*found, Finding("warning", "it squeaks", "elbow", "oil it"), Finding("note", "x"))
     )
     assert CalibrationProblem(told, simulator).doubts == ("elbow: it squeaks; oil it",)
+
+
+def test_a_parameter_that_matters_only_where_the_log_was_is_not_refused(tmp_path):
+    """A floor's friction is felt on the floor, and the model begins above it; velocities are hidden."""
+    model = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="9 9 .1"/>
+    <body name="box" pos="0 0 1">
+      <joint name="along" type="slide" axis="1 0 0"/><joint name="up" type="slide" axis="0 0 1"/>
+      <geom name="box" type="box" size=".1 .1 .1" mass="1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+    spec = """\
+madoc: 1
+name: sledge
+model: sledge.xml
+control_step: 0.02
+signals:
+  - {name: along, reads: position(along)}
+  - {name: up, reads: position(up)}
+actions:
+  - {name: push, joint: along, means: force, low: -20, high: 20}
+parameters:
+  - {field: geom_friction, element: floor, low: 0.1, high: 2}
+  - {field: body_mass, element: box, low: 0.5, high: 2}
+"""
+    (tmp_path / "sledge.xml").write_text(model)
+    (tmp_path / "sledge.yaml").write_text(spec)
+    robot = robots.load(tmp_path / "sledge.yaml")
+    simulator = simulation.make(robot.task, threads=1)
+    system = simulator.bind(np.array([[0.5, 1.0]]))
+    state, seen = simulator.initial_state[None, None].copy(), []
+    state[..., 1] = -0.9  # on the floor
+    push = np.repeat(np.random.default_rng(0).uniform(-1, 1, 60), 5)
+    for force in push:
+        seen.append(np.asarray(system.observe(state))[0, 0])
+        state = system.step(state, np.array([[[force]]]))
+    along, up = np.stack(seen).T
+    columns = {"time": 0.02 * np.arange(300), "along": along, "up": up, "push": 20.0 * push}
+    dataset = logs.read(write_csv(tmp_path / "log.csv", columns), robot)
+    assert not check(dataset, simulator, robot=robot).fatal
+    assert refuse_insensitive(simulator, *CalibrationProblem(dataset, simulator).probe, key=jax.random.key(0)) > 0

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from madoc.data import Dataset, logged_states
-from madoc.data.dataset import with_pending
 from madoc.data.noise import estimate_noise
-from madoc.data.velocities import moving_states
+from madoc.data.velocities import states_near
 from madoc.errors import MadocError
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.window_features import WindowScaling, last_rows, logged_stretch
@@ -78,10 +77,7 @@ class CalibrationProblem:
         task = self.simulator.task
         if task.state_from_observation is not None or task.posture is None:
             return self._rebuilt
-        states = moving_states(self.dataset, task)[0]
-        initial = self.simulator.initial_state[: self.physical_size]
-        states = np.where(np.isnan(states), initial, states)
-        return with_pending(self.dataset, task, states, np.arange(len(self.dataset)))
+        return states_near(self.dataset, task, self.simulator.initial_state[: self.physical_size])
 
     @property
     def physical_size(self) -> int:
@@ -132,13 +128,15 @@ class CalibrationProblem:
 
     @cached_property
     def probe(self) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
-        """States and actions at which every parameter must matter: logged ones where states can be rebuilt.
+        """States and actions at which every parameter must matter: logged ones, or near them where speeds are hidden.
 
         Else where the first logged actions lead from a reset, as at rest many parameters have no say.
         """
-        task = self.simulator.task
-        if task.state_from_observation is not None:
+        if self.simulator.task.state_from_observation is not None:
             return self.logged_states, self.logged_actions
+        if self.starts_known:
+            states, rows = self.approximate_states
+            return states, np.asarray(self.dataset.transitions.action)[rows]
         actions = np.asarray(self.dataset.transitions.action, dtype=np.float64)[np.arange(64) % len(self.dataset)]
         return _walked(self.simulator, actions), actions
 

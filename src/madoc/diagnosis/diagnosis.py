@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
+from jaxtyping import Float, PRNGKeyArray
 
 from madoc.data import Dataset, logged_states
+from madoc.data.velocities import states_near
 from madoc.diagnosis.channels import Channel, channel_findings, channels_of
 from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, excite_unseen
 from madoc.diagnosis.explanation import Explanation, action_findings, explain, explanation_findings
@@ -16,6 +18,7 @@ from madoc.robots import Robot
 from madoc.simulation import CpuSimulator
 from madoc.simulation.rollout import reset_states
 from madoc.simulation.sensitivity import insensitive
+from madoc.simulation.velocities import unseen_positions
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,7 @@ def check(dataset: Dataset, simulator: CpuSimulator, *, robot: Robot | None = No
         if len(rows):
             probing = insensitive(simulator, states, actions[rows], key=of_rows)
         else:
-            probes = reset_states(simulator)(of_rows, 64)
-            probing = insensitive(simulator, probes, actions[np.arange(64) % len(actions)], key=of_rows)
+            probing = insensitive(simulator, *_probe(dataset, simulator, of_rows), key=of_rows)
         spent += probing[1]
         findings += _insensitive_findings(probing[0])
         if len(rows):
@@ -120,6 +122,18 @@ def _states(
             "log the position and the velocity of every joint if you can",
         )
         return np.zeros((0, 0)), np.zeros(0, dtype=np.int64), [finding]
+
+
+def _probe(
+    dataset: Dataset, simulator: CpuSimulator, key: PRNGKeyArray
+) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
+    """Where parameters must matter if no state can be rebuilt: near the log's if positions tell, else at resets."""
+    task, actions = simulator.task, np.asarray(dataset.transitions.action)
+    if task.posture is None or unseen_positions(task):
+        return reset_states(simulator)(key, 64), actions[np.arange(64) % len(actions)]
+    physical = len(simulator.initial_state) - task.pending * simulator.action_size
+    states, rows = states_near(dataset, task, simulator.initial_state[:physical])
+    return states, actions[rows]
 
 
 def _insensitive_findings(names: list[str]) -> list[Finding]:
