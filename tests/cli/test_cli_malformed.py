@@ -90,7 +90,7 @@ MALFORMED = {
     "a negative control step": (spec("0.02", "-0.02"), "expected greater than 0 in control_step"),
     "a joint the model lacks": (spec("position(elbow)", "position(elbo)"), "no joint 'elbo'; nearest: elbow"),
     "an expression cut short": (spec("position(elbow)", "position(elbow"), "does not parse"),
-    "an expression that would run code": (spec("position(elbow)", "__import__('os')"), "line 7"),
+    "an expression that would run code": (spec("position(elbow)", "__import__('os')"), "arm.yaml, line 7: "),
     "a unit that is not the model's": (spec("{name: elbow, reads", "{name: elbow, unit: deg, reads"), "in rad"),
     "an actuator the model lacks": (spec("actuator: elbow", "actuator: elbw"), "nearest: elbow"),
     "a range upside down": (spec("low: 0.5, high: 2.0", "low: 2.0, high: 0.5"), "low < high"),
@@ -126,7 +126,7 @@ MALFORMED = {
         "it never moves: 0 in all 59 rows",
     ),
     "an npz cut short": (raw("logs/1.npz", b"PK\x03\x04 and no more"), "1.npz"),
-    "a kind of file no reader knows": (raw("logs/1.bag", b"#ROSBAG"), "log"),
+    "a kind of file no reader knows": (raw("logs/1.bag", b"#ROSBAG"), "expected logs in the folder logs"),
 }
 
 

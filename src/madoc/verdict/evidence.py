@@ -9,7 +9,7 @@ from jaxtyping import Float
 from madoc.data import logged_states
 from madoc.data.windows import Windows, first_rows, windows_at
 from madoc.files import replacing
-from madoc.verdict.assessment import Bench, signal_names
+from madoc.verdict.bench import Bench, signal_names
 from madoc.verdict.prediction import evenly
 
 TRACES = 6
