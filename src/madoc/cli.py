@@ -64,11 +64,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except BrokenPipeError:  # the reader of the help has seen enough, as `head` does
         return _hang_up()
+    except OSError as error:  # a full disk, a folder that may not be written to, a name that is too long
+        print(f"madoc: {_refused_by_the_system(error)}", file=sys.stderr)
+        return REFUSED
     try:
         _say(answer, as_json=command.output.json)
     except BrokenPipeError:
         _hang_up()
     return EXIT_CODES[answer.status]
+
+
+def _refused_by_the_system(error: OSError) -> str:
+    reason = error.strerror or str(error)
+    where = "" if error.filename is None else f" at {os.fspath(error.filename)!r:.200}"
+    return f"the system refused{where}: {reason}; check the path, the rights and the space, and try again"
 
 
 def _hang_up() -> int:

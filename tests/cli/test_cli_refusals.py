@@ -42,6 +42,7 @@ def places(recorded, whole, tmp_path):
         (CALIBRATE + "--budgt 3", "--budget"),
         (CALIBRATE + "--budget many", "--budget"),
         ("calibrate hopper", "--data"),
+        (f"calibrate hopper --data {'x' * 300}.npz --out {{out}}", "File name too long; check the path"),
         ("record hoper-medium --out {out}", "did you mean hopper?"),
         ("record hopper-medum --out {out}", "did you mean medium?"),
         ("record hopper --out {out}", "expected TASK-QUALITY"),

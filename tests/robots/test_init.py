@@ -1,6 +1,7 @@
 """The first spec: written from a model, loadable as it is, and its comments true when they are made lines."""
 
 import re
+import shutil
 from pathlib import Path
 
 import gymnasium
@@ -111,6 +112,14 @@ def test_of_gymnasiums_models(tmp_path, name):
     robot = robots.load(path)
     assert robot.spec.name == ("my_hopper" if name == "hopper" else robot.spec.name)
     assert len(robot.task.parameters) <= 16
+
+
+def test_a_model_may_lie_deep(tmp_path):
+    deep = tmp_path.joinpath(*["folder_of_a_long_name"] * 12)
+    deep.mkdir(parents=True)
+    shutil.copy(ASSETS / "hopper.xml", deep)
+    write_spec(deep / "hopper.xml", tmp_path / "mine.yaml")
+    assert robots.load(tmp_path / "mine.yaml").spec.name == "my_hopper"
 
 
 @pytest.mark.parametrize(

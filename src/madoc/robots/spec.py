@@ -14,6 +14,7 @@ from madoc.tasks import TASKS
 VERSION = 1
 
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]+$")]
+File = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00-\x1f]+$")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -135,7 +136,7 @@ class RobotSpec(Part):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$", max_length=60)] = Field(
         description="Letters, digits, _ . and -."
     )
-    model: Name = Field(description="MJCF or URDF, relative to this file.")
+    model: File = Field(description="MJCF or URDF, relative to this file.")
     control_step: Positive = Field(description="Time between two actions, s; a whole multiple of the timestep.")
     timestep: Positive | None = Field(None, description="Of the physics, s. Default: the model's.")
     signals: list[SignalSpec] = Field(min_length=1, description="The observation, in this order.")
@@ -209,6 +210,8 @@ def _sentence(detail: Any, place: Place) -> str:
     expected = detail["msg"].removeprefix("Input should ").removeprefix("be ").removeprefix("have ")
     expected = {
         "string_pattern_mismatch": "a name of letters, digits, _ . and -" if place == ("name",) else "a printable name",
+        "string_too_long": f"at most {detail.get('ctx', {}).get('max_length')} characters",
+        "string_too_short": "some text",
         "too_short": "at least one item",
         "float_type": "a number",
         "float_parsing": "a number",
