@@ -81,6 +81,44 @@ max_episode_steps: 200
 """
 """An encoder alone."""
 
+BOUNCER = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <geom type="plane" size="5 5 .1"/>
+    <body name="trunk" pos="0 0 .8">
+      <joint name="height" type="slide" axis="0 0 1" damping="1"/>
+      <geom type="sphere" size=".1" mass="2" contype="0" conaffinity="0"/>
+      <body name="leg">
+        <joint name="knee" type="slide" axis="0 0 1" damping="5" stiffness="300" range="-.3 .3"/>
+        <geom type="sphere" size=".05" pos="0 0 -.5" mass=".5"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="knee" gear="60"/></actuator>
+</mujoco>
+"""
+"""A leg that pushes itself off the floor and lands on it, half of the time."""
+
+BOUNCER_SPEC = """\
+madoc: 1
+name: bouncer
+model: bouncer.xml
+control_step: 0.01
+signals:
+  - {name: height, reads: position(height)}
+  - {name: knee, reads: position(knee)}
+  - {name: height_speed, reads: velocity(height)}
+  - {name: knee_speed, reads: velocity(knee)}
+actions:
+  - {name: push, actuator: push, low: -1, high: 1}
+parameters:
+  - {field: body_mass, element: trunk, low: 1, high: 4}
+  - {field: body_mass, element: leg, low: 0.2, high: 1}
+  - {field: dof_damping, element: knee, low: 1, high: 15}
+max_episode_steps: 200
+"""
+
 MODELS = {"arm.xml": ARM, "spring.xml": SPRING, "cart.xml": CART, "pendulum.xml": PENDULUM}
 
 

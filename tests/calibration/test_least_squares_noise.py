@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from madoc.calibration.least_squares.noise import channel_deviation, takes_turns
+from madoc.calibration.least_squares.noise import channel_deviation, takes_turns, unlike
 
 
 def test_deviation_is_the_median_over_what_the_states_left():
@@ -29,3 +29,23 @@ def test_noise_takes_turns_and_a_wrong_model_does_not():
     assert takes_turns(before + 3.0, after + 3.0) < -0.5
     assert takes_turns(noise[0], noise[1]) == pytest.approx(0.0, abs=0.03)
     assert takes_turns(before[:0], after[:0]) == 0.0
+
+
+def test_half_of_the_channels_tell_of_noise():
+    noise = np.random.default_rng(0).normal(size=(3, 20_000, 2))
+    before, after = noise[1] - noise[0], noise[2] - noise[1]
+    before[:, 1], after[:, 1] = noise[0, :, 1], noise[1, :, 1]
+    assert takes_turns(before, after) == pytest.approx(0.5, abs=0.03)
+
+
+def test_what_is_unlike_the_others_is_measured_in_their_deviations():
+    middle, reach = unlike(np.array([[1.0, 2.0, 3.0, 4.0, 100.0]]), np.ones(5))
+    np.testing.assert_allclose(middle, [[3.0]])
+    np.testing.assert_allclose(reach, [[5.0 * 1.4826 * 1.0]])
+
+
+def test_windows_in_which_nothing_happens_do_not_say_what_is_usual():
+    cost = np.array([[0.0, 0.0, 0.0, 0.0, 5.0, 6.0, 7.0]])
+    middle, reach = unlike(cost, np.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
+    np.testing.assert_allclose(middle, [[6.0]])
+    assert (cost[:, 4:] < middle + reach).all()

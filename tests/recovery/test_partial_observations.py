@@ -10,7 +10,7 @@ from test_madoc_recovers import quick
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
 from madoc.data import Disturbance, disturb
-from own_robots import ARM_SPEC, PENDULUM_SPEC, write_robot
+from own_robots import ARM_SPEC, BOUNCER, BOUNCER_SPEC, PENDULUM_SPEC, write_robot
 from robots import recorded
 
 ARM = {"body_mass.fore": 0.4, "dof_damping.shoulder": 0.3, "dof_damping.elbow": 0.35}
@@ -69,6 +69,40 @@ def test_a_delay_and_a_bias_are_found_with_the_states(tmp_path):
     method = LeastSquares(windows=40, search_windows=12, searches=2)
     result = calibrate(method, problem_of(task, truth, rows=1000), key=jax.random.key(0), budget=400_000)
     assert (off(result, task, truth) < 0.1).all(), off(result, task, truth)
+
+
+@pytest.fixture
+def bouncer(tmp_path):
+    return robots.load(write_robot(tmp_path, BOUNCER_SPEC, bouncer=BOUNCER)).task
+
+
+def covered(task, seed):
+    """Which intervals hold a truth drawn with the seed, recorded with noise of 5 % of a step's change."""
+    space = task.parameters
+    truth = space.low + np.random.default_rng(seed).uniform(0.15, 0.85, len(space)) * (space.high - space.low)
+    problem = problem_of(task, dict(zip(space.names, truth, strict=True)), rows=3000, noise=0.05, seed=seed)
+    result = calibrate(LeastSquares(), problem, key=jax.random.key(seed), budget=300_000)
+    assert result.status == "converged"
+    assert off(result, task, dict(zip(space.names, truth, strict=True))).max() < 1.0
+    assert any("of 100 windows count for nothing" in warning for warning in result.warnings)
+    spans = np.array([row.interval for row in result.parameters.values()])
+    return (spans[:, 0] <= truth) & (truth <= spans[:, 1])
+
+
+def test_noise_at_contacts_misleads_neither_estimates_nor_intervals(bouncer):
+    assert np.sum([covered(bouncer, seed) for seed in range(4)]) >= 11
+
+
+@pytest.mark.slow
+def test_intervals_cover_at_contacts(bouncer):
+    assert 0.9 < np.mean([covered(bouncer, seed) for seed in range(100, 140)]) < 0.995
+
+
+def test_a_search_that_the_budget_ends_says_so(arm):
+    method = LeastSquares(windows=40, search_windows=12)
+    result = calibrate(method, problem_of(arm, ARM, rows=1000), key=jax.random.key(0), budget=20_000)
+    assert result.status == "finished"
+    assert any("before the search had settled" in warning for warning in result.warnings)
 
 
 @pytest.mark.slow

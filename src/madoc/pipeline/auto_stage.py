@@ -35,14 +35,16 @@ class Candidate:
 
     Attributes:
         name: In `CALIBRATORS`.
+        share: Of the budget that is left, as against the shares of those after it; what it leaves is theirs.
         hidden: Hyperparameters that differ where the log does not tell where rollouts may start.
     """
 
     name: str
+    share: int
     hidden: Mapping[str, Any] = field(default_factory=dict)
 
 
-CANDIDATES = (Candidate("least-squares"), Candidate("madoc", hidden={"starts": "policy"}))
+CANDIDATES = (Candidate("least-squares", share=2), Candidate("madoc", share=1, hidden={"starts": "policy"}))
 """In the order they are tried: seconds before minutes."""
 
 
@@ -51,7 +53,7 @@ def calibrate_auto_in(
 ) -> CalibrationResult:
     """Try the candidates within the budget, each in a folder of its own, and keep what predicts the hold-out best.
 
-    What is left of the budget is shared by a candidate and those after it.
+    What is left of the budget is shared by a candidate and those after it: least squares only settles or does not.
 
     The first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and so does a
     verdict on the data itself. Killed at any moment and resumed, the result has the same bits but for its seconds.
@@ -82,8 +84,9 @@ def calibrate_auto_in(
             if why_not:
                 rows.append({"method": name, "not_run": why_not})
                 continue
-            others = len(methods) - len(rows)  # it and those that may follow it
-            part = replace(order, method=name, changes={}, budget=max(1, (order.budget - spent) // others))
+            shares = [candidate.share for candidate in CANDIDATES[len(rows) :]]  # its own, and of those that may follow
+            budget = max(1, (order.budget - spent) * shares[0] // sum(shares))
+            part = replace(order, method=name, changes={}, budget=budget)
             place = out / name
             result, assessment = calibrate_prepared(place, part, prepared, method, resume=holds_run(place), quiet=quiet)
             if assessment is None:  # interrupted or diverged

@@ -124,8 +124,11 @@ class LeastSquares:
         assert state.logged is not None
         logged, metrics = self._logged(problem).step(problem, state.logged)
         following = replace(state, logged=logged)
-        if state.phase == "undecided" and self._logged(problem).settled(logged):
-            following = self._decide(problem, following)
+        if state.phase == "undecided" and logged.refining and not logged.epochs:
+            following = self._ask(problem, following)
+        elif state.phase == "undecided" and self._logged(problem).settled(logged):
+            following = self._ask(problem, following)
+            following = replace(following, phase="logged") if following.phase == "undecided" else following
         elif state.phase == "starting" and logged.refining:
             following = _go_on(following)
         return following, metrics
@@ -149,6 +152,7 @@ class LeastSquares:
                 *identifiability(found, space.names),
                 *at_end_of_range(unit, space.names),
                 *exploded(failures, self.control_steps(state)),
+                *_said_of_ending(search),
                 *self._said_of_states(problem, state),
             ),
             covariance=covariance,
@@ -231,17 +235,20 @@ class LeastSquares:
         """The search that has the estimate, and its windows; one with estimated states has it once it has begun."""
         estimated, logged = state.estimated, state.logged
         if estimated is not None and (logged is None or estimated.control_steps):
-            return estimated, self._estimated(problem).window_count(estimated)
+            return estimated, estimated.explained
         assert logged is not None
         return logged, self._logged(problem).window_count(logged)
 
-    def _decide(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
-        """Estimate states where residuals of consecutive rows take turns, as noise of the sensors makes them."""
+    def _ask(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
+        """Estimate states where residuals of consecutive rows take turns, as noise of the sensors makes them.
+
+        Asked once the search has ended, and, as what the model does wrong may hide it, again once nothing moves.
+        """
         assert state.logged is not None
         if np.sqrt(state.logged.cost[0]) < EXACT:
-            return replace(state, phase="logged")
+            return state
         pairs, spent = consecutive_residuals(problem, state.logged.unit[0], state.logged.chosen)
-        state = replace(state, phase="logged", checking=state.checking + spent)
+        state = replace(state, checking=state.checking + spent)
         return _go_on(state) if takes_turns(*pairs) > NOISY else state
 
     def _said_of_states(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
@@ -262,12 +269,22 @@ class LeastSquares:
         if estimated.refining:
             found = f"; the noise it finds is {100.0 * float(np.median(estimated.deviation)):.2g} % of a step's change"
         told = f"initial states of windows were estimated with the parameters, as {why}{found}"
-        tails = (
-            "residuals have longer tails than noise has: some windows are not explained by any initial state found, as "
-            "where contacts begin, and the intervals are too narrow"
+        if not estimated.refining or float(estimated.deviation.max()) < EXACT:
+            return (told,)
+        left_out = len(estimated.rows) - estimated.explained
+        windows = (
+            f"{left_out} of {len(estimated.rows)} windows count for nothing: no initial state found explains them as "
+            "well as others, as where contacts begin"
         )
-        exact = float(estimated.deviation.max()) < EXACT
-        return (told, tails) if estimated.refining and not exact and estimated.cost[0] > LONG_TAILS else (told,)
+        tails = "residuals have longer tails than noise has: the intervals are too narrow"
+        return (told, *([windows] if left_out else []), *([tails] if estimated.cost[0] > LONG_TAILS else []))
+
+
+def _said_of_ending(search: LoggedState | EstimatedState) -> tuple[str, ...]:
+    """That it did not come to an end, where it did not."""
+    ended = EstimatedStates.settled(search) if isinstance(search, EstimatedState) else LoggedStates.settled(search)
+    said = "the budget ended before the search had settled, and intervals do not count what is missing; take more"
+    return () if ended else (said,)
 
 
 def horizon_of(dataset: Dataset) -> int:

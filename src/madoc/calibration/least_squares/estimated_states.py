@@ -4,15 +4,16 @@ from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
 from madoc.calibration.least_squares.elimination import WindowSlopes, eliminate
-from madoc.calibration.least_squares.noise import channel_deviation
+from madoc.calibration.least_squares.noise import channel_deviation, unlike
 from madoc.calibration.least_squares.readings import Readings, slopes_at
 from madoc.data.windows import apart
 from madoc.errors import MadocError
+from madoc.residuals.linearisation import Linearisation
 from madoc.residuals.losses import (
     ALL_FAILED,
     TUNING,
@@ -27,6 +28,8 @@ from madoc.types import Metrics
 TRIALS = (1e-2, 1.0, 1e2)
 """Dampings of the parameters' step tried at once; where none helps, the next are a thousand times larger."""
 DAMPING_RANGE = (1e-10, 1e10)
+STUCK = 1e3
+"""Damping at which steps are a thousandth of Gauss and Newton's."""
 STATE_DAMPING_RANGE = (1e-9, 1e6)
 FIRST_DAMPING = 1e-2
 LITTLE = 5e-3
@@ -39,6 +42,10 @@ STATES_FIRST = 2
 """Epochs on all windows in which parameters wait: states of windows that are new begin at their readings."""
 FAILED_WINDOW = 1e6
 """Cost of a window that failed, in squared deviations of the noise; a state holds no infinity."""
+LIKE_NOISE = 1.5
+"""Cost of a window that noise alone leaves now and then; it leaves 0.8 on average under Cauchy's loss."""
+_BLIND = 1e-12
+"""Squared slope, relative to the largest, below which windows tell nothing of a direction."""
 _SMALLEST = 1e-100
 """Keeps a move over a tolerance of 0 finite."""
 
@@ -59,6 +66,7 @@ class EstimatedState:
         deviation: Noise of each channel, in its typical changes.
         bread: Of the best search, where it last linearised.
         meat: The same.
+        explained: How many windows they are of.
         refining: 0 while searching on few windows, 1 on all.
         epochs: Done in this stage.
         control_steps: Simulated.
@@ -75,6 +83,7 @@ class EstimatedState:
     deviation: Float[np.ndarray, " channels"]
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
+    explained: int
     refining: int
     epochs: int
     control_steps: int
@@ -124,6 +133,7 @@ class EstimatedStates:
             deviation=np.ones(channels),
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),
+            explained=0,
             refining=0,
             epochs=0,
             control_steps=0,
@@ -137,9 +147,7 @@ class EstimatedStates:
         unit, states = state.unit[:running], state.states[:running, :windows]
         slopes = slopes_at(problem.simulator, readings, unit, states)
         plans = [
-            self._plan(
-                around, point, damping, own[:windows], by_channel=bool(state.refining), channels=len(readings.scale)
-            )
+            self._plan(around, point, damping, own[:windows], readings, refining=bool(state.refining))
             for around, point, damping, own in zip(slopes, unit, state.damping, state.state_damping, strict=False)
         ]
         residuals = _tried(problem, readings, plans, states)
@@ -164,6 +172,7 @@ class EstimatedStates:
             deviation=plans[leader].deviation,
             bread=plans[leader].bread,
             meat=plans[leader].meat,
+            explained=int(plans[leader].whole.sum()),
             epochs=state.epochs + 1,
             control_steps=state.control_steps + self._epoch_steps(problem, state),
             failures=state.failures + sum(int((~around.whole).sum()) for around in slopes),
@@ -175,6 +184,7 @@ class EstimatedStates:
         }
         if not state.refining and (new["moved"][leader] < 1.0 or following.epochs >= self.search_epochs):
             order = np.argsort(np.arange(self.searches) != leader, kind="stable")
+            new["damping"] = np.full(self.searches, FIRST_DAMPING)
             following = replace(following, **{name: new[name][order] for name in carried}, refining=1, epochs=0)
         return following, metrics
 
@@ -196,7 +206,7 @@ class EstimatedStates:
     def _epoch_steps(self, problem: CalibrationProblem, state: EstimatedState) -> int:
         """Control steps of an epoch of the stage: central differences by parameters and states, and the steps tried."""
         running, parameters = 1 if state.refining else self.searches, state.unit.shape[1]
-        columns = 1 + 2 * parameters + 2 * problem.physical_size + len(FOLLOWED) * (len(TRIALS) + 1)
+        columns = 1 + 2 * parameters + problem.physical_size + len(FOLLOWED) * (len(TRIALS) + 1)
         return running * self.window_count(state) * columns * self.horizon
 
     def _plan(
@@ -205,16 +215,22 @@ class EstimatedStates:
         unit: Float[np.ndarray, " d"],
         damping: float,
         state_damping: Float[np.ndarray, " windows"],
+        readings: Readings,
         *,
-        by_channel: bool,
-        channels: int,
+        refining: bool,
     ) -> "_Plan":
-        """What the slopes say: the noise, the steps to try, the curvature; channels weigh by their noise, or alike."""
+        """What the slopes say: the noise, the steps to try, the curvature.
+
+        While refining, channels weigh by their noise, and windows that are not `explained` not at all.
+        """
+        channels = len(readings.scale)
         least = np.full(len(state_damping), STATE_DAMPING_RANGE[0])
         spare = eliminate(slopes, np.ones_like(slopes.residuals), least).spare
         deviation = _deviation(slopes, spare, channels)
-        deviation = deviation if by_channel else np.full(channels, np.median(deviation))
-        slopes = slopes.over(np.tile(deviation, slopes.residuals.shape[1] // channels))
+        deviation = deviation if refining else np.full(channels, np.median(deviation))
+        slopes = slopes.over(np.tile(deviation, readings.steps + 1))
+        if refining:
+            slopes = slopes.only(self._explained(slopes, readings))
         z = (slopes.residuals / TUNING[self.loss]) ** 2
         weights = loss_slope(z, self.loss) * slopes.whole[:, None]
         damped = eliminate(slopes, weights, state_damping)
@@ -227,11 +243,13 @@ class EstimatedStates:
         ratio = _noise_ratio(slopes, weights, share, float(spare[slopes.whole].sum()) - len(unit))
         return _Plan(
             unit=unit,
+            damping=damping,
             residuals=slopes.residuals,
             whole=slopes.whole,
             deviation=deviation,
             steps=np.stack(steps),
             state_steps=np.stack([damped.states_step(step) for step in steps]),
+            activity=readings.activity,
             bread=curved,
             meat=at_least_noise(jackknife_meat(exact, share, curved), curved, ratio),
         )
@@ -240,14 +258,19 @@ class EstimatedStates:
         self, plan: "_Plan", residuals: Float[np.ndarray, "trials ways windows values"], *, waiting: bool
     ) -> "_Move":
         """Which step of the parameters helps most, each window's state following as far as fits it best."""
-        before = np.where(plan.whole, self._costs(plan.residuals), FAILED_WINDOW).mean()
         costs = self._costs(residuals)
-        totals = costs.min(1).mean(-1)
+        if plan.whole.any():
+            before = self._costs(plan.residuals)[plan.whole]
+            change = costs.min(1)[:, plan.whole] - before
+            robust = self.loss != "linear"
+            totals = before.mean() + (clipped_mean(change, plan.activity[plan.whole]) if robust else change.mean(-1))
+        else:
+            before, totals = np.array([FAILED_WINDOW]), costs.min(1).mean(-1)
         trial = len(TRIALS) if waiting else int(np.argmin(totals))
         better = trial < len(TRIALS)
-        saved = 1.0 - float(totals[trial]) / max(float(before), _SMALLEST)
-        # Of steps that did not help, the shortest tells how near the search is to the end of what helps.
-        shortest = np.abs(plan.steps[trial if better else len(TRIALS) - 1])
+        saved = 1.0 - float(totals[trial]) / max(float(before.mean()), _SMALLEST)
+        # That no step helps says that the end is near only where even steps too short to cross a contact do not help.
+        tried = np.abs(plan.steps[trial if better else len(TRIALS) - 1 if plan.damping > STUCK else 0])
         error = np.sqrt(np.diag(sandwich(plan.bread, plan.meat).covariance))
         worthwhile = np.maximum(2.0 * max(self.tolerance, _SMALLEST), SETTLED * error)
         exact = float(plan.deviation.max()) < ROUNDING
@@ -256,8 +279,24 @@ class EstimatedStates:
             followed=np.array(FOLLOWED)[costs[trial].argmin(0)],
             factor=TRIALS[trial] if better else 1.0 if waiting else 1e3,
             cost=float(totals[trial]),
-            moved=max(float((shortest / worthwhile).max()), 0.0 if exact else saved / LITTLE),
+            moved=max(float((tried / worthwhile).max()), 0.0 if exact else saved / LITTLE),
         )
+
+    def _explained(self, slopes: WindowSlopes, readings: Readings) -> Bool[np.ndarray, " windows"]:
+        """Windows whose cost is like most others' or near that of noise, if they tell of all that the others tell of.
+
+        At contacts a search for an initial state ends in a wrong one now and then. Such a window pulls the parameters
+        anywhere, and there are steps that help all windows but these.
+        """
+        if self.loss == "linear" or not slopes.whole.any():
+            return slopes.whole
+        costs = self._costs(slopes.residuals)
+        middle, reach = unlike(costs[slopes.whole], readings.activity[slopes.whole])
+        kept = slopes.whole & (costs <= np.maximum(middle + reach, LIKE_NOISE))
+        alike = np.ones_like(slopes.residuals)
+        least = np.full(len(costs), STATE_DAMPING_RANGE[0])
+        told = [_directions(eliminate(slopes.only(part), alike, least).reduced) for part in (slopes.whole, kept)]
+        return kept if told[1] >= told[0] else slopes.whole
 
     def _costs(self, residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray, "*windows"]:
         """Mean loss of each window."""
@@ -272,11 +311,13 @@ class _Plan:
     """What the slopes around a point say; residuals in deviations of the noise. The last step moves states alone."""
 
     unit: Float[np.ndarray, " d"]
+    damping: float
     residuals: Float[np.ndarray, "windows values"]
     whole: np.ndarray
     deviation: Float[np.ndarray, " channels"]
     steps: Float[np.ndarray, "trials d"]
     state_steps: Float[np.ndarray, "trials windows state"]
+    activity: Float[np.ndarray, " windows"]
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
 
@@ -290,6 +331,24 @@ class _Move:
     factor: float
     cost: float
     moved: float
+
+
+def clipped_mean(
+    change: Float[np.ndarray, "trials windows"], activity: Float[np.ndarray, " windows"]
+) -> Float[np.ndarray, " trials"]:
+    """Mean change of the windows' costs, of those that are `unlike` the others only as much as of those that are like.
+
+    A window that a step takes across a contact becomes much worse until its state has followed, in later epochs; it
+    alone does not forbid a step that helps the others.
+    """
+    middle, reach = unlike(change, activity)
+    return np.clip(change, middle - reach, middle + reach).mean(-1)
+
+
+def _directions(around: Linearisation) -> int:
+    """How many directions of the parameters windows tell of."""
+    values = np.linalg.eigvalsh(bread(around, 1.0, "linear"))
+    return int((values > _BLIND * values[-1]).sum())
 
 
 def _deviation(slopes: WindowSlopes, spare: np.ndarray, channels: int) -> Float[np.ndarray, " channels"]:

@@ -10,6 +10,8 @@ from madoc.residuals.window_residuals import window_residuals
 
 _NORMAL_MAD = 1.4826
 """Standard deviations in a median absolute deviation, for normal noise."""
+UNLIKE = 5.0
+"""Robust deviations from the middle; of normal values one in two million is farther."""
 _LEAST_SPARE = 0.05
 """Readings that their window's state explains by more than the rest say nothing of the noise."""
 _LEAST_SHARE = 1e-3
@@ -32,6 +34,30 @@ def channel_deviation(
     known = (column[np.isfinite(column)] for column in columns.T)
     deviation = np.array([robust_deviation(column) if column.size else 0.0 for column in known])
     return np.maximum(deviation, max(_LEAST_SHARE * float(deviation.max()), _SMALLEST))
+
+
+def unlike(
+    values: Float[np.ndarray, "*rows windows"], activity: Float[np.ndarray, " windows"]
+) -> tuple[Float[np.ndarray, "*rows 1"], Float[np.ndarray, "*rows 1"]]:
+    """The middle of windows' values, and how far from it one may be and still be like the others: 5 deviations.
+
+    Both by weighted medians. Windows in which nothing moves are all alike and say little: windows weigh by how much
+    happens in them.
+    """
+    weights = np.broadcast_to(activity + np.finfo(float).tiny, values.shape)
+
+    def middle_of(part: np.ndarray) -> np.ndarray:
+        found = [
+            np.quantile(row, 0.5, weights=own, method="inverted_cdf") for row, own in zip(part, weights, strict=True)
+        ]
+        return np.array(found)[:, None]
+
+    rows = values.reshape(-1, values.shape[-1])
+    weights = weights.reshape(rows.shape)
+    middle = middle_of(rows)
+    reach = UNLIKE * _NORMAL_MAD * middle_of(np.abs(rows - middle))
+    shape = (*values.shape[:-1], 1)
+    return middle.reshape(shape), reach.reshape(shape)
 
 
 Residuals = Float[np.ndarray, "pairs channels"]
@@ -62,15 +88,17 @@ def consecutive_residuals(
 
 
 def takes_turns(before: Residuals, after: Residuals) -> float:
-    """Minus the correlation of a channel's residual with the next row's, the mean over channels; 0 without pairs.
+    """Minus the correlation of a channel's residual with the next row's, the mean over the half that have most of it.
 
     Of noise e alone a residual is about e' - e, as the reading it starts at carries noise as well as the one it ends
     at: the next one is e'' - e', and they correlate by -1/2. What a model does wrong it does wrong in the next row too.
-    Residuals count up to five times the median, so that contacts do not decide.
+    Contacts answer to noise in ways of their own, in some channels: so half of them decide, and residuals count up to
+    five times the median. 0 without pairs.
     """
     if not len(before):
         return 0.0
-    most = 5.0 * _NORMAL_MAD * np.maximum(np.median(np.abs(before), axis=0), _SMALLEST)
+    most = UNLIKE * _NORMAL_MAD * np.maximum(np.median(np.abs(before), axis=0), _SMALLEST)
     first, second = (np.clip(part, -most, most) for part in (before, after))
     power = np.sqrt((first**2).mean(0) * (second**2).mean(0))
-    return float(np.mean(-(first * second).mean(0) / np.maximum(power, _SMALLEST**2)))
+    turns = np.sort(-(first * second).mean(0) / np.maximum(power, _SMALLEST**2))
+    return float(turns[len(turns) // 2 :].mean())

@@ -49,6 +49,12 @@ class Readings:
         """Control steps of each."""
         return self.actions.shape[1]
 
+    @property
+    def activity(self) -> Float[np.ndarray, " windows"]:
+        """How much happens in each: the mean change from reading to reading, of a channel up to 3 typical ones."""
+        change = np.abs(np.diff(self.observed, axis=1)) / self.scale
+        return np.minimum(change, 3.0).mean((1, 2))
+
     def moved(self, steps: Float[np.ndarray, "*rows physical"], size: int) -> Float[np.ndarray, "*rows state"]:
         """Steps in units of `spread` as differences of states of so many values."""
         differences = np.zeros((*steps.shape[:-1], size))
@@ -78,34 +84,34 @@ def slopes_at(
     unit: Float[np.ndarray, "searches d"],
     states: Float[np.ndarray, "searches windows state"],
 ) -> list[WindowSlopes]:
-    """Residuals and central differences around every search's parameters and states, all in one batch each.
+    """Residuals and differences around every search's parameters and states, all in one batch each.
 
-    Parameters are systems, states are rows: searches · windows · (1 + 2 d + 2 n) · steps control steps.
+    Central ones by parameters, as intervals are made of them; one-sided ones by states, of which there are many.
+    Parameters are systems, states are rows: searches · windows · (1 + 2 d + n) · steps control steps.
     """
     searches, windows, size = states.shape
     points = np.stack([difference_points(point) for point in unit])
     each, count = points.shape[1:]
     by_points = readings.residuals(simulator, points.reshape(-1, count), np.repeat(states, each, axis=0))
     shift = readings.moved(DIFFERENCE * np.eye(len(readings.spread)), size)
-    shifted = states[:, None] + np.concatenate([shift, -shift])[:, None]
+    shifted = states[:, None] + shift[:, None]
     by_shifts = readings.residuals(simulator, unit, shifted.reshape(searches, -1, size))
     by_points = by_points.reshape(searches, each, windows, -1)
-    return [_central(*parts, count) for parts in zip(points, by_points, by_shifts, strict=True)]
+    return [_differences(*parts, count) for parts in zip(points, by_points, by_shifts, strict=True)]
 
 
-def _central(
+def _differences(
     points: Float[np.ndarray, "points d"],
     by_points: Float[np.ndarray, "points windows values"],
     by_shifts: Float[np.ndarray, "shifts windows values"],
     count: int,
 ) -> WindowSlopes:
-    """Central differences; one-sided where the parameters' box ends."""
-    size = len(by_shifts) // 2
+    """Differences; by parameters one-sided where their box ends."""
     whole = np.isfinite(by_points).all((0, 2)) & np.isfinite(by_shifts).all((0, 2))
     with np.errstate(invalid="ignore"):
         width = np.diagonal(points[1 : count + 1] - points[count + 1 :])
         by_parameters = (by_points[1 : count + 1] - by_points[count + 1 :]) / width[:, None, None]
-        by_states = (by_shifts[:size] - by_shifts[size:]) / (2.0 * DIFFERENCE)
+        by_states = (by_shifts - by_points[0]) / DIFFERENCE
     parts = (np.where(whole[:, None], part, 0.0) for part in (by_points[0], by_parameters, by_states))
     residuals, by_parameters, by_states = parts
     return WindowSlopes(residuals, np.moveaxis(by_parameters, 0, -1), np.moveaxis(by_states, 0, -1), whole)
