@@ -112,6 +112,9 @@ def test_of_gymnasiums_models(tmp_path, name):
     robot = robots.load(path)
     assert robot.spec.name == ("my_hopper" if name == "hopper" else robot.spec.name)
     assert len(robot.task.parameters) <= 16
+    assert not any("root" in parameter for parameter in robot.task.parameters.names), "a root is no joint of a machine"
+    assert "# - {field: geom_friction, element: floor" in path.read_text()
+    assert "# - {field: actuator_gain, element: " in path.read_text()
 
 
 def test_a_model_may_lie_deep(tmp_path):

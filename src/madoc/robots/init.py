@@ -172,8 +172,8 @@ def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Itera
 
 
 def _parameters(model: mujoco.MjModel, joints: list[str]) -> Iterator[str]:
-    """Masses, stiffness, damping and friction; friction, and all past the first few, as comments."""
-    found = [*_masses(model), *_stiffness(model, joints), *_of_joints(model, joints)]
+    """Masses, stiffness, damping and friction, gains; friction, gains, and all past the first few, as comments."""
+    found = [*_masses(model), *_stiffness(model, joints), *_of_joints(model, joints), *_gains(model), *_contacts(model)]
     active = 0
     for fields, comment, wanted in found:
         active += wanted
@@ -191,8 +191,7 @@ def _masses(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
             joint = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, model.body_jntadr[body])
             name = joint if joint and joint not in bodies else ""
         if name:
-            fields: Fields = {"field": "body_mass", "element": name, "low": _round(mass / 2), "high": _round(mass * 2)}
-            yield fields, f"kg; the model has {mass:.4g}", True
+            yield _around("body_mass", name, mass), f"kg; the model has {mass:.4g}", True
 
 
 def _stiffness(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
@@ -202,16 +201,14 @@ def _stiffness(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Field
         value = float(np.atleast_1d(model.jnt_stiffness[index])[0])
         if value > 0 and is_single(model, index):
             unit = "N/m" if is_slide(model, index) else "N·m/rad"
-            fields: Fields = {
-                "field": "jnt_stiffness",
-                "element": joint,
-                "low": _round(value / 2),
-                "high": _round(value * 2),
-            }
-            yield fields, f"{unit}; the model has {value:.4g}", True
+            yield _around("jnt_stiffness", joint, value), f"{unit}; the model has {value:.4g}", True
 
 
 def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
+    """Damping and dry friction; a joint that nothing drives or damps may be no joint of the machine, as of a root."""
+    on_joints = np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    # Through tendons an actuator may drive any joint.
+    driven = set(model.actuator_trnid[:, 0]) if model.nu and on_joints.all() else set(range(model.njnt))
     for field, wanted in (("dof_damping", True), ("dof_frictionloss", False)):
         for joint in joints:
             index = model.joint(joint).id
@@ -225,7 +222,27 @@ def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Field
             units = ("N·s/m", "N") if slide else ("N·m·s/rad", "N·m")
             unit = units[field == "dof_frictionloss"]
             fields: Fields = {"field": field, "element": joint, "low": 0.0, "high": _round(high)}
-            yield fields, f"{unit}; the model has {value:.4g}", wanted
+            yield fields, f"{unit}; the model has {value:.4g}", wanted and (value > 0 or index in driven)
+
+
+def _gains(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
+    for actuator in names_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu):
+        value = float(model.actuator_gainprm[model.actuator(actuator).id, 0])
+        if value > 0:
+            yield _around("actuator_gain", actuator, value), f"the model has {value:.4g}", False
+
+
+def _contacts(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
+    """Sliding friction of what collides."""
+    for geom in names_of(model, mujoco.mjtObj.mjOBJ_GEOM, model.ngeom):
+        index = model.geom(geom).id
+        value = float(model.geom_friction[index, 0])
+        if value > 0 and (model.geom_contype[index] or model.geom_conaffinity[index]):
+            yield _around("geom_friction", geom, value), f"sliding, in contacts; the model has {value:.4g}", False
+
+
+def _around(field: str, element: str, value: float) -> Fields:
+    return {"field": field, "element": element, "low": _round(value / 2), "high": _round(value * 2)}
 
 
 def _round(value: float) -> float:
