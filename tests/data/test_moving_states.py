@@ -59,7 +59,7 @@ def test_differences_are_put_in_where_a_robot_measures_none(encoders):
     np.testing.assert_allclose(filled.transitions.next_observation[:, 3] * STEP, [2.0, 4.0, 5.0, 2.0, 3.0])
     task = observed_task(encoders, filled)
     assert task.observation_size == 4
-    assert task.signals[3] == "qvel[1]"
+    assert task.signals[3] == "velocity(elbow)"
     state = np.random.default_rng(0).normal(size=(5, 4))
     np.testing.assert_allclose(task.state_from_observation(task.observe(state)), state)
     assert any("differences of positions" in sentence for sentence in filled.disturbance.sentences())

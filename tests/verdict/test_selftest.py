@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -5,7 +7,7 @@ from planted import ROBOTS, at_rest, log_of
 
 from madoc import simulation
 from madoc.calibration import CmaEs, LeastSquares
-from madoc.data import Disturbance, disturb, hide_velocities
+from madoc.data import Disturbance, disturb, hide_velocities, observed_task
 from madoc.errors import MadocError
 from madoc.verdict.selftest import RECOVERABLE, STRETCH, plant, selftest
 
@@ -54,8 +56,6 @@ def test_another_truth_moves_otherwise_and_noise_is_read_once():
 
 def test_hidden_velocities_start_at_resets():
     task, _ = ROBOTS["arm"]
-    from dataclasses import replace
-
     seen = replace(task, velocities=2)
     log = disturb(log_of("arm", rows=300), Disturbance(hidden_velocities=True), seen, KEYS[0])
     simulator = simulation.make(hide_velocities(seen), threads=1)
@@ -64,12 +64,27 @@ def test_hidden_velocities_start_at_resets():
     assert planted.transitions.observation.shape == (300, 2)
 
 
+def test_where_velocities_are_differences_the_planted_ones_are_too():
+    task, _ = ROBOTS["arm"]
+    seen = replace(task, velocities=2)
+    put_in = Disturbance(hidden_velocities=True, velocities="differences")
+    log = disturb(log_of("arm", rows=300), put_in, seen, KEYS[0])
+    simulator = simulation.make(observed_task(seen, log), threads=1)
+    planted = plant(log, simulator, task.parameters.middle, noise=np.zeros(4), key=KEYS[0])
+    assert planted.disturbance.velocities == "differences"
+    angle, speed = np.split(planted.transitions.observation, 2, axis=1)
+    inner = np.setdiff1d(np.arange(1, len(planted) - 1), [*planted.episode_starts, *(planted.episode_ends - 1)])
+    between = (angle[inner + 1] - angle[inner - 1]) / (2 * simulator.control_step)
+    assert speed[inner] == pytest.approx(between, abs=1e-9)
+
+
 def test_data_that_can_find_a_truth_passes():
     task, _ = ROBOTS["spring"]
     outcome = run(log_of("spring"), task)
     assert outcome.passed
     assert outcome.method == "least-squares"
     assert "could find every parameter: each of 2 planted truths" in outcome.sentence
+    assert outcome.sentence.endswith("of 6 95 % intervals hold the truth")
     assert len(outcome.rows) == 2 * 3
     assert all(row.percent_of_range < 1e-6 for row in outcome.rows)
     assert {row.truth for row in outcome.rows} == {1, 2}

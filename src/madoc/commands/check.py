@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -22,6 +22,8 @@ class Check:
     """Logs: files (CSV, npz, HDF5, Parquet, MCAP) or folders of them, Minari or LeRobot directories."""
     clip_actions: bool = False
     """Clip actions outside their ranges instead of refusing them."""
+    velocities: Literal["logged", "differences"] = "logged"
+    """differences puts velocities from positions where the logs have none, as `calibrate` does if told so."""
     budget: int = 300_000
     """Control steps to forecast the time of."""
     forecast: bool = True
@@ -36,7 +38,14 @@ class Check:
         from madoc.pipeline.check_stage import check_logs
 
         budget = self.budget if self.forecast else None
-        found = check_logs(self.spec, self.data, clip_actions=self.clip_actions, budget=budget, seed=self.seed)
+        found = check_logs(
+            self.spec,
+            self.data,
+            clip_actions=self.clip_actions,
+            velocities=self.velocities,
+            budget=budget,
+            seed=self.seed,
+        )
         status = "rejected" if found.fatal else "finished"
         if found.diagnosis is None:
             assert found.refusal is not None

@@ -61,6 +61,18 @@ def states_near(
     return with_pending(dataset, task, np.where(np.isnan(states), initial, states), np.arange(len(dataset)))
 
 
+def velocity_names(task: Task, addresses: Int[np.ndarray, " values"]) -> tuple[str, ...]:
+    """velocity(JOINT) as a spec reads it, of addresses in (qpos, qvel); velocity(JOINT)[2] where it has several."""
+    model = task.compile()
+    names = []
+    for dof in np.asarray(addresses) - model.nq:
+        joint = model.dof_jntid[dof]
+        of_joint = np.flatnonzero(model.dof_jntid == joint)
+        part = f"[{dof - of_joint[0]}]" if len(of_joint) > 1 else ""
+        names.append(f"velocity({model.joint(joint).name or joint}){part}")
+    return tuple(names)
+
+
 def show_velocities(task: Task) -> Task:
     """The same robot seen with the velocities that its signals do not tell, behind them: a state can then be rebuilt.
 
@@ -85,7 +97,7 @@ def show_velocities(task: Task) -> Task:
         observation_size=size + len(missing),
         observe=lambda state: both(observe(state), state),
         sense=None if sense is None else lambda state, sensordata: both(sense(state, sensordata), state),
-        signals=(*task.signals, *(f"qvel[{address - task.compile().nq}]" for address in missing)),
+        signals=(*task.signals, *velocity_names(task, missing)),
         state_from_observation=rebuild,
         velocities=len(missing),
     )

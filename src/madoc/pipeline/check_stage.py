@@ -6,12 +6,14 @@ from pathlib import Path
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
-from madoc.data import Dataset, logs
+from madoc.data import Dataset, Disturbance, disturb, logs, observed_task
+from madoc.data.dataset import Velocities
 from madoc.diagnosis import Diagnosis, check, refuse_fatal
 from madoc.errors import MadocError
 from madoc.findings import Finding
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.forecast import Forecast, forecast
+from madoc.pipeline.keys import stage_key
 from madoc.simulation import CpuSimulator
 
 
@@ -42,10 +44,11 @@ def check_logs(
     paths: Sequence[str | Path],
     *,
     clip_actions: bool = False,
+    velocities: Velocities = "logged",
     budget: int | None = 300_000,
     seed: int = 0,
 ) -> Checked:
-    """Read logs of a robot of one's own and say what they can and cannot tell.
+    """Read logs of a robot of one's own and say what they can and cannot tell, with velocities put in if asked.
 
     A log that cannot be read is a finding too; a spec that cannot be is refused. Without a budget there is no forecast.
 
@@ -57,6 +60,9 @@ def check_logs(
     space = simulator.parameters
     try:
         dataset = logs.read(paths, robot, clip_actions=clip_actions)
+        if velocities == "differences":
+            dataset = disturb(dataset, Disturbance(velocities=velocities), robot.task, stage_key(seed, "disturbing"))
+            simulator = simulation.make(observed_task(robot.task, dataset))
     except MadocError as error:
         return Checked(space, None, refusal=Finding("fatal", str(error)))
     diagnosis = check(dataset, simulator, robot=robot, seed=seed)

@@ -1,7 +1,7 @@
 """A selftest: could this data find a truth? One is planted in the same model, the logged actions replayed in it."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import jax
@@ -11,7 +11,7 @@ from jaxtyping import Float, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Calibrator
 from madoc.calibration.calibrate import calibrate
 from madoc.calibration.result import CalibrationResult
-from madoc.data import Dataset, Disturbance, logged_states
+from madoc.data import Dataset, Disturbance, disturb, logged_states
 from madoc.data.dataset import starts_after
 from madoc.errors import MadocError
 from madoc.simulation.base import Simulator
@@ -83,7 +83,8 @@ def plant(
     """The log as it would be if the simulator at `truth` were the robot: its actions, its starts, its noise.
 
     From a logged state every `STRETCH` rows; where none can be rebuilt, from resets at the beginning of each episode.
-    Every replay is an episode, and ends where its simulation failed or the task ended.
+    Every replay is an episode, and ends where its simulation failed or the task ended. Where the log's velocities are
+    differences of its positions, so are the planted ones.
 
     Args:
         dataset: Whose actions.
@@ -125,9 +126,12 @@ def plant(
     ends = last[valid]
     zeros = np.zeros(len(ends))
     transitions = Transitions(rows_at[0], rows_at[1], zeros, rows_at[2], rows_at[3], ends & ~rows_at[3])
-    return Dataset(
-        transitions, starts_after(ends), task.name, task.physics, f"planted in {dataset.origin}", None, Disturbance()
-    )
+    origin = f"planted in {dataset.origin}"
+    planted = Dataset(transitions, starts_after(ends), task.name, task.physics, origin, None, Disturbance())
+    if dataset.disturbance.velocities != "differences":
+        return planted
+    differences = Disturbance(hidden_velocities=True, velocities="differences")
+    return replace(disturb(planted, differences, task, of_noise), disturbance=Disturbance(velocities="differences"))
 
 
 def selftest(
@@ -170,7 +174,7 @@ def selftest(
         method=name,
         rows=tuple(found),
         recoverable=recoverable,
-        sentence=_sentence(worst, recoverable, len(keys)),
+        sentence=_sentence(worst, recoverable, len(keys)) + _of_intervals(found),
         noise=dict(zip(signals, noise.tolist(), strict=True)),
         control_steps=spent,
     )
@@ -223,3 +227,9 @@ def _sentence(worst: dict[str, float], recoverable: tuple[str, ...], truths: int
         f"this data could not find {lost} in {planted} to within {RECOVERABLE:g} % of the range; do not believe a "
         "calibration of it: leave it out, or log motions that excite it"
     )
+
+
+def _of_intervals(rows: Sequence[Planted]) -> str:
+    """How many of a method's intervals hold the truth, where it has any."""
+    covered = [row.covered for row in rows if row.covered is not None]
+    return f"; {sum(covered)} of {len(covered)} 95 % intervals hold the truth" if covered else ""
