@@ -58,15 +58,3 @@ def test_damping_shortens_a_states_step(damping):
     slopes = slopes_of([[3.0, 1.0]], [[[1.0], [0.0]]], [[[1.0], [1.0]]])
     found = eliminate(slopes, np.ones((1, 2)), np.array([damping]))
     np.testing.assert_allclose(found.states_step(np.zeros(1)), [[-4.0 / (2.0 + 2.0 * damping)]])
-
-
-def test_windows_left_out_say_nothing():
-    random = np.random.default_rng(0)
-    slopes = slopes_of(*(random.normal(size=(3, *shape)) for shape in ((6,), (6, 2), (6, 1))))
-    kept = np.array([True, False, True])
-    part = eliminate(slopes.only(kept), np.ones((3, 6)), np.full(3, 1e-9)).reduced
-    alone = WindowSlopes(slopes.residuals[kept], slopes.by_parameters[kept], slopes.by_states[kept], kept[kept])
-    whole = eliminate(alone, np.ones((2, 6)), np.full(2, 1e-9)).reduced
-    np.testing.assert_allclose(part.jacobian[kept], whole.jacobian)
-    assert not part.jacobian[1].any()
-    assert not part.residuals[1].any()

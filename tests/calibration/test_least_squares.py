@@ -24,9 +24,11 @@ from madoc.residuals.uncertainty import (
     at_least_noise,
     bread,
     correlated_pairs,
+    directions,
     half_width,
     identifiability,
     jackknife_meat,
+    leverage,
     meat,
     sandwich,
 )
@@ -195,6 +197,17 @@ def test_values_of_one_window_count_as_one_piece_of_evidence():
 def test_where_cauchys_tails_prevail_the_weights_stand_in_for_the_curvature():
     around = at(np.ones((2, 1, 1)), [[3.0], [-3.0]])
     assert bread(around, 1.0, "cauchy")[0, 0] == pytest.approx(2 * 0.1)
+
+
+def test_leverage_is_a_windows_part_of_what_all_tell():
+    # One parameter, slopes 1, 1 and 2: of squares that sum to 6.
+    around = Linearisation(np.zeros((3, 1)), np.array([[[1.0]], [[1.0]], [[2.0]]]))
+    np.testing.assert_allclose(leverage(around), [1 / 6, 1 / 6, 4 / 6])
+    np.testing.assert_allclose(leverage(around.where(np.array([True, True, False]))), [0.5, 0.5, 0.0])
+    assert directions(around) == 1
+    unseen = Linearisation(np.zeros((2, 1)), np.array([[[1.0, 1.0]], [[2.0, 2.0]]]))
+    assert directions(unseen) == 1
+    np.testing.assert_allclose(leverage(unseen).sum(), 1.0)
 
 
 def test_the_interval_is_students():

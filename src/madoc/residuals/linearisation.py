@@ -25,6 +25,15 @@ class Linearisation:
     residuals: Float[np.ndarray, "windows values"]
     jacobian: Float[np.ndarray, "windows values d"]
 
+    def of(self, kept: Bool[np.ndarray, " windows"]) -> "Linearisation":
+        """Of these windows alone."""
+        return Linearisation(self.residuals[kept], self.jacobian[kept])
+
+    def where(self, kept: Bool[np.ndarray, " windows"]) -> "Linearisation":
+        """Of these windows, the others 0 everywhere."""
+        part = kept[:, None]
+        return Linearisation(np.where(part, self.residuals, 0.0), np.where(part[..., None], self.jacobian, 0.0))
+
 
 def difference_points(unit: Float[np.ndarray, " d"]) -> Float[np.ndarray, "points d"]:
     """The point itself, then each parameter in turn a little higher, then a little lower, never outside the box."""

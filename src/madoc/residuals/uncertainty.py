@@ -76,6 +76,18 @@ def jackknife_meat(around: Linearisation, share: float, bread: Float[np.ndarray,
     return influence.T @ influence * (windows - 1) / max(1, windows)
 
 
+def leverage(around: Linearisation) -> Float[np.ndarray, " windows"]:
+    """tr(B⁻¹ B_w): a window's part of what all tell, as a number of parameters; they sum to that of directions told."""
+    inverse = np.linalg.pinv(_sum_of_products(around, np.ones_like(around.residuals)), rcond=_BLIND, hermitian=True)
+    return np.einsum("wvd,de,wve->w", around.jacobian, inverse, around.jacobian, optimize=True)
+
+
+def directions(around: Linearisation) -> int:
+    """How many directions of the parameters windows tell of."""
+    values = np.linalg.eigvalsh(_sum_of_products(around, np.ones_like(around.residuals)))
+    return int((values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)).sum())
+
+
 def at_least_noise(
     meat: Float[np.ndarray, "d d"], bread: Float[np.ndarray, "d d"], ratio: float
 ) -> Float[np.ndarray, "d d"]:

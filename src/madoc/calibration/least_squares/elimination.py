@@ -40,16 +40,6 @@ class WindowSlopes:
         wide = deviation[:, None]
         return WindowSlopes(self.residuals / deviation, self.by_parameters / wide, self.by_states / wide, self.whole)
 
-    def only(self, kept: Bool[np.ndarray, " windows"]) -> "WindowSlopes":
-        """The same, as if no other window were whole."""
-        part = kept[:, None]
-        return WindowSlopes(
-            np.where(part, self.residuals, 0.0),
-            np.where(part[..., None], self.by_parameters, 0.0),
-            np.where(part[..., None], self.by_states, 0.0),
-            self.whole & kept,
-        )
-
 
 @dataclass(frozen=True)
 class Eliminated:

@@ -13,7 +13,6 @@ from madoc.calibration.least_squares.noise import channel_deviation, unlike
 from madoc.calibration.least_squares.readings import Readings, slopes_at
 from madoc.data.windows import apart
 from madoc.errors import MadocError
-from madoc.residuals.linearisation import Linearisation
 from madoc.residuals.losses import (
     ALL_FAILED,
     TUNING,
@@ -22,7 +21,7 @@ from madoc.residuals.losses import (
     loss_slope,
     loss_value,
 )
-from madoc.residuals.uncertainty import SETTLED, at_least_noise, bread, jackknife_meat, sandwich
+from madoc.residuals.uncertainty import SETTLED, at_least_noise, bread, directions, jackknife_meat, leverage, sandwich
 from madoc.types import Metrics
 
 TRIALS = (1e-2, 1.0, 1e2)
@@ -44,8 +43,10 @@ FAILED_WINDOW = 1e6
 """Cost of a window that failed, in squared deviations of the noise; a state holds no infinity."""
 LIKE_NOISE = 1.5
 """Cost of a window that noise alone leaves now and then; it leaves 0.8 on average under Cauchy's loss."""
-_BLIND = 1e-12
-"""Squared slope, relative to the largest, below which windows tell nothing of a direction."""
+OUTWEIGHS = 1.0 / 3.0
+"""Leverage of a window, or ..."""
+FEW = 6.0
+"""... so many times the mean one, from which its slopes are taken for differences across a contact."""
 _SMALLEST = 1e-100
 """Keeps a move over a tolerance of 0 finite."""
 
@@ -60,7 +61,8 @@ class EstimatedState:
         states: Initial state of every window there.
         damping: λ of the parameters' step.
         state_damping: λ of every window's.
-        cost: Mean squared residual in deviations of the noise; `ALL_FAILED` before the first epoch.
+        cost: Mean squared residual, in typical changes, and in deviations of the noise once refining; `ALL_FAILED`
+            before the first epoch.
         moved: The largest move of the last step over what is worth one; below 1 the search has settled.
         rows: Where the windows begin.
         deviation: Noise of each channel, in its typical changes.
@@ -164,7 +166,9 @@ class EstimatedStates:
             new["state_damping"][index, :windows] = np.clip(
                 state.state_damping[index, :windows] * factor, *STATE_DAMPING_RANGE
             )
-            new["cost"][index], new["moved"][index] = move.cost, move.moved
+            # Searches are compared by what they leave; once one is left, it is measured in deviations of the noise.
+            unit_of_cost = 1.0 if state.refining else float(plan.deviation[0]) ** 2
+            new["cost"][index], new["moved"][index] = move.cost * unit_of_cost, move.moved
         leader = int(np.argmin(new["cost"][:running]))
         following = replace(
             state,
@@ -172,7 +176,7 @@ class EstimatedStates:
             deviation=plans[leader].deviation,
             bread=plans[leader].bread,
             meat=plans[leader].meat,
-            explained=int(plans[leader].whole.sum()),
+            explained=int(plans[leader].kept.sum()),
             epochs=state.epochs + 1,
             control_steps=state.control_steps + self._epoch_steps(problem, state),
             failures=state.failures + sum(int((~around.whole).sum()) for around in slopes),
@@ -221,31 +225,34 @@ class EstimatedStates:
     ) -> "_Plan":
         """What the slopes say: the noise, the steps to try, the curvature.
 
-        While refining, channels weigh by their noise, and windows that are not `explained` not at all.
+        While refining, channels weigh by their noise, and only windows that are `_trusted` move the parameters.
         """
         channels = len(readings.scale)
         least = np.full(len(state_damping), STATE_DAMPING_RANGE[0])
-        spare = eliminate(slopes, np.ones_like(slopes.residuals), least).spare
-        deviation = _deviation(slopes, spare, channels)
-        deviation = deviation if refining else np.full(channels, np.median(deviation))
-        slopes = slopes.over(np.tile(deviation, readings.steps + 1))
+        alike = eliminate(slopes, np.ones_like(slopes.residuals), least)
+        kept = slopes.whole
+        deviation = _deviation(slopes, alike.spare, channels, kept)
         if refining:
-            slopes = slopes.only(self._explained(slopes, readings))
+            kept = self._trusted(slopes.over(np.tile(deviation, readings.steps + 1)), readings.activity)
+            deviation = _deviation(slopes, alike.spare, channels, kept)
+        else:
+            deviation = np.full(channels, np.median(deviation))
+        slopes = slopes.over(np.tile(deviation, readings.steps + 1))
         z = (slopes.residuals / TUNING[self.loss]) ** 2
         weights = loss_slope(z, self.loss) * slopes.whole[:, None]
         damped = eliminate(slopes, weights, state_damping)
-        factors = triangular_factors(damped.reduced, 1.0, "linear")
+        factors = triangular_factors(damped.reduced.where(kept), 1.0, "linear")
         steps = [*(damped_step(*factors, unit, damping * trial) for trial in TRIALS), np.zeros_like(unit)]
-        exact = eliminate(slopes, weights, least).reduced
-        exact = replace(exact, residuals=exact.residuals[slopes.whole], jacobian=exact.jacobian[slopes.whole])
-        share = curvature_share(z[slopes.whole], self.loss)
+        exact = eliminate(slopes, weights, least).reduced.of(kept)
+        share = curvature_share(z[kept], self.loss)
         curved = share * bread(exact, 1.0, "linear")
-        ratio = _noise_ratio(slopes, weights, share, float(spare[slopes.whole].sum()) - len(unit))
+        freedom = float(alike.spare[kept].sum()) - len(unit)
+        ratio = _noise_ratio(slopes.residuals[kept], weights[kept], share, freedom)
         return _Plan(
             unit=unit,
             damping=damping,
             residuals=slopes.residuals,
-            whole=slopes.whole,
+            kept=kept,
             deviation=deviation,
             steps=np.stack(steps),
             state_steps=np.stack([damped.states_step(step) for step in steps]),
@@ -259,11 +266,11 @@ class EstimatedStates:
     ) -> "_Move":
         """Which step of the parameters helps most, each window's state following as far as fits it best."""
         costs = self._costs(residuals)
-        if plan.whole.any():
-            before = self._costs(plan.residuals)[plan.whole]
-            change = costs.min(1)[:, plan.whole] - before
+        if plan.kept.any():
+            before = self._costs(plan.residuals)[plan.kept]
+            change = costs.min(1)[:, plan.kept] - before
             robust = self.loss != "linear"
-            totals = before.mean() + (clipped_mean(change, plan.activity[plan.whole]) if robust else change.mean(-1))
+            totals = before.mean() + (clipped_mean(change, plan.activity[plan.kept]) if robust else change.mean(-1))
         else:
             before, totals = np.array([FAILED_WINDOW]), costs.min(1).mean(-1)
         trial = len(TRIALS) if waiting else int(np.argmin(totals))
@@ -282,21 +289,23 @@ class EstimatedStates:
             moved=max(float((tried / worthwhile).max()), 0.0 if exact else saved / LITTLE),
         )
 
-    def _explained(self, slopes: WindowSlopes, readings: Readings) -> Bool[np.ndarray, " windows"]:
-        """Windows whose cost is like most others' or near that of noise, if they tell of all that the others tell of.
+    def _trusted(self, slopes: WindowSlopes, activity: Float[np.ndarray, " windows"]) -> Bool[np.ndarray, " windows"]:
+        """Windows that an initial state explains and that do not outweigh the others; all if these tell of less.
 
-        At contacts a search for an initial state ends in a wrong one now and then. Such a window pulls the parameters
-        anywhere, and there are steps that help all windows but these.
+        At contacts a search for an initial state ends in a wrong one now and then, and differences taken across one
+        are no slopes. Such a window pulls the parameters anywhere. One is explained if its cost is like most others'
+        or near that of noise.
         """
-        if self.loss == "linear" or not slopes.whole.any():
-            return slopes.whole
+        whole = slopes.whole
+        if self.loss == "linear" or not whole.any():
+            return whole
         costs = self._costs(slopes.residuals)
-        middle, reach = unlike(costs[slopes.whole], readings.activity[slopes.whole])
-        kept = slopes.whole & (costs <= np.maximum(middle + reach, LIKE_NOISE))
-        alike = np.ones_like(slopes.residuals)
-        least = np.full(len(costs), STATE_DAMPING_RANGE[0])
-        told = [_directions(eliminate(slopes.only(part), alike, least).reduced) for part in (slopes.whole, kept)]
-        return kept if told[1] >= told[0] else slopes.whole
+        middle, reach = unlike(costs[whole], activity[whole])
+        kept = whole & (costs <= np.maximum(middle + reach, LIKE_NOISE))
+        least = np.full(len(whole), STATE_DAMPING_RANGE[0])
+        reduced = eliminate(slopes, np.ones_like(slopes.residuals), least).reduced
+        kept &= leverage(reduced.where(kept)) <= max(OUTWEIGHS, FEW * reduced.jacobian.shape[-1] / kept.sum())
+        return kept if directions(reduced.of(kept)) == directions(reduced.of(whole)) else whole
 
     def _costs(self, residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray, "*windows"]:
         """Mean loss of each window."""
@@ -313,7 +322,7 @@ class _Plan:
     unit: Float[np.ndarray, " d"]
     damping: float
     residuals: Float[np.ndarray, "windows values"]
-    whole: np.ndarray
+    kept: Bool[np.ndarray, " windows"]
     deviation: Float[np.ndarray, " channels"]
     steps: Float[np.ndarray, "trials d"]
     state_steps: Float[np.ndarray, "trials windows state"]
@@ -345,24 +354,23 @@ def clipped_mean(
     return np.clip(change, middle - reach, middle + reach).mean(-1)
 
 
-def _directions(around: Linearisation) -> int:
-    """How many directions of the parameters windows tell of."""
-    values = np.linalg.eigvalsh(bread(around, 1.0, "linear"))
-    return int((values > _BLIND * values[-1]).sum())
-
-
-def _deviation(slopes: WindowSlopes, spare: np.ndarray, channels: int) -> Float[np.ndarray, " channels"]:
-    """Each channel's noise in the windows that did not fail."""
-    shape = (int(slopes.whole.sum()), slopes.residuals.shape[1] // channels, channels)
-    return channel_deviation(slopes.residuals[slopes.whole].reshape(shape), spare[slopes.whole].reshape(shape))
+def _deviation(
+    slopes: WindowSlopes, spare: np.ndarray, channels: int, kept: Bool[np.ndarray, " windows"]
+) -> Float[np.ndarray, " channels"]:
+    """Each channel's noise in windows that are kept."""
+    shape = (int(kept.sum()), slopes.residuals.shape[1] // channels, channels)
+    return channel_deviation(slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape))
 
 
 def _noise_ratio(
-    slopes: WindowSlopes, weights: Float[np.ndarray, "windows values"], share: float, freedom: float
+    residuals: Float[np.ndarray, "windows values"],
+    weights: Float[np.ndarray, "windows values"],
+    share: float,
+    freedom: float,
 ) -> float:
     """Variance of what a reading pulls with, ψ, over ψ', its mean curvature; 1 for squares of deviations."""
-    pull = ((weights * slopes.residuals)[slopes.whole] ** 2).sum() / max(1.0, freedom)
-    curvature = share * weights[slopes.whole].sum() / max(1, weights[slopes.whole].size)
+    pull = ((weights * residuals) ** 2).sum() / max(1.0, freedom)
+    curvature = share * weights.sum() / max(1, weights.size)
     return float(pull / max(curvature, _SMALLEST))
 
 
