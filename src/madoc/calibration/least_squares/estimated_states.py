@@ -345,13 +345,13 @@ class _Move:
 def clipped_mean(
     change: Float[np.ndarray, "trials windows"], activity: Float[np.ndarray, " windows"]
 ) -> Float[np.ndarray, " trials"]:
-    """Mean change of the windows' costs, of those that are `unlike` the others only as much as of those that are like.
+    """Mean change of the windows' costs; one that becomes worse, `unlike` the others, counts as the worst that is like.
 
     A window that a step takes across a contact becomes much worse until its state has followed, in later epochs; it
     alone does not forbid a step that helps the others.
     """
     middle, reach = unlike(change, activity)
-    return np.clip(change, middle - reach, middle + reach).mean(-1)
+    return np.minimum(change, np.maximum(middle + reach, 0.0)).mean(-1)
 
 
 def _deviation(
