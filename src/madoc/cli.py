@@ -71,12 +71,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say(answer, as_json=command.output.json)
     except BrokenPipeError:
         _hang_up()
+    except OSError as error:  # as of a full disk
+        print(f"madoc: {_refused_by_the_system(error)}", file=sys.stderr)
+        return REFUSED
     return EXIT_CODES[answer.status]
 
 
 def _refused_by_the_system(error: OSError) -> str:
     reason = error.strerror or str(error)
-    where = "" if error.filename is None else f" at {os.fspath(error.filename)!r:.200}"
+    where = "" if error.filename is None else f" at {error.filename!r:.200}"
     return f"the system refused{where}: {reason}; check the path, the rights and the space, and try again"
 
 

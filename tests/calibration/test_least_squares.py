@@ -24,11 +24,10 @@ from madoc.residuals.uncertainty import (
     at_least_noise,
     bread,
     correlated_pairs,
-    directions,
     half_width,
     identifiability,
     jackknife_meat,
-    leverage,
+    least_share,
     meat,
     sandwich,
 )
@@ -199,15 +198,14 @@ def test_where_cauchys_tails_prevail_the_weights_stand_in_for_the_curvature():
     assert bread(around, 1.0, "cauchy")[0, 0] == pytest.approx(2 * 0.1)
 
 
-def test_leverage_is_a_windows_part_of_what_all_tell():
-    # One parameter, slopes 1, 1 and 2: of squares that sum to 6.
-    around = Linearisation(np.zeros((3, 1)), np.array([[[1.0]], [[1.0]], [[2.0]]]))
-    np.testing.assert_allclose(leverage(around), [1 / 6, 1 / 6, 4 / 6])
-    np.testing.assert_allclose(leverage(around.where(np.array([True, True, False]))), [0.5, 0.5, 0.0])
-    assert directions(around) == 1
-    unseen = Linearisation(np.zeros((2, 1)), np.array([[[1.0, 1.0]], [[2.0, 2.0]]]))
-    assert directions(unseen) == 1
-    np.testing.assert_allclose(leverage(unseen).sum(), 1.0)
+def test_the_least_share_is_that_of_the_direction_a_part_tells_least_of():
+    # Squares of slopes: of the first parameter 1, 1 and 2, of the second 4 in the last window alone.
+    jacobian = np.array([[[1.0, 0.0], [0.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]], [[1.0, 0.0], [1.0, 2.0]]])
+    around = Linearisation(np.zeros((3, 2)), jacobian)
+    assert least_share(around, around) == pytest.approx(1.0)
+    assert least_share(around.of(np.array([True, True, False])), around) == pytest.approx(0.0, abs=1e-12)
+    alike = Linearisation(np.zeros((4, 1)), np.ones((4, 1, 2)))  # tells of one direction only
+    assert least_share(alike.of(np.array([True, False, False, False])), alike) == pytest.approx(0.25)
 
 
 def test_the_interval_is_students():

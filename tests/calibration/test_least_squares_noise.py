@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from madoc.calibration.least_squares.estimated_states import clipped_mean
+from madoc.calibration.least_squares.estimated_states import FAILED_WINDOW, clipped_change
 from madoc.calibration.least_squares.noise import channel_deviation, takes_turns, unlike
 
 
@@ -53,13 +53,22 @@ def test_windows_in_which_nothing_happens_do_not_say_what_is_usual():
 
 
 def test_a_window_thrown_across_a_contact_does_not_forbid_what_helps_the_others():
-    # Deviation of the changes from their middle, -2: 1, 0, 1, 102, so 5 · 1.4826 · 1 is how far is like the others.
-    change = np.array([[-3.0, -2.0, -1.0, 100.0]])
-    np.testing.assert_allclose(clipped_mean(change, np.ones(4)), [(-3.0 - 2.0 - 1.0 + -2.0 + 5.0 * 1.4826) / 4.0])
+    # From their middle, 2, the changes are 1, 0, 1 and 98 away, so 5 · 1.4826 · 1 is how far is like the others.
+    before, after = np.zeros(4), np.array([[1.0, 2.0, 3.0, 100.0]])
+    change = clipped_change(before, after, np.ones(4))
+    np.testing.assert_allclose(change, [[1.0, 2.0, 3.0, 2.0 + 5.0 * 1.4826]])
+
+
+def test_a_step_that_makes_simulations_fail_pays_for_it():
+    before, after = np.ones(5), np.array([[0.9, 0.9, 0.9, 0.9, FAILED_WINDOW]])
+    assert clipped_change(before, after, np.ones(5)).sum() > 0.0
 
 
 def test_costs_never_fall_below_nothing():
-    before = np.array([10.0, 10.0, 10.0, 0.1])
-    change = clipped_mean(np.array([[-9.0, -9.0, -9.0, -0.05]]), np.ones(4))
-    np.testing.assert_allclose(change, [-27.05 / 4.0])
-    assert before.mean() + change[0] >= 0.0
+    before, after = np.array([10.0, 10.0, 10.0, 0.1]), np.array([[1.0, 1.0, 1.0, 0.05]])
+    np.testing.assert_allclose(clipped_change(before, after, np.ones(4)), after - before)
+
+
+def test_where_most_windows_rest_the_others_are_not_done_without():
+    change = clipped_change(np.ones(5), np.array([[1.0, 1.0, 1.0, 2.0, 2.0]]), np.array([1.0, 1.0, 1.0, 1.0, 1.0]))
+    np.testing.assert_allclose(change, [[0.0, 0.0, 0.0, 1.0, 1.0]])

@@ -102,7 +102,7 @@ def test_a_search_that_the_budget_ends_says_so(arm):
     method = LeastSquares(windows=40, search_windows=12)
     result = calibrate(method, problem_of(arm, ARM, rows=1000), key=jax.random.key(0), budget=20_000)
     assert result.status == "finished"
-    assert any("before the search had settled" in warning for warning in result.warnings)
+    assert any("had not settled when it ended" in warning for warning in result.warnings)
 
 
 @pytest.mark.slow

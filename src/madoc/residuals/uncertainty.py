@@ -76,16 +76,17 @@ def jackknife_meat(around: Linearisation, share: float, bread: Float[np.ndarray,
     return influence.T @ influence * (windows - 1) / max(1, windows)
 
 
-def leverage(around: Linearisation) -> Float[np.ndarray, " windows"]:
-    """tr(B⁻¹ B_w): a window's part of what all tell, as a number of parameters; they sum to that of directions told."""
-    inverse = np.linalg.pinv(_sum_of_products(around, np.ones_like(around.residuals)), rcond=_BLIND, hermitian=True)
-    return np.einsum("wvd,de,wve->w", around.jacobian, inverse, around.jacobian, optimize=True)
+def least_share(part: Linearisation, whole: Linearisation) -> float:
+    """The least share of what all windows tell of a direction that a part of them tells; of those all tell of.
 
-
-def directions(around: Linearisation) -> int:
-    """How many directions of the parameters windows tell of."""
-    values = np.linalg.eigvalsh(_sum_of_products(around, np.ones_like(around.residuals)))
-    return int((values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)).sum())
+    The smallest eigenvalue of B_part v = λ B_whole v.
+    """
+    values, vectors = np.linalg.eigh(_sum_of_products(whole, np.ones_like(whole.residuals)))
+    told = values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)
+    if not told.any():
+        return 1.0
+    basis = vectors[:, told] / np.sqrt(values[told])
+    return float(np.linalg.eigvalsh(basis.T @ _sum_of_products(part, np.ones_like(part.residuals)) @ basis)[0])
 
 
 def at_least_noise(

@@ -11,7 +11,7 @@ from jaxtyping import Float, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Calibrator
 from madoc.calibration.calibrate import calibrate
 from madoc.calibration.result import CalibrationResult
-from madoc.data import Dataset, Disturbance, disturb, logged_states
+from madoc.data import Dataset, Disturbance, disturb, hide_velocities, logged_states
 from madoc.data.dataset import starts_after
 from madoc.errors import MadocError
 from madoc.simulation.base import Simulator
@@ -130,8 +130,18 @@ def plant(
     planted = Dataset(transitions, starts_after(ends), task.name, task.physics, origin, None, Disturbance())
     if dataset.disturbance.velocities != "differences":
         return planted
-    differences = Disturbance(hidden_velocities=True, velocities="differences")
-    return replace(disturb(planted, differences, task, of_noise), disturbance=Disturbance(velocities="differences"))
+    # Of a robot of one's own velocities were put in behind its signals; the others show them by themselves.
+    shown, hidden = (task, True) if task.source is None else (hide_velocities(task), False)
+    if not hidden:
+        seen = slice(shown.observation_size)
+        cut = replace(
+            transitions,
+            observation=transitions.observation[:, seen],
+            next_observation=transitions.next_observation[:, seen],
+        )
+        planted = replace(planted, transitions=cut)
+    asked = Disturbance(hidden_velocities=hidden, velocities="differences")
+    return replace(disturb(planted, asked, shown, of_noise), disturbance=Disturbance(velocities="differences"))
 
 
 def selftest(

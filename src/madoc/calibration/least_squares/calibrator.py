@@ -152,7 +152,7 @@ class LeastSquares:
                 *identifiability(found, space.names),
                 *at_end_of_range(unit, space.names),
                 *exploded(failures, self.control_steps(state)),
-                *_said_of_ending(search),
+                *_said_of_ending(search, state.phase),
                 *self._said_of_states(problem, state),
             ),
             covariance=covariance,
@@ -254,7 +254,7 @@ class LeastSquares:
     def _said_of_states(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
         """That states were estimated, and why, where the data has chosen so."""
         estimated = state.estimated
-        if state.phase != "estimated" or estimated is None or self.initial_states is not None:
+        if estimated is None or not estimated.control_steps or self.initial_states is not None:
             return ()
         noise = problem.dataset.disturbance.noise
         if problem.simulator.task.state_from_observation is None:
@@ -269,21 +269,24 @@ class LeastSquares:
         if estimated.refining:
             found = f"; the noise it finds is {100.0 * float(np.median(estimated.deviation)):.2g} % of a step's change"
         told = f"initial states of windows were estimated with the parameters, as {why}{found}"
-        if not estimated.refining or float(estimated.deviation.max()) < EXACT:
+        if not (estimated.refining and estimated.epochs) or float(estimated.deviation.max()) < EXACT:
             return (told,)
         left_out = len(estimated.rows) - estimated.explained
         windows = (
             f"{left_out} of {len(estimated.rows)} windows count for nothing: no initial state found explains them as "
-            "well as others, as where contacts begin"
+            "well as others, as where contacts begin, or their simulation failed"
         )
         tails = "residuals have longer tails than noise has: the intervals are too narrow"
         return (told, *([windows] if left_out else []), *([tails] if estimated.cost[0] > LONG_TAILS else []))
 
 
-def _said_of_ending(search: LoggedState | EstimatedState) -> tuple[str, ...]:
+def _said_of_ending(search: LoggedState | EstimatedState, phase: str) -> tuple[str, ...]:
     """That it did not come to an end, where it did not."""
-    ended = EstimatedStates.settled(search) if isinstance(search, EstimatedState) else LoggedStates.settled(search)
-    said = "the budget ended before the search had settled, and intervals do not count what is missing; take more"
+    if isinstance(search, EstimatedState):
+        ended = EstimatedStates.settled(search)
+    else:
+        ended = LoggedStates.settled(search) and phase in ("logged", "undecided")
+    said = "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"
     return () if ended else (said,)
 
 

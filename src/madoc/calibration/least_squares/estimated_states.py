@@ -21,7 +21,7 @@ from madoc.residuals.losses import (
     loss_slope,
     loss_value,
 )
-from madoc.residuals.uncertainty import SETTLED, at_least_noise, bread, directions, jackknife_meat, leverage, sandwich
+from madoc.residuals.uncertainty import SETTLED, at_least_noise, bread, jackknife_meat, least_share, sandwich
 from madoc.types import Metrics
 
 TRIALS = (1e-2, 1.0, 1e2)
@@ -43,10 +43,8 @@ FAILED_WINDOW = 1e6
 """Cost of a window that failed, in squared deviations of the noise; a state holds no infinity."""
 LIKE_NOISE = 1.5
 """Cost of a window that noise alone leaves now and then; it leaves 0.8 on average under Cauchy's loss."""
-OUTWEIGHS = 1.0 / 3.0
-"""Leverage of a window, or ..."""
-FEW = 6.0
-"""... so many times the mean one, from which its slopes are taken for differences across a contact."""
+TOLD = 0.02
+"""Share of what windows tell of a direction that is enough to do without the rest."""
 _SMALLEST = 1e-100
 """Keeps a move over a tolerance of 0 finite."""
 
@@ -61,14 +59,14 @@ class EstimatedState:
         states: Initial state of every window there.
         damping: λ of the parameters' step.
         state_damping: λ of every window's.
-        cost: Mean squared residual, in typical changes, and in deviations of the noise once refining; `ALL_FAILED`
-            before the first epoch.
+        cost: Mean loss of a residual, in squared typical changes, and in squared deviations of the noise once refining;
+            `ALL_FAILED` before the first epoch.
         moved: The largest move of the last step over what is worth one; below 1 the search has settled.
         rows: Where the windows begin.
         deviation: Noise of each channel, in its typical changes.
         bread: Of the best search, where it last linearised.
         meat: The same.
-        explained: How many windows they are of.
+        explained: How many windows they are of: those that are trusted.
         refining: 0 while searching on few windows, 1 on all.
         epochs: Done in this stage.
         control_steps: Simulated.
@@ -167,8 +165,8 @@ class EstimatedStates:
                 state.state_damping[index, :windows] * factor, *STATE_DAMPING_RANGE
             )
             # Searches are compared by what they leave; once one is left, it is measured in deviations of the noise.
-            unit_of_cost = 1.0 if state.refining else float(plan.deviation[0]) ** 2
-            new["cost"][index], new["moved"][index] = move.cost * unit_of_cost, move.moved
+            new["cost"][index] = move.cost if state.refining else _left(move.cost, plan)
+            new["moved"][index] = move.moved
         leader = int(np.argmin(new["cost"][:running]))
         following = replace(
             state,
@@ -195,7 +193,7 @@ class EstimatedStates:
     @staticmethod
     def settled(state: EstimatedState) -> bool:
         """Whether the next step would change nothing worth a simulation; not where every window fails."""
-        moves = float(state.moved[0]) >= 1.0 or float(state.cost[0]) >= FAILED_WINDOW
+        moves = not float(state.moved[0]) < 1.0 or float(state.cost[0]) >= FAILED_WINDOW
         return bool(state.refining) and state.epochs > STATES_FIRST and not moves
 
     def window_count(self, state: EstimatedState) -> int:
@@ -208,7 +206,7 @@ class EstimatedStates:
         return searching * self.search_epochs + refining * refining_epochs
 
     def _epoch_steps(self, problem: CalibrationProblem, state: EstimatedState) -> int:
-        """Control steps of an epoch of the stage: central differences by parameters and states, and the steps tried."""
+        """Control steps of an epoch of the stage: differences by parameters and states, and the steps tried."""
         running, parameters = 1 if state.refining else self.searches, state.unit.shape[1]
         columns = 1 + 2 * parameters + problem.physical_size + len(FOLLOWED) * (len(TRIALS) + 1)
         return running * self.window_count(state) * columns * self.horizon
@@ -267,18 +265,19 @@ class EstimatedStates:
         """Which step of the parameters helps most, each window's state following as far as fits it best."""
         costs = self._costs(residuals)
         if plan.kept.any():
-            before = self._costs(plan.residuals)[plan.kept]
-            change = costs.min(1)[:, plan.kept] - before
+            before, after = self._costs(plan.residuals)[plan.kept], costs.min(1)[:, plan.kept]
             robust = self.loss != "linear"
-            totals = before.mean() + (clipped_mean(change, plan.activity[plan.kept]) if robust else change.mean(-1))
+            change = clipped_change(before, after, plan.activity[plan.kept]) if robust else after - before
+            totals = before.mean() + change.mean(-1)
         else:
             before, totals = np.array([FAILED_WINDOW]), costs.min(1).mean(-1)
         trial = len(TRIALS) if waiting else int(np.argmin(totals))
-        better = trial < len(TRIALS)
+        better = bool(totals[trial] < totals[-1])
+        trial = trial if better else len(TRIALS)
         saved = 1.0 - float(totals[trial]) / max(float(before.mean()), _SMALLEST)
-        # That no step helps says that the end is near only where even steps too short to cross a contact do not help.
-        tried = np.abs(plan.steps[trial if better else len(TRIALS) - 1 if plan.damping > STUCK else 0])
-        error = np.sqrt(np.diag(sandwich(plan.bread, plan.meat).covariance))
+        # A short step that helps, or none, says that the end is near only where no longer one is tried any more.
+        tried = np.abs(plan.steps[0 if plan.damping <= STUCK else min(trial, len(TRIALS) - 1)])
+        error = np.sqrt(np.maximum(np.diag(sandwich(plan.bread, plan.meat).covariance), 0.0))
         worthwhile = np.maximum(2.0 * max(self.tolerance, _SMALLEST), SETTLED * error)
         exact = float(plan.deviation.max()) < ROUNDING
         return _Move(
@@ -290,11 +289,10 @@ class EstimatedStates:
         )
 
     def _trusted(self, slopes: WindowSlopes, activity: Float[np.ndarray, " windows"]) -> Bool[np.ndarray, " windows"]:
-        """Windows that an initial state explains and that do not outweigh the others; all if these tell of less.
+        """Windows that an initial state explains; all of them if the others tell of a direction hardly anything.
 
-        At contacts a search for an initial state ends in a wrong one now and then, and differences taken across one
-        are no slopes. Such a window pulls the parameters anywhere. One is explained if its cost is like most others'
-        or near that of noise.
+        At contacts a search for an initial state ends in a wrong one now and then. Such a window pulls the parameters
+        anywhere. One is explained if its cost is like most others' or near that of noise.
         """
         whole = slopes.whole
         if self.loss == "linear" or not whole.any():
@@ -302,10 +300,9 @@ class EstimatedStates:
         costs = self._costs(slopes.residuals)
         middle, reach = unlike(costs[whole], activity[whole])
         kept = whole & (costs <= np.maximum(middle + reach, LIKE_NOISE))
-        least = np.full(len(whole), STATE_DAMPING_RANGE[0])
-        reduced = eliminate(slopes, np.ones_like(slopes.residuals), least).reduced
-        kept &= leverage(reduced.where(kept)) <= max(OUTWEIGHS, FEW * reduced.jacobian.shape[-1] / kept.sum())
-        return kept if directions(reduced.of(kept)) == directions(reduced.of(whole)) else whole
+        weights = loss_slope((slopes.residuals / TUNING[self.loss]) ** 2, self.loss)
+        reduced = eliminate(slopes, weights, np.full(len(whole), STATE_DAMPING_RANGE[0])).reduced
+        return kept if least_share(reduced.of(kept), reduced.of(whole)) > TOLD else whole
 
     def _costs(self, residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray, "*windows"]:
         """Mean loss of each window."""
@@ -342,16 +339,25 @@ class _Move:
     moved: float
 
 
-def clipped_mean(
-    change: Float[np.ndarray, "trials windows"], activity: Float[np.ndarray, " windows"]
-) -> Float[np.ndarray, " trials"]:
-    """Mean change of the windows' costs; one that becomes worse, `unlike` the others, counts as the worst that is like.
+def clipped_change(
+    before: Float[np.ndarray, " windows"],
+    after: Float[np.ndarray, "trials windows"],
+    activity: Float[np.ndarray, " windows"],
+) -> Float[np.ndarray, "trials windows"]:
+    """Change of the windows' costs; one that becomes worse, `unlike` the others, counts as the worst that is like.
 
     A window that a step takes across a contact becomes much worse until its state has followed, in later epochs; it
-    alone does not forbid a step that helps the others.
+    alone does not forbid a step that helps the others. One whose simulation fails does.
     """
+    change = after - before
     middle, reach = unlike(change, activity)
-    return np.minimum(change, np.maximum(middle + reach, 0.0)).mean(-1)
+    return np.where(after < FAILED_WINDOW, np.minimum(change, np.maximum(middle + reach, LIKE_NOISE)), change)
+
+
+def _left(cost: float, plan: _Plan) -> float:
+    """What a search leaves, in typical changes; a window that failed counts as a whole one."""
+    failed = 1.0 - float(plan.kept.mean())
+    return ALL_FAILED if failed == 1.0 else cost * float(plan.deviation[0]) ** 2 + failed
 
 
 def _deviation(
