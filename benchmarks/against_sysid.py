@@ -1,10 +1,11 @@
 """Least squares beside MuJoCo's own system identification, `mujoco.sysid`, on the same planted problems.
 
-    python benchmarks/against_sysid.py                              # 3 robots in 2 situations, one JSON file each
+    python benchmarks/against_sysid.py                              # 2 robots in 2 situations, one JSON file each
 
 Both get the logs, the ranges and the middle of them to start from; files already there are skipped. `mujoco.sysid` has
 its default optimizer, residuals and intervals, and runs both whole and in stretches; counted is what leaves the smaller
-residual, and only the seconds that this took.
+residual, and only the seconds that this took. The hopper is left to `--robots hopper`: four minutes of core time,
+both tools together, had not brought its first problem to an end when it was stopped.
 """
 
 import argparse
@@ -41,7 +42,7 @@ ROUNDING = 1.0 - 1e-12
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--robots", nargs="+", default=list(TRUTHS), choices=list(TRUTHS))
+    parser.add_argument("--robots", nargs="+", default=["pendulum", "arm"], choices=list(TRUTHS))
     parser.add_argument("--situations", nargs="+", default=["exact", "noise"], choices=["exact", "noise"])
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
