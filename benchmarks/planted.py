@@ -22,7 +22,7 @@ import yaml
 
 from calibration import commit
 from madoc import robots
-from madoc.pipeline import CalibrationOrder, Source, calibrate_auto_in, calibrate_in
+from madoc.pipeline import AUTO_BUDGET, CalibrationOrder, Source, calibrate_auto_in, calibrate_in
 
 RESULTS = Path(__file__).parent / "results" / "planted"
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -78,7 +78,7 @@ def main() -> None:
     parser.add_argument("--situations", nargs="+", default=list(SITUATIONS), choices=SITUATIONS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--coverage", type=int, default=0, help="problems on the pendulum; the table is then left out")
-    parser.add_argument("--budget", type=int, default=300_000)
+    parser.add_argument("--budget", type=int, default=AUTO_BUDGET, help="control steps of a calibration")
     arguments = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     if arguments.coverage:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from layouts import make_dataset
 
-from madoc.data.windows import apart, first_rows, readings_at, windows_at
+from madoc.data.windows import apart, evenly, first_rows, readings_at, rows_that_fit, windows_at
 from madoc.errors import MadocError
 
 
@@ -31,6 +31,7 @@ def test_episodes_that_are_too_short_are_refused(hopper):
     dataset = make_dataset(hopper, lengths=(3, 4), falls=())
     with pytest.raises(MadocError, match=r"no stretch of 5 rows .* whose longest episode has 4 rows"):
         first_rows(dataset, np.arange(7), 5)
+    assert not len(rows_that_fit(dataset, np.arange(7), 5))
 
 
 def test_windows_apart_share_no_reading(hopper):
@@ -47,3 +48,8 @@ def test_readings_include_the_first(hopper):
     assert found.shape == (2, 3, 11)
     np.testing.assert_array_equal(found[:, 0], dataset.transitions.observation[[0, 4]])
     np.testing.assert_array_equal(found[1, 1:], dataset.transitions.next_observation[4:6])
+
+
+def test_windows_are_spread_evenly():
+    assert evenly(np.arange(10), 4).tolist() == [0, 3, 6, 9]
+    assert evenly(np.arange(3), 4).tolist() == [0, 1, 2]

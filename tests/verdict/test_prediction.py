@@ -8,7 +8,7 @@ from planted import ROBOTS, log_of
 from madoc import simulation
 from madoc.data import Disturbance, disturb
 from madoc.data.dataset import Dataset
-from madoc.verdict.prediction import evenly, nearby_best, replays_of
+from madoc.verdict.prediction import nearby_best, replays_of
 
 TASK, TRUTH = ROBOTS["spring"]
 SIMULATOR = simulation.make(TASK, threads=1)
@@ -40,11 +40,6 @@ def test_horizons_that_no_episode_lasts_are_left_out():
     single = disturb(short, Disturbance(shuffled="rows"), TASK, jax.random.key(0))
     assert replays_of(single, SIMULATOR, SCALE).horizons == (1,)
     assert isinstance(short, Dataset)
-
-
-def test_windows_are_spread_evenly():
-    assert evenly(np.arange(10), 4).tolist() == [0, 3, 6, 9]
-    assert evenly(np.arange(3), 4).tolist() == [0, 1, 2]
 
 
 def test_nearby_the_truth_is_found():

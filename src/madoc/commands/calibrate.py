@@ -35,8 +35,8 @@ class Calibrate:
     """Where rollouts start: free running from resets, short ones from logged states, or one step of the log."""
     set: Settings = ()
     """Hyperparameters of the method as name=value; of a method that auto tries as madoc.name=value."""
-    budget: int = 300_000
-    """Simulated control steps."""
+    budget: int | None = None
+    """Simulated control steps. Default: 600000 for auto, which tries several methods with them, else 300000."""
     seed: int = 0
     """Of all randomness."""
     truth: Path | None = None
@@ -49,7 +49,7 @@ class Calibrate:
 
     def run(self) -> Answer:
         """Calibrate, and leave the run folder."""
-        from madoc.pipeline import AUTO, calibrate_auto_in, calibrate_in, leave_report, split_name
+        from madoc.pipeline import AUTO, AUTO_BUDGET, BUDGET, calibrate_auto_in, calibrate_in, leave_report, split_name
         from madoc.pipeline.data_stage import read_truth
         from madoc.robots import is_spec_path
 
@@ -60,7 +60,7 @@ class Calibrate:
             self.task,
             method=method,
             changes=changes_of(self.set, self.starts),
-            budget=self.budget,
+            budget=self.budget if self.budget is not None else AUTO_BUDGET if method == AUTO else BUDGET,
             seed=self.seed,
             truth=None if self.truth is None else read_truth(self.truth),
             holdout=self.holdout,

@@ -46,8 +46,7 @@ def first_rows(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -
     Raises:
         MadocError: No episode is long enough.
     """
-    episode = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
-    found = np.flatnonzero(rows + steps <= dataset.episode_ends[episode])
+    found = rows_that_fit(dataset, rows, steps)
     if not len(found):
         longest = int((dataset.episode_ends - dataset.episode_starts).max())
         raise MadocError(
@@ -55,6 +54,12 @@ def first_rows(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -
             f"episode has {longest} rows; take a horizon of 1, or data with its rows in order"
         )
     return found
+
+
+def rows_that_fit(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Int[np.ndarray, " windows"]:
+    """As `first_rows`; none where no episode is long enough."""
+    episode = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
+    return np.flatnonzero(rows + steps <= dataset.episode_ends[episode])
 
 
 def windows_at(
@@ -100,3 +105,10 @@ def readings_at(
     first = np.asarray(logged.observation)[rows]
     following = np.asarray(logged.next_observation)[rows[:, None] + np.arange(steps)]
     return np.concatenate([first[:, None], following], axis=1)
+
+
+def evenly(positions: Int[np.ndarray, " positions"], count: int) -> Int[np.ndarray, " chosen"]:
+    """At most `count` of them, spread evenly."""
+    if len(positions) <= count:
+        return positions
+    return positions[np.linspace(0, len(positions) - 1, count).round().astype(np.int64)]

@@ -1,7 +1,7 @@
 """The stages of the main job with their files, and `run_all`, which does them one after another."""
 
-from madoc.pipeline.auto_stage import AUTO, calibrate_auto_in
-from madoc.pipeline.calibration_stage import HOLDOUT, CalibrationOrder, calibrate_in, read_calibration
+from madoc.pipeline.auto_stage import AUTO, AUTO_BUDGET, calibrate_auto_in
+from madoc.pipeline.calibration_stage import BUDGET, HOLDOUT, CalibrationOrder, calibrate_in, read_calibration
 from madoc.pipeline.data_stage import Source, fingerprint, load_source, record_named, split_name
 from madoc.pipeline.evaluation_stage import evaluate_folder
 from madoc.pipeline.export_stage import export_run
@@ -12,6 +12,8 @@ from madoc.pipeline.whole import Plan, run_all
 
 __all__ = [
     "AUTO",
+    "AUTO_BUDGET",
+    "BUDGET",
     "HOLDOUT",
     "CalibrationOrder",
     "Plan",

@@ -35,25 +35,25 @@ class Candidate:
 
     Attributes:
         name: In `CALIBRATORS`.
-        share: Of the budget that is left, as against the shares of those after it; what it leaves is theirs.
+        most: Share of the budget that it may have; what it leaves is there for those after it, up to their own.
         hidden: Hyperparameters that differ where the log does not tell where rollouts may start.
     """
 
     name: str
-    share: int
+    most: float
     hidden: Mapping[str, Any] = field(default_factory=dict)
 
 
-CANDIDATES = (Candidate("least-squares", share=2), Candidate("madoc", share=1, hidden={"starts": "policy"}))
+CANDIDATES = (Candidate("least-squares", most=2 / 3), Candidate("madoc", most=1 / 2, hidden={"starts": "policy"}))
 """In the order they are tried: seconds before minutes."""
+AUTO_BUDGET = 600_000
+"""Control steps of all candidates together, unless told otherwise; the last has what it has alone."""
 
 
 def calibrate_auto_in(
     out: Path, order: CalibrationOrder, *, resume: bool = False, quiet: bool = True
 ) -> CalibrationResult:
     """Try the candidates within the budget, each in a folder of its own, and keep what predicts the hold-out best.
-
-    What is left of the budget is shared by a candidate and those after it: least squares only settles or does not.
 
     The first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and so does a
     verdict on the data itself. Killed at any moment and resumed, the result has the same bits but for its seconds.
@@ -78,14 +78,14 @@ def calibrate_auto_in(
         folder.result.unlink(missing_ok=True)
         rows: list[dict[str, Any]] = []
         tried: list[tuple[CalibrationResult, Assessment]] = []
-        for name, method in methods.items():
+        for candidate in CANDIDATES:
+            name, method = candidate.name, methods[candidate.name]
             spent = sum(result.control_steps for result, _ in tried)
             why_not = _why_not(tried, order.budget - spent) or _refusal(method, prepared, order)
             if why_not:
                 rows.append({"method": name, "not_run": why_not})
                 continue
-            shares = [candidate.share for candidate in CANDIDATES[len(rows) :]]  # its own, and of those that may follow
-            budget = max(1, (order.budget - spent) * shares[0] // sum(shares))
+            budget = max(1, min(round(candidate.most * order.budget), order.budget - spent))
             part = replace(order, method=name, changes={}, budget=budget)
             place = out / name
             result, assessment = calibrate_prepared(place, part, prepared, method, resume=holds_run(place), quiet=quiet)

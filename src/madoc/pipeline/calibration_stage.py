@@ -30,6 +30,10 @@ HOLDOUT = 0.2
 """Share of the rows held out where nothing else is asked: as cross-validation in five folds."""
 
 
+BUDGET = 300_000
+"""Control steps of a calibration, unless told otherwise."""
+
+
 @dataclass(frozen=True)
 class CalibrationOrder:
     """What a calibration is asked.
@@ -55,7 +59,7 @@ class CalibrationOrder:
     parameters: tuple[str, ...] = ()
     method: str = "madoc"
     changes: Mapping[str, Any] = field(default_factory=dict)
-    budget: int = 300_000
+    budget: int = BUDGET
     seed: int = 0
     truth: Mapping[str, float] | None = None
     holdout: float | None = None

@@ -11,13 +11,14 @@ from sklearn.neighbors import NearestNeighbors
 from madoc.calibration.base import CalibrationProblem
 from madoc.data import logged_states
 from madoc.data.split import Split
+from madoc.data.windows import evenly
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
 from madoc.tasks import Task
 from madoc.verdict import noise as sensors
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
-from madoc.verdict.prediction import MOST_WINDOWS, Replays, evenly, replays_of
+from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import better_than_chance
 from madoc.verdict.two_sample import Told, WindowView, behaviour, rolled, tell_apart
 

@@ -7,10 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.data import logged_states
-from madoc.data.windows import Windows, first_rows, windows_at
+from madoc.data.windows import Windows, evenly, first_rows, windows_at
 from madoc.files import replacing
 from madoc.verdict.bench import Bench, signal_names
-from madoc.verdict.prediction import evenly
 
 TRACES = 6
 """Stretches to draw."""

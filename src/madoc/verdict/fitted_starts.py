@@ -12,9 +12,10 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.readings import Readings
+from madoc.data.windows import evenly, rows_that_fit
 from madoc.residuals.linearisation import DIFFERENCE
 from madoc.simulation.base import Simulator
-from madoc.verdict.prediction import FEWEST_WINDOWS, WORST, evenly, window_starts
+from madoc.verdict.prediction import FEWEST_WINDOWS, WORST
 
 FITTED = 10
 """Control steps whose readings tell the start."""
@@ -135,7 +136,7 @@ def fitted_replays_of(held: CalibrationProblem, scale: Float[np.ndarray, " chann
     """Windows spread evenly over the rows held out; None where too few are long enough."""
     near, rows = held.approximate_states
     steps = FITTED + AHEAD[-1]
-    possible = window_starts(held.dataset, rows, steps)
+    possible = rows_that_fit(held.dataset, rows, steps)
     if len(possible) < FEWEST_WINDOWS:
         return None
     chosen = evenly(possible, MOST)

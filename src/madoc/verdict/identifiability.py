@@ -4,9 +4,10 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.data.windows import evenly
 from madoc.residuals.linearisation import DIFFERENCE, difference_points, linearise
 from madoc.residuals.uncertainty import BOX_VARIANCE
-from madoc.verdict.prediction import MOST_WINDOWS, evenly
+from madoc.verdict.prediction import MOST_WINDOWS
 
 WINDOW = 20
 """Control steps that are looked at together where velocities are hidden: they are told by what follows."""

@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.data import Dataset, logged_states
+from madoc.data.windows import evenly
 from madoc.simulation.base import Simulator
-from madoc.verdict.prediction import MOST_WINDOWS, Replays, evenly
+from madoc.verdict.prediction import MOST_WINDOWS, Replays
 
 PROBE = 1e-3
 """Of a step's typical change: how far an observation is moved to see how much of it is left after a step."""

@@ -7,8 +7,7 @@ from jaxtyping import Float, Int
 
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
 from madoc.data import Dataset, logged_states
-from madoc.data.windows import Windows, first_rows, windows_at
-from madoc.errors import MadocError
+from madoc.data.windows import Windows, evenly, rows_that_fit, windows_at
 from madoc.residuals.linearisation import difference_points, linearise
 from madoc.residuals.losses import scale_of
 from madoc.residuals.window_residuals import window_residuals
@@ -82,7 +81,7 @@ def replays_of(held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " o
         MadocError: No state of them can be rebuilt.
     """
     states, rows = logged_states(held, simulator.task)
-    starts = {horizon: window_starts(held, rows, horizon) for horizon in HORIZONS}
+    starts = {horizon: rows_that_fit(held, rows, horizon) for horizon in HORIZONS}
     enough = min(FEWEST_WINDOWS, len(starts[1]))
     horizons = tuple(horizon for horizon in HORIZONS if len(starts[horizon]) >= enough)
     chosen = evenly(starts[horizons[-1]], MOST_WINDOWS)
@@ -118,18 +117,3 @@ def nearby_best(replays: Replays, unit: Float[np.ndarray, " d"]) -> tuple[Float[
         if np.abs(step).max() < _STILL:
             break
     return np.array(found[-_KEPT:]).reshape(-1, len(unit)), spent
-
-
-def evenly(positions: Int[np.ndarray, " positions"], count: int) -> Int[np.ndarray, " chosen"]:
-    """At most `count` of them, spread evenly."""
-    if len(positions) <= count:
-        return positions
-    return positions[np.linspace(0, len(positions) - 1, count).round().astype(np.int64)]
-
-
-def window_starts(held: Dataset, rows: Int[np.ndarray, " states"], horizon: int) -> Int[np.ndarray, " windows"]:
-    """As `first_rows`; none where no stretch is long enough."""
-    try:
-        return first_rows(held, rows, horizon)
-    except MadocError:
-        return rows[:0]

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from madoc.data import Dataset
 from madoc.data.dataset import starts_after
+from madoc.data.windows import evenly
 from madoc.learning.cloning import clone
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.networks import adam
@@ -21,7 +22,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import begin, reset_states, roll
 from madoc.types import Transitions
-from madoc.verdict.prediction import Replays, evenly
+from madoc.verdict.prediction import Replays
 from madoc.verdict.statistics import area_under_curve, interval_of
 
 MOST_ROWS = 1000

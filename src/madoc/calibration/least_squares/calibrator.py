@@ -9,7 +9,8 @@ from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.cautions import at_end_of_range, exploded
-from madoc.calibration.least_squares.estimated_states import EstimatedState, EstimatedStates
+from madoc.calibration.least_squares.estimated_states import STATES_FIRST, EstimatedState, EstimatedStates
+from madoc.calibration.least_squares.lengthening import AS_WELL, HOPELESS, LENGTHS, begun, explain_as_well, lengthened
 from madoc.calibration.least_squares.logged_states import LoggedState, LoggedStates
 from madoc.calibration.least_squares.noise import consecutive_residuals, takes_turns
 from madoc.data import Dataset
@@ -40,14 +41,18 @@ class LeastSquaresState:
 
     Attributes:
         logged: The search from logged states; None where they cannot be rebuilt.
-        estimated: The search with estimated ones; None where it never comes to that.
+        estimated: Searches with estimated ones on longer and longer windows; none where it never comes to that.
+        length: Which of them is under way; their number once none has to be any more.
+        found: Which of them has the estimate.
         phase: `estimated` once the latter is under way; `starting` before it, where it is known to come; `undecided`
             where the data is yet to be asked; `logged` where it never comes.
         checking: Control steps spent on asking.
     """
 
     logged: LoggedState | None
-    estimated: EstimatedState | None
+    estimated: tuple[EstimatedState, ...]
+    length: int
+    found: int
     phase: str
     checking: int
 
@@ -59,14 +64,17 @@ class LeastSquares:
     Residuals are in units of each channel's typical change in one step. From `logged` initial states it is exact where
     they are clean and complete, and biased by noise in them, as it takes them for true. With `estimated` ones each
     window's initial state is an unknown besides the parameters, the first reading is a reading like the others, and
-    channels weigh by the noise that the fit finds in them. By default states are estimated where they cannot be
-    rebuilt, where the data is known to be noisy, and where residuals of consecutive rows speak of noise: a reading that
-    is too high makes the step to it look too long and the step from it too short.
+    channels weigh by the noise that the fit finds in them. Once nothing moves, windows become three times as long, and
+    again, for as long as they are explained as well: where a robot moves smoothly, long windows say more. By default
+    states are estimated where they cannot be rebuilt, where the data is known to be noisy, and where residuals of
+    consecutive rows speak of noise: a reading that is too high makes the step to it look too long and the step from it
+    too short.
 
     Attributes:
         initial_states: `logged`, `estimated`, or None for the data to choose.
         horizon: Control steps of a window; the observation after every one of them counts. None takes 1 from logged
-            states; with estimated ones as many as it takes the robot to move from one pose to another (`horizon_of`).
+            states; with estimated ones as many as it takes the robot to move from one pose to another (`horizon_of`),
+            then `LENGTHS` times as many.
         loss: `linear`, or a robust one (`huber`, `soft-l1`, `cauchy`) whose scale follows the residuals.
         windows: Windows, at most; all there are if fewer. None takes 1000 from logged states, 100 with estimated ones.
         searches: The first begins at mid-range, the others at random places. The best goes on.
@@ -110,7 +118,9 @@ class LeastSquares:
         phase = self._first_phase(problem)
         return LeastSquaresState(
             logged=None if phase == "estimated" else self._logged(problem).init(problem, key),
-            estimated=None if phase == "logged" else self._estimated(problem).init(problem, jax.random.fold_in(key, 1)),
+            estimated=() if phase == "logged" else self._searches(problem, jax.random.fold_in(key, 1)),
+            length=0,
+            found=0,
             phase=phase,
             checking=0,
         )
@@ -118,9 +128,9 @@ class LeastSquares:
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Metrics]:
         """One damped step of the search under way: two simulations, one of slopes, one of the steps tried."""
         if state.phase == "estimated":
-            assert state.estimated is not None
-            estimated, metrics = self._estimated(problem).step(problem, state.estimated)
-            return replace(state, estimated=estimated), metrics
+            under_way = min(state.length, len(state.estimated) - 1)
+            search, metrics = self._estimated(problem, under_way).step(problem, state.estimated[under_way])
+            return self._lengthen(_with(state, under_way, search)), metrics
         assert state.logged is not None
         logged, metrics = self._logged(problem).step(problem, state.logged)
         following = replace(state, logged=logged)
@@ -143,7 +153,7 @@ class LeastSquares:
         covariance = half[:, None] * found.covariance * half
         width = half * half_width(found.covariance, windows)
         interval = np.clip(np.stack([mean - width, mean + width], axis=-1), space.low[:, None], space.high[:, None])
-        failures = sum(part.failures for part in (state.logged, state.estimated) if part is not None)
+        failures = sum(part.failures for part in _parts(state))
         return Estimate(
             mean=mean,
             std=np.sqrt(np.diag(covariance)),
@@ -161,21 +171,21 @@ class LeastSquares:
 
     def control_steps(self, state: LeastSquaresState) -> int:
         """Simulated control steps so far."""
-        parts = (state.logged, state.estimated)
-        return state.checking + sum(part.control_steps for part in parts if part is not None)
+        return state.checking + sum(part.control_steps for part in _parts(state))
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:
         """About how many control steps a run from the beginning takes, as far as the data has chosen already."""
         steps = 0
         if state.logged is not None:
             steps += self._logged(problem).whole_run(state.logged, 0 if state.phase == "starting" else refining_epochs)
-        if state.estimated is not None and state.phase != "undecided":
-            steps += self._estimated(problem).whole_run(problem, state.estimated, refining_epochs)
+        if state.phase != "undecided":
+            for length, search in enumerate(state.estimated):
+                steps += self._estimated(problem, length).whole_run(problem, search, refining_epochs)
         return steps
 
     def stage(self, state: LeastSquaresState) -> str:
         """What the next epoch does."""
-        search = state.estimated if state.phase == "estimated" else state.logged
+        search = state.estimated[state.found] if state.phase == "estimated" else state.logged
         return "calibrating" if search is not None and search.refining else "searching"
 
     def progress(self, state: LeastSquaresState, budget: int) -> float:
@@ -185,8 +195,8 @@ class LeastSquares:
     def converged(self, state: LeastSquaresState) -> str | None:
         """A sentence once the steps are too small to matter."""
         search: LoggedState | EstimatedState | None = None
-        if state.phase == "estimated" and state.estimated is not None:
-            search = state.estimated if EstimatedStates.settled(state.estimated) else None
+        if state.phase == "estimated":
+            search = state.estimated[state.found] if state.length == len(state.estimated) else None
         elif state.phase == "logged" and state.logged is not None:
             search = state.logged if LoggedStates.settled(state.logged) else None
         if search is None:
@@ -217,10 +227,10 @@ class LeastSquares:
             tolerance=self.tolerance,
         )
 
-    def _estimated(self, problem: CalibrationProblem) -> EstimatedStates:
+    def _estimated(self, problem: CalibrationProblem, length: int = 0) -> EstimatedStates:
         """A search from logged states, where there was one, is where this one starts: it needs no others."""
         return EstimatedStates(
-            horizon=self.horizon or horizon_of(problem.dataset),
+            horizon=self.horizon or LENGTHS[length] * horizon_of(problem.dataset),
             loss=self.loss,
             windows=self.windows or WINDOWS["estimated"],
             searches=self.searches if self._first_phase(problem) == "estimated" else 1,
@@ -229,12 +239,39 @@ class LeastSquares:
             tolerance=self.tolerance,
         )
 
+    def _searches(self, problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[EstimatedState, ...]:
+        """All lengths of windows that the data has room for; one where the length is given."""
+        searches = [self._estimated(problem).init(problem, key)]
+        for length in range(1, len(LENGTHS) if self.horizon is None else 1):
+            longer = lengthened(problem, searches[-1], self._estimated(problem, length).horizon, LENGTHS[length])
+            if longer is None:
+                break
+            searches.append(longer)
+        return tuple(searches)
+
+    def _lengthen(self, state: LeastSquaresState) -> LeastSquaresState:
+        """On to longer windows once nothing moves, while those explain the readings as well as shorter ones do."""
+        searches, length, last = state.estimated, state.length, len(state.estimated)
+        if length == last:
+            return state
+        search, ended = searches[length], replace(state, length=last)
+        settled = EstimatedStates.settled(search)
+        if length and not explain_as_well(search, searches[state.found], AS_WELL if settled else HOPELESS):
+            return ended
+        if not settled:
+            return ended if length and search.epochs >= STATES_FIRST + self.search_epochs else state
+        following = replace(state, found=length, length=length + 1)
+        if length + 1 == last or float(search.deviation.max()) < EXACT:
+            return replace(following, length=last)
+        return _with(following, length + 1, begun(searches[length + 1], search))
+
     def _search(
         self, problem: CalibrationProblem, state: LeastSquaresState
     ) -> tuple[LoggedState | EstimatedState, int]:
         """The search that has the estimate, and its windows; one with estimated states has it once it has begun."""
-        estimated, logged = state.estimated, state.logged
-        if estimated is not None and (logged is None or estimated.control_steps):
+        logged = state.logged
+        if state.estimated and (logged is None or state.estimated[0].control_steps):
+            estimated = state.estimated[state.found]
             return estimated, estimated.explained
         assert logged is not None
         return logged, self._logged(problem).window_count(logged)
@@ -253,9 +290,9 @@ class LeastSquares:
 
     def _said_of_states(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
         """That states were estimated, and why, where the data has chosen so."""
-        estimated = state.estimated
-        if estimated is None or not estimated.control_steps or self.initial_states is not None:
+        if not state.estimated or not state.estimated[0].control_steps or self.initial_states is not None:
             return ()
+        estimated = state.estimated[state.found]
         noise = problem.dataset.disturbance.noise
         if problem.simulator.task.state_from_observation is None:
             why = "states cannot be rebuilt from the data"
@@ -306,7 +343,16 @@ def horizon_of(dataset: Dataset) -> int:
 
 def _go_on(state: LeastSquaresState) -> LeastSquaresState:
     """With estimated states from where the best search stands."""
-    logged, estimated = state.logged, state.estimated
-    assert logged is not None
-    assert estimated is not None
-    return replace(state, phase="estimated", estimated=replace(estimated, unit=logged.unit[:1].copy()))
+    assert state.logged is not None
+    first = replace(state.estimated[0], unit=state.logged.unit[:1].copy())
+    return replace(_with(state, 0, first), phase="estimated")
+
+
+def _with(state: LeastSquaresState, length: int, search: EstimatedState) -> LeastSquaresState:
+    """The state with the search of this length in its place."""
+    return replace(state, estimated=(*state.estimated[:length], search, *state.estimated[length + 1 :]))
+
+
+def _parts(state: LeastSquaresState) -> tuple[LoggedState | EstimatedState, ...]:
+    """Every search there is."""
+    return (*(() if state.logged is None else (state.logged,)), *state.estimated)
