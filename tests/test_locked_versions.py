@@ -1,0 +1,26 @@
+"""The versions written down install on every Python that the package allows."""
+
+from importlib.metadata import distributions
+from pathlib import Path
+
+from packaging.specifiers import SpecifierSet
+
+LOCK = Path(__file__).parents[1] / "requirements.lock"
+OLDEST = "3.11.0"
+
+
+def locked():
+    """Name and version of every line."""
+    return [line.split("==") for line in LOCK.read_text().splitlines()]
+
+
+def test_locked_packages_take_the_oldest_python():
+    names = {name for name, _ in locked()}
+    needs = {found.name: found.metadata["Requires-Python"] or "" for found in distributions() if found.name in names}
+    assert needs
+    assert [name for name, wanted in needs.items() if OLDEST not in SpecifierSet(wanted)] == []
+
+
+def test_the_lock_names_versions_and_no_address():
+    assert all(len(parts) == 2 and all(parts) for parts in locked())
+    assert not any(mark in LOCK.read_text() for mark in "/@:")
