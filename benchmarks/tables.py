@@ -47,7 +47,18 @@ PAPER_RETURN = {
 
 def main() -> None:
     parts = ["# Measured\n\nMade by `python benchmarks/tables.py` from the files beside it.\n"]
-    parts += [calibration(), disturbed(), policies(), planted(), sysid(), pendulum(), fuzz(), speed(), not_run()]
+    parts += [
+        calibration(),
+        groups(),
+        disturbed(),
+        policies(),
+        planted(),
+        sysid(),
+        pendulum(),
+        fuzz(),
+        speed(),
+        not_run(),
+    ]
     text = "\n".join(part for part in parts if part)
     (RESULTS / "README.md").write_text(text)
     print(text)
@@ -90,6 +101,29 @@ def calibration() -> str:
             f"| {robot} | {quality} | {method} | {starts} | {steps:,} | {len(rows)} | {shown(errors)} "
             f"| {percent:.2f} | {paper} | {seconds:.0f} | {commits} |"
         )
+    return "\n".join(lines) + "\n"
+
+
+def groups() -> str:
+    """Error of groups and of one agent where the reward is ours and where it is the paper's."""
+    cells = defaultdict(lambda: defaultdict(list))
+    for path in sorted((RESULTS / "groups").glob("*.json")):
+        row = json.loads(path.read_text())
+        cells[row["robot"], row["reward"], row["budget"]][row["method"]].append(row)
+    if not cells:
+        return ""
+    lines = [
+        "## Groups or one agent\n\n`python benchmarks/groups.py`. Free running starts; all settings the default but "
+        "for the reward. Mean absolute error, median (lowest to highest) over seeds.\n",
+        "| robot | reward | control steps | seeds | groups (madoc) | one agent (madoc-s) | commit |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for (robot, reward, budget), rows in sorted(cells.items()):
+        errors = [shown([row["error"]["mean_absolute"] for row in rows[name]]) for name in ("madoc", "madoc-s")]
+        both = rows["madoc"] + rows["madoc-s"]
+        commits = ", ".join(sorted({row["commit"] for row in both}))
+        seeds = len({row["seed"] for row in both})
+        lines.append(f"| {robot} | {reward} | {budget:,} | {seeds} | {errors[0]} | {errors[1]} | {commits} |")
     return "\n".join(lines) + "\n"
 
 
