@@ -179,10 +179,11 @@ class EstimatedStates:
             control_steps=state.control_steps + self._epoch_steps(problem, state),
             failures=state.failures + sum(int((~around.whole).sum()) for around in slopes),
         )
+        noise = float(np.median(plans[leader].deviation))
         metrics = {
-            "residual": float(np.sqrt(new["cost"][leader])),
+            "residual": float(np.sqrt(new["cost"][leader])) * (noise if state.refining else 1.0),
             "moved": float(new["moved"][leader]),
-            "noise": float(np.median(plans[leader].deviation)),
+            "noise": noise,
         }
         if not state.refining and (new["moved"][leader] < 1.0 or following.epochs >= self.search_epochs):
             order = np.argsort(np.arange(self.searches) != leader, kind="stable")
