@@ -23,6 +23,7 @@ import yaml
 from calibration import commit
 from madoc import robots
 from madoc.pipeline import AUTO_BUDGET, CalibrationOrder, Source, calibrate_auto_in, calibrate_in
+from madoc.pipeline.auto_stage import CANDIDATES
 
 RESULTS = Path(__file__).parent / "results" / "planted"
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -82,7 +83,7 @@ def main() -> None:
     arguments = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     if arguments.coverage:
-        cover(arguments.coverage, arguments.budget)
+        cover(arguments.coverage, round(CANDIDATES[0].most * arguments.budget))
         return
     for robot in arguments.robots:
         for situation in arguments.situations:
@@ -130,7 +131,10 @@ def planted(folder: Path, robot: str, situation: str, seed: int, budget: int) ->
 
 
 def cover(problems: int, budget: int) -> None:
-    """How often 95 % intervals cover the truth: a new truth, new commands and new noise each time; least squares."""
+    """How often 95 % intervals cover the truth: a new truth, new commands and new noise each time.
+
+    Least squares, with what it may have of the budget under auto.
+    """
     path = RESULTS / f"pendulum-coverage-{problems}.json"
     rows = json.loads(path.read_text())["rows"] if path.exists() else []
     machine = base("pendulum")
@@ -146,13 +150,13 @@ def cover(problems: int, budget: int) -> None:
             spec = str(folder / "known.yaml")
             order = CalibrationOrder(spec, source, method="least-squares", budget=budget, seed=problem)
             result = calibrate_in(folder / "run", order).to_json()
-        rows.append({"status": result["status"], "parameters": compared(result, truth)})
+        rows.append({"status": result["status"], "commit": commit(), "parameters": compared(result, truth)})
         covered = [row["covered"] for said in rows for row in said["parameters"].values()]
         summary = {
             "covered": sum(covered) / len(covered),
             "problems": len(rows),
             "noise": NOISE,
-            "commit": commit(),
+            "commit": ", ".join(sorted({said["commit"] for said in rows})),
         }
         path.write_text(json.dumps(summary | {"rows": rows}, indent=1))
         print(problem, f"{100 * summary['covered']:.1f} % of {len(covered)} intervals cover", flush=True)

@@ -119,7 +119,8 @@ def groups() -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for (robot, reward, budget), rows in sorted(cells.items()):
-        errors = [shown([row["error"]["mean_absolute"] for row in rows[name]]) for name in ("madoc", "madoc-s")]
+        found = [[row["error"]["mean_absolute"] for row in rows[name]] for name in ("madoc", "madoc-s")]
+        errors = [shown(each) if each else "" for each in found]
         both = rows["madoc"] + rows["madoc-s"]
         commits = ", ".join(sorted({row["commit"] for row in both}))
         seeds = len({row["seed"] for row in both})

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from madoc.calibration.least_squares.estimated_states import FAILED_WINDOW, clipped_change
-from madoc.calibration.least_squares.noise import channel_deviation, takes_turns, unlike
+from madoc.calibration.least_squares.noise import channel_deviation, echo, takes_turns, unlike
 
 
 def test_deviation_is_the_median_over_what_the_states_left():
@@ -72,3 +72,12 @@ def test_costs_never_fall_below_nothing():
 def test_where_most_windows_rest_the_others_are_not_done_without():
     change = clipped_change(np.ones(5), np.array([[1.0, 1.0, 1.0, 2.0, 2.0]]), np.array([1.0, 1.0, 1.0, 1.0, 1.0]))
     np.testing.assert_allclose(change, [[0.0, 0.0, 0.0, 1.0, 1.0]])
+
+
+def test_what_is_left_of_consecutive_readings_is_correlated_where_it_is_not_noise():
+    # One window, two channels: products 2 and -1 + -1 over squares 3 and 3.
+    residuals = np.array([[[1.0, 1.0], [1.0, -1.0], [1.0, 1.0]]])
+    assert echo(residuals) == pytest.approx(2.0 / 3.0)
+    assert echo(residuals[..., 1:]) == pytest.approx(-2.0 / 3.0)
+    assert echo(0.1 * residuals) == pytest.approx(0.02 / 3.0)  # less than the noise says nothing
+    assert echo(100.0 * residuals) == pytest.approx(2.0 / 3.0)  # 3 deviations at most

@@ -9,9 +9,9 @@ import pytest
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares
 from madoc.calibration.least_squares.calibrator import horizon_of
-from madoc.calibration.least_squares.estimated_states import EstimatedStates
-from madoc.calibration.least_squares.lengthening import begun, explain_as_well, lengthened
-from madoc.checkpoint import difference, layout
+from madoc.calibration.least_squares.estimated_states import STATES_FIRST, EstimatedStates
+from madoc.calibration.least_squares.lengthening import begun, hopeless, lengthened, noise_alone, says_more
+from madoc.checkpoint import difference, layout, load, save
 from madoc.data import Disturbance, disturb
 from own_robots import PENDULUM_SPEC, write_robot
 from robots import PENDULUM, recorded
@@ -72,14 +72,32 @@ def test_too_few_longer_windows_are_none(pendulum):
     assert lengthened(problem, shorter, 10_000, 3) is None
 
 
-def test_longer_windows_explain_as_well_if_no_channel_is_noisier(pendulum):
+def test_longer_windows_may_leave_as_much_noise_as_the_first_and_no_echo(pendulum):
     shorter, longer = searches_of(problem_of(pendulum))
-    shorter = replace(shorter, deviation=np.array([1.0, 2.0]), explained=len(shorter.rows))
-    longer = replace(longer, deviation=np.array([1.1, 2.3]), explained=len(longer.rows))
-    assert explain_as_well(longer, shorter)
-    assert not explain_as_well(replace(longer, deviation=np.array([1.0, 2.5])), shorter)
-    assert explain_as_well(replace(longer, deviation=np.array([1.0, 2.5])), shorter, 2.0)
-    assert not explain_as_well(replace(longer, explained=len(longer.rows) // 2), shorter)
+    shorter = replace(shorter, deviation=np.array([1.0, 2.0]))
+    longer = replace(longer, deviation=np.array([1.1, 2.3]), explained=25)
+    assert noise_alone(longer, shorter, 16)
+    assert not noise_alone(replace(longer, deviation=np.array([1.0, 2.5])), shorter, 16)
+    # Of 25 windows of 16 readings white noise seems correlated by 1 / 20, three times that by chance alone.
+    assert noise_alone(replace(longer, echo=0.149), shorter, 16)
+    assert not noise_alone(replace(longer, echo=0.151), shorter, 16)
+
+
+def test_a_search_is_hopeless_from_its_second_step_on(pendulum):
+    shorter, longer = searches_of(problem_of(pendulum))
+    loud = replace(longer, deviation=2.1 * shorter.deviation)
+    assert not hopeless(replace(loud, epochs=STATES_FIRST + 1), shorter)
+    assert hopeless(replace(loud, epochs=STATES_FIRST + 2), shorter)
+    assert not hopeless(replace(longer, deviation=1.9 * shorter.deviation, epochs=STATES_FIRST + 2), shorter)
+
+
+def test_longer_windows_say_more_if_intervals_are_narrower_and_as_many_are_explained(pendulum):
+    shorter, longer = searches_of(problem_of(pendulum))
+    shorter = replace(shorter, bread=np.eye(3), meat=np.eye(3), explained=len(shorter.rows))
+    longer = replace(longer, bread=4.0 * np.eye(3), meat=4.0 * np.eye(3), explained=len(longer.rows))
+    assert says_more(longer, shorter)
+    assert not says_more(replace(longer, bread=np.eye(3), meat=4.0 * np.eye(3)), shorter)
+    assert not says_more(replace(longer, explained=12), replace(shorter, explained=0))
 
 
 def test_where_motion_is_smooth_they_make_noise_matter_less(pendulum):
@@ -94,17 +112,35 @@ def test_where_motion_is_smooth_they_make_noise_matter_less(pendulum):
         widths.append(interval[:, 1] - interval[:, 0])
     assert state.found == len(state.estimated) - 1 > 0
     assert (widths[1] < 0.5 * widths[0]).all()
-    # A killed run begins with what `init` makes: the layout has to stay.
-    assert difference(layout(state), layout(method.init(problem, jax.random.key(0)))) is None
+
+
+def test_a_run_killed_on_longer_windows_goes_on_with_the_same_bits(pendulum, tmp_path):
+    problem, method = problem_of(pendulum), LeastSquares()
+    state = method.init(problem, jax.random.key(0))
+    while state.length == 0 or not state.estimated[1].control_steps:
+        state, _ = method.step(problem, state)
+    save(tmp_path / "checkpoint.npz", state, {})
+    again, _ = load(tmp_path / "checkpoint.npz", method.init(problem, jax.random.key(0)))
+    (state, _), (again, _) = (method.step(problem, each) for each in (state, again))
+    jax.tree.map(np.testing.assert_array_equal, state, again)
+
+
+def test_longer_windows_cost_what_they_are_forecast_to(pendulum):
+    problem = problem_of(pendulum)
+    state = ended(LeastSquares(), problem)
+    forecast = LeastSquares().whole_run(problem, LeastSquares().init(problem, jax.random.key(0)), refining_epochs=6)
+    assert 0.5 < LeastSquares().control_steps(state) / forecast < 1.5
 
 
 def test_what_the_model_does_wrong_ends_them(pendulum, tmp_path):
     machine = tmp_path / "machine"
     machine.mkdir()
-    rough = PENDULUM.replace('damping="0.1"', 'damping="0.1" frictionloss="0.5"')
+    rough = PENDULUM.replace('damping="0.1"', 'damping="0.1" frictionloss="0.02"')
     assert rough != PENDULUM
-    of_machine = problem_of(robots.load(write_robot(machine, PENDULUM_SPEC, pendulum=rough)).task, noise=0.0)
+    of_machine = problem_of(robots.load(write_robot(machine, PENDULUM_SPEC, pendulum=rough)).task, noise=0.1)
     problem = CalibrationProblem(of_machine.dataset, simulation.make(pendulum, threads=1))
     state = ended(LeastSquares(), problem)
     assert state.found == 0
-    assert state.estimated[1].epochs > 0
+    assert state.estimated[1].control_steps > 0
+    warnings = LeastSquares().estimate(problem, state).warnings
+    assert any("the simulator leaves more than noise" in warning for warning in warnings)

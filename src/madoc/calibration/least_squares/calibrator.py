@@ -10,7 +10,15 @@ from jaxtyping import PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.cautions import at_end_of_range, exploded
 from madoc.calibration.least_squares.estimated_states import STATES_FIRST, EstimatedState, EstimatedStates
-from madoc.calibration.least_squares.lengthening import AS_WELL, HOPELESS, LENGTHS, begun, explain_as_well, lengthened
+from madoc.calibration.least_squares.lengthening import (
+    LENGTHS,
+    READINGS,
+    begun,
+    hopeless,
+    lengthened,
+    noise_alone,
+    says_more,
+)
 from madoc.calibration.least_squares.logged_states import LoggedState, LoggedStates
 from madoc.calibration.least_squares.noise import consecutive_residuals, takes_turns
 from madoc.data import Dataset
@@ -65,7 +73,8 @@ class LeastSquares:
     they are clean and complete, and biased by noise in them, as it takes them for true. With `estimated` ones each
     window's initial state is an unknown besides the parameters, the first reading is a reading like the others, and
     channels weigh by the noise that the fit finds in them. Once nothing moves, windows become three times as long, and
-    again, for as long as they are explained as well: where a robot moves smoothly, long windows say more. By default
+    again, for as long as they say more and leave noise alone: where a robot moves smoothly, long windows say more, and
+    what the model does wrong shows in them. By default
     states are estimated where they cannot be rebuilt, where the data is known to be noisy, and where residuals of
     consecutive rows speak of noise: a reading that is too high makes the step to it look too long and the step from it
     too short.
@@ -74,7 +83,7 @@ class LeastSquares:
         initial_states: `logged`, `estimated`, or None for the data to choose.
         horizon: Control steps of a window; the observation after every one of them counts. None takes 1 from logged
             states; with estimated ones as many as it takes the robot to move from one pose to another (`horizon_of`),
-            then `LENGTHS` times as many.
+            then 3 and 9 times as many.
         loss: `linear`, or a robust one (`huber`, `soft-l1`, `cauchy`) whose scale follows the residuals.
         windows: Windows, at most; all there are if fewer. None takes 1000 from logged states, 100 with estimated ones.
         searches: The first begins at mid-range, the others at random places. The best goes on.
@@ -128,9 +137,9 @@ class LeastSquares:
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Metrics]:
         """One damped step of the search under way: two simulations, one of slopes, one of the steps tried."""
         if state.phase == "estimated":
-            under_way = min(state.length, len(state.estimated) - 1)
+            under_way = state.length if state.length < len(state.estimated) else state.found
             search, metrics = self._estimated(problem, under_way).step(problem, state.estimated[under_way])
-            return self._lengthen(_with(state, under_way, search)), metrics
+            return self._lengthen(problem, _with(state, under_way, search)), metrics
         assert state.logged is not None
         logged, metrics = self._logged(problem).step(problem, state.logged)
         following = replace(state, logged=logged)
@@ -201,7 +210,8 @@ class LeastSquares:
             search = state.logged if LoggedStates.settled(state.logged) else None
         if search is None:
             return None
-        return f"after {search.epochs} steps on all windows the next would change nothing worth a simulation"
+        steps = search.epochs - (STATES_FIRST if state.found else 0)
+        return f"after {steps} steps on all windows the next would change nothing worth a simulation"
 
     def _first_phase(self, problem: CalibrationProblem) -> str:
         """What the first epoch does: `logged`, `estimated`, `starting` from logged for estimated, or `undecided`."""
@@ -243,27 +253,39 @@ class LeastSquares:
         """All lengths of windows that the data has room for; one where the length is given."""
         searches = [self._estimated(problem).init(problem, key)]
         for length in range(1, len(LENGTHS) if self.horizon is None else 1):
-            longer = lengthened(problem, searches[-1], self._estimated(problem, length).horizon, LENGTHS[length])
+            most = READINGS * len(searches[0].rows) // LENGTHS[length]
+            longer = lengthened(problem, searches[-1], self._estimated(problem, length).horizon, most)
             if longer is None:
                 break
             searches.append(longer)
         return tuple(searches)
 
-    def _lengthen(self, state: LeastSquaresState) -> LeastSquaresState:
-        """On to longer windows once nothing moves, while those explain the readings as well as shorter ones do."""
+    def _lengthen(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
+        """On to longer windows once nothing moves, while those say more.
+
+        Back to the first if longer ones leave more than noise: what the model lacks moves the estimate by about as much
+        for all lengths, and wide intervals may count it.
+        """
         searches, length, last = state.estimated, state.length, len(state.estimated)
         if length == last:
             return state
         search, ended = searches[length], replace(state, length=last)
-        settled = EstimatedStates.settled(search)
-        if length and not explain_as_well(search, searches[state.found], AS_WELL if settled else HOPELESS):
+        if not EstimatedStates.settled(search):
+            lost = hopeless(search, searches[0]) or search.epochs >= STATES_FIRST + self.search_epochs
+            return ended if length and lost else state
+        if length and not self._noise_alone(problem, state, length):
+            return replace(ended, found=0)
+        if length and not says_more(search, searches[state.found]):
             return ended
-        if not settled:
-            return ended if length and search.epochs >= STATES_FIRST + self.search_epochs else state
         following = replace(state, found=length, length=length + 1)
         if length + 1 == last or float(search.deviation.max()) < EXACT:
             return replace(following, length=last)
         return _with(following, length + 1, begun(searches[length + 1], search))
+
+    def _noise_alone(self, problem: CalibrationProblem, state: LeastSquaresState, length: int) -> bool:
+        """Whether windows of this length leave what the first did."""
+        readings = self._estimated(problem, length).horizon + 1
+        return noise_alone(state.estimated[length], state.estimated[0], readings)
 
     def _search(
         self, problem: CalibrationProblem, state: LeastSquaresState
@@ -302,10 +324,10 @@ class LeastSquares:
             why = "the data is noisy"
         else:
             why = "residuals of consecutive rows speak of noise"
-        found = ""
+        horizon = self._estimated(problem, state.found).horizon
+        told = f"initial states of windows of {horizon} control steps were estimated with the parameters, as {why}"
         if estimated.refining:
-            found = f"; the noise it finds is {100.0 * float(np.median(estimated.deviation)):.2g} % of a step's change"
-        told = f"initial states of windows were estimated with the parameters, as {why}{found}"
+            told += f"; the noise it finds is {100.0 * float(np.median(estimated.deviation)):.2g} % of a step's change"
         if not (estimated.refining and estimated.epochs) or float(estimated.deviation.max()) < EXACT:
             return (told,)
         left_out = len(estimated.rows) - estimated.explained
@@ -314,7 +336,26 @@ class LeastSquares:
             "well as others, as where contacts begin, or their simulation failed"
         )
         tails = "residuals have longer tails than noise has: the intervals are too narrow"
-        return (told, *([windows] if left_out else []), *([tails] if estimated.cost[0] > LONG_TAILS else []))
+        return (
+            told,
+            *([windows] if left_out else []),
+            *([tails] if estimated.cost[0] > LONG_TAILS else []),
+            *self._said_of_longer_windows(problem, state),
+        )
+
+    def _said_of_longer_windows(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
+        """That they were not done with, or that they leave more than noise."""
+        length, last = state.length, len(state.estimated)
+        if 0 < length < last:
+            return ("longer windows were under way when it ended: a larger budget may narrow the intervals",)
+        for longer in range(state.found + 1, last):
+            if EstimatedStates.settled(state.estimated[longer]) and not self._noise_alone(problem, state, longer):
+                horizon = self._estimated(problem, longer).horizon
+                return (
+                    f"over {horizon} control steps the simulator leaves more than noise: something the model lacks, "
+                    "which intervals do not count",
+                )
+        return ()
 
 
 def _said_of_ending(search: LoggedState | EstimatedState, phase: str) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
 from madoc.calibration.least_squares.elimination import WindowSlopes, eliminate
-from madoc.calibration.least_squares.noise import channel_deviation, unlike
+from madoc.calibration.least_squares.noise import channel_deviation, echo, unlike
 from madoc.calibration.least_squares.readings import Readings, slopes_at
 from madoc.data.windows import apart
 from madoc.errors import MadocError
@@ -67,6 +67,7 @@ class EstimatedState:
         bread: Of the best search, where it last linearised.
         meat: The same.
         explained: How many windows they are of: those that are trusted.
+        echo: Correlation of what is left of consecutive readings of these.
         refining: 0 while searching on few windows, 1 on all.
         epochs: Done in this stage.
         control_steps: Simulated.
@@ -84,6 +85,7 @@ class EstimatedState:
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
     explained: int
+    echo: float
     refining: int
     epochs: int
     control_steps: int
@@ -134,6 +136,7 @@ class EstimatedStates:
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),
             explained=0,
+            echo=0.0,
             refining=0,
             epochs=0,
             control_steps=0,
@@ -175,6 +178,7 @@ class EstimatedStates:
             bread=plans[leader].bread,
             meat=plans[leader].meat,
             explained=int(plans[leader].kept.sum()),
+            echo=plans[leader].echo,
             epochs=state.epochs + 1,
             control_steps=state.control_steps + self._epoch_steps(problem, state),
             failures=state.failures + sum(int((~around.whole).sum()) for around in slopes),
@@ -202,9 +206,9 @@ class EstimatedStates:
         return len(state.rows) if state.refining else min(self.search_windows, len(state.rows))
 
     def whole_run(self, problem: CalibrationProblem, state: EstimatedState, refining_epochs: int) -> int:
-        """Control steps of a search as long as it may be, and so many epochs on all windows."""
+        """Control steps of a search as long as it may be, where it has yet to end, and of epochs on all windows."""
         searching, refining = (self._epoch_steps(problem, replace(state, refining=stage)) for stage in (0, 1))
-        return searching * self.search_epochs + refining * refining_epochs
+        return searching * self.search_epochs * (1 - state.refining) + refining * refining_epochs
 
     def _epoch_steps(self, problem: CalibrationProblem, state: EstimatedState) -> int:
         """Control steps of an epoch of the stage: differences by parameters and states, and the steps tried."""
@@ -252,6 +256,7 @@ class EstimatedStates:
             damping=damping,
             residuals=slopes.residuals,
             kept=kept,
+            echo=echo(slopes.residuals.reshape(len(kept), -1, channels)[kept]),
             deviation=deviation,
             steps=np.stack(steps),
             state_steps=np.stack([damped.states_step(step) for step in steps]),
@@ -321,6 +326,7 @@ class _Plan:
     damping: float
     residuals: Float[np.ndarray, "windows values"]
     kept: Bool[np.ndarray, " windows"]
+    echo: float
     deviation: Float[np.ndarray, " channels"]
     steps: Float[np.ndarray, "trials d"]
     state_steps: Float[np.ndarray, "trials windows state"]

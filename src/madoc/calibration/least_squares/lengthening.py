@@ -10,29 +10,33 @@ import numpy as np
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.estimated_states import STATES_FIRST, EstimatedState
 from madoc.data.windows import apart, evenly, rows_that_fit
+from madoc.residuals.uncertainty import half_width, sandwich
 
 LENGTHS = (1, 3, 9)
 """Windows' lengths, in those of the first."""
-ROWS = 200
-"""Of all windows of a length, in lengths of the first's: an epoch takes twice as long as one of 100 windows."""
+READINGS = 2
+"""Of all windows of a length, at most so many times the first's."""
 FEWEST = 10
 """Windows more than parameters that intervals are made of; where fewer fit they grow by Student's t."""
 AS_WELL = 1.2
-"""Times the noise that shorter windows find in a channel: what the model does wrong grows with a window's length."""
+"""Times the noise that the first windows find in a channel: what the model does wrong grows with a window's length."""
 HOPELESS = 2.0
-"""Times that noise while still searching."""
+"""Times that noise while still searching, from the second step on: the first begins at states that noise has moved."""
 LEFT_OUT = 0.1
 """Share of windows by which more may be left unexplained."""
+CHANCE = 3.0
+"""Standard deviations by which white noise may seem to be correlated."""
+_SMALLEST = 1e-100
 
 
-def lengthened(problem: CalibrationProblem, shorter: EstimatedState, horizon: int, times: int) -> EstimatedState | None:
+def lengthened(problem: CalibrationProblem, shorter: EstimatedState, horizon: int, most: int) -> EstimatedState | None:
     """A search yet to begin on windows of `horizon` rows that share no reading, at rows where shorter ones begin.
 
     Args:
         problem: Data and simulator.
         shorter: The search before it, as it was drawn.
         horizon: Control steps of a window.
-        times: How many times as long as the first's that is.
+        most: Windows, but for `FEWEST`.
 
     Returns:
         The search, its states at their first guess; None where too few windows fit.
@@ -41,7 +45,7 @@ def lengthened(problem: CalibrationProblem, shorter: EstimatedState, horizon: in
     rows, fewest = np.sort(shorter.rows), FEWEST + count
     if not len(rows_that_fit(problem.dataset, rows, horizon)):
         return None
-    chosen = rows[evenly(apart(problem.dataset, rows, horizon), max(ROWS // times, fewest))]
+    chosen = rows[evenly(apart(problem.dataset, rows, horizon), max(most, fewest))]
     if len(chosen) < fewest:
         return None
     known = np.searchsorted(rows, chosen)
@@ -50,7 +54,7 @@ def lengthened(problem: CalibrationProblem, shorter: EstimatedState, horizon: in
         unit=shorter.unit[:1],
         states=shorter.states[:1, np.argsort(shorter.rows)[known]],
         damping=shorter.damping[:1],
-        state_damping=shorter.state_damping[:1, known],
+        state_damping=shorter.state_damping[:1, : len(chosen)],
         cost=shorter.cost[:1],
         moved=shorter.moved[:1],
         rows=chosen,
@@ -62,15 +66,33 @@ def lengthened(problem: CalibrationProblem, shorter: EstimatedState, horizon: in
 def begun(longer: EstimatedState, shorter: EstimatedState) -> EstimatedState:
     """The longer search where the shorter one stands."""
     same = np.argsort(shorter.rows)[np.searchsorted(np.sort(shorter.rows), longer.rows)]
-    return replace(
-        longer, unit=shorter.unit[:1].copy(), states=shorter.states[:1, same].copy(), deviation=shorter.deviation
-    )
+    return replace(longer, unit=shorter.unit[:1].copy(), states=shorter.states[:1, same].copy())
 
 
-def explain_as_well(longer: EstimatedState, shorter: EstimatedState, times: float = AS_WELL) -> bool:
-    """Whether longer windows leave no more than so many times the noise of shorter ones in every channel.
+def hopeless(longer: EstimatedState, first: EstimatedState) -> bool:
+    """Whether a search that is under way leaves so much more noise than the first that it need not go on."""
+    told = longer.epochs >= STATES_FIRST + 2
+    return told and bool((longer.deviation > HOPELESS * first.deviation).any())
 
-    Nor more windows unexplained.
+
+def noise_alone(longer: EstimatedState, first: EstimatedState, readings: int) -> bool:
+    """Whether longer windows leave no more noise in any channel than the first did, and uncorrelated.
+
+    Args:
+        longer: A search that has settled.
+        first: That on the shortest windows.
+        readings: Of each of the longer windows.
     """
+    quiet = bool((longer.deviation <= AS_WELL * first.deviation).all())
+    return quiet and longer.echo <= CHANCE / np.sqrt(max(1, longer.explained * readings))
+
+
+def says_more(longer: EstimatedState, shorter: EstimatedState) -> bool:
+    """Whether longer windows are explained as often, and leave narrower intervals, on average over parameters."""
+    fewest = FEWEST + longer.unit.shape[1]
     explained, before = (search.explained / len(search.rows) for search in (longer, shorter))
-    return bool((longer.deviation <= times * shorter.deviation).all()) and explained >= before - LEFT_OUT
+    if longer.explained < fewest or explained < before - LEFT_OUT:
+        return False
+    widths = (half_width(sandwich(each.bread, each.meat).covariance, each.explained) for each in (longer, shorter))
+    now, then = (np.log(np.maximum(width, _SMALLEST)).mean() for width in widths)
+    return bool(now < then)

@@ -10,6 +10,8 @@ from madoc.residuals.window_residuals import window_residuals
 
 _NORMAL_MAD = 1.4826
 """Standard deviations in a median absolute deviation, for normal noise."""
+LOUDEST = 3.0
+"""Deviations of the noise that a residual counts as at most, where residuals are correlated."""
 UNLIKE = 5.0
 """Robust deviations from the middle; of normal values one in two million is farther."""
 _LEAST_SPARE = 0.05
@@ -85,6 +87,17 @@ def consecutive_residuals(
     whole = np.isfinite(residuals).all(-1).reshape(2, -1).all(0)
     before, after = residuals.reshape(2, len(first), -1)[:, whole]
     return (before, after), len(both)
+
+
+def echo(residuals: Float[np.ndarray, "windows readings channels"]) -> float:
+    """Correlation of a reading's residual with the next one's, of the channel that has most of it.
+
+    Noise has none, what a model does wrong has. Residuals are in deviations of the noise; of a channel that leaves less
+    than that nothing is said, and none counts more than `LOUDEST` deviations.
+    """
+    clipped = np.clip(residuals, -LOUDEST, LOUDEST)
+    power = np.maximum((clipped**2).sum((0, 1)), clipped[..., 0].size)
+    return float(((clipped[:, 1:] * clipped[:, :-1]).sum((0, 1)) / power).max())
 
 
 def takes_turns(before: Residuals, after: Residuals) -> float:
