@@ -45,7 +45,7 @@ def test_least_squares_is_near_on_noisy_states_and_says_that_they_are_noisy(robo
     assert any("observation noise of 1 %" in warning for warning in result.warnings)
 
 
-QUICK_OTED = Oted(hidden=(64, 64), cloning_epochs=20, average_rate=0.05)
+QUICK_OTED = Oted(draws=100, hidden=(64, 64), cloning_epochs=20, average_rate=0.05)
 
 
 @pytest.mark.slow
