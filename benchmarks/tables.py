@@ -136,11 +136,12 @@ def shown(errors: list[float]) -> str:
 
 def disturbed() -> str:
     """Median error of every method on every kind of data, or that it refuses."""
-    cells, methods = defaultdict(list), {}
+    cells, methods, robots = defaultdict(list), {}, set()
     for row in calibrations():
         cells[row["robot"], row["data"], row["budget"], label(row)].append(row)
         if row["data"] != "clean":
             methods[label(row)] = None
+            robots.add(row["robot"])
     if not methods:
         return ""
     lines = [
@@ -151,7 +152,7 @@ def disturbed() -> str:
     ]
     for robot, data, budget in sorted({cell[:3] for cell in cells}):
         columns = [cells.get((robot, data, budget, method), []) for method in methods]
-        if any(columns):
+        if robot in robots and any(columns):
             lines.append(f"| {robot} | {data} | {budget:,} | {' | '.join(map(_cell, columns))} |")
     return "\n".join(lines) + "\n"
 
