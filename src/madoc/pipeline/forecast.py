@@ -48,10 +48,10 @@ def forecast(problem: CalibrationProblem, *, budget: int) -> tuple[Forecast, ...
 
     Least squares takes one step of its search, Madoc two epochs, the first of which compiles.
     """
-    return (_least_squares(problem), _madoc(problem, budget))
+    return (_least_squares(problem, budget), _madoc(problem, budget))
 
 
-def _least_squares(problem: CalibrationProblem) -> Forecast:
+def _least_squares(problem: CalibrationProblem, budget: int) -> Forecast:
     method = LeastSquares()
     try:
         state = method.init(problem, jax.random.key(0))
@@ -60,7 +60,7 @@ def _least_squares(problem: CalibrationProblem) -> Forecast:
     started = time.monotonic()
     state, _ = method.step(problem, state)
     seconds = time.monotonic() - started
-    total = method.whole_run(problem, state, refining_epochs=REFINING_EPOCHS)
+    total = min(budget, method.whole_run(problem, state, refining_epochs=REFINING_EPOCHS))
     return Forecast(method.name, seconds / method.control_steps(state) * total, total)
 
 
