@@ -77,25 +77,27 @@ def bouncer(tmp_path):
 
 
 def covered(task, seed):
-    """Which intervals hold a truth drawn with the seed, recorded with noise of 5 % of a step's change."""
+    """Which intervals hold a drawn truth, under noise of 5 % of a step's change; and whether windows counted for nothing."""
     space = task.parameters
     truth = space.low + np.random.default_rng(seed).uniform(0.15, 0.85, len(space)) * (space.high - space.low)
     problem = problem_of(task, dict(zip(space.names, truth, strict=True)), rows=3000, noise=0.05, seed=seed)
     result = calibrate(LeastSquares(), problem, key=jax.random.key(seed), budget=1_000_000)
     assert result.status == "converged"
     assert off(result, task, dict(zip(space.names, truth, strict=True))).max() < 1.0
-    assert any("windows count for nothing" in warning for warning in result.warnings)
     spans = np.array([row.interval for row in result.parameters.values()])
-    return (spans[:, 0] <= truth) & (truth <= spans[:, 1])
+    left_out = any("windows count for nothing" in warning for warning in result.warnings)
+    return (spans[:, 0] <= truth) & (truth <= spans[:, 1]), left_out
 
 
 def test_noise_at_contacts_misleads_neither_estimates_nor_intervals(bouncer):
-    assert np.sum([covered(bouncer, seed) for seed in range(4)]) >= 11
+    held, left_out = zip(*(covered(bouncer, seed) for seed in range(4)), strict=True)
+    assert np.sum(held) >= 11
+    assert any(left_out)
 
 
 @pytest.mark.slow
 def test_intervals_cover_at_contacts(bouncer):
-    assert 0.9 < np.mean([covered(bouncer, seed) for seed in range(100, 140)]) < 0.995
+    assert 0.9 < np.mean([covered(bouncer, seed)[0] for seed in range(100, 140)]) < 0.995
 
 
 def test_a_search_that_the_budget_ends_says_so(arm):
