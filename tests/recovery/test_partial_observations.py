@@ -77,7 +77,7 @@ def bouncer(tmp_path):
 
 
 def covered(task, seed):
-    """Which intervals hold a drawn truth, under noise of 5 % of a step's change; and whether windows counted for nothing."""
+    """Which intervals hold a truth, under noise of 5 % of a change; and whether windows counted for nothing."""
     space = task.parameters
     truth = space.low + np.random.default_rng(seed).uniform(0.15, 0.85, len(space)) * (space.high - space.low)
     problem = problem_of(task, dict(zip(space.names, truth, strict=True)), rows=3000, noise=0.05, seed=seed)
