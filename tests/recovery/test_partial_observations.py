@@ -51,9 +51,7 @@ def test_least_squares_is_exact_on_exact_encoders(arm):
     result = calibrate(method, problem_of(arm, ARM, rows=1000), key=jax.random.key(0), budget=400_000)
     assert (off(result, arm, ARM) < EXACT).all(), off(result, arm, ARM)
     assert result.status == "converged"
-    assert result.warnings[0].startswith(
-        "initial states of windows were estimated with the parameters, as states cannot be rebuilt from the data"
-    )
+    assert "were estimated with the parameters, as states cannot be rebuilt from the data" in result.warnings[0]
 
 
 DELAYED = """\
