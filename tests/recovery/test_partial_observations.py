@@ -75,22 +75,23 @@ def bouncer(tmp_path):
 
 
 def covered(task, seed):
-    """Which intervals hold a truth, under noise of 5 % of a change; and whether windows counted for nothing."""
+    """Which intervals hold a truth, under noise of 5 % of a change; how far it is off, in %; if all windows counted."""
     space = task.parameters
     truth = space.low + np.random.default_rng(seed).uniform(0.15, 0.85, len(space)) * (space.high - space.low)
     problem = problem_of(task, dict(zip(space.names, truth, strict=True)), rows=3000, noise=0.05, seed=seed)
     result = calibrate(LeastSquares(), problem, key=jax.random.key(seed), budget=1_000_000)
     assert result.status == "converged"
-    assert off(result, task, dict(zip(space.names, truth, strict=True))).max() < 1.0
     spans = np.array([row.interval for row in result.parameters.values()])
     left_out = any("windows count for nothing" in warning for warning in result.warnings)
-    return (spans[:, 0] <= truth) & (truth <= spans[:, 1]), left_out
+    error = off(result, task, dict(zip(space.names, truth, strict=True)))
+    return (spans[:, 0] <= truth) & (truth <= spans[:, 1]), error, not left_out
 
 
 def test_noise_at_contacts_misleads_neither_estimates_nor_intervals(bouncer):
-    held, left_out = zip(*(covered(bouncer, seed) for seed in range(4)), strict=True)
+    held, error, all_counted = zip(*(covered(bouncer, seed) for seed in range(4)), strict=True)
     assert np.sum(held) >= 11
-    assert any(left_out)
+    assert np.max(error) < 1.0
+    assert not all(all_counted)
 
 
 @pytest.mark.slow
