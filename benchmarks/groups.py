@@ -56,6 +56,8 @@ def main() -> None:
             settings = {"starts": "policy", "agents": agents} | changes
             row = {"robot": robot, "reward": reward, "budget": arguments.budget, "seed": seed, "commit": revision}
             row |= run(method, settings, problem, dataset, seed, arguments.budget)
+            if row["status"] == "interrupted":
+                return
             path.write_text(json.dumps(row, indent=1) + "\n")
             print(path.name, row["error"]["mean_absolute"], f"{row['wall_seconds']:.0f} s", flush=True)
 

@@ -1,5 +1,6 @@
 """Robots of one's own that measure positions alone, and not exactly: states are estimated, or windows compared."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -51,7 +52,8 @@ def test_least_squares_is_exact_on_exact_encoders(arm):
     result = calibrate(method, problem_of(arm, ARM, rows=1000), key=jax.random.key(0), budget=400_000)
     assert (off(result, arm, ARM) < EXACT).all(), off(result, arm, ARM)
     assert result.status == "converged"
-    assert "were estimated with the parameters, as states cannot be rebuilt from the data" in result.warnings[0]
+    said = r"initial states of windows of \d+ control steps were estimated with the parameters, as states cannot be"
+    assert re.match(said + " rebuilt from the data", result.warnings[0])
 
 
 DELAYED = """\
@@ -75,23 +77,22 @@ def bouncer(tmp_path):
 
 
 def covered(task, seed):
-    """Which intervals hold a truth, under noise of 5 % of a change; how far it is off, in %; if all windows counted."""
+    """Which intervals hold a truth, under noise of 5 % of a change; and whether windows counted for nothing."""
     space = task.parameters
     truth = space.low + np.random.default_rng(seed).uniform(0.15, 0.85, len(space)) * (space.high - space.low)
     problem = problem_of(task, dict(zip(space.names, truth, strict=True)), rows=3000, noise=0.05, seed=seed)
     result = calibrate(LeastSquares(), problem, key=jax.random.key(seed), budget=1_000_000)
     assert result.status == "converged"
+    assert off(result, task, dict(zip(space.names, truth, strict=True))).max() < 1.0
     spans = np.array([row.interval for row in result.parameters.values()])
     left_out = any("windows count for nothing" in warning for warning in result.warnings)
-    error = off(result, task, dict(zip(space.names, truth, strict=True)))
-    return (spans[:, 0] <= truth) & (truth <= spans[:, 1]), error, not left_out
+    return (spans[:, 0] <= truth) & (truth <= spans[:, 1]), left_out
 
 
 def test_noise_at_contacts_misleads_neither_estimates_nor_intervals(bouncer):
-    held, error, all_counted = zip(*(covered(bouncer, seed) for seed in range(4)), strict=True)
+    held, left_out = zip(*(covered(bouncer, seed) for seed in range(4)), strict=True)
     assert np.sum(held) >= 11
-    assert np.max(error) < 1.0
-    assert not all(all_counted)
+    assert any(left_out)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
 from madoc.calibration.least_squares.elimination import WindowSlopes, eliminate
-from madoc.calibration.least_squares.noise import channel_deviation, echo, unlike
+from madoc.calibration.least_squares.noise import channel_deviation, echo, noise_ratio, unlike
 from madoc.calibration.least_squares.readings import Readings, slopes_at
 from madoc.data.windows import apart
 from madoc.errors import MadocError
@@ -250,7 +250,7 @@ class EstimatedStates:
         share = curvature_share(z[kept], self.loss)
         curved = share * bread(exact, 1.0, "linear")
         freedom = float(alike.spare[kept].sum()) - len(unit)
-        ratio = _noise_ratio(slopes.residuals[kept], weights[kept], share, freedom)
+        ratio = noise_ratio(slopes.residuals[kept], weights[kept], share, freedom)
         return _Plan(
             unit=unit,
             damping=damping,
@@ -373,18 +373,6 @@ def _deviation(
     """Each channel's noise in windows that are kept."""
     shape = (int(kept.sum()), slopes.residuals.shape[1] // channels, channels)
     return channel_deviation(slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape))
-
-
-def _noise_ratio(
-    residuals: Float[np.ndarray, "windows values"],
-    weights: Float[np.ndarray, "windows values"],
-    share: float,
-    freedom: float,
-) -> float:
-    """Variance of what a reading pulls with, ψ, over ψ', its mean curvature; 1 for squares of deviations."""
-    pull = ((weights * residuals) ** 2).sum() / max(1.0, freedom)
-    curvature = share * weights.sum() / max(1, weights.size)
-    return float(pull / max(curvature, _SMALLEST))
 
 
 def _tried(

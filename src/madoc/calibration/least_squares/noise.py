@@ -62,6 +62,18 @@ def unlike(
     return middle.reshape(shape), reach.reshape(shape)
 
 
+def noise_ratio(
+    residuals: Float[np.ndarray, "windows values"],
+    weights: Float[np.ndarray, "windows values"],
+    share: float,
+    freedom: float,
+) -> float:
+    """Variance of what a reading pulls with, ψ, over ψ', its mean curvature; 1 for squares of deviations."""
+    pull = ((weights * residuals) ** 2).sum() / max(1.0, freedom)
+    curvature = share * weights.sum() / max(1, weights.size)
+    return float(pull / max(curvature, _SMALLEST))
+
+
 Residuals = Float[np.ndarray, "pairs channels"]
 
 
