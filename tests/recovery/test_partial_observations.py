@@ -81,8 +81,8 @@ def covered(task, seed):
     space = task.parameters
     truth = space.low + np.random.default_rng(seed).uniform(0.15, 0.85, len(space)) * (space.high - space.low)
     problem = problem_of(task, dict(zip(space.names, truth, strict=True)), rows=3000, noise=0.05, seed=seed)
-    result = calibrate(LeastSquares(), problem, key=jax.random.key(seed), budget=1_000_000)
-    assert result.status == "converged"
+    result = calibrate(LeastSquares(), problem, key=jax.random.key(seed), budget=300_000)
+    assert not any("had not settled" in warning for warning in result.warnings)
     assert off(result, task, dict(zip(space.names, truth, strict=True))).max() < 1.0
     spans = np.array([row.interval for row in result.parameters.values()])
     left_out = any("windows count for nothing" in warning for warning in result.warnings)
