@@ -10,7 +10,8 @@ from scipy import stats
 
 from affine import affine
 from madoc.learning import replay, sac_losses
-from madoc.learning.actor_critic import ActorCritic, Descent, actor_step, soft_critic_step
+from madoc.learning.actor_critic import ActorCritic, Descent, actor_step, fresh, soft_critic_step
+from madoc.learning.features import Features
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.interaction import UniformPolicy
@@ -28,7 +29,7 @@ def column(numbers):
 
 
 def twins(first, second):
-    made = TwinCritic(2, (), key=jax.random.key(0))
+    made = TwinCritic(1, 1, (), key=jax.random.key(0))
     nets = tuple(affine([numbers[:2]], numbers[2:]) for numbers in (first, second))
     return eqx.tree_at(lambda twins: (twins.first, twins.second), made, nets)
 
@@ -55,6 +56,31 @@ def drawn(key, state):
     raw = MEAN_SLOPE * state + MEAN + noise
     action = np.tanh(raw)
     return noise, action, stats.norm.logpdf(noise, 0, STD) - np.log1p(-(action**2))
+
+
+def test_networks_see_the_data_standardised():
+    features = Features(*(jnp.asarray(part) for part in ([1.0, 2.0, 9.0], [0.999, 3.999, 9.0], [1.0, 1.0], 0.0, 1.0)))
+    key, rows, action = jax.random.key(3), jnp.array([[3.0, 6.0]]), jnp.array([[0.5]])
+    plain = fresh(2, 1, hidden=(4,), descent=PLAIN, key=key)
+    standardised = fresh(2, 1, hidden=(4,), descent=PLAIN, features=features, key=key)
+    seen = jnp.array([[2.0, 1.0]])  # (3 - 1) / (0.999 + 0.001), (6 - 2) / (3.999 + 0.001)
+    np.testing.assert_allclose(standardised.policy(rows), plain.policy(seen), rtol=1e-6)
+    for name in ("critic", "target_critic"):
+        found = getattr(standardised, name)(rows, action)
+        np.testing.assert_allclose(found, getattr(plain, name)(seen, action), rtol=1e-6)
+
+
+def test_how_observations_are_standardised_is_not_learnt():
+    features = Features(*(jnp.asarray(part) for part in ([1.0, 0.0], [2.0, 1.0], [1.0], 0.0, 1.0)))
+    learner = fresh(1, 1, hidden=(4,), descent=PLAIN, features=features, key=jax.random.key(3))
+    batch = {name: jnp.ones((2, 1)) for name in ("observation", "action", "next_observation")}
+    batch |= {"reward": jnp.ones(2), "terminated": jnp.zeros(2)}
+    following, _ = soft_critic_step(learner, batch, jax.random.key(0), PLAIN, discount=0.9)
+    following, _ = actor_step(following, batch["observation"], jax.random.key(1), PLAIN)
+    for name in ("policy", "critic", "target_critic"):
+        before, after = getattr(learner, name), getattr(following, name)
+        np.testing.assert_array_equal(before.offset, after.offset)
+        np.testing.assert_array_equal(before.scale, after.scale)
 
 
 def test_critic_update_by_hand(compiled):

@@ -14,7 +14,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy, log_density
 
 
 def twins(first, second):
-    made = TwinCritic(2, (), key=jax.random.key(0))
+    made = TwinCritic(1, 1, (), key=jax.random.key(0))
     return eqx.tree_at(lambda critic: (critic.first, critic.second), made, (first, second))
 
 

@@ -51,7 +51,7 @@ def test_loss_by_hand(compiled):
     # Q = s + 2a + 0.5 and -s + a + 3
     # logged (1, 0.5): 2.5, 2.5, target 2 -> 0.25 + 0.25; simulated (0, -1): -1.5, 2, target 0.5 -> 4 + 2.25, times 0.2
     # regulariser of one row: ω = 1, so Q simulated - Q logged: -4 and -0.5
-    made = TwinCritic(2, (), key=jax.random.key(0))
+    made = TwinCritic(1, 1, (), key=jax.random.key(0))
     nets = affine([[1, 2]], [0.5]), affine([[-1, 1]], [3])
     critic = eqx.tree_at(lambda parts: (parts.first, parts.second), made, nets)
     logged = column([1.0]), column([0.5]), jnp.array([2.0])

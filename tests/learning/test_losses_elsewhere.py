@@ -44,7 +44,7 @@ def rows(start, count, width):
 
 
 def twins(first, second):
-    made = TwinCritic(5, (4,), key=jax.random.key(0))
+    made = TwinCritic(3, 2, (4,), key=jax.random.key(0))
     return eqx.tree_at(lambda critic: (critic.first, critic.second), made, (net(first, 5, 1), net(second, 5, 1)))
 
 

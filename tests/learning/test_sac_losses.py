@@ -13,7 +13,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 
 def critic_of(first, second):
     """Twins of chosen affine maps of (s, a)."""
-    made = TwinCritic(len(first[0][0]), (), key=jax.random.key(0))
+    made = TwinCritic(len(first[0][0]) - 1, 1, (), key=jax.random.key(0))
     return eqx.tree_at(lambda twins: (twins.first, twins.second), made, (affine(*first), affine(*second)))
 
 
@@ -33,7 +33,7 @@ def test_twins_by_hand(compiled):
 
 
 def test_twins_start_different():
-    first, second = TwinCritic(2, (8,), key=jax.random.key(0))(jnp.ones((3, 1)), jnp.ones((3, 1)))
+    first, second = TwinCritic(1, 1, (8,), key=jax.random.key(0))(jnp.ones((3, 1)), jnp.ones((3, 1)))
     assert not np.allclose(first, second)
 
 

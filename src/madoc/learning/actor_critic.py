@@ -10,12 +10,17 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from madoc.learning import sac_losses
+from madoc.learning.features import Features
 from madoc.learning.networks import adam, descend, moving_average
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
 
 Batch = dict[str, Array]
 """Rows as `replay.sample` gives them: observation, action, reward, next_observation, terminated."""
+
+
+STILL = 1e-3
+"""Added to the spread of an observation, as TD3+BC does: what hardly moved in the data may move far in a simulator."""
 
 
 @jax.tree_util.register_dataclass
@@ -59,12 +64,28 @@ def fresh(
     hidden: tuple[int, ...],
     critic_hidden: tuple[int, ...] | None = None,
     descent: Descent,
+    features: Features | None = None,
     key: PRNGKeyArray,
 ) -> ActorCritic:
-    """New networks for so many observations and actions, temperature 1; `critic_hidden` None is `hidden`."""
+    """New networks, temperature 1.
+
+    Args:
+        observation: Values of an observation.
+        action: Values of an action.
+        hidden: Units per layer.
+        critic_hidden: Those of the critics; None is `hidden`.
+        descent: How they will change.
+        features: How the data's observations are standardised, as TD3+BC has it (Fujimoto & Gu 2021, section 5); None
+            where there is no data, and networks see observations as they are.
+        key: Of the weights.
+    """
     of_policy, of_critic = jax.random.split(key)
-    policy = TanhGaussianPolicy(observation, action, hidden, key=of_policy)
-    critic = TwinCritic(observation + action, hidden if critic_hidden is None else critic_hidden, key=of_critic)
+    seen = {}
+    if features is not None:
+        scale = features.pair_scale[:observation] + STILL
+        seen = {"offset": features.pair_offset[:observation], "scale": scale}
+    policy = TanhGaussianPolicy(observation, action, hidden, key=of_policy, **seen)
+    critic = TwinCritic(observation, action, critic_hidden or hidden, key=of_critic, **seen)
     log_temperature = jnp.zeros(())
     return ActorCritic(
         policy,

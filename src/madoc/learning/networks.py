@@ -45,6 +45,14 @@ class Network(eqx.Module):
         return rows
 
 
+def standardise(
+    rows: Float[Array, "*rows n"], offset: Float[Array, " n"], scale: Float[Array, " n"]
+) -> Float[Array, "*rows n"]:
+    """(rows - offset) / scale, of which neither is learnt."""
+    offset, scale = (jnp.broadcast_to(jax.lax.stop_gradient(part), rows.shape) for part in (offset, scale))
+    return (rows - offset) / scale
+
+
 def drop(rows: Float[Array, "*rows units"], rate: float, key: PRNGKeyArray) -> Float[Array, "*rows units"]:
     """Dropout. A unit is dropped by one random byte, so the rate is met to within 1/512; four come from one number."""
     bound = round(256 * rate)

@@ -5,26 +5,39 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from madoc.learning.networks import Network
+from madoc.learning.networks import Network, standardise
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
 
 
 class TwinCritic(eqx.Module):
-    """Two independent action values."""
+    """Two independent action values of standardised observations."""
 
     first: Network
     second: Network
+    offset: Float[Array, " observation"]
+    scale: Float[Array, " observation"]
 
-    def __init__(self, inputs: int, hidden: tuple[int, ...], *, key: PRNGKeyArray) -> None:
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        hidden: tuple[int, ...],
+        *,
+        key: PRNGKeyArray,
+        offset: Array | None = None,
+        scale: Array | None = None,
+    ) -> None:
         first, second = jax.random.split(key)
-        self.first = Network(inputs, 1, hidden, key=first)
-        self.second = Network(inputs, 1, hidden, key=second)
+        self.first = Network(observation_size + action_size, 1, hidden, key=first)
+        self.second = Network(observation_size + action_size, 1, hidden, key=second)
+        self.offset = jnp.zeros(observation_size) if offset is None else offset
+        self.scale = jnp.ones(observation_size) if scale is None else scale
 
     def __call__(
         self, observation: Float[Array, "rows observation"], action: Float[Array, "rows action"]
     ) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
         """Both values of every row."""
-        pair = jnp.concatenate([observation, action], axis=-1)
+        pair = jnp.concatenate([standardise(observation, self.offset, self.scale), action], axis=-1)
         return self.first(pair)[..., 0], self.second(pair)[..., 0]
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from madoc.learning.networks import Network
+from madoc.learning.networks import Network, standardise
 
 LOG_STD_RANGE = (-5.0, 2.0)
 _EDGE = 1.0 - 1e-5
@@ -50,8 +50,8 @@ class TanhGaussianPolicy(eqx.Module):
         hidden: tuple[int, ...],
         *,
         key: PRNGKeyArray,
-        offset: np.ndarray | None = None,
-        scale: np.ndarray | None = None,
+        offset: np.ndarray | Array | None = None,
+        scale: np.ndarray | Array | None = None,
     ) -> None:
         self.network = Network(observation_size, 2 * action_size, hidden, key=key)
         self.offset = jnp.zeros(observation_size) if offset is None else jnp.asarray(offset, jnp.float32)
@@ -61,10 +61,8 @@ class TanhGaussianPolicy(eqx.Module):
         self, observation: Float[Array, "*rows observation"]
     ) -> tuple[Float[Array, "*rows action"], Float[Array, "*rows action"]]:
         """Mean and log std before squashing."""
-        offset, scale = (
-            jnp.broadcast_to(jax.lax.stop_gradient(part), observation.shape) for part in (self.offset, self.scale)
-        )
-        mean, log_std = jnp.split(self.network((observation - offset) / scale), 2, axis=-1)
+        seen = standardise(observation, self.offset, self.scale)
+        mean, log_std = jnp.split(self.network(seen), 2, axis=-1)
         return mean, jnp.clip(log_std, *LOG_STD_RANGE)
 
     def __call__(

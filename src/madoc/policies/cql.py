@@ -30,7 +30,8 @@ class CQLState:
 class CQL:
     """CQL(H): SAC on logged rows, whose critics are held down where the data has no actions.
 
-    Without a Lagrange multiplier and without entropy in the backup, as the authors ran it on D4RL's locomotion.
+    Without a Lagrange multiplier and without entropy in the backup, as the authors ran it on D4RL's locomotion. Unlike
+    theirs, networks see standardised observations.
 
     Attributes:
         hidden: Units per layer of the policy.
@@ -103,6 +104,7 @@ class CQL:
             hidden=self.hidden,
             critic_hidden=self.critic_hidden,
             descent=self._descent,
+            features=problem.features,
             key=of_learner,
         )
         return CQLState(learner, key, 0)

@@ -46,8 +46,9 @@ class H2O:
     """Dynamics-aware hybrid offline-and-online learning: SAC on half logged, half simulated rows.
 
     Two discriminators tell logged from simulated transitions. Their ratio weighs the Bellman error of simulated rows,
-    and values are held down where simulated and real dynamics differ. Unlike the authors', the discriminators see
-    standardised (s, a) and s' - s, for which their input noise of 0.1 is a tenth of the spread.
+    and values are held down where simulated and real dynamics differ. Unlike the authors', policy and critics see
+    standardised observations, and the discriminators (s, a) and s' - s, for which their input noise of 0.1 is a tenth
+    of the spread.
 
     Attributes:
         hidden: Units per layer of policy, critics and discriminators.
@@ -122,7 +123,7 @@ class H2O:
         require_data(problem, self.name, rows=self.batch)
         of_learner, of_discriminators, of_start, key = jax.random.split(key, 4)
         sizes = problem.simulator.task.observation_size, problem.simulator.action_size
-        learner = fresh(*sizes, hidden=self.hidden, descent=self._descent, key=of_learner)
+        learner = fresh(*sizes, hidden=self.hidden, descent=self._descent, features=problem.features, key=of_learner)
         discriminators = Discriminators(
             *sizes, self.hidden, key=of_discriminators, bound=self.bound, pair_bound=self.bound, dropout=0.0
         )

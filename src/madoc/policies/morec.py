@@ -61,7 +61,7 @@ class MOREC:
     updates of the policy; those of models and discriminators come before it.
 
     The constants are the authors' where they gave them. They imagine 50 000 rows' rollouts every 1000 updates, on a
-    GPU; here a few transitions come with every update.
+    GPU; here a few transitions come with every update. Unlike theirs, policy and critics see standardised observations.
 
     Attributes:
         hidden: Units per layer of policy and critics.
@@ -183,7 +183,7 @@ class MOREC:
             adam(self.model_learning_rate).init(eqx.filter(ensemble, eqx.is_array)),
             jnp.arange(self.elites),
             adversary,
-            fresh(*sizes, hidden=self.hidden, descent=self._descent, key=keys[2]),
+            fresh(*sizes, hidden=self.hidden, descent=self._descent, features=problem.features, key=keys[2]),
             replay.empty(self.replay_capacity, **columns, reward=(), terminated=()),
             fall_asleep(problem.logged["observation"], self.imagined_rows, keys[3]),
             keys[4],

@@ -57,7 +57,7 @@ class SAC:
         replay_capacity: Rows kept.
         cloning: None is SAC. A number w is SAC+BC: the actor minimises w / mean|Q| times SAC's loss plus the
             squared distance to the data's actions. The paper does not print its form; this weighting is
-            TD3+BC's (Fujimoto & Gu 2021), with its w = 2.5.
+            TD3+BC's (Fujimoto & Gu 2021), with its w = 2.5; and as there, networks see observations standardised.
         randomize: Draw every environment's parameters anew each epoch, uniformly over the simulator's whole box,
             whatever those of the problem: with `cloning`, the paper's baseline DR+BC.
         judge_every: Control steps of learning after which the policy acts whole episodes, without noise, in the
@@ -121,7 +121,8 @@ class SAC:
             require_data(problem, self.name, rows=self.batch, outcomes=False)
         of_learner, of_start, key = jax.random.split(key, 3)
         sizes = problem.simulator.task.observation_size, problem.simulator.action_size
-        learner = fresh(*sizes, hidden=self.hidden, descent=self._descent, key=of_learner)
+        features = problem.features if self.needs_data else None
+        learner = fresh(*sizes, hidden=self.hidden, descent=self._descent, features=features, key=of_learner)
         interaction = start_acting(
             self._place(problem), of_start, environments=self.environments, capacity=self.replay_capacity
         )
