@@ -97,6 +97,7 @@ def run(method, robot: str, at: str, arguments: argparse.Namespace, seed: int) -
     judged = {"key": jax.random.key(1000 + seed), "episodes": arguments.episodes}
     return evaluate(learnt.policy, simulator, truth, **judged).summary() | {
         "seconds": learnt.seconds,
+        "control_steps": learnt.control_steps,
         "status": learnt.status,
         "spent": learnt.spent,
     }

@@ -284,31 +284,38 @@ def fuzz() -> str:
     return f"## Fuzzing\n\n`python benchmarks/fuzz.py --minutes {told['minutes']:g}`: {counts} ({told['commit']}).\n"
 
 
+ROBOTS = ("hopper", "halfcheetah")
+SIMULATING = {"hopper": "hidden=[128,128] updates_per_step=1", "halfcheetah": "hidden=[128,128] updates_per_step=0.25"}
+OFFLINE = dict.fromkeys(ROBOTS, "")
 POLICIES = [
-    ("sac", ("calibrated", "truth", "midrange"), 300_000),
-    ("sac", ("uniform", "distribution"), 300_000),
-    ("sac-bc", ("calibrated",), 300_000),
-    ("dr-bc", ("uniform",), 300_000),
-    ("h2o", ("midrange",), 300_000),
-    ("bc", ("-",), 20_000),
-    ("cql", ("-",), 300_000),
-    ("morec", ("-",), 300_000),
+    ("sac", ("calibrated", "distribution", "uniform", "midrange", "truth"), (300_000, 300_000), SIMULATING),
+    ("sac-bc", ("calibrated",), (100_000, 300_000), SIMULATING),
+    ("dr-bc", ("uniform",), (100_000, 300_000), SIMULATING),
+    ("h2o", ("midrange",), (100_000, 300_000), SIMULATING),
+    ("bc", ("-",), (20_000, 20_000), OFFLINE),
+    ("cql", ("-",), (10_000, 10_000), dict.fromkeys(ROBOTS, "hidden=[128,128]")),
+    ("morec", ("-",), (20_000, 20_000), OFFLINE),
 ]
-"""Learners, where they learn, and the budget the table should hold."""
+"""Learners, where they learn, and the budget and settings on each robot that fit two cores; of 3 seeds."""
 
 
 def policies_not_run() -> list[str]:
-    """Of every learner, robot and place, the seeds that no settings have been run with."""
+    """Of every learner, robot and place, the seeds that the table should hold and does not."""
     rows = [json.loads(path.read_text()) for path in (RESULTS / "policies").glob("*.json")]
-    done = {(row["robot"], row["method"], row["at"], row["seed"]) for row in rows}
+    done = {(row["robot"], row["method"], row["at"], row["budget"], " ".join(row["set"]), row["seed"]) for row in rows}
     lines = []
-    for (method, places, budget), robot in product(POLICIES, ("hopper", "halfcheetah")):
+    for (method, places, budgets, settings), (index, robot) in product(POLICIES, enumerate(ROBOTS)):
+        budget, chosen = budgets[index], settings[robot]
         for at in places:
-            seeds = [str(seed) for seed in range(3) if (robot, method, at, seed) not in done]
-            where = "" if at == "-" else f" --at {at}"
+            seeds = [str(seed) for seed in range(3) if (robot, method, at, budget, chosen, seed) not in done]
+            words = [
+                *([f"--at {at}"] if at != "-" else []),
+                f"--budget {budget}",
+                *([f"--set {chosen}"] if chosen else []),
+            ]
             if seeds:
                 lines.append(
-                    f"- `python benchmarks/policies.py --robots {robot} --methods {method}{where} --budget {budget} "
+                    f"- `python benchmarks/policies.py --robots {robot} --methods {method} {' '.join(words)} "
                     f"--seeds {' '.join(seeds)}`"
                 )
     return lines
@@ -331,7 +338,7 @@ def not_run() -> str:
                     f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --starts {starts} "
                     f"--seeds {' '.join(map(str, seeds))}`"
                 )
-    for method, robot in product(CALIBRATORS, ("hopper", "halfcheetah")):
+    for method, robot in product(CALIBRATORS, ROBOTS):
         found = [row for row in calibrations() if (row.get("method"), row["robot"]) == (method, robot)]
         done = {row["seed"] for row in found if row["data"] == "clean"}
         seeds = [str(seed) for seed in range(3) if seed not in done]

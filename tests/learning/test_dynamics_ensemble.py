@@ -12,6 +12,7 @@ from madoc.learning.dynamics_ensemble import (
     likelihood_loss,
     training_rows,
     uncertainty_penalty,
+    weight_decay,
 )
 from madoc.learning.features import Features
 from madoc.learning.networks import adam
@@ -35,6 +36,14 @@ def test_loss_by_hand(compiled):
     pair, target = jnp.zeros((2, 3, 2)), jnp.zeros((2, 3, 2))
     wanted = (2.5 + 0.5) * np.exp(-0.5) + 1.0 + BOUNDS_WEIGHT * 120.0
     assert compiled(likelihood_loss)(ensemble, pair, target) == pytest.approx(wanted, rel=1e-5)
+
+
+def test_weight_decay_by_hand(compiled):
+    # 2 models of a first layer of 2 x 2 ones and a last of 4 x 2: half of 2.5e-5 · 4 + 1e-4 · 8, twice
+    made = Ensemble(1, 1, (2,), models=2, key=jax.random.key(0))
+    ones = [jnp.ones_like(layer.weight) for layer in made.networks.layers]
+    made = eqx.tree_at(lambda e: [layer.weight for layer in e.networks.layers], made, ones)
+    assert compiled(weight_decay)(made) == pytest.approx(9e-4)
 
 
 def test_variance_stays_within_its_bounds():

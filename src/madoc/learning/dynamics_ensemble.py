@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
@@ -11,6 +12,8 @@ from madoc.learning.networks import Network, descend, map_stack, scan_updates, s
 
 BOUNDS_WEIGHT = 0.01
 """How hard the learnt bounds of the variance are pulled together; the authors' (Chua et al., appendix A.1)."""
+DECAY = (2.5e-5, 1e-4)
+"""Of the first layer's weights and of the last's, as MOPO's code has them; evenly between."""
 
 
 class Ensemble(eqx.Module):
@@ -30,7 +33,11 @@ class Ensemble(eqx.Module):
         self, observation: int, action: int, hidden: tuple[int, ...], *, models: int, key: PRNGKeyArray
     ) -> None:
         outputs = observation + 1
-        self.networks = stack(models, lambda key: Network(observation + action, 2 * outputs, hidden, key=key), key)
+        self.networks = stack(
+            models,
+            lambda key: Network(observation + action, 2 * outputs, hidden, key=key, activation=jax.nn.silu),
+            key,
+        )
         self.largest, self.smallest = jnp.full(outputs, 0.5), jnp.full(outputs, -10.0)
 
     @property
@@ -75,6 +82,18 @@ def likelihood_loss(
     return error.mean((1, 2)).sum() + BOUNDS_WEIGHT * (ensemble.largest - ensemble.smallest).sum()
 
 
+def weight_decay(ensemble: Ensemble) -> Float[Array, ""]:
+    """Half the squared norm of every layer's weights, each layer's times its `DECAY`, summed over layers and models."""
+    weights = [layer.weight for layer in ensemble.networks.layers]
+    return sum(
+        (
+            0.5 * decay * (weight**2).sum()
+            for decay, weight in zip(np.linspace(*DECAY, len(weights)), weights, strict=True)
+        ),
+        start=jnp.zeros(()),
+    )
+
+
 def holdout_error(
     ensemble: Ensemble, pair: Float[Array, "rows pair"], target: Float[Array, "rows outputs"]
 ) -> Float[Array, " models"]:
@@ -111,8 +130,12 @@ def fit(
     def update(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, dict[str, Array]]:
         ensemble, optimiser_state = carry
         drawn = training_rows(jax.random.randint(key, (ensemble.count, batch), 0, size), holdout_every)
-        loss, gradients = eqx.filter_value_and_grad(likelihood_loss)(ensemble, rows[0][drawn], rows[1][drawn])
+        loss, gradients = eqx.filter_value_and_grad(_fitting_loss)(ensemble, rows[0][drawn], rows[1][drawn])
         return descend(optimiser, gradients, optimiser_state, ensemble), {"model_loss": loss}
 
     (ensemble, optimiser_state), metrics = scan_updates(update, (ensemble, optimiser_state), key, count)
     return ensemble, optimiser_state, metrics
+
+
+def _fitting_loss(ensemble: Ensemble, pair: Array, target: Array) -> Float[Array, ""]:
+    return likelihood_loss(ensemble, pair, target) + weight_decay(ensemble)

@@ -10,8 +10,8 @@ from madoc.learning.sac_losses import TwinCritic
 RATIO_RANGE = (1e-5, 1.0)
 """The authors' bounds of the dynamics ratio."""
 
-GAP_RANGE = (1e-6, 10.0)
-"""Bounds of the dynamics gap. The authors' lower one, 1e-45, is 0 in float32 on most machines, and log 0 no weight."""
+GAP_RANGE = (1e-30, 10.0)
+"""Bounds of the dynamics gap. The authors' lower one, 1e-45, is 0 in float32 on most machines, and has no logarithm."""
 
 
 def dynamics_ratio(log_ratio: Float[Array, " rows"]) -> Float[Array, " rows"]:
@@ -31,7 +31,7 @@ def dynamics_gap(
     """u(s, a) = KL(P_simulated || P_real), Eq. (7): the mean of -log ratio over s' drawn about the simulated one.
 
     A simulator that is deterministic has no distribution to draw from: like the authors' code, s' is blurred by
-    normal noise. Theirs is as wide as the data's states; `spread` is in units of a step's change.
+    normal noise. The paper's is as wide as the data's states; `spread` is in units of a step's change.
     """
     noise = spread * jax.random.normal(key, (samples, *following.shape))
     drawn = (jnp.broadcast_to(following, noise.shape) + noise).reshape(-1, following.shape[-1])
@@ -42,7 +42,7 @@ def dynamics_gap(
 
 def gap_weighted_value(value: Float[Array, " rows"], gap: Float[Array, " rows"]) -> Float[Array, ""]:
     """Log Σ ω exp Q over simulated rows, ω = u / Σ u: the closed form of Eq. (9), what H2O pushes down."""
-    return jax.nn.logsumexp(value + jnp.log(gap / gap.sum()))
+    return jax.nn.logsumexp(value + jnp.log(gap) - jnp.log(gap.sum()))
 
 
 def h2o_loss(

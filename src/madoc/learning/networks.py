@@ -14,13 +14,21 @@ Carry = TypeVar("Carry")
 
 
 class Network(eqx.Module):
-    """A ReLU multilayer perceptron on a batch, with optional dropout between layers."""
+    """A multilayer perceptron on a batch, with optional dropout between layers."""
 
     layers: list[eqx.nn.Linear]
     dropout: float = eqx.field(static=True)
+    activation: Callable[[Array], Array] = eqx.field(static=True)
 
     def __init__(
-        self, inputs: int, outputs: int, hidden: Sequence[int], *, key: PRNGKeyArray, dropout: float = 0.0
+        self,
+        inputs: int,
+        outputs: int,
+        hidden: Sequence[int],
+        *,
+        key: PRNGKeyArray,
+        dropout: float = 0.0,
+        activation: Callable[[Array], Array] = jax.nn.relu,
     ) -> None:
         sizes = (inputs, *hidden, outputs)
         keys = jax.random.split(key, len(sizes) - 1)
@@ -29,6 +37,7 @@ class Network(eqx.Module):
             for size, following, layer_key in zip(sizes[:-1], sizes[1:], keys, strict=True)
         ]
         self.dropout = dropout
+        self.activation = activation
 
     def __call__(
         self, rows: Float[Array, "*rows inputs"], key: PRNGKeyArray | None = None
@@ -39,7 +48,7 @@ class Network(eqx.Module):
             rows = rows @ layer.weight.T
             rows = rows + jnp.broadcast_to(layer.bias, rows.shape)
             if index + 1 < len(self.layers):
-                rows = jax.nn.relu(rows)
+                rows = self.activation(rows)
                 if self.dropout and key is not None:
                     rows = drop(rows, self.dropout, jax.random.fold_in(key, index))
         return rows

@@ -39,7 +39,8 @@ class CQL:
         weight: Of the regulariser; the authors' 5 (10 in older runs of theirs).
         samples: Actions drawn from each of three proposals: uniform, π(s), π(s').
         cloning_updates: In the first updates the policy clones instead of climbing values that mean nothing yet. The
-            authors' 40 000 are of 3 million updates; these of 300 000.
+            authors' 40 000 are of 3 million updates; these of 300 000, in which the temperature has not fallen yet:
+            their entropy term is left out here, it would pull the clone from the data.
         epoch_updates: Gradient updates per `step`. With the default networks one costs about as much as 20 of SAC's.
         batch: Rows per update.
         discount: γ.
@@ -134,8 +135,7 @@ class CQL:
             )
 
             def combine(policy: TanhGaussianPolicy, loss: Array, value: Array) -> Array:
-                # SAC's loss without its value is the entropy term alone.
-                return loss + value.mean() + cloning_loss(policy, observation, action) if clones else loss
+                return cloning_loss(policy, observation, action) if clones else loss
 
             learner, (loss, gap) = critic_step(
                 learner,

@@ -60,8 +60,10 @@ class MOREC:
     the one that past discriminators find most real is kept; if even that is not, the row ends. The budget counts
     updates of the policy; those of models and discriminators come before it.
 
-    The constants are the authors' where they gave them. They imagine 50 000 rows' rollouts every 1000 updates, on a
-    GPU; here a few transitions come with every update. Unlike theirs, policy and critics see standardised observations.
+    The constants are the authors' where they gave them. They imagine up to 200 transitions for every update, on a GPU;
+    here a tenth of that. They learn for 3 million updates, and scale each past discriminator's logits by the values,
+    unpublished, that it had for real and for generated transitions; here logits count as they are. Unlike theirs,
+    policy and critics see standardised observations.
 
     Attributes:
         hidden: Units per layer of policy and critics.
@@ -76,7 +78,8 @@ class MOREC:
         samples: Candidates from each elite.
         threshold: An imagined row whose best dynamics reward is below ends there.
         horizon: Longest imagined rollout, in control steps.
-        penalty: λ of MOPO. The authors chose it by dataset; 2.5 is their code's default.
+        penalty: λ of MOPO, on rewards and state changes in their units. The authors chose it by dataset: 15 for Hopper
+            medium, 0.5 for HalfCheetah and Walker2d medium; 2.5 is their code's default.
         real: Share of logged rows in a batch.
         imagined_per_update: Imagined transitions for each update of the policy.
         imagined_rows: Rows imagined at a time.
@@ -105,8 +108,8 @@ class MOREC:
     horizon: int = 100
     penalty: float = 2.5
     real: float = 0.05
-    imagined_per_update: int = 5
-    imagined_rows: int = 50
+    imagined_per_update: int = 20
+    imagined_rows: int = 200
     epoch_updates: int = 100
     holdout_every: int = 100
     batch: int = 256
