@@ -61,7 +61,10 @@ class H2O:
         noise: Of the discriminators' inputs while they learn.
         gap_samples: Next states drawn for the dynamics gap of a row.
         gap_spread: How wide, in units of a step's change.
-        bound: Of the discriminators' logits.
+        bound: Of the logits that s' adds to those of (s, a).
+        pair_bound: Of the logits of (s, a). The authors' is 2, as the other: that cannot say all that (s, a) tell while
+            the policy is where no data is, s' then says it in their place, and the ratio takes any simulated row for
+            false.
         discount: γ.
         target_rate: τ of the target critics.
         learning_rate: Adam's, for everything.
@@ -79,6 +82,7 @@ class H2O:
     gap_samples: int = 10
     gap_spread: float = 1.0
     bound: float = 2.0
+    pair_bound: float = 10.0
     discount: float = 0.99
     target_rate: float = 0.005
     learning_rate: float = 3e-4
@@ -87,7 +91,9 @@ class H2O:
     def __post_init__(self) -> None:
         check_at_least(self, hidden=1, environments=1, batch=2, replay_capacity=1, warmup_steps=0, weight=0.0)
         check_at_least(self, epoch_steps=self.environments, updates_per_step=0.0, discount=0.0, noise=0.0)
-        check_at_least(self, target_rate=0.0, learning_rate=0.0, gap_samples=1, gap_spread=0.0, bound=0.0)
+        check_at_least(
+            self, target_rate=0.0, learning_rate=0.0, gap_samples=1, gap_spread=0.0, bound=0.0, pair_bound=0.0
+        )
 
     @property
     def name(self) -> str:
@@ -125,7 +131,7 @@ class H2O:
         sizes = problem.simulator.task.observation_size, problem.simulator.action_size
         learner = fresh(*sizes, hidden=self.hidden, descent=self._descent, features=problem.features, key=of_learner)
         discriminators = Discriminators(
-            *sizes, self.hidden, key=of_discriminators, bound=self.bound, pair_bound=self.bound, dropout=0.0
+            *sizes, self.hidden, key=of_discriminators, bound=self.bound, pair_bound=self.pair_bound, dropout=0.0
         )
         optimiser = adam(self.learning_rate).init(eqx.filter(discriminators, eqx.is_array))
         interaction = start_acting(problem, of_start, environments=self.environments, capacity=self.replay_capacity)
