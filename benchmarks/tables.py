@@ -327,6 +327,23 @@ CALIBRATORS = ("dropo", "e-dropo", "droid", "oted", "cma-es", "cma-es-distributi
 """Besides Madoc, with the paper's budget."""
 
 
+DISTURBED = ("noise-1", "noise-10", "modern", "friction-20", "hidden", "shuffled-rows", "shuffled-next")
+
+
+def disturbed_not_run() -> list[str]:
+    """Of every calibrator and robot, the disturbances that it has not met."""
+    done = {(row.get("method"), row["robot"], row["data"]) for row in calibrations()}
+    lines = []
+    for method, robot in product((*CALIBRATORS, "madoc"), ROBOTS):
+        data = [name for name in DISTURBED if (method, robot, name) not in done]
+        if data:
+            lines.append(
+                f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --data-is {' '.join(data)} "
+                "--budget 300000 --seeds 0`"
+            )
+    return lines
+
+
 def not_run() -> str:
     """What the tables should hold and do not, each with the command that runs it."""
     lines = []
@@ -349,6 +366,7 @@ def not_run() -> str:
                 f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --budget 1000000 "
                 f"--seeds {' '.join(seeds)}`"
             )
+    lines += disturbed_not_run()
     lines += policies_not_run()
     if not (RESULTS / "speed.json").exists():
         lines.append("- `python benchmarks/speed.py`")
