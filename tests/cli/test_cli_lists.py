@@ -34,7 +34,9 @@ def test_methods_are_listed(capsys):
     assert [row["name"] for row in answer["methods"]] == [*CALIBRATORS, *LEARNERS]
     assert all(row["paper"] and row["year"] and row["summary"] for row in answer["methods"])
     assert main(["methods"]) == 0
-    assert "policy learner" in capsys.readouterr().out
+    told = capsys.readouterr().out.splitlines()
+    assert [line.split()[1] for line in told if line.startswith("│")] == [*CALIBRATORS, *LEARNERS]  # one line each
+    assert [line.split(",")[0].strip() for line in told if line[0].isalpha()] == ["calibrators", "policy learners"]
 
 
 @pytest.mark.parametrize("words", [["--help"], ["calibrate", "--help"]])

@@ -25,12 +25,10 @@ CALIBRATORS: dict[str, MethodEntry[Calibrator]] = {
     "madoc-ungrouped": MethodEntry(partial(Madoc, groups="each"), "one agent a parameter", _PAPER, 2024),
     "madoc-paper": MethodEntry(Madoc.paper, "Madoc with the paper's own constants", _PAPER, 2024),
     "least-squares": MethodEntry(
-        LeastSquares, "damped Gauss-Newton on next states, robust, with intervals", "Levenberg; Marquardt", 1963
+        LeastSquares, "damped Gauss-Newton, robust, with intervals", "Levenberg; Marquardt", 1963
     ),
-    "oted": MethodEntry(
-        Oted, "(s, a) distribution matching by a bandit's gradient", "Gur et al. (from its abstract)", 2021
-    ),
-    "dropo": MethodEntry(Dropo, "a distribution that makes logged next states likely", "Tiboni et al., DROPO", 2022),
+    "oted": MethodEntry(Oted, "matches (s, a) by a bandit's policy gradient", "Gur et al. (from its abstract)", 2021),
+    "dropo": MethodEntry(Dropo, "distribution that makes next states likely", "Tiboni et al., DROPO", 2022),
     "e-dropo": MethodEntry(
         partial(Dropo, entropy_weight=ENTROPY_WEIGHT), "DROPO with an entropy bonus", "Fickinger et al., E-DROPO", 2025
     ),
@@ -38,15 +36,15 @@ CALIBRATORS: dict[str, MethodEntry[Calibrator]] = {
     "cma-es": MethodEntry(CmaEs, "one-step error, black box: a yardstick", "Hansen and Ostermeier, CMA-ES", 2001),
     "cma-es-distribution": MethodEntry(
         partial(CmaEs, "distribution"),
-        "distance of unordered observations, black box",
-        "after Proprioceptive Distribution Matching",
+        "distance of unordered observations",
+        "after arXiv 2604.11090",
         2026,
     ),
     "nominal": MethodEntry(Uncalibrated, "mid-range, uncalibrated: a yardstick", "no paper: a yardstick", 2024),
     "uniform": MethodEntry(
         partial(Uncalibrated, randomised=True),
         "the whole box as randomization",
-        "Tobin et al., domain randomization",
+        "Tobin et al., randomization",
         2017,
     ),
 }

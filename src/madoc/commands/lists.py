@@ -44,7 +44,7 @@ class Methods:
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
-        """The methods, as a table."""
+        """The methods, one line each."""
         from madoc.calibration import CALIBRATORS
         from madoc.policies import LEARNERS
 
@@ -55,13 +55,21 @@ class Methods:
             for kind, entries in kinds
             for name, entry in entries.items()
         ]
-        table = Table(title="methods", title_justify="left")
-        columns = ("name", "kind", "summary", "paper", "year", "budget")
-        for heading in columns:
-            table.add_column(heading, no_wrap=heading in ("name", "kind", "year", "budget"))
-        for row in rows:
-            table.add_row(*(str(row[column]) for column in columns))
-        return Answer({"methods": rows}, (table,))
+        return Answer({"methods": rows}, tuple(_methods_table(kind, rows) for kind, _ in kinds))
+
+
+def _methods_table(kind: str, rows: list[dict[str, Any]]) -> Table:
+    """The methods of one kind; what their budgets count is in the title where all count the same."""
+    own = [row for row in rows if row["kind"] == kind]
+    units = {row["budget"] for row in own}
+    columns = ["name", "summary", "paper", "year", *(["budget"] if len(units) > 1 else [])]
+    told = "" if len(units) > 1 else f", budgets in {units.pop()}"
+    table = Table(title=f"{kind}s{told}", title_justify="left")
+    for heading in columns:
+        table.add_column(heading, no_wrap=heading in ("name", "year", "budget"))
+    for row in own:
+        table.add_row(*(str(row[column]) for column in columns))
+    return table
 
 
 def _task_row(task: Any) -> dict[str, Any]:

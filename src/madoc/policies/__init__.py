@@ -23,16 +23,14 @@ LEARNERS: dict[str, MethodEntry[PolicyLearner]] = {
     ),
     "dr-bc": MethodEntry(
         partial(SAC, cloning=2.5, randomize=True),
-        "SAC over the whole box, cloning the data's actions too",
-        "Tobin et al., Domain Randomization",
+        "SAC over the whole box, cloning the data",
+        "Tobin et al., randomization",
         2017,
     ),
-    "bc": MethodEntry(BC, "Clones the data's policy", "Pomerleau, ALVINN", 1988, "updates"),
-    "cql": MethodEntry(CQL, "Conservative values, from the data alone", "Kumar et al., CQL", 2020, "updates"),
-    "morec": MethodEntry(
-        MOREC, "A learnt model, kept to transitions that look real", "Luo et al., MOREC", 2024, "updates"
-    ),
-    "h2o": MethodEntry(H2O, "Logged and simulated rows, trusted by their dynamics", "Niu et al., H2O", 2022),
+    "bc": MethodEntry(BC, "clones the data's policy", "Pomerleau, ALVINN", 1988, "updates"),
+    "cql": MethodEntry(CQL, "conservative values, from the data alone", "Kumar et al., CQL", 2020, "updates"),
+    "morec": MethodEntry(MOREC, "a learnt model, kept to what looks real", "Luo et al., MOREC", 2024, "updates"),
+    "h2o": MethodEntry(H2O, "SAC on logged and trusted simulated rows", "Niu et al., H2O", 2022),
 }
 
 __all__ = [
