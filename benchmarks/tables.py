@@ -175,8 +175,8 @@ def policies() -> str:
     lines = [
         "## Policies\n\n`python benchmarks/policies.py` (see its options). Deterministic, in the target; medium data "
         "where a learner takes data. Budgets are a fraction of the paper's, 1e6 control steps or updates on D4RL's own "
-        "data: none has converged. SAC, SAC+BC and DR+BC hand back the policy that did best in their own simulator, which "
-        "costs up to as many control steps again; the others hand back their last.\n",
+        "data: none has converged. SAC, SAC+BC and DR+BC hand back the policy that did best in their own simulator, "
+        "which costs up to as many control steps again; the others hand back their last.\n",
         "| robot | learner | learnt at | budget | settings | seeds | return | normalized (mean ± std) | paper | s |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
