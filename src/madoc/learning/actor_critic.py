@@ -85,7 +85,7 @@ def fresh(
         scale = features.pair_scale[:observation] + STILL
         seen = {"offset": features.pair_offset[:observation], "scale": scale}
     policy = TanhGaussianPolicy(observation, action, hidden, key=of_policy, **seen)
-    critic = TwinCritic(observation, action, critic_hidden or hidden, key=of_critic, **seen)
+    critic = TwinCritic(observation, action, hidden if critic_hidden is None else critic_hidden, key=of_critic, **seen)
     log_temperature = jnp.zeros(())
     return ActorCritic(
         policy,
