@@ -19,8 +19,8 @@ import yaml
 from calibration import commit
 from madoc import pipeline, robots, simulation
 from madoc.data import Dataset, logged_states, logs
-from madoc.data.windows import first_rows, windows_at
-from madoc.residuals.window_residuals import window_residuals
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import first_rows, windows_at
 
 ROOT = Path(__file__).parent
 PENDULUM = ROOT.parent / "examples" / "pendulum"

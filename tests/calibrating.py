@@ -9,7 +9,7 @@ import jax
 
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, Madoc, calibrate
-from madoc.run_folder import RunFolder
+from madoc.runs.run_folder import RunFolder
 from robots import SPRING_TRUTH, recorded, spring
 
 KEY = jax.random.key(0)

@@ -3,7 +3,7 @@
 import sys
 from dataclasses import replace
 
-from madoc.cli import main
+from madoc.commands.main import main
 from madoc.tasks import TASKS
 from robots import spring
 

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from madoc.loop import run
-from madoc.run_folder import RunFolder
+from madoc.runs.loop import run
+from madoc.runs.run_folder import RunFolder
 
 BUDGET = 600
 SPEC = {"method": "wander", "hyperparameters": {"scale": 1.0}, "seed": 0, "budget": BUDGET}

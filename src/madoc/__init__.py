@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from madoc.pipeline import Plan, run_all
     from madoc.policies import SAC, PolicyProblem, learn_policy, load_policy, save_policy
     from madoc.policies.behaviours import record_quality as record
-    from madoc.run_folder import RunFolder
+    from madoc.runs.run_folder import RunFolder
 
-_ROOMS = ("calibration", "data", "policies", "robots", "simulation", "tasks")
+_ROOMS = ("calibration", "data", "identification", "policies", "robots", "runs", "simulation", "tasks")
 
 _PLACES = {
     "CalibrationProblem": "calibration",
@@ -31,7 +31,7 @@ _PLACES = {
     "ParameterSpace": "parameters",
     "Plan": "pipeline",
     "PolicyProblem": "policies",
-    "RunFolder": "run_folder",
+    "RunFolder": "runs.run_folder",
     "SAC": "policies",
     "calibrate": "calibration",
     "evaluate": "evaluation",

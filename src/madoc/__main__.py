@@ -2,7 +2,7 @@
 
 import sys
 
-from madoc.cli import main
+from madoc.commands.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

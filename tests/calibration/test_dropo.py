@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from madoc.calibration.droid import trajectory_cost
-from madoc.calibration.dropo.calibrator import DEVIATIONS, distribution_of
-from madoc.calibration.dropo.likelihood import (
+from madoc.calibration.baselines.droid import trajectory_cost
+from madoc.calibration.baselines.dropo.calibrator import DEVIATIONS, distribution_of
+from madoc.calibration.baselines.dropo.likelihood import (
     entropy,
     moments,
     negative_log_likelihood,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from cmaes import CMA
 
-from madoc.calibration import evolution
+from madoc.calibration.baselines import evolution
 
 BOX = np.tile([-1.0, 1.0], (3, 1))
 

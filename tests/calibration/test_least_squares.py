@@ -10,17 +10,9 @@ from madoc import simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
 from madoc.data import Disturbance, disturb
-from madoc.data.windows import windows_at
 from madoc.errors import MadocError
-from madoc.parameters import Parameter
-from madoc.residuals import losses
-from madoc.residuals.linearisation import (
-    DIFFERENCE,
-    Linearisation,
-    difference_points,
-    linearise,
-)
-from madoc.residuals.uncertainty import (
+from madoc.identification import losses
+from madoc.identification.information import (
     at_least_noise,
     bread,
     correlated_pairs,
@@ -31,7 +23,15 @@ from madoc.residuals.uncertainty import (
     meat,
     sandwich,
 )
-from madoc.residuals.window_residuals import window_residuals
+from madoc.identification.linearisation import (
+    DIFFERENCE,
+    Linearisation,
+    difference_points,
+    linearise,
+)
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import windows_at
+from madoc.parameters import Parameter
 from robots import SPRING_TRUTH, CountingSimulator, recorded, spring
 
 ROBUST = ("huber", "soft-l1", "cauchy")

@@ -11,8 +11,8 @@ from madoc.calibration import CalibrationProblem, LeastSquares
 from madoc.calibration.least_squares.calibrator import horizon_of
 from madoc.calibration.least_squares.estimated_states import STATES_FIRST, EstimatedStates
 from madoc.calibration.least_squares.lengthening import begun, hopeless, lengthened, noise_alone, says_more
-from madoc.checkpoint import difference, layout, load, save
 from madoc.data import Disturbance, disturb
+from madoc.runs.checkpoint import difference, layout, load, save
 from own_robots import PENDULUM_SPEC, write_robot
 from robots import PENDULUM, recorded
 

@@ -4,7 +4,13 @@ import jax
 import numpy as np
 import pytest
 
-from madoc.calibration.cma_es.mean_embedding import RIDGE, CosineFeatures, adjusted, cosine_features, discrepancies
+from madoc.calibration.baselines.cma_es.mean_embedding import (
+    RIDGE,
+    CosineFeatures,
+    adjusted,
+    cosine_features,
+    discrepancies,
+)
 
 
 def test_features_by_hand():

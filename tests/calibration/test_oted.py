@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from affine import affine
-from madoc.calibration.oted.bandit import (
+from madoc.calibration.baselines.oted.bandit import (
     REWARD_BOUND,
     Distribution,
     advantages,
@@ -16,7 +16,7 @@ from madoc.calibration.oted.bandit import (
     mean_rewards,
     natural_step,
 )
-from madoc.calibration.oted.visits import comparable_starts, discriminator_loss, first_lives, visits
+from madoc.calibration.baselines.oted.visits import comparable_starts, discriminator_loss, first_lives, visits
 from madoc.data.dataset import close_episodes
 from robots import SPRING_TRUTH, recorded, spring
 

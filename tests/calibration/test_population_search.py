@@ -6,7 +6,7 @@ import pytest
 
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, evolution
-from madoc.calibration.population_search import (
+from madoc.calibration.baselines.population_search import (
     SearchState,
     draw_windows,
     estimate_from_search,

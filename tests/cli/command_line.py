@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from madoc.cli import main
+from madoc.commands.main import main
 
 SOURCE = Path(__file__).parents[2] / "src"
 

@@ -1,7 +1,7 @@
 import pytest
 from command_line import WHOLE
 
-from madoc.cli import main
+from madoc.commands.main import main
 
 
 @pytest.fixture(scope="session")

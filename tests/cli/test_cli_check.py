@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from madoc.cli import main
+from madoc.commands.main import main
 
 sys.path.append(str(Path(__file__).parents[1] / "data"))
 from logged_arm import arm_of, columns_of, write_csv

@@ -6,7 +6,7 @@ import pytest
 import yaml
 from command_line import asked_for_json
 
-from madoc.cli import main
+from madoc.commands.main import main
 from madoc.pipeline import read_calibration
 from madoc.simulation import make
 

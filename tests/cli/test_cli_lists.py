@@ -2,7 +2,7 @@ import pytest
 from command_line import asked_for_json, start
 
 from madoc.calibration import CALIBRATORS
-from madoc.cli import main
+from madoc.commands.main import main
 from madoc.policies import LEARNERS
 from madoc.tasks import TASKS
 

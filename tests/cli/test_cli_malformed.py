@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from madoc.cli import main
+from madoc.commands.main import main
 from robots import ARM
 
 sys.path.append(str(Path(__file__).parents[1] / "data"))

@@ -8,7 +8,7 @@ import pytest
 from command_line import asked_for_json, without_seconds
 
 from madoc import data, robots
-from madoc.cli import main
+from madoc.commands.main import main
 from own_robots import ARM_SPEC, PENDULUM_SPEC, SPRING_SPEC, write_robot
 from robots import ARM, ARM_TRUTH, recorded
 

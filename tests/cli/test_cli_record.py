@@ -2,7 +2,7 @@ import pytest
 from command_line import asked_for_json
 
 from madoc import data, tasks
-from madoc.cli import main
+from madoc.commands.main import main
 from madoc.data.targets import paper_truth
 
 

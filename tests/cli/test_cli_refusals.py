@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from command_line import arguments
 
-from madoc.cli import main
+from madoc.commands.main import main
 
 CALIBRATE = "calibrate hopper --data {data} --out {out} "
 

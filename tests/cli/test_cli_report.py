@@ -1,7 +1,7 @@
 import pytest
 from command_line import asked_for_json
 
-from madoc.cli import main
+from madoc.commands.main import main
 
 
 def test_a_run_leaves_its_page(whole):

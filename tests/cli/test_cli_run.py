@@ -6,7 +6,7 @@ import time
 import pytest
 from command_line import CALIBRATION, WHOLE, asked_for_json, start, without_seconds
 
-from madoc.cli import main
+from madoc.commands.main import main
 
 
 def summary_of(folder):

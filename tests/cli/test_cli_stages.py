@@ -6,7 +6,7 @@ import pytest
 from command_line import CALIBRATION, LEARNING, asked_for_json, without_seconds
 
 from madoc.calibration import CalibrationResult
-from madoc.cli import main
+from madoc.commands.main import main
 from madoc.data.targets import paper_truth
 from madoc.numpy_policy import NumpyPolicy
 

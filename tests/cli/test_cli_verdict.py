@@ -11,7 +11,7 @@ from command_line import asked_for_json, without_seconds
 import comparing
 from madoc import data
 from madoc.calibration import CalibrationResult
-from madoc.cli import main
+from madoc.commands.main import main
 from madoc.data import Disturbance, disturb
 from madoc.pipeline import read_calibration
 from madoc.tasks import TASKS, make

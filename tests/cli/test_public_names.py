@@ -27,7 +27,7 @@ def test_a_robots_computer_needs_numpy_alone():
 
 
 def test_the_command_line_starts_without_jax():
-    assert "jax" not in loaded_by("import madoc.cli")
+    assert "jax" not in loaded_by("import madoc.commands.main")
 
 
 def test_public_names_are_there():

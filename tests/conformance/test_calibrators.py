@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import madoc.data.targets
-from madoc import checkpoint, simulation
+from madoc import simulation
 from madoc.calibration import (
     CALIBRATORS,
     CalibrationProblem,
@@ -25,7 +25,8 @@ from madoc.calibration import (
 from madoc.data import Dataset, Disturbance, disturb, observed_task
 from madoc.errors import MadocError
 from madoc.parameters import Parameter
-from madoc.run_folder import RunFolder
+from madoc.runs import checkpoint
+from madoc.runs.run_folder import RunFolder
 from robots import ARM_TRUTH, CountingSimulator, recorded, two_link_arm
 
 KEY = jax.random.key(0)

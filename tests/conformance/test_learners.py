@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from madoc import checkpoint, simulation
+from madoc import simulation
 from madoc.data.dataset import Disturbance
 from madoc.errors import MadocError
 from madoc.numpy_policy import NumpyPolicy
@@ -19,7 +19,8 @@ from madoc.policies import (
     learn_policy,
     load_policy,
 )
-from madoc.run_folder import RunFolder
+from madoc.runs import checkpoint
+from madoc.runs.run_folder import RunFolder
 from robots import ARM_TRUTH, CountingSimulator, recorded, two_link_arm
 
 KEY = jax.random.key(0)

@@ -17,9 +17,9 @@ from mcap.writer import Writer
 from mcap_ros2.writer import Writer as RosWriter
 
 from madoc.data import logs
+from madoc.data.findings import Finding
 from madoc.data.logs import mcap_reader, parquet_reader
 from madoc.errors import MadocError
-from madoc.findings import Finding
 
 ROS_JOINT_STATE = """\
 std_msgs/Header header

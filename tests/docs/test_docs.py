@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from madoc import robots
-from madoc.cli import main
+from madoc.commands.main import main
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -3,15 +3,15 @@
 from functools import partial
 
 from madoc.calibration.base import CalibrationProblem, Calibrator, Estimate
+from madoc.calibration.baselines.cma_es.calibrator import CmaEs
+from madoc.calibration.baselines.droid import Droid
+from madoc.calibration.baselines.dropo.calibrator import ENTROPY_WEIGHT, Dropo
+from madoc.calibration.baselines.oted.calibrator import Oted
+from madoc.calibration.baselines.uncalibrated import Uncalibrated
 from madoc.calibration.calibrate import calibrate
-from madoc.calibration.cma_es.calibrator import CmaEs
-from madoc.calibration.droid import Droid
-from madoc.calibration.dropo.calibrator import ENTROPY_WEIGHT, Dropo
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.madoc.calibrator import Madoc
-from madoc.calibration.oted.calibrator import Oted
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
-from madoc.calibration.uncalibrated import Uncalibrated
 from madoc.types import MethodEntry
 
 _PAPER = "Jiang et al., Madoc"

@@ -7,14 +7,14 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from madoc import loop
 from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
 from madoc.calibration.cautions import told_once
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
-from madoc.files import replacing
 from madoc.parameters import ParameterSpace
-from madoc.run_folder import RunFolder
+from madoc.runs import loop
+from madoc.runs.files import replacing
+from madoc.runs.run_folder import RunFolder
 from madoc.simulation.sensitivity import refuse_insensitive
 
 

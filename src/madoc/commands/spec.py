@@ -56,7 +56,7 @@ class Spec:
     def run(self) -> Answer:
         """Check and describe."""
         from madoc import robots
-        from madoc.files import json_text
+        from madoc.runs.files import json_text
 
         if self.schema:
             schema = robots.schema()

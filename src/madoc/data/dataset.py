@@ -7,8 +7,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
+from madoc.data.findings import Finding
 from madoc.errors import MadocError
-from madoc.findings import Finding
 from madoc.tasks import Task
 from madoc.types import Transitions
 
@@ -113,6 +113,10 @@ class Dataset:
         """One past the last row of every episode."""
         return np.append(self.episode_starts[1:], len(self))
 
+    def episode_of(self, rows: Int[np.ndarray, "*rows"]) -> Int[np.ndarray, "*rows"]:
+        """The index of the episode that each of the given rows belongs to."""
+        return np.searchsorted(self.episode_starts, rows, side="right") - 1
+
 
 def starts_after(ends: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, " episodes"]:
     """Rows where an episode begins, from whether a row ends one."""
@@ -204,4 +208,4 @@ def with_pending(
 def _age(dataset: Dataset) -> Int[np.ndarray, " rows"]:
     """How many rows of its episode come before each row."""
     rows = np.arange(len(dataset))
-    return rows - dataset.episode_starts[np.searchsorted(dataset.episode_starts, rows, side="right") - 1]
+    return rows - dataset.episode_starts[dataset.episode_of(rows)]

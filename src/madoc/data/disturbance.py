@@ -143,7 +143,7 @@ def _shuffle_rows(dataset: Dataset, order: Int[np.ndarray, " rows"]) -> Dataset:
     starts = np.arange(len(dataset))
     names = dataset.run_names
     if names is not None:
-        episode = np.searchsorted(dataset.episode_starts, order, side="right") - 1
+        episode = dataset.episode_of(order)
         names = tuple(names[index] for index in episode)
     transitions = close_episodes(dataset.transitions.take(order), starts)
     return replace(dataset, transitions=transitions, episode_starts=starts, run_names=names)

@@ -11,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from madoc.data.dataset import Dataset, Disturbance
 from madoc.data.disturbance import observed_task
+from madoc.data.findings import Finding
 from madoc.data.npz import array_names, is_npz, read_arrays
 from madoc.data.validation import (
     NAMES,
@@ -21,9 +22,8 @@ from madoc.data.validation import (
     validate,
 )
 from madoc.errors import MadocError
-from madoc.files import json_text, replacing
-from madoc.findings import Finding
 from madoc.parameters import FIELDS
+from madoc.runs.files import json_text, replacing
 from madoc.tasks import Task
 from madoc.types import Transitions
 

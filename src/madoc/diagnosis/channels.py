@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.data import Dataset
+from madoc.data.findings import Finding
 from madoc.errors import MadocError
-from madoc.findings import Finding
 from madoc.robots import Robot
 from madoc.simulation import CpuSimulator
 from madoc.tasks import Task

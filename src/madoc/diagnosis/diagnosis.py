@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.data import Dataset, logged_states
+from madoc.data.findings import Finding, worst_first
 from madoc.data.velocities import states_near
 from madoc.diagnosis.channels import Channel, channel_findings, channels_of
 from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, excite_unseen
 from madoc.diagnosis.explanation import Explanation, action_findings, explain, explanation_findings
 from madoc.errors import MadocError
-from madoc.findings import Finding, worst_first
 from madoc.robots import Robot
 from madoc.simulation import CpuSimulator
 from madoc.simulation.rollout import reset_states

@@ -8,11 +8,11 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.optimize import lsq_linear
 
 from madoc.data import Dataset
-from madoc.data.windows import Windows, windows_at
-from madoc.findings import Finding
-from madoc.residuals.linearisation import Linearisation, difference_points, linearise
-from madoc.residuals.uncertainty import bread, correlated_pairs, half_width, identifiability, meat, sandwich
-from madoc.residuals.window_residuals import window_residuals
+from madoc.data.findings import Finding
+from madoc.identification.information import bread, correlated_pairs, half_width, identifiability, meat, sandwich
+from madoc.identification.linearisation import Linearisation, difference_points, linearise
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import Windows, windows_at
 from madoc.simulation import CpuSimulator
 from madoc.simulation.rollout import reset_states
 
@@ -129,7 +129,7 @@ def excite_unseen(dataset: Dataset, simulator: CpuSimulator, *, key: PRNGKeyArra
     space, task = simulator.parameters, simulator.task
     steps = int(min(_UNSEEN, (dataset.episode_ends - dataset.episode_starts).max()))
     rows = np.arange(len(dataset))
-    ends = dataset.episode_ends[np.searchsorted(dataset.episode_starts, rows, side="right") - 1]
+    ends = dataset.episode_ends[dataset.episode_of(rows)]
     possible = np.flatnonzero(rows + steps <= ends)
     chosen = possible[np.asarray(jax.random.permutation(of_rows, len(possible)))[: WINDOWS[_UNSEEN]]]
     starts = reset_states(simulator)(of_starts, len(chosen))
@@ -184,7 +184,7 @@ def _apart(
     dataset: Dataset, rows: Int[np.ndarray, " states"], horizon: int, key: PRNGKeyArray
 ) -> tuple[Int[np.ndarray, " windows"], int, int]:
     """Positions in `rows` of stretches that do not overlap, their length, and how many there are in the whole log."""
-    episode = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
+    episode = dataset.episode_of(rows)
     start, end = dataset.episode_starts[episode], dataset.episode_ends[episode]
     steps = int(min(horizon, (end - rows).max()))
     possible = np.flatnonzero(((rows - start) % steps == 0) & (rows + steps <= end))

@@ -8,10 +8,10 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.stats import qmc
 
 from madoc.data import Dataset
-from madoc.data.windows import Windows, windows_at
+from madoc.data.findings import Finding
 from madoc.diagnosis.channels import Channel, action_names
-from madoc.findings import Finding
-from madoc.residuals.window_residuals import window_residuals
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import Windows, windows_at
 from madoc.simulation import CpuSimulator
 from madoc.tasks import Task
 
@@ -173,7 +173,7 @@ def _stretches(
     dataset: Dataset, rows: Int[np.ndarray, " states"], longest: int, key: PRNGKeyArray
 ) -> tuple[Int[np.ndarray, " windows"], int]:
     """Positions in `rows` where stretches begin, and how long they are: as long as asked, or as there are."""
-    ends = dataset.episode_ends[np.searchsorted(dataset.episode_starts, rows, side="right") - 1]
+    ends = dataset.episode_ends[dataset.episode_of(rows)]
     steps = int(min(longest, (ends - rows).max()))
     possible = np.flatnonzero(rows + steps <= ends)
     picked = np.asarray(jax.random.permutation(key, len(possible)))[:WINDOWS]
@@ -182,7 +182,7 @@ def _stretches(
 
 def _inside(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Int[np.ndarray, " windows"]:
     """Positions in `rows` with a row of the same episode before a stretch and one after it."""
-    episode = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
+    episode = dataset.episode_of(rows)
     whole = (rows > dataset.episode_starts[episode]) & (rows + steps < dataset.episode_ends[episode])
     return np.flatnonzero(whole)
 

@@ -9,8 +9,8 @@ from rich import box
 from rich.console import RenderableType
 from rich.table import Table
 
+from madoc.data.findings import LEVELS
 from madoc.diagnosis.diagnosis import Diagnosis
-from madoc.findings import LEVELS
 from madoc.parameters import ParameterSpace
 
 MOST_ALIKE = 4

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from madoc.errors import MadocError
-from madoc.files import replacing
 from madoc.numpy_policy import NumpyPolicy
+from madoc.runs.files import replacing
 
 OPSET = 17
 """Of the operators used here all are older; ONNX Runtime has read it since 2022."""

@@ -8,8 +8,8 @@ from typing import Any
 import yaml
 
 from madoc.calibration.result import ParameterEstimate
-from madoc.files import replacing
 from madoc.parameters import FIELDS, Parameter
+from madoc.runs.files import replacing
 from madoc.simulation.mjcf import Change
 
 NORMAL_95 = 1.959963984540054

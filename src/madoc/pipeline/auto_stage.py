@@ -7,7 +7,6 @@ from typing import Any
 
 from madoc.calibration import CALIBRATORS, CalibrationResult, Calibrator
 from madoc.errors import MadocError, unknown_name
-from madoc.files import read_json
 from madoc.pipeline.calibration_stage import (
     HOLDOUT,
     CalibrationOrder,
@@ -21,6 +20,7 @@ from madoc.pipeline.calibration_stage import (
 from madoc.pipeline.folders import ended, holds_run, working_folder
 from madoc.pipeline.keys import seed_key
 from madoc.pipeline.methods import hyperparameters, make_method
+from madoc.runs.files import read_json
 from madoc.verdict import Assessment
 from madoc.verdict.evidence import evidence, save_evidence
 from madoc.verdict.judge import explains_all

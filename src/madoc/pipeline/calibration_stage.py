@@ -12,13 +12,13 @@ from madoc.calibration import CALIBRATORS, CalibrationProblem, CalibrationResult
 from madoc.data import Dataset, Disturbance, observed_task
 from madoc.data.split import hold_out
 from madoc.errors import MadocError, unknown_name
-from madoc.files import read_json
 from madoc.parameters import Parameter, ParameterSpace
 from madoc.pipeline.check_stage import checked
 from madoc.pipeline.data_stage import Source, check_truth, fingerprint, load_source, stored_robot, task_of_spec
 from madoc.pipeline.folders import ENDED, restored_path, stored_path, working_folder
 from madoc.pipeline.keys import seed_key, stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
+from madoc.runs.files import read_json
 from madoc.simulation import CpuSimulator
 from madoc.tasks import Task
 from madoc.verdict import Assessment, Bench, assess, judge

@@ -8,9 +8,9 @@ from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
 from madoc.data import Dataset, Disturbance, disturb, logs, observed_task
 from madoc.data.dataset import Velocities
+from madoc.data.findings import Finding
 from madoc.diagnosis import Diagnosis, check, refuse_fatal
 from madoc.errors import MadocError
-from madoc.findings import Finding
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.forecast import Forecast, forecast
 from madoc.pipeline.keys import stage_key

@@ -12,10 +12,10 @@ from madoc import data, robots, simulation, tasks
 from madoc.data import Dataset, Disturbance, logs
 from madoc.data.native import recognises as is_recorded
 from madoc.errors import MadocError, unknown_name
-from madoc.files import read_json
 from madoc.pipeline.keys import stage_key
 from madoc.policies.behaviours import QUALITIES, record_quality
-from madoc.progress import bar
+from madoc.runs.files import read_json
+from madoc.runs.progress import bar
 from madoc.simulation import CpuSimulator
 from madoc.tasks import TASKS, Task
 

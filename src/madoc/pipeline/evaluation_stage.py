@@ -6,11 +6,11 @@ from typing import Any
 
 from madoc.errors import MadocError
 from madoc.evaluation import evaluate
-from madoc.files import read_json, write_json
 from madoc.pipeline.data_stage import check_truth, make_target, task_of_spec
 from madoc.pipeline.keys import stage_key
 from madoc.policies import load_policy
-from madoc.progress import bar
+from madoc.runs.files import read_json, write_json
+from madoc.runs.progress import bar
 
 
 def evaluate_folder(

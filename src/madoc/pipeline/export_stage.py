@@ -6,10 +6,10 @@ from typing import Any
 from madoc import simulation
 from madoc.errors import MadocError
 from madoc.export import Found, Provenance, save_onnx, save_patch, save_randomization, save_sysid_parameters
-from madoc.files import read_json
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibration_stage import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
+from madoc.runs.files import read_json
 from madoc.simulation import CpuSimulator
 from madoc.simulation.mjcf import save_mjcf
 from madoc.simulation.write import nominal_values

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from madoc.errors import MadocError
-from madoc.files import read_json
-from madoc.run_folder import RunFolder
+from madoc.runs.files import read_json
+from madoc.runs.run_folder import RunFolder
 
 ENDED = ("finished", "converged")
 """How a stage ends whose successor may start."""

@@ -9,7 +9,6 @@ from madoc import data, robots
 from madoc.calibration import CALIBRATORS, CalibrationResult
 from madoc.data import Disturbance
 from madoc.errors import MadocError
-from madoc.files import read_json
 from madoc.pipeline.calibration_stage import (
     Calibrated,
     CalibrationOrder,
@@ -24,6 +23,7 @@ from madoc.pipeline.keys import seed_key
 from madoc.pipeline.learning_stage import PolicyOrder, learn_in
 from madoc.pipeline.methods import hyperparameters, make_method
 from madoc.policies import LEARNERS, require_reward
+from madoc.runs.files import read_json
 
 
 @dataclass(frozen=True)

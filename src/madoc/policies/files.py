@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from madoc.errors import MadocError
-from madoc.files import replacing
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.numpy_policy import NumpyPolicy
+from madoc.runs.files import replacing
 
 
 def save_policy(policy: TanhGaussianPolicy, path: str | Path, *, task_name: str) -> None:

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 from jaxtyping import PRNGKeyArray
 
-from madoc import loop
 from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
 from madoc.policies.files import save_policy
-from madoc.run_folder import RunFolder
+from madoc.runs import loop
+from madoc.runs.run_folder import RunFolder
 from madoc.types import Policy, Unit
 
 

@@ -9,10 +9,10 @@ from typing import Any
 import jinja2
 
 from madoc.errors import MadocError
-from madoc.files import replacing
 from madoc.report import sections
 from madoc.report.reading import Run, read_run
 from madoc.report.words import count, duration, number
+from madoc.runs.files import replacing
 
 GENERATOR = "madoc report"
 """What a page says it was made by; only such files are written over."""

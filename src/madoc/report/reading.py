@@ -13,7 +13,7 @@ import yaml
 from jaxtyping import Float
 
 from madoc.errors import MadocError
-from madoc.files import read_json
+from madoc.runs.files import read_json
 
 
 @dataclass(frozen=True)

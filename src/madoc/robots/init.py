@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 
 from madoc.errors import MadocError
-from madoc.files import replacing
 from madoc.robots.model import ModelFiles, compiled, is_single, is_slide, joint_kind, names_of
+from madoc.runs.files import replacing
 from madoc.tasks import TASKS
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z]+)?|(position|velocity)\([A-Za-z_][A-Za-z0-9_]*\)")

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.errors import MadocError
-from madoc.files import replacing
+from madoc.runs.files import replacing
 from madoc.simulation.base import Simulator
 
 DIGITS = 17

@@ -11,7 +11,7 @@ from sklearn.neighbors import NearestNeighbors
 from madoc.calibration.base import CalibrationProblem
 from madoc.data import logged_states
 from madoc.data.split import Split
-from madoc.data.windows import evenly
+from madoc.identification.windows import evenly
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
@@ -118,7 +118,7 @@ class Bench:
         here = np.asarray(held.transitions.observation)[rows]
         guess = np.where(np.isfinite(guess), guess, here)
         followed = np.asarray(held.transitions.next_observation)[rows]
-        episodes = np.searchsorted(held.episode_starts, rows, side="right") - 1
+        episodes = held.episode_of(rows)
         return better_than_chance(guess / spread, followed / spread, episodes)
 
     def rolled_apart(self, unit: Float[np.ndarray, " d"]) -> Told:

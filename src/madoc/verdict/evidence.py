@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.data import logged_states
-from madoc.data.windows import Windows, evenly, first_rows, windows_at
-from madoc.files import replacing
+from madoc.identification.windows import Windows, evenly, first_rows, windows_at
+from madoc.runs.files import replacing
 from madoc.verdict.bench import Bench, signal_names
 
 TRACES = 6
@@ -63,13 +63,13 @@ def save_evidence(path: Path, arrays: dict[str, Any]) -> None:
 def _stretches(bench: Bench, rows: np.ndarray) -> tuple[int, np.ndarray]:
     """How long the stretches are, and the rows of the hold-out they begin at."""
     held = bench.split.held
-    ends = held.episode_ends[np.searchsorted(held.episode_starts, rows, side="right") - 1]
+    ends = held.episode_ends[held.episode_of(rows)]
     steps = int(min(TRACE_STEPS, (ends - rows).max()))
     return steps, rows[evenly(first_rows(held, rows, steps), TRACES)]
 
 
 def _placed(bench: Bench, first: np.ndarray, steps: int, control_step: float) -> dict[str, Any]:
-    episode = np.searchsorted(bench.split.held.episode_starts, first, side="right") - 1
+    episode = bench.split.held.episode_of(first)
     return {"time": control_step * np.arange(steps + 1), "episode": episode, "row": first}
 
 

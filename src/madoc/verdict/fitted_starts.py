@@ -12,8 +12,8 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.readings import Readings
-from madoc.data.windows import evenly, rows_that_fit
-from madoc.residuals.linearisation import DIFFERENCE
+from madoc.identification.linearisation import DIFFERENCE
+from madoc.identification.windows import evenly, rows_that_fit
 from madoc.simulation.base import Simulator
 from madoc.verdict.prediction import FEWEST_WINDOWS, WORST
 
@@ -141,7 +141,7 @@ def fitted_replays_of(held: CalibrationProblem, scale: Float[np.ndarray, " chann
         return None
     chosen = evenly(possible, MOST)
     readings = replace(Readings.at(held, rows[chosen], steps), scale=scale[: held.measured])
-    episodes = np.searchsorted(held.dataset.episode_starts, rows[chosen], side="right") - 1
+    episodes = held.dataset.episode_of(rows[chosen])
     return FittedReplays(held.simulator, readings, near[chosen], episodes)
 
 

@@ -4,9 +4,9 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.data.windows import evenly
-from madoc.residuals.linearisation import DIFFERENCE, difference_points, linearise
-from madoc.residuals.uncertainty import BOX_VARIANCE
+from madoc.identification.information import BOX_VARIANCE
+from madoc.identification.linearisation import DIFFERENCE, difference_points, linearise
+from madoc.identification.windows import evenly
 from madoc.verdict.prediction import MOST_WINDOWS
 
 WINDOW = 20

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.data import Dataset, logged_states
-from madoc.data.windows import evenly
+from madoc.identification.windows import evenly
 from madoc.simulation.base import Simulator
 from madoc.verdict.prediction import MOST_WINDOWS, Replays
 

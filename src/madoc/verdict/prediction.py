@@ -7,10 +7,10 @@ from jaxtyping import Float, Int
 
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
 from madoc.data import Dataset, logged_states
-from madoc.data.windows import Windows, evenly, rows_that_fit, windows_at
-from madoc.residuals.linearisation import difference_points, linearise
-from madoc.residuals.losses import scale_of
-from madoc.residuals.window_residuals import window_residuals
+from madoc.identification.linearisation import difference_points, linearise
+from madoc.identification.losses import scale_of
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import Windows, evenly, rows_that_fit, windows_at
 from madoc.simulation.base import Simulator
 
 HORIZONS = (1, 5, 20)
@@ -90,7 +90,7 @@ def replays_of(held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " o
         windows_at(held, states[chosen], rows[chosen], horizons[-1]),
         np.asarray(held.transitions.observation)[rows[chosen]],
         rows[chosen],
-        np.searchsorted(held.episode_starts, rows[chosen], side="right") - 1,
+        held.episode_of(rows[chosen]),
         horizons,
         scale,
     )

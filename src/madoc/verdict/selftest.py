@@ -192,7 +192,7 @@ def selftest(
 
 def _stretches(dataset: Dataset, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions in `rows` at which replays begin, and how long each is."""
-    episode = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
+    episode = dataset.episode_of(rows)
     chosen, lengths, until = [], [], -1
     for position, (row, end) in enumerate(zip(rows, dataset.episode_ends[episode], strict=True)):
         if row >= until:

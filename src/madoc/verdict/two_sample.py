@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from madoc.data import Dataset
 from madoc.data.dataset import starts_after
-from madoc.data.windows import evenly
+from madoc.identification.windows import evenly
 from madoc.learning.cloning import clone
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.networks import adam
@@ -248,7 +248,7 @@ def _change_of_motion(dataset: Dataset, scaling: Scaling) -> tuple[np.ndarray, n
     second = np.setdiff1d(np.arange(len(dataset)), dataset.episode_starts)
     rows = second if len(second) else np.arange(len(dataset))
     pair, moved = scaling.features(logged.take(rows))
-    episodes = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
+    episodes = dataset.episode_of(rows)
     if not len(second):
         return pair.astype(np.float64), moved.astype(np.float64), episodes
     earlier, moved_before = scaling.features(logged.take(second - 1))

@@ -23,8 +23,8 @@ from madoc.calibration.least_squares.logged_states import LoggedState, LoggedSta
 from madoc.calibration.least_squares.noise import consecutive_residuals, takes_turns
 from madoc.data import Dataset
 from madoc.errors import check_at_least
-from madoc.residuals.losses import Loss
-from madoc.residuals.uncertainty import half_width, identifiability, sandwich
+from madoc.identification.information import half_width, identifiability, sandwich
+from madoc.identification.losses import Loss
 from madoc.types import Metrics
 
 InitialStates = Literal["logged", "estimated"]

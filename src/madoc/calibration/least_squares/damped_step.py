@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import lsq_linear
 
-from madoc.residuals.linearisation import Linearisation
-from madoc.residuals.losses import Loss, loss_slope
+from madoc.identification.linearisation import Linearisation
+from madoc.identification.losses import Loss, loss_slope
 
 
 def triangular_factors(

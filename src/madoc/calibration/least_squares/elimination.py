@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from madoc.residuals.linearisation import Linearisation
+from madoc.identification.linearisation import Linearisation
 
 _FLOOR = 1e-3
 """Least length of a state's column, relative to the window's longest: what no reading shows stays where it is."""

@@ -11,9 +11,9 @@ from madoc.calibration.least_squares.damped_step import damped_step, triangular_
 from madoc.calibration.least_squares.elimination import WindowSlopes, eliminate
 from madoc.calibration.least_squares.noise import channel_deviation, echo, noise_ratio, unlike
 from madoc.calibration.least_squares.readings import Readings, slopes_at
-from madoc.data.windows import apart
 from madoc.errors import MadocError
-from madoc.residuals.losses import (
+from madoc.identification.information import SETTLED, at_least_noise, bread, jackknife_meat, least_share, sandwich
+from madoc.identification.losses import (
     ALL_FAILED,
     TUNING,
     Loss,
@@ -21,7 +21,7 @@ from madoc.residuals.losses import (
     loss_slope,
     loss_value,
 )
-from madoc.residuals.uncertainty import SETTLED, at_least_noise, bread, jackknife_meat, least_share, sandwich
+from madoc.identification.windows import apart
 from madoc.types import Metrics
 
 TRIALS = (1e-2, 1.0, 1e2)

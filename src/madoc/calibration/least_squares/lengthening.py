@@ -9,8 +9,8 @@ import numpy as np
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.estimated_states import STATES_FIRST, EstimatedState
-from madoc.data.windows import apart, evenly, rows_that_fit
-from madoc.residuals.uncertainty import half_width, sandwich
+from madoc.identification.information import half_width, sandwich
+from madoc.identification.windows import apart, evenly, rows_that_fit
 
 LENGTHS = (1, 3, 9)
 """Windows' lengths, in those of the first."""

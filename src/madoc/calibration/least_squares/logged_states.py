@@ -8,12 +8,12 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.data.windows import Windows, apart, first_rows, windows_at
 from madoc.errors import MadocError
-from madoc.residuals.linearisation import difference_points, linearise
-from madoc.residuals.losses import ALL_FAILED, Loss, mean_cost, scale_of
-from madoc.residuals.uncertainty import SETTLED, bread, meat, sandwich
-from madoc.residuals.window_residuals import window_residuals
+from madoc.identification.information import SETTLED, bread, meat, sandwich
+from madoc.identification.linearisation import difference_points, linearise
+from madoc.identification.losses import ALL_FAILED, Loss, mean_cost, scale_of
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import Windows, apart, first_rows, windows_at
 from madoc.types import Metrics
 
 TRIALS = (1e-2, 1.0, 1e2)

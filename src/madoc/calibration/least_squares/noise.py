@@ -4,9 +4,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.data.windows import windows_at
-from madoc.residuals.losses import robust_deviation
-from madoc.residuals.window_residuals import window_residuals
+from madoc.identification.losses import robust_deviation
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import windows_at
 
 _NORMAL_MAD = 1.4826
 """Standard deviations in a median absolute deviation, for normal noise."""

@@ -7,9 +7,9 @@ from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.elimination import WindowSlopes
-from madoc.data.windows import readings_at
-from madoc.residuals.linearisation import DIFFERENCE, difference_points
-from madoc.residuals.window_residuals import simulated_readings
+from madoc.identification.linearisation import DIFFERENCE, difference_points
+from madoc.identification.replay import simulated_readings
+from madoc.identification.windows import readings_at
 from madoc.simulation.base import Simulator
 
 

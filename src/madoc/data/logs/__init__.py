@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from madoc.data.dataset import Dataset
+from madoc.data.findings import Finding
 from madoc.data.logs import (
     csv_reader,
     hdf5_reader,
@@ -23,7 +24,6 @@ from madoc.data.logs.tables import Run, Table
 from madoc.data.minari_reader import recognises as is_minari
 from madoc.data.validation import require_file, validate
 from madoc.errors import MadocError
-from madoc.findings import Finding
 from madoc.robots import Robot
 
 

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from madoc.data.dataset import Dataset, close_episodes
+from madoc.data.findings import Finding
 from madoc.data.logs.tables import Run, Table, as_numbers, listed
 from madoc.data.logs.timing import Resample, Series, check_ascending, common_grid, on_grid, steady_links
 from madoc.data.validation import ACTION_TOLERANCE
 from madoc.errors import MadocError
-from madoc.findings import Finding
 from madoc.robots import Robot
 from madoc.robots.spec import LogSpec
 from madoc.types import Transitions

@@ -9,7 +9,7 @@ import numpy as np
 from madoc.data.logs.parquet_reader import read_columns
 from madoc.data.logs.tables import Run, tables_of
 from madoc.errors import MadocError
-from madoc.files import read_json
+from madoc.runs.files import read_json
 
 CLOCK = "timestamp"
 

@@ -6,9 +6,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from madoc.data.findings import Finding
 from madoc.data.logs.tables import Table
 from madoc.errors import MadocError
-from madoc.findings import Finding
 
 Resample = Literal["hold", "linear"]
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from madoc.errors import MadocError
-from madoc.files import json_text, replacing
+from madoc.runs.files import json_text, replacing
 
 State = TypeVar("State")
 

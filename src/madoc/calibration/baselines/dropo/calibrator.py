@@ -9,20 +9,20 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from madoc.calibration import evolution
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.cautions import at_end_of_range, exploded
-from madoc.calibration.dropo.likelihood import (
+from madoc.calibration.baselines import evolution
+from madoc.calibration.baselines.dropo.likelihood import (
     entropy,
     moments,
     negative_log_likelihood,
     parameter_draws,
     truncated_noise,
 )
-from madoc.calibration.population_search import SearchState, draw_windows, mean_with_failures, next_generation
-from madoc.data.windows import first_rows
+from madoc.calibration.baselines.population_search import SearchState, draw_windows, mean_with_failures, next_generation
+from madoc.calibration.cautions import at_end_of_range, exploded
 from madoc.errors import check_at_least
-from madoc.residuals.window_residuals import window_residuals
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import first_rows
 from madoc.types import Metrics
 
 DEVIATIONS = (1e-3, 0.5)

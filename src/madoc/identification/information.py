@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import t
 
-from madoc.residuals.linearisation import Linearisation
-from madoc.residuals.losses import Loss, loss_curvature, loss_slope
+from madoc.identification.linearisation import Linearisation
+from madoc.identification.losses import Loss, loss_curvature, loss_slope
 
 CONFIDENCE = 0.95
 SETTLED = 0.1

@@ -17,9 +17,15 @@ import optax
 from jaxtyping import Int, PRNGKeyArray, PyTree
 
 from madoc.calibration.base import CalibrationProblem, Estimate
+from madoc.calibration.baselines.oted.bandit import (
+    Distribution,
+    advantages,
+    antithetic_noise,
+    mean_rewards,
+    natural_step,
+)
+from madoc.calibration.baselines.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
 from madoc.calibration.cautions import at_end_of_range, exploded
-from madoc.calibration.oted.bandit import Distribution, advantages, antithetic_noise, mean_rewards, natural_step
-from madoc.calibration.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
 from madoc.errors import check_at_least
 from madoc.learning import replay
 from madoc.learning.cloning import clone

@@ -3,7 +3,7 @@ import json
 import pytest
 
 from madoc.errors import MadocError
-from madoc.files import read_json, remove_leftovers, replacing, write_json
+from madoc.runs.files import read_json, remove_leftovers, replacing, write_json
 
 
 def test_json_round_trip(tmp_path):

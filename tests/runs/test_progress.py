@@ -3,8 +3,8 @@ import sys
 
 import pytest
 
-from madoc import progress
-from madoc.progress import Moment
+from madoc.runs import progress
+from madoc.runs.progress import Moment
 
 
 class Terminal(io.StringIO):

@@ -24,7 +24,7 @@ from madoc.commands.run import Run
 from madoc.commands.selftest import Selftest
 from madoc.commands.spec import Init, Spec
 from madoc.errors import MadocError
-from madoc.files import json_text
+from madoc.runs.files import json_text
 
 REFUSED = 2
 """Exit code of a user's mistake."""

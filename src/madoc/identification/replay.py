@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from madoc.data.windows import Windows
+from madoc.identification.windows import Windows
 from madoc.simulation.base import Simulator, System
 
 

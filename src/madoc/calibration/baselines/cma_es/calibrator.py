@@ -15,26 +15,26 @@ import numpy as np
 import optax
 from jaxtyping import Float, PRNGKeyArray, PyTree
 
-from madoc.calibration import evolution
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.cma_es.mean_embedding import (
+from madoc.calibration.baselines import evolution
+from madoc.calibration.baselines.cma_es.mean_embedding import (
     CosineFeatures,
     adjusted,
     cosine_features,
     discrepancies,
 )
-from madoc.calibration.population_search import (
+from madoc.calibration.baselines.population_search import (
     SearchState,
     draw_windows,
     estimate_from_search,
     mean_with_failures,
     next_generation,
 )
-from madoc.data.windows import first_rows
 from madoc.errors import check_at_least
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import first_rows
 from madoc.learning.cloning import clone
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
-from madoc.residuals.window_residuals import window_residuals
 from madoc.simulation.rollout import Walkers, begin, reset_states, roll
 from madoc.types import Metrics
 

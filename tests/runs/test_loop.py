@@ -12,10 +12,10 @@ import jax
 import numpy as np
 import pytest
 
-from madoc import checkpoint
+from madoc.runs import checkpoint
 from madoc.errors import MadocError
-from madoc.loop import run
-from madoc.run_folder import RunFolder
+from madoc.runs.loop import run
+from madoc.runs.run_folder import RunFolder
 from wandering import BUDGET, SPEC, Wander, bits
 
 KEY = jax.random.key(0)

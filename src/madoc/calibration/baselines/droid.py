@@ -11,18 +11,18 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from madoc.calibration import evolution
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.population_search import (
+from madoc.calibration.baselines import evolution
+from madoc.calibration.baselines.population_search import (
     SearchState,
     draw_windows,
     estimate_from_search,
     mean_with_failures,
     next_generation,
 )
-from madoc.data.windows import first_rows
 from madoc.errors import check_at_least
-from madoc.residuals.window_residuals import window_residuals
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import first_rows
 from madoc.types import Metrics
 
 

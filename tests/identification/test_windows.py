@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from layouts import make_dataset
 
-from madoc.data.windows import apart, evenly, first_rows, readings_at, rows_that_fit, windows_at
 from madoc.errors import MadocError
+from madoc.identification.windows import apart, evenly, first_rows, readings_at, rows_that_fit, windows_at
 
 
 def test_windows_never_cross_the_end_of_an_episode(hopper):

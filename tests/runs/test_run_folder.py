@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from madoc.errors import MadocError
-from madoc.run_folder import RunFolder
+from madoc.runs.run_folder import RunFolder
 
 SPEC = {
     "method": "madoc",
@@ -85,7 +85,7 @@ def test_a_locked_folder_is_refused(tmp_path):
     with RunFolder.create(tmp_path, SPEC):
         with pytest.raises(MadocError, match="in use by another process"):
             RunFolder.open(tmp_path)
-        program = f"from madoc.run_folder import RunFolder; RunFolder.open({str(tmp_path)!r})"
+        program = f"from madoc.runs.run_folder import RunFolder; RunFolder.open({str(tmp_path)!r})"
         other = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
         assert "is in use by another process; wait until it ends" in other.stderr
     RunFolder.open(tmp_path).close()

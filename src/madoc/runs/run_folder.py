@@ -13,7 +13,7 @@ import filelock
 import numpy as np
 
 from madoc.errors import MadocError
-from madoc.files import json_text, read_json, remove_leftovers, write_json
+from madoc.runs.files import json_text, read_json, remove_leftovers, write_json
 from madoc.types import Metrics, Unit
 
 _FREE = ("budget", "versions")

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from madoc.calibration import evolution
 from madoc.calibration.base import CalibrationProblem, Estimate
+from madoc.calibration.baselines import evolution
+from madoc.calibration.baselines.evolution import Evolution
 from madoc.calibration.cautions import at_end_of_range, exploded
-from madoc.calibration.evolution import Evolution
-from madoc.data.windows import Windows, first_rows, windows_at
+from madoc.identification.windows import Windows, first_rows, windows_at
 
 
 @jax.tree_util.register_dataclass

@@ -8,7 +8,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from madoc.data import Dataset
-from madoc.data.windows import first_rows
+from madoc.identification.windows import first_rows
 from madoc.learning import replay
 from madoc.learning.networks import Network, descend, scan_updates
 from madoc.types import Transitions
@@ -28,7 +28,7 @@ def comparable_starts(dataset: Dataset, rows: Int[np.ndarray, " states"], horizo
     Raises:
         MadocError: No episode is long enough.
     """
-    episode = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
+    episode = dataset.episode_of(rows)
     falls = np.asarray(dataset.transitions.terminated)[dataset.episode_ends - 1][episode]
     whole = np.zeros(len(rows), dtype=bool)
     whole[first_rows(dataset, rows, horizon)] = True

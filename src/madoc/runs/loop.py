@@ -9,11 +9,11 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from jaxtyping import PRNGKeyArray
 
-from madoc import checkpoint
+from madoc.runs import checkpoint
 from madoc.errors import MadocError
-from madoc.interruption import interruptible
-from madoc.progress import Moment, display
-from madoc.run_folder import RunFolder, RunLog, count_name
+from madoc.runs.interruption import interruptible
+from madoc.runs.progress import Moment, display
+from madoc.runs.run_folder import RunFolder, RunLog, count_name
 from madoc.types import Metrics, Unit
 
 Problem = TypeVar("Problem", contravariant=True)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from madoc import checkpoint
+from madoc.runs import checkpoint
 from madoc.errors import MadocError
 
 

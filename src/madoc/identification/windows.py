@@ -58,7 +58,7 @@ def first_rows(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -
 
 def rows_that_fit(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Int[np.ndarray, " windows"]:
     """As `first_rows`; none where no episode is long enough."""
-    episode = np.searchsorted(dataset.episode_starts, rows, side="right") - 1
+    episode = dataset.episode_of(rows)
     return np.flatnonzero(rows + steps <= dataset.episode_ends[episode])
 
 
@@ -89,7 +89,7 @@ def apart(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Int
     """
     chosen, free, episode = [], 0, -1
     possible = first_rows(dataset, rows, steps)
-    episodes = np.searchsorted(dataset.episode_starts, rows[possible], side="right") - 1
+    episodes = dataset.episode_of(rows[possible])
     for position, row, own in zip(possible.tolist(), rows[possible].tolist(), episodes.tolist(), strict=True):
         if own != episode or row >= free:
             chosen.append(position)

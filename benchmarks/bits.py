@@ -1,0 +1,179 @@
+"""Fingerprints of every method's result with fixed seeds, to hold one commit against another bit by bit.
+
+    python benchmarks/bits.py --out results/bits/after.json
+    PYTHONPATH=/tmp/before/src python benchmarks/bits.py --out results/bits/before.json   # another checkout's code
+    python benchmarks/bits.py --compare results/bits/before.json results/bits/after.json
+
+Everything goes through the command line, whose options are the same on both commits. A cell that is in the file already
+is not run again. Estimates are compared with all their digits, policies weight by weight; seconds are not compared.
+"""
+
+import argparse
+import hashlib
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+MADOC = [sys.executable, "-m", "madoc"]
+EXAMPLES = Path(__file__).parent.parent / "examples"
+ROWS = 4000
+SMALL = ["--set", "cloning_epochs=5", "grouping_epochs=2"]
+NETWORKS = "hidden=[32, 32]"
+
+RECORDED = {
+    "clean": [],
+    "noisy": ["--noise", "0.1"],
+    "hidden": ["--hide-velocities"],
+    "shuffled": ["--shuffle", "next_observations"],
+}
+"""Options of `madoc record hopper-medium`, by the name of the data."""
+
+CALIBRATIONS = {
+    **{f"{method} clean": ("clean", method, 15_000, SMALL) for method in ("madoc", "madoc-s", "madoc-vdn")},
+    **{f"{method} clean": ("clean", method, 15_000, SMALL) for method in ("madoc-isac", "madoc-ungrouped")},
+    "madoc-paper clean": ("clean", "madoc-paper", 8_000, ["--set", "grouping_epochs=2", "cloning_epochs=2"]),
+    "madoc policy": ("clean", "madoc", 15_000, ["--starts", "policy", *SMALL]),
+    "madoc replay": ("clean", "madoc", 15_000, ["--starts", "replay", *SMALL]),
+    "madoc hidden": ("hidden", "madoc", 15_000, ["--starts", "policy", *SMALL]),
+    "madoc noisy": ("noisy", "madoc", 15_000, SMALL),
+    "madoc shuffled": ("shuffled", "madoc", 15_000, SMALL),
+    **{
+        f"{method} {data}": (data, method, 150_000, [])
+        for method, data in (
+            ("least-squares", "clean"),
+            ("least-squares", "noisy"),
+            ("least-squares", "hidden"),
+            ("dropo", "clean"),
+            ("e-dropo", "clean"),
+            ("droid", "clean"),
+            ("cma-es", "clean"),
+            ("cma-es-distribution", "clean"),
+            ("nominal", "clean"),
+            ("uniform", "clean"),
+        )
+    },
+    "least-squares horizon 5": ("clean", "least-squares", 150_000, ["--set", "horizon=5", "loss=huber"]),
+    "oted clean": ("clean", "oted", 30_000, []),
+    "oted policy": ("clean", "oted", 30_000, ["--starts", "policy"]),
+    "least-squares arm": ("arm", "least-squares", 600_000, ["--holdout", "0.2"]),
+    "auto arm": ("arm", "auto", 600_000, []),
+    "least-squares spring": ("spring", "least-squares", 300_000, ["--holdout", "0.2"]),
+}
+"""By the name of the cell: the data, the method, its budget, and more options."""
+
+POLICIES = {
+    "sac": (6_000, ["--set", NETWORKS, "updates=50"]),
+    "sac-bc": (6_000, ["--set", NETWORKS, "updates=50"]),
+    "dr-bc": (6_000, ["--set", NETWORKS, "updates=50"]),
+    "h2o": (4_000, ["--set", NETWORKS, "updates=50"]),
+    "bc": (2_000, []),
+    "cql": (2_000, ["--set", NETWORKS]),
+    "morec": (2_000, []),
+}
+"""By learner: its budget, and more options."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--compare", type=Path, nargs=2, metavar=("BEFORE", "AFTER"))
+    parser.add_argument("--only", nargs="+", default=[], help="cells whose name has one of these words")
+    parser.add_argument("--folder", type=Path, help="keep data and run folders here instead of a temporary folder")
+    arguments = parser.parse_args()
+    if arguments.compare:
+        sys.exit(compare(*(json.loads(path.read_text()) for path in arguments.compare)))
+    with tempfile.TemporaryDirectory() as temporary:
+        run(arguments.out, arguments.folder or Path(temporary), arguments.only)
+
+
+def run(out: Path, folder: Path, only: list[str]) -> None:
+    """Run every cell that `out` does not have yet."""
+    done = json.loads(out.read_text()) if out.exists() else {}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    cells = {
+        **{f"calibrate: {name}": calibration for name in CALIBRATIONS},
+        **{f"learn: {name}": policy for name in POLICIES},
+    }
+    for cell, fingerprint in cells.items():
+        if cell in done or not any(word in cell for word in only or [""]):
+            continue
+        done[cell] = fingerprint(cell.split(": ")[1], folder)
+        print(cell, done[cell], flush=True)
+        out.write_text(json.dumps(done, indent=1) + "\n")
+
+
+def calibration(name: str, folder: Path) -> str:
+    """The fingerprint of an estimate with its spread, intervals, groups, status and cost."""
+    data, method, budget, options = CALIBRATIONS[name]
+    result = calibrated(folder / name.replace(" ", "-"), data, method, budget, options)
+    rows = result["parameters"].values()
+    kept = [[row["estimate"], row["std"], row.get("interval")] for row in rows]
+    kept += [result.get("covariance"), result["groups"], result["status"], result["control_steps"]]
+    return digest(json.dumps(kept).encode())
+
+
+def policy(name: str, folder: Path) -> str:
+    """The fingerprint of a policy's weights."""
+    budget, options = POLICIES[name]
+    run = folder / "nominal"
+    calibrated(run, "clean", "nominal", 1, [])
+    out = folder / f"policy-{name}"
+    madoc("learn", str(run), "--method", name, "--budget", str(budget), "--out", str(out), "--quiet", *options)
+    with np.load(out / "policy.npz") as arrays:
+        return digest(*(key.encode() + arrays[key].tobytes() for key in sorted(arrays)))
+
+
+def calibrated(out: Path, data: str, method: str, budget: int, options: list[str]) -> dict:
+    """The result of a calibration."""
+    if not (out / "result.json").exists():
+        robot, log = recorded(out.parent, data)
+        asked = ["--method", method, "--budget", str(budget), "--out", str(out), "--quiet", *options]
+        madoc("calibrate", robot, "--data", str(log), *asked)
+    return json.loads((out / "result.json").read_text())
+
+
+def recorded(folder: Path, data: str) -> tuple[str, Path]:
+    """The robot, and a log of it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / f"data-{data}"
+    if data in RECORDED:
+        if not log.with_suffix(".npz").exists():
+            size = ["--transitions", str(ROWS), "--out", str(log.with_suffix(".npz")), "--quiet"]
+            madoc("record", "hopper-medium", *size, *RECORDED[data])
+        return "hopper", log.with_suffix(".npz")
+    spec = EXAMPLES / data / f"{data}.yaml"
+    if not log.exists():
+        truth, script = EXAMPLES / data / "truth.json", EXAMPLES / "record_logs.py"
+        subprocess.run([sys.executable, script, spec, truth, log], check=True, stdout=subprocess.DEVNULL)
+    return str(spec), log
+
+
+def madoc(*words: str) -> None:
+    """The command line; a verdict's exit code is no failure."""
+    answer = subprocess.run([*MADOC, *words], capture_output=True, text=True)
+    if answer.returncode not in (0, 10, 11, 12, 13):
+        raise SystemExit(f"madoc {' '.join(words)}: {answer.stderr[-2000:]}")
+
+
+def digest(*parts: bytes) -> str:
+    """Sixteen digits of SHA-256."""
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
+
+
+def compare(before: dict[str, str], after: dict[str, str]) -> int:
+    """Print a row a cell; the number of cells that differ."""
+    different = 0
+    for cell in sorted({*before, *after}):
+        first, second = (run.get(cell, "not run") for run in (before, after))
+        different += first != second
+        print(f"| {cell} | {first} | {second} | {'equal' if first == second else 'DIFFERS'} |")
+    print(f"{different} of {len({*before, *after})} differ")
+    return different
+
+
+if __name__ == "__main__":
+    main()

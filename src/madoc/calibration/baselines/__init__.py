@@ -1,0 +1,1 @@
+"""Calibrators that Madoc and least squares are compared with, and what their searches share."""
