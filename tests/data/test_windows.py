@@ -3,7 +3,7 @@ import pytest
 from layouts import make_dataset
 
 from madoc.errors import MadocError
-from madoc.identification.windows import apart, evenly, first_rows, readings_at, rows_that_fit, windows_at
+from madoc.identification.windows import disjoint_windows, evenly, first_rows, readings_at, rows_that_fit, windows_at
 
 
 def test_windows_never_cross_the_end_of_an_episode(hopper):
@@ -37,9 +37,9 @@ def test_episodes_that_are_too_short_are_refused(hopper):
 def test_windows_apart_share_no_reading(hopper):
     dataset = make_dataset(hopper, lengths=(6, 4), falls=())
     # Of two rows each, three readings: 0-2, 3-5, and, as another episode shares none with it, from its first row.
-    np.testing.assert_array_equal(apart(dataset, np.arange(10), 2), [0, 3, 6])
+    np.testing.assert_array_equal(disjoint_windows(dataset, np.arange(10), 2), [0, 3, 6])
     rows = np.array([1, 2, 4, 7])
-    np.testing.assert_array_equal(rows[apart(dataset, rows, 2)], [1, 4, 7])
+    np.testing.assert_array_equal(rows[disjoint_windows(dataset, rows, 2)], [1, 4, 7])
 
 
 def test_readings_include_the_first(hopper):

@@ -9,11 +9,12 @@ from logged_arm import SPEC, TRUTH, arm_of, columns_of, write_csv
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
-from madoc.data import logged_states, logs
+from madoc.data import logs
 from madoc.data.findings import Finding
 from madoc.diagnosis import check, refuse_fatal
 from madoc.diagnosis.excitation import excite
 from madoc.errors import MadocError
+from madoc.identification.states import logged_states
 from madoc.simulation.sensitivity import refuse_insensitive
 from robots import ARM
 
