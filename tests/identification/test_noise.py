@@ -3,9 +3,8 @@ import numpy as np
 import pytest
 
 from madoc import simulation
-from madoc.data import Dataset, Disturbance, disturb
+from madoc.data import Dataset
 from madoc.identification.noise import clipped, consecutive_noise, difference_noise, own_slopes
-from madoc.identification.windows import consecutive_rows
 from madoc.types import Transitions
 from robots import SPRING_TRUTH, recorded, spring
 
@@ -73,11 +72,3 @@ def test_the_slopes_of_the_spring_by_itself():
     assert slopes[:, 0] == pytest.approx(1 - stiffness / mass * h**2 * 0.75, abs=1e-3)
     assert slopes[:, 1] == pytest.approx(1 - damping / mass * h, abs=2e-3)
     assert slopes[0] == pytest.approx(slopes[1], abs=1e-9)  # a spring is linear
-
-
-def test_rows_that_follow_each_other_lie_in_one_episode():
-    log = recorded(spring(max_episode_steps=4), SPRING_TRUTH, 12, jax.random.key(0))
-    assert consecutive_rows(log, np.arange(12)).tolist() == [0, 1, 2, 4, 5, 6, 8, 9, 10]
-    assert consecutive_rows(log, np.array([0, 2, 3, 4])).tolist() == [2]
-    lost = disturb(log, Disturbance(shuffled="rows"), spring(), jax.random.key(0))
-    assert not len(consecutive_rows(lost, np.arange(12)))

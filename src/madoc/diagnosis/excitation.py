@@ -94,7 +94,7 @@ def _excited(
     """As `excite`, over stretches of one length."""
     space = simulator.parameters
     steps = longest_fit(dataset, rows, horizon)
-    disjoint = disjoint_windows(dataset, rows, steps)
+    disjoint = disjoint_windows(dataset, rows, steps, gap=0)
     chosen, available = drawn(disjoint, WINDOWS[horizon], key), len(disjoint)
     windows = windows_at(dataset, states[chosen], rows[chosen], steps)
     scale = typical_change(dataset)

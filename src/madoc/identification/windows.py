@@ -95,10 +95,11 @@ def longest_fit(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) 
     return int(min(steps, (dataset.episode_ends[dataset.episode_of(rows)] - rows).max()))
 
 
-def disjoint_windows(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Positions:
+def disjoint_windows(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int, *, gap: int = 1) -> Positions:
     """Rows that begin windows of `steps` rows without a common observation, as many as fit one after the other.
 
-    A window has `steps` + 1 observations; the next one begins behind the last of them.
+    A window has `steps` + 1 observations; the next one begins behind the last of them. With a gap of 0 it begins at the
+    last of them, so that only actions are disjoint.
 
     Raises:
         MadocError: No episode is long enough.
@@ -109,7 +110,7 @@ def disjoint_windows(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: 
     for position, row, own in zip(possible.tolist(), rows[possible].tolist(), episodes.tolist(), strict=True):
         if own != episode or row >= free:
             chosen.append(position)
-            free, episode = row + steps + 1, own
+            free, episode = row + steps + gap, own
     return np.array(chosen)
 
 
