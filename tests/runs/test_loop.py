@@ -252,8 +252,8 @@ def test_an_error_in_a_step_closes_everything(tmp_path):
 
 class Grows(Wander):
     def step(self, problem, state):
-        state, metrics = super().step(problem, state)
-        return type(state)(**{**vars(state), "sum": np.zeros(state.epoch)}), metrics
+        state, epoch = super().step(problem, state)
+        return type(state)(**{**vars(state), "sum": np.zeros(state.epoch)}), epoch
 
 
 def test_a_state_that_changes_shape_is_refused_before_it_is_saved(tmp_path):
