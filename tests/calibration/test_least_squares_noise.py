@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
 
-from madoc.calibration.least_squares.estimated_states import FAILED_WINDOW, clipped_change
-from madoc.calibration.least_squares.noise import echo, takes_turns, unlike
+from madoc.calibration.least_squares.statistics import alternation, clipped_change, echo, unlike
+from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE
 from madoc.identification.noise import channel_noise
+
+LIMITS = {"least": LIKE_NOISE, "failed": FAILED_WINDOW}
 
 
 def test_deviation_is_the_median_over_what_the_states_left():
@@ -27,17 +29,17 @@ def test_no_channel_is_a_thousand_times_surer_than_another():
 def test_noise_takes_turns_and_a_wrong_model_does_not():
     noise = np.random.default_rng(0).normal(size=(3, 20_000, 1))
     before, after = noise[1] - noise[0], noise[2] - noise[1]
-    assert takes_turns(before, after) == pytest.approx(0.5, abs=0.03)
-    assert takes_turns(before + 3.0, after + 3.0) < -0.5
-    assert takes_turns(noise[0], noise[1]) == pytest.approx(0.0, abs=0.03)
-    assert takes_turns(before[:0], after[:0]) == 0.0
+    assert alternation(before, after) == pytest.approx(0.5, abs=0.03)
+    assert alternation(before + 3.0, after + 3.0) < -0.5
+    assert alternation(noise[0], noise[1]) == pytest.approx(0.0, abs=0.03)
+    assert alternation(before[:0], after[:0]) == 0.0
 
 
 def test_half_of_the_channels_tell_of_noise():
     noise = np.random.default_rng(0).normal(size=(3, 20_000, 2))
     before, after = noise[1] - noise[0], noise[2] - noise[1]
     before[:, 1], after[:, 1] = noise[0, :, 1], noise[1, :, 1]
-    assert takes_turns(before, after) == pytest.approx(0.5, abs=0.03)
+    assert alternation(before, after) == pytest.approx(0.5, abs=0.03)
 
 
 def test_what_is_unlike_the_others_is_measured_in_their_deviations():
@@ -56,22 +58,22 @@ def test_windows_in_which_nothing_happens_do_not_say_what_is_usual():
 def test_a_window_thrown_across_a_contact_does_not_forbid_what_helps_the_others():
     # From their middle, 2, the changes are 1, 0, 1 and 98 away, so 5 · 1.4826 · 1 is how far is like the others.
     before, after = np.zeros(4), np.array([[1.0, 2.0, 3.0, 100.0]])
-    change = clipped_change(before, after, np.ones(4))
+    change = clipped_change(before, after, np.ones(4), **LIMITS)
     np.testing.assert_allclose(change, [[1.0, 2.0, 3.0, 2.0 + 5.0 * 1.4826]])
 
 
 def test_a_step_that_makes_simulations_fail_pays_for_it():
     before, after = np.ones(5), np.array([[0.9, 0.9, 0.9, 0.9, FAILED_WINDOW]])
-    assert clipped_change(before, after, np.ones(5)).sum() > 0.0
+    assert clipped_change(before, after, np.ones(5), **LIMITS).sum() > 0.0
 
 
 def test_costs_never_fall_below_nothing():
     before, after = np.array([10.0, 10.0, 10.0, 0.1]), np.array([[1.0, 1.0, 1.0, 0.05]])
-    np.testing.assert_allclose(clipped_change(before, after, np.ones(4)), after - before)
+    np.testing.assert_allclose(clipped_change(before, after, np.ones(4), **LIMITS), after - before)
 
 
 def test_where_most_windows_rest_the_others_are_not_done_without():
-    change = clipped_change(np.ones(5), np.array([[1.0, 1.0, 1.0, 2.0, 2.0]]), np.array([1.0, 1.0, 1.0, 1.0, 1.0]))
+    change = clipped_change(np.ones(5), np.array([[1.0, 1.0, 1.0, 2.0, 2.0]]), np.ones(5), **LIMITS)
     np.testing.assert_allclose(change, [[0.0, 0.0, 0.0, 1.0, 1.0]])
 
 

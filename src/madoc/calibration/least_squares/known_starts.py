@@ -59,23 +59,30 @@ class KnownStarts:
         """Systems simulated an epoch: central differences, and the steps tried."""
         return 1 + 2 * len(problem.simulator.parameters) + len(TRIALS)
 
-    def windows(self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int) -> Windows:
+    def windows(self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int) -> "KnownWindows":
         """The windows that begin at the given rows."""
         states = problem.logged_states[np.searchsorted(problem.logged_rows, rows)]
-        return windows_at(problem.dataset, states, rows, horizon)
-
-    def in_state_units(self, windows: Windows, steps: np.ndarray, size: int) -> np.ndarray:
-        """No steps of initial states, of which there are none."""
-        return steps
+        return KnownWindows(problem, windows_at(problem.dataset, states, rows, horizon), self.loss)
 
     def comparable(self, cost: float, plan: Plan) -> float:
         """The cost by which searches are compared."""
         return cost
 
+
+@dataclass(frozen=True)
+class KnownWindows:
+    """Windows to be simulated from logged states."""
+
+    problem: CalibrationProblem
+    windows: Windows
+    loss: Loss
+
+    def in_state_units(self, steps: Float[np.ndarray, "0 0"], size: int) -> Float[np.ndarray, "0 0"]:
+        """No steps of initial states, of which there are none."""
+        return steps
+
     def plans(
         self,
-        problem: CalibrationProblem,
-        windows: Windows,
         unit: Float[np.ndarray, "searches d"],
         states: Float[np.ndarray, "searches 0 0"],
         damping: Float[np.ndarray, " searches"],
@@ -85,20 +92,14 @@ class KnownStarts:
     ) -> list[Plan]:
         """Central differences around every search's point, in one batch."""
         points = np.stack([difference_points(point) for point in unit])
-        around = self._residuals(problem, windows, points)
-        return [self._plan(windows, *each) for each in zip(points, around, damping.tolist(), strict=True)]
+        around = self._residuals(points)
+        return [self._plan(*each) for each in zip(points, around, damping.tolist(), strict=True)]
 
-    def outcomes(
-        self,
-        problem: CalibrationProblem,
-        windows: Windows,
-        plans: list[Plan],
-        states: Float[np.ndarray, "searches 0 0"],
-    ) -> list[Outcome]:
+    def outcomes(self, plans: list[Plan], states: Float[np.ndarray, "searches 0 0"]) -> list[Outcome]:
         """Costs after every step of every search, in one batch."""
         tried = np.stack([plan.unit + plan.steps[:-1] for plan in plans])
         found = []
-        for plan, residuals in zip(plans, self._residuals(problem, windows, tried), strict=True):
+        for plan, residuals in zip(plans, self._residuals(tried), strict=True):
             before = mean_cost(plan.residuals, plan.scale, self.loss)
             totals = np.array([*(mean_cost(each, plan.scale, self.loss) for each in residuals), before])
             failures = int((~np.isfinite(residuals).all(-1)).sum())
@@ -107,7 +108,6 @@ class KnownStarts:
 
     def _plan(
         self,
-        windows: Windows,
         points: Float[np.ndarray, "points d"],
         residuals: Float[np.ndarray, "points windows values"],
         damping: float,
@@ -123,8 +123,8 @@ class KnownStarts:
             steps=np.stack([*steps, np.zeros_like(points[0])]),
             state_steps=np.zeros((len(TRIALS) + 1, 0, 0)),
             scale=scale,
-            deviation=np.ones(windows.following.shape[-1]),
-            activity=np.ones(len(windows)),
+            deviation=np.ones(self.problem.states.measured),
+            activity=np.ones(len(self.windows)),
             bread=bread(around, scale, self.loss),
             meat=meat(around, scale, self.loss),
             echo=0.0,
@@ -133,8 +133,8 @@ class KnownStarts:
         )
 
     def _residuals(
-        self, problem: CalibrationProblem, windows: Windows, points: Float[np.ndarray, "searches points d"]
+        self, points: Float[np.ndarray, "searches points d"]
     ) -> Float[np.ndarray, "searches points windows values"]:
         flat = points.reshape(-1, points.shape[-1])
-        residuals = window_residuals(problem.simulator, windows, flat, problem.typical_change)
+        residuals = window_residuals(self.problem.simulator, self.windows, flat, self.problem.typical_change)
         return residuals.reshape(*points.shape[:2], *residuals.shape[1:])

@@ -15,7 +15,7 @@ from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome,
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.identification.information import SETTLED, sandwich
 from madoc.identification.losses import ALL_FAILED
-from madoc.types import Metrics
+from madoc.types import Epoch
 
 DAMPING_RANGE = (1e-10, 1e10)
 """Relative damping of the parameters' step, lowest and highest; it is clipped to them."""
@@ -49,7 +49,6 @@ class SearchState:
         refining: 0 while searching on few windows, 1 on all of them.
         waiting: Epochs on all windows in which only initial states still move.
         epochs: Done in this stage, those of waiting not counted.
-        control_steps: Simulated.
         failures: Windows whose simulation failed.
     """
 
@@ -68,7 +67,6 @@ class SearchState:
     refining: int
     waiting: int
     epochs: int
-    control_steps: int
     failures: int
 
 
@@ -129,32 +127,29 @@ class Search:
             refining=0,
             waiting=0,
             epochs=0,
-            control_steps=0,
             failures=0,
         )
 
-    def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Metrics]:
+    def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
         """One damped step of every search under way: derivatives in one simulation, the steps tried in another."""
         running, count = self._running(state), self.window_count(state)
         windows = self.starts.windows(problem, state.rows[:count], self.horizon)
         unit, states = state.unit[:running], state.states[:running, :count]
-        plans = self.starts.plans(
-            problem,
-            windows,
+        plans = windows.plans(
             unit,
             states,
             state.damping[:running],
             state.state_damping[:running, :count],
             refining=bool(state.refining),
         )
-        outcomes = self.starts.outcomes(problem, windows, plans, states)
+        outcomes = windows.outcomes(plans, states)
         new = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}
         for index, (plan, outcome) in enumerate(zip(plans, outcomes, strict=True)):
             trial, factor = chosen(outcome, waiting=state.waiting > 0)
             followed = outcome.followed[trial]
             new["unit"][index] = np.clip(unit[index] + plan.steps[trial], -1.0, 1.0)
             change = followed[:, None] * plan.state_steps[trial]
-            new["states"][index, :count] += self.starts.in_state_units(windows, change, states.shape[2])
+            new["states"][index, :count] += windows.in_state_units(change, states.shape[2])
             new["damping"][index] = np.clip(state.damping[index] * factor, *DAMPING_RANGE)
             state_factor = np.select([followed == 1.0, followed > 0.0], [0.1, 1.0], 10.0)
             new["state_damping"][index, :count] = np.clip(
@@ -175,18 +170,18 @@ class Search:
             echo=best.echo,
             waiting=max(0, state.waiting - 1),
             epochs=state.epochs + (state.waiting == 0),
-            control_steps=state.control_steps + self._epoch_steps(problem, state),
-            failures=state.failures + sum(part.failures for part in (*plans, *outcomes)),
+            failures=state.failures + sum(each.failures for each in plans) + sum(each.failures for each in outcomes),
         )
         noise = float(np.median(best.deviation))
         metrics = {
             "residual": float(np.sqrt(new["cost"][leader])) * (noise if state.refining else 1.0),
             "moved": float(new["moved"][leader]),
         }
-        metrics |= {"noise": noise} if isinstance(self.starts, UnknownStarts) else {}
+        metrics |= {"noise": noise} if states.size else {}
         if not state.refining and (new["moved"][leader] < 1.0 or following.epochs >= self.search_epochs):
             following = self._refined(following, leader)
-        return following, metrics
+        stage = "calibrating" if state.refining else "searching"
+        return following, Epoch(metrics, self._epoch_steps(problem, state), stage=stage)
 
     def settled(self, state: SearchState) -> bool:
         """Whether the next step would change nothing worth a simulation; not where every window fails."""

@@ -1,4 +1,4 @@
-"""Statistics of residuals that a search decides by: which windows are like most, and whether noise is all that is left."""
+"""Statistics of residuals that a search decides by: which windows are outliers, and whether only noise is left."""
 
 import numpy as np
 from jaxtyping import Float, Int

@@ -19,13 +19,14 @@ from madoc.identification.losses import ALL_FAILED, TUNING, Loss, curvature_shar
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.windows import disjoint_windows
+from madoc.simulation.base import Simulator
 
 FOLLOWED = (1.0, 0.3, 0.0)
 """Shares of an initial state's step, from 0 to 1, that every window chooses from: at contacts all of it is too far."""
 FAILED_WINDOW = 1e6
 """Cost of a window that failed, in squared standard deviations of the noise."""
 LIKE_NOISE = 1.5
-"""Cost of a window, in squared standard deviations, that noise alone exceeds rarely; 0.8 is usual under Cauchy's loss."""
+"""Cost of a window, in squared standard deviations, that noise alone exceeds rarely; it leaves 0.8 on average."""
 ROUNDING = 1e-8
 """Largest noise, in a channel's typical change, of exact readings: their residuals cannot become smaller."""
 _SUFFICIENT = 0.02
@@ -84,25 +85,33 @@ class UnknownStarts:
         unknown = 2 * len(problem.simulator.parameters) + problem.states.physical_size
         return 1 + unknown + len(FOLLOWED) * (len(TRIALS) + 1)
 
-    def windows(self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int) -> Readings:
+    def windows(self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int) -> "UnknownWindows":
         """The windows that begin at the given rows."""
-        return Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
-
-    def in_state_units(
-        self, windows: Readings, steps: Float[np.ndarray, "windows physical"], size: int
-    ) -> Float[np.ndarray, "windows state"]:
-        """Steps of initial states, in their units."""
-        return windows.in_state_units(steps, size)
+        readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
+        return UnknownWindows(problem.simulator, readings, self.loss)
 
     def comparable(self, cost: float, plan: Plan) -> float:
         """The cost in typical changes, by which searches are compared; a window that failed adds a whole change."""
         failed = 1.0 - float(plan.kept.mean())
         return ALL_FAILED if failed == 1.0 else cost * float(plan.deviation[0]) ** 2 + failed
 
+
+@dataclass(frozen=True)
+class UnknownWindows:
+    """Windows to be simulated from estimated states."""
+
+    simulator: Simulator
+    readings: Readings
+    loss: Loss
+
+    def in_state_units(
+        self, steps: Float[np.ndarray, "windows physical"], size: int
+    ) -> Float[np.ndarray, "windows state"]:
+        """Steps of initial states, in their units."""
+        return self.readings.in_state_units(steps, size)
+
     def plans(
         self,
-        problem: CalibrationProblem,
-        windows: Readings,
         unit: Float[np.ndarray, "searches d"],
         states: Float[np.ndarray, "searches windows state"],
         damping: Float[np.ndarray, " searches"],
@@ -111,30 +120,24 @@ class UnknownStarts:
         refining: bool,
     ) -> list[Plan]:
         """Differences around every search's point and initial states, in one batch each."""
-        slopes = slopes_at(problem.simulator, windows, unit, states)
+        slopes = slopes_at(self.simulator, self.readings, unit, states)
         searches = zip(slopes, unit, damping.tolist(), state_damping, strict=True)
-        return [self._plan(windows, *each, refining=refining) for each in searches]
+        return [self._plan(*each, refining=refining) for each in searches]
 
-    def outcomes(
-        self,
-        problem: CalibrationProblem,
-        windows: Readings,
-        plans: list[Plan],
-        states: Float[np.ndarray, "searches windows state"],
-    ) -> list[Outcome]:
+    def outcomes(self, plans: list[Plan], states: Float[np.ndarray, "searches windows state"]) -> list[Outcome]:
         """Costs after every step of every search, each window's state following as far as fits it best."""
         ways = np.array(FOLLOWED)[:, None, None]
-        size = states.shape[2]
+        readings, size = self.readings, states.shape[2]
         starts = [
-            state + ways * windows.in_state_units(plan.state_steps, size)[:, None]
+            state + ways * readings.in_state_units(plan.state_steps, size)[:, None]
             for plan, state in zip(plans, states, strict=True)
         ]
-        flat = np.concatenate(starts).reshape(-1, len(FOLLOWED) * len(windows), size)
+        flat = np.concatenate(starts).reshape(-1, len(FOLLOWED) * len(readings), size)
         units = np.concatenate([plan.unit + plan.steps for plan in plans])
-        residuals = windows.residuals(problem.simulator, units, flat)
+        residuals = readings.residuals(self.simulator, units, flat)
         residuals = residuals.reshape(len(plans), -1, *residuals.shape[1:])
         return [
-            self._outcome(plan, part / np.tile(plan.deviation, windows.steps + 1))
+            self._outcome(plan, part / np.tile(plan.deviation, readings.steps + 1))
             for part, plan in zip(residuals, plans, strict=True)
         ]
 
@@ -152,7 +155,6 @@ class UnknownStarts:
 
     def _plan(
         self,
-        windows: Readings,
         slopes: WindowSlopes,
         unit: Float[np.ndarray, " d"],
         damping: float,
@@ -161,13 +163,13 @@ class UnknownStarts:
         refining: bool,
     ) -> Plan:
         """While refining, channels weigh by their noise, and only windows that are `_trusted` move the parameters."""
-        channels, readings = len(windows.scale), windows.steps + 1
+        channels, readings = len(self.readings.scale), self.readings.steps + 1
         least = np.full(len(state_damping), _LEAST_DAMPING)
         alike = eliminate(slopes, np.ones_like(slopes.residuals), least)
         kept = slopes.whole
         deviation = _deviation(slopes, alike.spare, channels, kept)
         if refining:
-            kept = self._trusted(slopes.over(np.tile(deviation, readings)), windows.activity)
+            kept = self._trusted(slopes.over(np.tile(deviation, readings)), self.readings.activity)
             deviation = _deviation(slopes, alike.spare, channels, kept)
         else:
             deviation = np.full(channels, np.median(deviation))
@@ -190,7 +192,7 @@ class UnknownStarts:
             state_steps=np.stack([damped.states_step(step) for step in steps]),
             scale=TUNING[self.loss],
             deviation=deviation,
-            activity=windows.activity,
+            activity=self.readings.activity,
             bread=curved,
             meat=at_least_noise(jackknife_meat(exact, share, curved), curved, ratio),
             echo=echo(slopes.residuals.reshape(len(kept), -1, channels)[kept]),
