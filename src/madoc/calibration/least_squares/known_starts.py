@@ -29,27 +29,22 @@ class KnownStarts:
     stuck: float = 0.0
     waiting: int = 0
 
-    def possible_rows(self, problem: CalibrationProblem, horizon: int) -> Int[np.ndarray, " windows"]:
+    def possible_rows(self, problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
         """Rows at which windows can begin. Those that share readings are not independent, but intervals take them so.
 
         Raises:
-            MadocError: No state can be rebuilt, or no episode is long enough.
+            MadocError: No state can be rebuilt, no episode is long enough, or there are fewer values than parameters.
         """
         pick = first_rows if horizon == 1 else disjoint_windows
-        return problem.logged_rows[pick(problem.dataset, problem.logged_rows, horizon)]
-
-    def require_enough(self, problem: CalibrationProblem, windows: int, horizon: int) -> None:
-        """Refuse fewer values than parameters.
-
-        Raises:
-            MadocError: Says how many there are.
-        """
+        possible = pick(problem.dataset, problem.logged_rows, horizon)
         count, values = len(problem.simulator.parameters), problem.simulator.task.observation_size
+        windows = min(most, len(possible))
         if windows * horizon * values < count:
             raise MadocError(
                 f"expected at least as many logged values as parameters, got {windows} windows of {horizon} rows "
                 f"with {values} values for {count} parameters; give it more rows or fewer parameters"
             )
+        return problem.logged_rows[possible]
 
     def guesses(self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"]) -> Float[np.ndarray, "0 0"]:
         """None: there is nothing to guess."""
@@ -63,10 +58,6 @@ class KnownStarts:
         """The windows that begin at the given rows."""
         states = problem.logged_states[np.searchsorted(problem.logged_rows, rows)]
         return KnownWindows(problem, windows_at(problem.dataset, states, rows, horizon), self.loss)
-
-    def comparable(self, cost: float, plan: Plan) -> float:
-        """The cost by which searches are compared."""
-        return cost
 
 
 @dataclass(frozen=True)
@@ -129,6 +120,7 @@ class KnownWindows:
             meat=meat(around, scale, self.loss),
             echo=0.0,
             exact=True,
+            left_out=0.0,
             failures=int((~np.isfinite(residuals).all(-1)).sum()),
         )
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from madoc.identification.losses import ALL_FAILED
+
 TRIALS = (1e-2, 1.0, 1e2)
 """Factors of the last damping that helped, tried at once; where none helps, the next are a thousand times larger."""
 FIRST_DAMPING = 1e-2
@@ -29,6 +31,7 @@ class Plan:
         meat: Scatter of its gradient.
         echo: Correlation of residuals of consecutive readings.
         exact: Whether residuals are rounding errors, or cannot tell that initial states have yet to move.
+        left_out: Share of the windows that the cost does not count.
         failures: Simulations that failed.
     """
 
@@ -44,7 +47,12 @@ class Plan:
     meat: Float[np.ndarray, "d d"]
     echo: float
     exact: bool
+    left_out: float
     failures: int
+
+    def comparable(self, cost: float) -> float:
+        """A cost in typical changes, by which searches are compared; a window left out adds a whole change."""
+        return ALL_FAILED if self.left_out == 1.0 else cost * float(self.deviation[0]) ** 2 + self.left_out
 
 
 @dataclass(frozen=True)

@@ -103,9 +103,8 @@ class Search:
         """
         of_windows, of_starts = jax.random.split(key)
         count = len(problem.simulator.parameters)
-        possible = self.starts.possible_rows(problem, self.horizon)
+        possible = self.starts.possible_rows(problem, self.horizon, self.windows)
         drawn = min(self.windows, len(possible))
-        self.starts.require_enough(problem, drawn, self.horizon)
         order = jax.random.choice(of_windows, len(possible), (drawn,), replace=False)
         rows = possible[np.asarray(order)]
         unit = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
@@ -156,7 +155,7 @@ class Search:
                 state.state_damping[index, :count] * state_factor, *STATE_DAMPING_RANGE
             )
             cost = float(outcome.totals[trial])
-            new["cost"][index] = cost if state.refining else self.starts.comparable(cost, plan)
+            new["cost"][index] = cost if state.refining else plan.comparable(cost)
             new["moved"][index] = self._moved(plan, outcome, trial, damping=float(state.damping[index]))
         leader = int(np.argmin(new["cost"][:running]))
         best = plans[leader]

@@ -15,7 +15,7 @@ from madoc.errors import MadocError
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.information import at_least_noise, bread, jackknife_meat, least_share
 from madoc.identification.linearisation import WindowSlopes
-from madoc.identification.losses import ALL_FAILED, TUNING, Loss, curvature_share, loss_slope, loss_value
+from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope, loss_value
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.windows import disjoint_windows
@@ -50,28 +50,23 @@ class UnknownStarts:
     stuck: float = 1e3
     waiting: int = 2
 
-    def possible_rows(self, problem: CalibrationProblem, horizon: int) -> Int[np.ndarray, " windows"]:
+    def possible_rows(self, problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
         """Rows at which windows can begin that share no reading.
 
         Raises:
-            MadocError: No position is observed, or no episode is long enough.
+            MadocError: No position is observed, no episode is long enough, or there are fewer readings than unknowns.
         """
         rows = problem.states.guesses()[1]
-        return rows[disjoint_windows(problem.dataset, rows, horizon)]
-
-    def require_enough(self, problem: CalibrationProblem, windows: int, horizon: int) -> None:
-        """Refuse fewer readings than unknowns.
-
-        Raises:
-            MadocError: Says how many there are.
-        """
+        rows = rows[disjoint_windows(problem.dataset, rows, horizon)]
+        windows = min(most, len(rows))
         readings = windows * (horizon + 1) * problem.states.measured
-        if readings < len(problem.simulator.parameters) + windows * problem.states.physical_size:
-            unknowns = len(problem.simulator.parameters) + windows * problem.states.physical_size
+        unknowns = len(problem.simulator.parameters) + windows * problem.states.physical_size
+        if readings < unknowns:
             raise MadocError(
                 f"expected at least as many readings as unknowns, got {windows} windows of {horizon} rows with "
                 f"{readings} readings for {unknowns} parameters and initial states; take a longer horizon"
             )
+        return rows
 
     def guesses(
         self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"]
@@ -89,11 +84,6 @@ class UnknownStarts:
         """The windows that begin at the given rows."""
         readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
         return UnknownWindows(problem.simulator, readings, self.loss)
-
-    def comparable(self, cost: float, plan: Plan) -> float:
-        """The cost in typical changes, by which searches are compared; a window that failed adds a whole change."""
-        failed = 1.0 - float(plan.kept.mean())
-        return ALL_FAILED if failed == 1.0 else cost * float(plan.deviation[0]) ** 2 + failed
 
 
 @dataclass(frozen=True)
@@ -197,6 +187,7 @@ class UnknownWindows:
             meat=at_least_noise(jackknife_meat(exact, share, curved), curved, ratio),
             echo=echo(slopes.residuals.reshape(len(kept), -1, channels)[kept]),
             exact=float(deviation.max()) < ROUNDING,
+            left_out=1.0 - float(kept.mean()),
             failures=int((~slopes.whole).sum()),
         )
 
