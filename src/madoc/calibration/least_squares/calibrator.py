@@ -200,27 +200,20 @@ class LeastSquares:
     def _known(self, problem: CalibrationProblem) -> Search:
         """The search from logged states; where it only finds a start for the other, short windows mislead least."""
         starting = self._first_stage(problem) == "starting"
-        return Search(
-            starts=KnownStarts(self.loss),
-            horizon=LOGGED_HORIZON if starting else self.horizon or LOGGED_HORIZON,
-            windows=self.windows or WINDOWS["logged"],
-            searches=self.searches,
-            search_windows=self.search_windows or SEARCH_WINDOWS["logged"],
-            search_epochs=self.search_epochs,
-            tolerance=self.tolerance,
-        )
+        horizon = LOGGED_HORIZON if starting else self.horizon or LOGGED_HORIZON
+        return self._search(KnownStarts(self.loss), "logged", horizon, self.searches)
 
     def _unknown(self, problem: CalibrationProblem, length: int = 0) -> Search:
         """The search with unknown initial states; it starts where one from logged states ended, if there was one."""
-        return Search(
-            starts=UnknownStarts(self.loss),
-            horizon=self.horizon or LENGTHS[length] * horizon_of(problem.dataset),
-            windows=self.windows or WINDOWS["estimated"],
-            searches=self.searches if self._first_stage(problem) == "estimated" else 1,
-            search_windows=self.search_windows or SEARCH_WINDOWS["estimated"],
-            search_epochs=self.search_epochs,
-            tolerance=self.tolerance,
-        )
+        searches = self.searches if self._first_stage(problem) == "estimated" else 1
+        horizon = self.horizon or LENGTHS[length] * horizon_of(problem.dataset)
+        return self._search(UnknownStarts(self.loss), "estimated", horizon, searches)
+
+    def _search(
+        self, starts: KnownStarts | UnknownStarts, states: InitialStates, horizon: int, searches: int
+    ) -> Search:
+        windows, search_windows = self.windows or WINDOWS[states], self.search_windows or SEARCH_WINDOWS[states]
+        return Search(starts, horizon, windows, searches, search_windows, self.search_epochs, self.tolerance)
 
     def _all_lengths(self, problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[SearchState, ...]:
         """Searches on all lengths of windows that the data has room for; on one where the length is given."""

@@ -115,7 +115,6 @@ class KnownWindows:
             state_steps=np.zeros((len(TRIALS) + 1, 0, 0)),
             scale=scale,
             deviation=np.ones(self.problem.states.measured),
-            activity=np.ones(len(self.windows)),
             bread=bread(around, scale, self.loss),
             meat=meat(around, scale, self.loss),
             echo=0.0,

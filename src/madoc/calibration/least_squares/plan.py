@@ -26,7 +26,6 @@ class Plan:
         state_steps: Of unknown initial states along with each of these, in units of their spread.
         scale: c of the loss.
         deviation: Noise of each channel, in its typical changes.
-        activity: How much happens in each window.
         bread: Curvature of the cost.
         meat: Scatter of its gradient.
         echo: Correlation of residuals of consecutive readings.
@@ -42,7 +41,6 @@ class Plan:
     state_steps: Float[np.ndarray, "trials unknown physical"]
     scale: float
     deviation: Float[np.ndarray, " channels"]
-    activity: Float[np.ndarray, " windows"]
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
     echo: float

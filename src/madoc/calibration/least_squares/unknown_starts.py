@@ -137,10 +137,10 @@ class UnknownWindows:
         if not plan.kept.any():
             return Outcome(FAILED_WINDOW, costs.min(1).mean(-1), followed, 0)
         before, after = self._costs(plan.residuals)[plan.kept], costs.min(1)[:, plan.kept]
-        robust = self.loss != "linear"
         change = after - before
-        if robust:
-            change = clipped_change(before, after, plan.activity[plan.kept], least=LIKE_NOISE, failed=FAILED_WINDOW)
+        if self.loss != "linear":
+            activity = self.readings.activity[plan.kept]
+            change = clipped_change(before, after, activity, least=LIKE_NOISE, failed=FAILED_WINDOW)
         return Outcome(float(before.mean()), before.mean() + change.mean(-1), followed, 0)
 
     def _plan(
@@ -182,7 +182,6 @@ class UnknownWindows:
             state_steps=np.stack([damped.states_step(step) for step in steps]),
             scale=TUNING[self.loss],
             deviation=deviation,
-            activity=self.readings.activity,
             bread=curved,
             meat=at_least_noise(jackknife_meat(exact, share, curved), curved, ratio),
             echo=echo(slopes.residuals.reshape(len(kept), -1, channels)[kept]),
