@@ -42,7 +42,9 @@ def test_windows_left_out_make_a_search_worse_than_its_cost_says():
     nothing = np.zeros(0)
     rest = {"unit": nothing, "residuals": nothing, "kept": nothing, "steps": nothing, "state_steps": nothing}
     rest |= {"bread": nothing, "meat": nothing}
-    plan = Plan(**rest, scale=1.0, deviation=np.array([0.5]), echo=0.0, exact=False, left_out=0.25, failures=0)
+    plan = Plan(
+        **rest, scale=1.0, deviation=np.array([0.5]), autocorrelation=0.0, exact=False, left_out=0.25, failures=0
+    )
     assert plan.comparable(2.0) == pytest.approx(2.0 * 0.25 + 0.25)
     assert replace(plan, left_out=1.0).comparable(2.0) == ALL_FAILED
 

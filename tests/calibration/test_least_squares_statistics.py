@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from madoc.calibration.least_squares.statistics import alternation, clipped_change, echo, unlike
+from madoc.calibration.least_squares.statistics import alternation, autocorrelation, clipped_change, outlier_limits
 from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE
 
 LIMITS = {"least": LIKE_NOISE, "failed": FAILED_WINDOW}
@@ -24,14 +24,14 @@ def test_half_of_the_channels_tell_of_noise():
 
 
 def test_what_is_unlike_the_others_is_measured_in_their_deviations():
-    middle, reach = unlike(np.array([[1.0, 2.0, 3.0, 4.0, 100.0]]), np.ones(5))
+    middle, reach = outlier_limits(np.array([[1.0, 2.0, 3.0, 4.0, 100.0]]), np.ones(5))
     np.testing.assert_allclose(middle, [[3.0]])
     np.testing.assert_allclose(reach, [[5.0 * 1.4826 * 1.0]])
 
 
 def test_windows_in_which_nothing_happens_do_not_say_what_is_usual():
     cost = np.array([[0.0, 0.0, 0.0, 0.0, 5.0, 6.0, 7.0]])
-    middle, reach = unlike(cost, np.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
+    middle, reach = outlier_limits(cost, np.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
     np.testing.assert_allclose(middle, [[6.0]])
     assert (cost[:, 4:] < middle + reach).all()
 
@@ -61,7 +61,7 @@ def test_where_most_windows_rest_the_others_are_not_done_without():
 def test_what_is_left_of_consecutive_readings_is_correlated_where_it_is_not_noise():
     # One window, two channels: products 2 and -1 + -1 over squares 3 and 3.
     residuals = np.array([[[1.0, 1.0], [1.0, -1.0], [1.0, 1.0]]])
-    assert echo(residuals) == pytest.approx(2.0 / 3.0)
-    assert echo(residuals[..., 1:]) == pytest.approx(-2.0 / 3.0)
-    assert echo(0.1 * residuals) == pytest.approx(0.02 / 3.0)  # less than the noise says nothing
-    assert echo(100.0 * residuals) == pytest.approx(2.0 / 3.0)  # 3 deviations at most
+    assert autocorrelation(residuals) == pytest.approx(2.0 / 3.0)
+    assert autocorrelation(residuals[..., 1:]) == pytest.approx(-2.0 / 3.0)
+    assert autocorrelation(0.1 * residuals) == pytest.approx(0.02 / 3.0)  # less than the noise says nothing
+    assert autocorrelation(100.0 * residuals) == pytest.approx(2.0 / 3.0)  # 3 deviations at most

@@ -88,8 +88,8 @@ def test_longer_windows_may_leave_as_much_noise_as_the_first_and_no_echo(pendulu
     assert noise_alone(longer, shorter, 16)
     assert not noise_alone(replace(longer, deviation=np.array([1.0, 2.5])), shorter, 16)
     # Of 25 windows of 16 readings white noise seems correlated by 1 / 20, three times that by chance alone.
-    assert noise_alone(replace(longer, echo=0.149), shorter, 16)
-    assert not noise_alone(replace(longer, echo=0.151), shorter, 16)
+    assert noise_alone(replace(longer, autocorrelation=0.149), shorter, 16)
+    assert not noise_alone(replace(longer, autocorrelation=0.151), shorter, 16)
 
 
 def test_a_search_is_hopeless_from_its_second_step_on(pendulum):

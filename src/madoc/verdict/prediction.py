@@ -129,7 +129,7 @@ def nearby_best(replays: Replays, unit: Float[np.ndarray, " d"]) -> tuple[Float[
     They look at the rows held out, so none is an estimate: they tell what the parameters could explain at best.
     """
     windows = replays.single_steps()
-    found, spent = [], 0
+    visited, spent = [], 0
     for _ in range(NEARBY_STEPS):
         points = difference_points(unit)
         residuals = window_residuals(replays.simulator, windows, points, replays.scale)
@@ -140,7 +140,7 @@ def nearby_best(replays: Replays, unit: Float[np.ndarray, " d"]) -> tuple[Float[
         scale = scale_of(around.residuals, "cauchy")
         step = damped_step(*triangular_factors(around, scale, "cauchy"), unit, _DAMPING)
         unit = unit + step
-        found.append(unit)
+        visited.append(unit)
         if np.abs(step).max() < _STILL:
             break
-    return np.array(found[-_KEPT:]).reshape(-1, len(unit)), spent
+    return np.array(visited[-_KEPT:]).reshape(-1, len(unit)), spent

@@ -22,7 +22,7 @@ from madoc.identification.windows import Windows, disjoint_windows, first_rows, 
 
 @dataclass(frozen=True)
 class KnownStarts:
-    """Windows begin at logged states, which are taken for true."""
+    """Windows begin at logged states, which are taken for true; attributes as of `UnknownStarts`."""
 
     loss: Loss
     failed_cost: float = ALL_FAILED
@@ -89,13 +89,13 @@ class KnownWindows:
     def outcomes(self, plans: list[Plan], states: Float[np.ndarray, "searches 0 0"]) -> list[Outcome]:
         """Costs after every step of every search, in one batch."""
         tried = np.stack([plan.unit + plan.steps[:-1] for plan in plans])
-        found = []
+        outcomes = []
         for plan, residuals in zip(plans, self._residuals(tried), strict=True):
             before = mean_cost(plan.residuals, plan.scale, self.loss)
             totals = np.array([*(mean_cost(each, plan.scale, self.loss) for each in residuals), before])
             failures = int((~np.isfinite(residuals).all(-1)).sum())
-            found.append(Outcome(before, totals, np.zeros((len(totals), 0)), failures))
-        return found
+            outcomes.append(Outcome(before, totals, np.zeros((len(totals), 0)), failures))
+        return outcomes
 
     def _plan(
         self,
@@ -117,7 +117,7 @@ class KnownWindows:
             deviation=np.ones(self.problem.states.measured),
             bread=bread(around, scale, self.loss),
             meat=meat(around, scale, self.loss),
-            echo=0.0,
+            autocorrelation=0.0,
             exact=True,
             left_out=0.0,
             failures=int((~np.isfinite(residuals).all(-1)).sum()),

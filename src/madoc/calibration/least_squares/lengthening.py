@@ -96,7 +96,7 @@ def noise_alone(longer: SearchState, first: SearchState, readings: int) -> bool:
         readings: Of each of the longer windows.
     """
     quiet = bool((longer.deviation <= AS_WELL * first.deviation).all())
-    return quiet and longer.echo <= CHANCE / np.sqrt(max(1, longer.explained * readings))
+    return quiet and longer.autocorrelation <= CHANCE / np.sqrt(max(1, longer.explained * readings))
 
 
 def tells_more(longer: SearchState, shorter: SearchState) -> bool:

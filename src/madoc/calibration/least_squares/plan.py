@@ -28,7 +28,7 @@ class Plan:
         deviation: Noise of each channel, in its typical changes.
         bread: Curvature of the cost.
         meat: Scatter of its gradient.
-        echo: Correlation of residuals of consecutive readings.
+        autocorrelation: Of residuals of consecutive readings.
         exact: Whether residuals are rounding errors, or cannot tell that initial states have yet to move.
         left_out: Share of the windows that the cost does not count.
         failures: Simulations that failed.
@@ -43,7 +43,7 @@ class Plan:
     deviation: Float[np.ndarray, " channels"]
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
-    echo: float
+    autocorrelation: float
     exact: bool
     left_out: float
     failures: int

@@ -45,7 +45,7 @@ class SearchState:
         bread: Curvature of the best search's cost where it last linearised.
         meat: Scatter of the cost's gradient there.
         explained: Number of windows that these two are of.
-        echo: Correlation of residuals of consecutive readings in these windows; 0 where initial states are known.
+        autocorrelation: Of residuals of consecutive readings in these windows; 0 where initial states are known.
         refining: 0 while searching on few windows, 1 on all of them.
         waiting: Epochs on all windows in which only initial states still move.
         epochs: Done in this stage, those of waiting not counted.
@@ -63,7 +63,7 @@ class SearchState:
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
     explained: int
-    echo: float
+    autocorrelation: float
     refining: int
     waiting: int
     epochs: int
@@ -122,7 +122,7 @@ class Search:
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),
             explained=0,
-            echo=0.0,
+            autocorrelation=0.0,
             refining=0,
             waiting=0,
             epochs=0,
@@ -166,7 +166,7 @@ class Search:
             bread=best.bread,
             meat=best.meat,
             explained=int(best.kept.sum()),
-            echo=best.echo,
+            autocorrelation=best.autocorrelation,
             waiting=max(0, state.waiting - 1),
             epochs=state.epochs + (state.waiting == 0),
             failures=state.failures + sum(each.failures for each in plans) + sum(each.failures for each in outcomes),

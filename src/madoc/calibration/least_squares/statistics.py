@@ -17,7 +17,7 @@ _SMALLEST = 1e-12
 Residuals = Float[np.ndarray, "pairs channels"]
 
 
-def unlike(
+def outlier_limits(
     values: Float[np.ndarray, "*rows windows"], activity: Float[np.ndarray, " windows"]
 ) -> tuple[Float[np.ndarray, "*rows 1"], Float[np.ndarray, "*rows 1"]]:
     """The median of windows' values, and how far from it a window is an outlier: `OUTLIER` robust deviations.
@@ -61,7 +61,7 @@ def clipped_change(
         failed: Cost of a window whose simulation failed.
     """
     change = after - before
-    middle, reach = unlike(change, activity)
+    middle, reach = outlier_limits(change, activity)
     return np.where(after < failed, np.minimum(change, np.maximum(middle + reach, least)), change)
 
 
@@ -77,7 +77,7 @@ def noise_ratio(
     return float(pull / max(curvature, _SMALLEST))
 
 
-def echo(residuals: Float[np.ndarray, "windows readings channels"]) -> float:
+def autocorrelation(residuals: Float[np.ndarray, "windows readings channels"]) -> float:
     """Correlation of a reading's residual with the next one's, of the channel that has most of it.
 
     Noise has none, model errors have. Residuals are in standard deviations of the noise and clipped at three of them;

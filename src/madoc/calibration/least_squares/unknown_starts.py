@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import TRIALS, Outcome, Plan
-from madoc.calibration.least_squares.statistics import clipped_change, echo, noise_ratio, unlike
+from madoc.calibration.least_squares.statistics import autocorrelation, clipped_change, noise_ratio, outlier_limits
 from madoc.errors import MadocError
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.information import at_least_noise, bread, jackknife_meat, least_share
@@ -184,7 +184,7 @@ class UnknownWindows:
             deviation=deviation,
             bread=curved,
             meat=at_least_noise(jackknife_meat(exact, share, curved), curved, ratio),
-            echo=echo(slopes.residuals.reshape(len(kept), -1, channels)[kept]),
+            autocorrelation=autocorrelation(slopes.residuals.reshape(len(kept), -1, channels)[kept]),
             exact=float(deviation.max()) < ROUNDING,
             left_out=1.0 - float(kept.mean()),
             failures=int((~slopes.whole).sum()),
@@ -200,7 +200,7 @@ class UnknownWindows:
         if self.loss == "linear" or not whole.any():
             return whole
         costs = self._costs(slopes.residuals)
-        middle, reach = unlike(costs[whole], activity[whole])
+        middle, reach = outlier_limits(costs[whole], activity[whole])
         kept = whole & (costs <= np.maximum(middle + reach, LIKE_NOISE))
         weights = loss_slope((slopes.residuals / TUNING[self.loss]) ** 2, self.loss)
         reduced = eliminate(slopes, weights, np.full(len(whole), _LEAST_DAMPING)).reduced
