@@ -15,7 +15,7 @@ from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, 
 from madoc.diagnosis.explanation import Explanation, action_findings, explain, explanation_findings
 from madoc.errors import MadocError
 from madoc.robots import Robot
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.simulation.rollout import reset_states
 from madoc.simulation.sensitivity import insensitive
 from madoc.simulation.velocities import unseen_positions
@@ -55,7 +55,7 @@ class Diagnosis:
         return any(finding.level == "fatal" for finding in self.findings)
 
 
-def check(dataset: Dataset, simulator: CpuSimulator, *, robot: Robot | None = None, seed: int = 0) -> Diagnosis:
+def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None, seed: int = 0) -> Diagnosis:
     """Look at a log and a model before any solving.
 
     Args:
@@ -107,7 +107,7 @@ def check(dataset: Dataset, simulator: CpuSimulator, *, robot: Robot | None = No
 
 
 def _states(
-    dataset: Dataset, simulator: CpuSimulator, robot: Robot | None
+    dataset: Dataset, simulator: Simulator, robot: Robot | None
 ) -> tuple[np.ndarray, np.ndarray, list[Finding]]:
     """States rebuilt from the log and their rows; none, and why, where that cannot be done."""
     try:
@@ -125,7 +125,7 @@ def _states(
 
 
 def _probe(
-    dataset: Dataset, simulator: CpuSimulator, key: PRNGKeyArray
+    dataset: Dataset, simulator: Simulator, key: PRNGKeyArray
 ) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
     """Where parameters must matter if no state can be rebuilt: near the log's if positions tell, else at resets."""
     task, actions = simulator.task, np.asarray(dataset.transitions.action)

@@ -13,7 +13,7 @@ from madoc.identification.information import bread, correlated_pairs, half_width
 from madoc.identification.linearisation import Linearisation, difference_points, linearise
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import Windows, windows_at
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.simulation.rollout import reset_states
 
 HORIZONS = (5, 25)
@@ -51,7 +51,7 @@ class Excitation:
 
 def excite(
     dataset: Dataset,
-    simulator: CpuSimulator,
+    simulator: Simulator,
     states: Float[np.ndarray, "states state"],
     rows: Int[np.ndarray, " states"],
     *,
@@ -82,7 +82,7 @@ def excite(
 
 def _excited(
     dataset: Dataset,
-    simulator: CpuSimulator,
+    simulator: Simulator,
     states: Float[np.ndarray, "states state"],
     rows: Int[np.ndarray, " states"],
     *,
@@ -123,7 +123,7 @@ def _excited(
     )
 
 
-def excite_unseen(dataset: Dataset, simulator: CpuSimulator, *, key: PRNGKeyArray) -> Excitation:
+def excite_unseen(dataset: Dataset, simulator: Simulator, *, key: PRNGKeyArray) -> Excitation:
     """What goes together, from the model's own reset under stretches of the log's actions: no state can be rebuilt."""
     of_rows, of_starts = jax.random.split(key)
     space, task = simulator.parameters, simulator.task
@@ -148,7 +148,7 @@ def excite_unseen(dataset: Dataset, simulator: CpuSimulator, *, key: PRNGKeyArra
     )
 
 
-def excitation_findings(found: Excitation, simulator: CpuSimulator) -> list[Finding]:
+def excitation_findings(found: Excitation, simulator: Simulator) -> list[Finding]:
     """A warning for each parameter that the log would leave open, and for those it cannot tell apart."""
     space = simulator.parameters
     findings = [Finding("warning", sentence, "parameters") for sentence in found.sentences]
