@@ -78,6 +78,7 @@ def calibrate(
         warnings=told_once(estimate.warnings, problem.doubts),
         error=None if known is None else calibration_error(estimate.mean, known, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
+        problem=problem,
     )
     if folder is not None:
         if isinstance(method, EmbedsParameters):

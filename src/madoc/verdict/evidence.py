@@ -31,9 +31,9 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
         mean: The estimate in physical units.
         control_step: Seconds.
     """
-    held = bench.split.held
+    held = bench.held_out
     names = {"signals": np.array(signal_names(bench.simulator.task)), "scale": bench.scaling.next_scale}
-    if not bench.rebuilds:
+    if not bench.states_known:
         rows = np.arange(len(held))
         stretch, first = _stretches(bench, rows)
         measured = _measured(bench, first, stretch)
@@ -62,19 +62,19 @@ def save_evidence(path: Path, arrays: dict[str, Any]) -> None:
 
 def _stretches(bench: Bench, rows: np.ndarray) -> tuple[int, np.ndarray]:
     """How long the stretches are, and the rows of the hold-out they begin at."""
-    held = bench.split.held
+    held = bench.held_out
     ends = held.episode_ends[held.episode_of(rows)]
     steps = int(min(TRACE_STEPS, (ends - rows).max()))
     return steps, rows[evenly(first_rows(held, rows, steps), TRACES)]
 
 
 def _placed(bench: Bench, first: np.ndarray, steps: int, control_step: float) -> dict[str, Any]:
-    episode = bench.split.held.episode_of(first)
+    episode = bench.held_out.episode_of(first)
     return {"time": control_step * np.arange(steps + 1), "episode": episode, "row": first}
 
 
 def _measured(bench: Bench, first: np.ndarray, steps: int) -> Float[np.ndarray, "stretches times observation"]:
-    logged = bench.split.held.transitions
+    logged = bench.held_out.transitions
     following = np.asarray(logged.next_observation)[first[:, None] + np.arange(steps)]
     return np.concatenate([np.asarray(logged.observation)[first][:, None], following], axis=1)
 
