@@ -61,7 +61,5 @@ def test_less_is_better_by_every_measure(report, score):
 
 
 def test_a_report_of_another_version_is_refused_in_a_sentence():
-    with pytest.raises(
-        MadocError, match=r"not written by this version of Madoc .*calibrate again, or delete its entry"
-    ):
+    with pytest.raises(MadocError, match=r"not written by this version .*calibrate again, or delete its entry"):
         holdout_from_json({"measure": "prediction", "relative": 0.1})

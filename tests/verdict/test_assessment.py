@@ -31,7 +31,7 @@ def test_a_result_and_rows_held_out_are_all_it_needs(result, split):
     assert found.verdict.word == "CALIBRATED"
     assert str(found).startswith("CALIBRATED: the prediction error on the hold-out is")
     assert (found.holdout.rows, found.holdout.measure) == (len(split.held), "predicted")
-    assert found.holdout.split == "100 rows in 2 episodes are held out"
+    assert found.holdout.split == "100 rows in 1 episode were held out"
 
 
 def test_a_result_from_a_file_needs_to_be_told_what_was_calibrated(result, split):
@@ -44,7 +44,7 @@ def test_a_result_from_a_file_needs_to_be_told_what_was_calibrated(result, split
 
 
 def test_what_cannot_be_judged_is_refused(result, split):
-    with pytest.raises(MadocError, match="expected at least 10 rows held out to judge a result by, got 5 beside 5"):
+    with pytest.raises(MadocError, match="expected at least 10 rows held out to judge a result by, got 5 beside 400"):
         madoc.assess(result, hold_out(split.held, 0.05, jax.random.key(0)).held)
     fewer = simulation.make(TASK.with_parameters(["body_mass.cart"]), threads=1)
     with pytest.raises(MadocError, match="expected a simulator with the result's parameters"):

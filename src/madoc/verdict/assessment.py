@@ -97,4 +97,4 @@ def _problem_of(result: CalibrationResult, training: Dataset | None, simulator: 
 
 def _split_sentence(held_out: Dataset) -> str:
     count = len(held_out.episode_starts)
-    return f"{len(held_out):,} rows in {count} episode{'s' * (count != 1)} are held out"
+    return f"{len(held_out):,} rows in {count} episode{'s' * (count != 1)} were held out"
