@@ -12,8 +12,8 @@ import jax
 import numpy as np
 import pytest
 
-from madoc.runs import checkpoint
 from madoc.errors import MadocError
+from madoc.runs import checkpoint
 from madoc.runs.loop import run
 from madoc.runs.run_folder import RunFolder
 from wandering import BUDGET, SPEC, Wander, bits

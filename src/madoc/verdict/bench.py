@@ -11,17 +11,19 @@ from sklearn.neighbors import NearestNeighbors
 
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.holdout import AgainstChance, Area
-from madoc.data import Dataset, logged_states
+from madoc.data import Dataset
 from madoc.errors import MadocError
-from madoc.identification.windows import evenly
+from madoc.identification.excitation import expected_half_widths
+from madoc.identification.noise import difference_noise
+from madoc.identification.states import logged_states
+from madoc.identification.windows import consecutive_rows, evenly
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
 from madoc.tasks import Task
-from madoc.verdict import noise as sensors
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
-from madoc.verdict.statistics import better_than_chance
+from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance, shares_of_ranges
 from madoc.verdict.two_sample import WindowView, behaviour, rolled, tell_apart
 
 FEWEST_HELD = 10
@@ -70,21 +72,26 @@ class Bench:
         return self.problem.scalings["standardised"]
 
     @property
+    def change(self) -> Float[np.ndarray, " observation"]:
+        """Typical change of each signal in one step, of the rows calibrated to: the unit of residuals."""
+        return self.problem.typical_change
+
+    @property
     def states_known(self) -> bool:
         """Whether states can be rebuilt from observations."""
-        return self.simulator.task.state_from_observation is not None
+        return self.problem.states.kind == "exact"
 
     @cached_property
     def replays(self) -> Replays:
         """Windows of the hold-out to replay from logged states, where those are known."""
-        return replays_of(self.held_out, self.simulator, self.scaling.next_scale)
+        return replays_of(self.held_out, self.simulator, self.change)
 
     @cached_property
     def fitted(self) -> FittedReplays | None:
         """Windows of the hold-out whose starting states are to be fitted; None where they cannot be."""
-        if self.states_known or not self.problem.starts_known or self.held_out.disturbance.shuffled != "none":
+        if self.problem.states.kind != "approximate" or self.held_out.disturbance.shuffled != "none":
             return None
-        return fitted_replays_of(CalibrationProblem(self.held_out, self.simulator), self.scaling.next_scale)
+        return fitted_replays_of(self.held_out, self.simulator, self.change)
 
     @cached_property
     def clone(self) -> TanhGaussianPolicy:
@@ -108,7 +115,7 @@ class Bench:
         if not self.states_known:
             return evenly(np.arange(len(held)), MOST_WINDOWS)
         rows = logged_states(held, self.simulator.task)[1]
-        pairs = sensors.consecutive(held, rows)
+        pairs = evenly(rows[consecutive_rows(held, rows)], MOST_WINDOWS)
         return np.unique(np.concatenate([pairs, pairs + 1])) if len(pairs) else evenly(rows, MOST_WINDOWS)
 
     @cached_property
@@ -141,7 +148,7 @@ class Bench:
             self.simulator.parameters.to_physical(unit),
             length=length,
             key=jax.random.fold_in(self.key, 1),
-            noise=sensors.difference_noise(self.problem.dataset),
+            noise=difference_noise(self.problem.dataset),
         )
         return tell_apart(self.view.sample(held), self.view.sample(simulated), overlap=True)
 
@@ -167,10 +174,12 @@ class CommonFields(TypedDict):
 def common_fields(
     bench: Bench,
     unit: Float[np.ndarray, " d"],
-    shares: Float[np.ndarray, " d"],
+    interval: Float[np.ndarray, "d 2"] | None,
     *,
+    at: Float[np.ndarray, " d"],
+    residual: Float[np.ndarray, " channels"],
     by_model: tuple[AgainstChance, ...],
-    noise: Float[np.ndarray, " observation"],
+    noise: Float[np.ndarray, " channels"],
     control_steps: int,
 ) -> CommonFields:
     """What every measure says of an estimate.
@@ -178,19 +187,25 @@ def common_fields(
     Args:
         bench: The hold-out.
         unit: The estimate in [-1, 1].
-        shares: Share of each range that the 95 % interval covers.
+        interval: Its 95 % intervals in physical units, if known.
+        at: Parameters in [-1, 1] at which the best possible intervals are computed.
+        residual: Standard deviation of what those intervals take for noise, in typical changes of a step.
         by_model: Simulated next observations against chance.
-        noise: Standard deviation of the sensors' noise, in each signal's unit.
-        control_steps: Simulated for it.
+        noise: Standard deviation of the sensors' noise, in typical changes of a step.
+        control_steps: Simulated so far.
     """
-    names = bench.simulator.parameters.names
+    space, problem = bench.simulator.parameters, bench.problem
+    residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
+    half, spent = expected_half_widths(problem.states, problem.dataset, problem.simulator, at, residual)
+    shares = shares_of_ranges(half, interval, space.high - space.low)
+    signals = signal_names(bench.simulator.task)[: len(noise)]
     return CommonFields(
         split=bench.split,
         rows=len(bench.held_out),
         episodes=len(bench.held_out.episode_starts),
-        estimate=dict(zip(names, unit.tolist(), strict=True)),
-        interval_shares=dict(zip(names, shares.tolist(), strict=True)),
+        estimate=dict(zip(space.names, unit.tolist(), strict=True)),
+        interval_shares=dict(zip(space.names, shares.tolist(), strict=True)),
         against_chance=(*by_model, *bench.model_free),
-        noise=dict(zip(signal_names(bench.simulator.task), noise.tolist(), strict=True)),
-        control_steps=control_steps,
+        noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
+        control_steps=control_steps + spent,
     )

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from madoc.data import logged_states
+from madoc.identification.states import logged_states
 from madoc.identification.windows import Windows, evenly, first_rows, windows_at
 from madoc.runs.files import replacing
 from madoc.verdict.bench import Bench, signal_names
@@ -32,7 +32,7 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
         control_step: Seconds.
     """
     held = bench.held_out
-    names = {"signals": np.array(signal_names(bench.simulator.task)), "scale": bench.scaling.next_scale}
+    names = {"signals": np.array(signal_names(bench.simulator.task)), "scale": bench.change}
     if not bench.states_known:
         rows = np.arange(len(held))
         stretch, first = _stretches(bench, rows)
@@ -45,7 +45,7 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     unit = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
     points = np.stack([np.zeros(len(unit)), unit])
     before, after = _simulated(bench, points, windows, measured)
-    single = bench.replays.residuals(points, bench.replays.single_steps())[:, :, 0] * bench.scaling.next_scale
+    single = bench.replays.residuals(points, bench.replays.single_steps())[:, :, 0] * bench.change
     return (
         names
         | _placed(bench, first, steps, control_step)
@@ -82,6 +82,6 @@ def _measured(bench: Bench, first: np.ndarray, steps: int) -> Float[np.ndarray, 
 def _simulated(
     bench: Bench, points: np.ndarray, windows: Windows, measured: np.ndarray
 ) -> Float[np.ndarray, "points stretches times observation"]:
-    residuals = bench.replays.residuals(points, windows) * bench.scaling.next_scale
+    residuals = bench.replays.residuals(points, windows) * bench.change
     start = np.broadcast_to(measured[:, :1], (len(points), *measured[:, :1].shape))
     return np.concatenate([start, measured[:, 1:] + residuals], axis=2)

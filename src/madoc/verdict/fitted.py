@@ -5,15 +5,12 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.holdout import AgainstChance, Fitted, PredictionErrors
-from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.calibration.least_squares.elimination import eliminate
-from madoc.calibration.least_squares.readings import slopes_at
+from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.losses import loss_slope, scale_of
+from madoc.identification.replay import slopes_at
 from madoc.verdict.bench import Bench, common_fields, signal_names
 from madoc.verdict.fitted_starts import FITTED, FittedReplays
-from madoc.verdict.identifiability import half_widths, told_shares
 from madoc.verdict.statistics import (
-    NEGLIGIBLE,
     better_than_chance,
     interval_of,
     prediction_errors,
@@ -41,7 +38,6 @@ def fitted(
         unit: The estimate in [-1, 1].
         interval: Its 95 % intervals in physical units, if known.
     """
-    space, scale = bench.simulator.parameters, bench.scaling.next_scale
     nearby, searching = _nearby_best(replays, unit)
     points = np.concatenate([np.zeros((1, len(unit))), unit[None], nearby])
     residuals = replays.residuals(points, replays.starts(points))
@@ -54,11 +50,11 @@ def fitted(
     floor = replays.magnitudes(alone)[:, 0]
     noise_alone = relative_to_first(np.stack([means[0], floor.mean((0, -1))]))[1]
     low, high = interval_of(relative_to_first(resampled(size.mean(-1), replays.episodes))[:, 1])
-    half, probing = half_widths(bench.problem, points[best], np.maximum(noise, NEGLIGIBLE))
     fitting = (len(points) + 1) * replays.fit_cost
     predicting = residuals[:, :, 1:, 0].size + alone[:, :, 1:, 0].size
+    signals = signal_names(bench.simulator.task)[: len(noise)]
     mid_range, estimate, nearby_error, noise_error = (
-        prediction_errors(kind, replays.episodes, replays.horizons, signal_names(bench.simulator.task))
+        prediction_errors(kind, replays.episodes, replays.horizons, signals)
         for kind in (size[:, 0], size[:, 1], size[:, best], floor)
     )
     readings = replays.readings
@@ -69,10 +65,12 @@ def fitted(
         **common_fields(
             bench,
             unit,
-            told_shares(half, interval, space.high - space.low),
+            interval,
+            at=points[best],
+            residual=noise,
             by_model=(_against_chance(replays, residuals[best]),),
-            noise=noise * scale,
-            control_steps=searching + fitting + predicting + probing,
+            noise=noise,
+            control_steps=searching + fitting + predicting,
         ),
         errors=PredictionErrors(
             mid_range=mid_range,
@@ -106,7 +104,7 @@ def _nearby_best(replays: FittedReplays, unit: Float[np.ndarray, " d"]) -> tuple
         weights = loss_slope((slopes.residuals / scale) ** 2, "cauchy")
         left = eliminate(slopes, weights, np.full(len(readings), _DAMPING))
         step = damped_step(*triangular_factors(left.reduced, 1.0, "linear"), unit, _DAMPING)
-        states = states + readings.moved(left.states_step(step), states.shape[1])
+        states = states + readings.in_state_units(left.states_step(step), states.shape[1])
         unit = unit + step
         points.append(unit)
     columns = 1 + 2 * len(unit) + len(readings.spread)

@@ -6,12 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.holdout import Predicted, PredictionErrors
-from madoc.data import logged_states
-from madoc.verdict import noise as sensors
+from madoc.identification import noise as sensors
+from madoc.identification.states import logged_states
 from madoc.verdict.bench import Bench, common_fields, signal_names
-from madoc.verdict.identifiability import half_widths, told_shares
 from madoc.verdict.prediction import nearby_best
-from madoc.verdict.statistics import NEGLIGIBLE, interval_of, prediction_errors, relative_to_first, resampled
+from madoc.verdict.statistics import interval_of, prediction_errors, relative_to_first, resampled
 from madoc.verdict.systematic import autocorrelation, explained, explained_at_end
 from madoc.verdict.two_sample import replayed, tell_apart
 
@@ -24,7 +23,7 @@ def predicted(bench: Bench, unit: Float[np.ndarray, " d"], interval: Float[np.nd
         unit: The estimate in [-1, 1].
         interval: Its 95 % intervals in physical units, if known.
     """
-    replays, space, scale = bench.replays, bench.simulator.parameters, bench.scaling.next_scale
+    replays = bench.replays
     nearby, spent = nearby_best(replays, unit)
     points = np.concatenate([np.zeros((1, len(unit))), unit[None], nearby])
     residuals = replays.residuals(points)
@@ -33,19 +32,20 @@ def predicted(bench: Bench, unit: Float[np.ndarray, " d"], interval: Float[np.nd
     relative = relative_to_first(means)
     best = 1 + int(np.argmin(relative[1:]))
     single = _single_steps(bench, points[best])
-    noisy = sensors.noise_floor(replays, bench.held_out, points[best], single.noise)
+    noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
     floor = replays.magnitudes(noisy)[:, 0]
     noise_alone = relative_to_first(np.stack([means[0], floor.mean((0, -1))]))[1]
-    half, probing = half_widths(bench.problem, points[best], np.maximum(single.size, NEGLIGIBLE))
     low, high = interval_of(relative_to_first(draws)[:, 1])
     systems = {"the simulator at mid-range": points[0], "the simulator at the best parameters nearby": points[best]}
     common = common_fields(
         bench,
         unit,
-        told_shares(half, interval, space.high - space.low),
+        interval,
+        at=points[best],
+        residual=single.size,
         by_model=tuple(bench.against_chance(name, _simulated(bench, point)) for name, point in systems.items()),
-        noise=single.noise * scale,
-        control_steps=spent + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps + probing,
+        noise=single.noise,
+        control_steps=spent + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps,
     )
     signals = signal_names(bench.simulator.task)
     mid_range, estimate, nearby_error, noise = (
@@ -89,7 +89,7 @@ def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
     points = np.concatenate([middle, nearby_best(bench.replays, middle[0])[0]])
     sizes = bench.replays.magnitudes(bench.replays.residuals(points)).mean((0, -1))
     best = points[int(np.argmin(relative_to_first(sizes)))]
-    return _single_steps(bench, best).noise * bench.scaling.next_scale
+    return _single_steps(bench, best).noise * bench.change
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class _SingleSteps:
 
 
 def _single_steps(bench: Bench, unit: Float[np.ndarray, " d"]) -> _SingleSteps:
-    held, rows, scale = bench.held_out, bench.judged_rows, bench.scaling.next_scale
+    held, rows, scale = bench.held_out, bench.judged_rows, bench.change
     followed = np.asarray(held.transitions.next_observation)[rows]
     residuals = sensors.clipped((_simulated(bench, unit) - followed) / scale)
     first = np.flatnonzero((np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts))
@@ -121,7 +121,7 @@ def _single_steps(bench: Bench, unit: Float[np.ndarray, " d"]) -> _SingleSteps:
     if len(first):
         slopes = sensors.own_slopes(bench.simulator, held, unit, rows[first], scale)
         unexplained = residuals - explanation
-        noise = sensors.noise_deviation(unexplained[first], unexplained[first + 1], slopes)
+        noise = sensors.consecutive_noise(unexplained[first], unexplained[first + 1], slopes)
         spent += len(first) * (1 + len(scale))
     together = autocorrelation(residuals[first], residuals[first + 1])
     return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise, spent)

@@ -79,6 +79,20 @@ def relative_to_first(errors: Float[np.ndarray, "*draws points horizons"]) -> Fl
     ).mean(-1)
 
 
+def shares_of_ranges(
+    half: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None, width: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, " d"]:
+    """Share of each range that the 95 % interval covers, at most 1: the method's own, and no less than the best one.
+
+    Args:
+        half: Half of the best possible interval in [-1, 1].
+        interval: The method's, in physical units, if it has one.
+        width: Of each range, in physical units.
+    """
+    share = half if interval is None else np.maximum(half, (interval[:, 1] - interval[:, 0]) / width)
+    return np.minimum(share, 1.0)
+
+
 def area_under_curve(
     scores: Float[np.ndarray, " rows"],
     real: Bool[np.ndarray, " rows"],

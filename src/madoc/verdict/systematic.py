@@ -8,7 +8,7 @@ from sklearn.model_selection import KFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from madoc.verdict.noise import clipped
+from madoc.identification.noise import clipped
 
 FOLDS = 5
 """Number of folds of the cross-validation."""
