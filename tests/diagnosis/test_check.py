@@ -14,6 +14,7 @@ from madoc.data.findings import Finding
 from madoc.diagnosis import check, refuse_fatal
 from madoc.diagnosis.excitation import excite
 from madoc.errors import MadocError
+from madoc.identification.states import states_of
 from madoc.simulation.sensitivity import refuse_insensitive
 from robots import ARM
 
