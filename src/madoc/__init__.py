@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from madoc.policies import SAC, PolicyProblem, learn_policy, load_policy, save_policy
     from madoc.policies.behaviours import record_quality as record
     from madoc.runs.run_folder import RunFolder
+    from madoc.verdict import assess
 
 _ROOMS = ("calibration", "data", "identification", "policies", "robots", "runs", "simulation", "tasks")
 
@@ -33,6 +34,7 @@ _PLACES = {
     "PolicyProblem": "policies",
     "RunFolder": "runs.run_folder",
     "SAC": "policies",
+    "assess": "verdict",
     "calibrate": "calibration",
     "evaluate": "evaluation",
     "learn_policy": "policies",
@@ -58,6 +60,7 @@ __all__ = [
     "Plan",
     "PolicyProblem",
     "RunFolder",
+    "assess",
     "calibrate",
     "calibration",
     "data",

@@ -1,11 +1,12 @@
 """`--method auto`: what the data allows, one method after another, compared on the hold-out; the best is kept."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from madoc.calibration import CALIBRATORS, CalibrationResult, Calibrator
+from madoc.calibration.holdout import NotRun, Tried
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.calibration_stage import (
     HOLDOUT,
@@ -76,14 +77,14 @@ def calibrate_auto_in(
         if ended(out, COMPARISON) and read_json(out / COMPARISON).get("budget") == order.budget:
             return CalibrationResult.from_json(read_json(folder.result))
         folder.result.unlink(missing_ok=True)
-        rows: list[dict[str, Any]] = []
+        rows: list[Tried | NotRun] = []
         tried: list[tuple[CalibrationResult, Assessment]] = []
         for candidate in CANDIDATES:
             name, method = candidate.name, methods[candidate.name]
             spent = sum(result.control_steps for result, _ in tried)
             why_not = _why_not(tried, order.budget - spent) or _refusal(method, prepared, order)
             if why_not:
-                rows.append({"method": name, "not_run": why_not})
+                rows.append(NotRun(name, why_not))
                 continue
             budget = max(1, min(round(candidate.most * order.budget), order.budget - spent))
             part = replace(order, method=name, changes={}, budget=budget)
@@ -91,18 +92,19 @@ def calibrate_auto_in(
             result, assessment = calibrate_prepared(place, part, prepared, method, resume=holds_run(place), quiet=quiet)
             if assessment is None:  # interrupted or diverged
                 if result.status == "diverged" and tried:
-                    rows.append({"method": name, "not_run": result.sentence})
+                    rows.append(NotRun(name, result.sentence))
                     continue
                 return result
             tried.append((result, assessment))
             rows.append(_row(result, assessment))
-            folder.write_json(COMPARISON, {"candidates": rows})
+            folder.write_json(COMPARISON, {"candidates": [asdict(row) for row in rows]})
         if not tried:
-            raise MadocError("; ".join(f"{row['method']}: {row['not_run']}" for row in rows))
+            raise MadocError("; ".join(f"{row.method}: {row.not_run}" for row in rows if isinstance(row, NotRun)))
         best = _joined(tried, rows)
         arrays = evidence(prepared.bench, best.mean, control_step=prepared.simulator.control_step)
         save_evidence(out / "evidence.npz", arrays)
-        folder.write_json(COMPARISON, {"candidates": rows, "chosen": best.method, "budget": order.budget})
+        compared = {"candidates": [asdict(row) for row in rows], "chosen": best.method, "budget": order.budget}
+        folder.write_json(COMPARISON, compared)
         folder.write_json("result.json", best.to_json())
         return best
 
@@ -139,10 +141,10 @@ def _changes_by_candidate(changes: Mapping[str, Any]) -> dict[str, dict[str, Any
 def _why_not(tried: list[tuple[CalibrationResult, Assessment]], left: int) -> str:
     """Why no other candidate is needed, or can be; empty to go on."""
     for result, assessment in tried:
-        word = result.verdict["word"] if result.verdict else ""
+        word = assessment.verdict.word
         if word == "DATA_REJECTED":
             return "the data was rejected, and no method changes that"
-        if word == "CALIBRATED" and explains_all(assessment):
+        if word == "CALIBRATED" and explains_all(assessment.holdout):
             return f"{result.method} explains the hold-out down to its noise"
     return "" if left > 0 else "the budget is spent"
 
@@ -156,25 +158,25 @@ def _refusal(method: Calibrator, prepared: Prepared, order: CalibrationOrder) ->
     return ""
 
 
-def _row(result: CalibrationResult, assessment: Assessment) -> dict[str, Any]:
+def _row(result: CalibrationResult, assessment: Assessment) -> Tried:
     """A line of the comparison."""
-    low, high = assessment.relative_interval
-    return {
-        "method": result.method,
-        "score": assessment.score,
-        "interval": [low, high],
-        "verdict": result.verdict["word"] if result.verdict else "",
-        "control_steps": result.control_steps,
-        "seconds": result.seconds,
-    }
+    holdout = assessment.holdout
+    return Tried(
+        method=result.method,
+        score=holdout.score,
+        interval=holdout.score_interval,
+        verdict=assessment.verdict.word,
+        control_steps=result.control_steps,
+        seconds=result.seconds,
+    )
 
 
-def _joined(tried: list[tuple[CalibrationResult, Assessment]], rows: list[dict[str, Any]]) -> CalibrationResult:
+def _joined(tried: list[tuple[CalibrationResult, Assessment]], rows: list[Tried | NotRun]) -> CalibrationResult:
     """The best result with the cost of all."""
-    best, assessment = min(tried, key=lambda pair: pair[1].score)
+    best, assessment = min(tried, key=lambda pair: pair[1].holdout.score)
     return replace(
         best,
         control_steps=sum(result.control_steps for result, _ in tried),
         seconds=round(sum(result.seconds for result, _ in tried), 3),
-        holdout=assessment.report | {"candidates": rows, "chosen": best.method},
+        holdout=replace(assessment.holdout, candidates=tuple(rows), chosen=best.method),
     )

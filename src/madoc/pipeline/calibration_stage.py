@@ -21,11 +21,9 @@ from madoc.pipeline.methods import hyperparameters, make_method
 from madoc.runs.files import read_json
 from madoc.simulation import Simulator
 from madoc.tasks import Task
-from madoc.verdict import Assessment, Bench, assess, judge
+from madoc.verdict import Assessment, Bench, assess
 from madoc.verdict.evidence import evidence, save_evidence
 
-FEWEST_HELD = 10
-"""Rows of which no verdict can be made: perfect predictions of fewer are no surer than chance."""
 HOLDOUT = 0.2
 """Share of the rows held out where nothing else is asked: as cross-validation in five folds."""
 
@@ -86,12 +84,8 @@ class Prepared:
         """What results are judged on."""
         seed, share = self.order.seed, self.order.holdout or HOLDOUT
         split = hold_out(self.dataset, share, stage_key(seed, "hold-out"))
-        if len(split.held) < FEWEST_HELD:
-            raise MadocError(
-                f"expected at least {FEWEST_HELD} rows held out to judge a result by, got {len(split.held)} of "
-                f"{len(self.dataset)}; log more, or hold out a larger share with --holdout"
-            )
-        return Bench(split, self.simulator, stage_key(seed, "verdict"))
+        problem = CalibrationProblem(split.kept, self.simulator)
+        return Bench(problem, split.held, stage_key(seed, "verdict"), split.sentence)
 
     @cached_property
     def problem(self) -> CalibrationProblem:
@@ -205,8 +199,8 @@ def calibrate_prepared(
         )
         if order.holdout is None or result.status not in ENDED:
             return result, None
-        assessment = assess(prepared.bench, result.mean, result.interval)
-        result = replace(result, verdict=judge(assessment).to_json(), holdout=assessment.report)
+        assessment = assess(result, prepared.bench)
+        result = replace(result, verdict=assessment.verdict, holdout=assessment.holdout)
         arrays = evidence(prepared.bench, result.mean, control_step=prepared.simulator.control_step)
         save_evidence(folder.path / "evidence.npz", arrays)
         folder.write_json("result.json", result.to_json())

@@ -3,13 +3,13 @@
 import jax
 
 from madoc.calibration import CALIBRATORS
+from madoc.diagnosis.channels import signal_names
 from madoc.errors import MadocError
 from madoc.pipeline.auto_stage import AUTO, candidates_for
 from madoc.pipeline.calibration_stage import CalibrationOrder, check_order, prepare
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import make_method
-from madoc.verdict.assessment import sensor_noise
-from madoc.verdict.bench import signal_names
+from madoc.verdict.predicted import sensor_noise
 from madoc.verdict.selftest import Selftest, selftest
 
 
