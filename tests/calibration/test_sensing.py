@@ -35,13 +35,13 @@ def test_windows_are_as_long_as_the_observation_wants(log):
     assert window_length(hidden, 5, "logged") == 5
     assert window_length(hidden, None, "replay") == 1
     with pytest.raises(MadocError, match=r"no episode .* has the 301 rows of a window; take a shorter one"):
-        seen.windows("standardised", 301)
+        seen.features.windows("standardised", 301)
 
 
 def test_simulated_readings_carry_the_noise_that_the_data_says_it_has(log):
     clean, noisy = problem_of(log), problem_of(log, noise=0.1)
     assert not noise_deviation(clean, None).any()
-    change = clean.scalings["standardised"].next_scale
+    change = clean.typical_change
     np.testing.assert_allclose(noise_deviation(noisy, None), 0.1 * change, rtol=0.05)
     np.testing.assert_allclose(noise_deviation(noisy, "estimated"), 0.1 * change, rtol=0.3)
     (told,) = said_of_observations(noisy, 1, noise_deviation(noisy, None), "logged")

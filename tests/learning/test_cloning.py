@@ -6,7 +6,7 @@ import optax
 import pytest
 
 from affine import affine
-from madoc.learning.cloning import clone, cloning_loss
+from madoc.learning.cloning import cloning_loss
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 
 

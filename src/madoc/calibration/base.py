@@ -4,16 +4,14 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from madoc.data import Dataset, typical_change
 from madoc.errors import MadocError
 from madoc.identification.noise import regression_noise
 from madoc.identification.states import LoggedStates, probing_rows, states_of
-from madoc.learning.dynamics_ratio import Scaling
-from madoc.learning.window_features import WindowScaling, last_rows, logged_stretch
+from madoc.learning.window_features import LoggedFeatures
 from madoc.simulation.base import Simulator
 from madoc.types import Method, State
 
@@ -64,11 +62,6 @@ class CalibrationProblem:
         return self.states.exact()[1]
 
     @cached_property
-    def logged_actions(self) -> Float[np.ndarray, "states action"]:
-        """The actions taken at `logged_states`."""
-        return np.asarray(self.dataset.transitions.action)[self.logged_rows]
-
-    @cached_property
     def typical_change(self) -> Float[np.ndarray, " observation"]:
         """Standard deviation of each channel's change in one control step."""
         return typical_change(self.dataset)
@@ -98,7 +91,7 @@ class CalibrationProblem:
         """
         if self.dataset.disturbance.shuffled == "next_observations":
             raise MadocError(
-                f"this method compares each row's next observation with a simulated one, and those of "
+                "this method compares each row's next observation with a simulated one, and those of "
                 f"{self.dataset.origin} are shuffled; take a method that compares distributions"
             )
 
@@ -108,53 +101,9 @@ class CalibrationProblem:
         return probing_rows(self.states, self.dataset, self.simulator)
 
     @cached_property
-    def pairs(self) -> tuple[Float[Array, "rows observation"], Float[Array, "rows action"]]:
-        """Logged observations and actions on the device, float32."""
-        logged = self.dataset.transitions
-        return jnp.asarray(logged.observation, jnp.float32), jnp.asarray(logged.action, jnp.float32)
-
-    @cached_property
-    def scalings(self) -> dict[str, Scaling]:
-        """The two ways to describe (s, a, s') to a network, by name."""
-        logged = self.dataset.transitions
-        return {"standardised": Scaling.standardised(logged), "raw": Scaling.raw(logged)}
-
-    @cached_property
-    def standardised_features(self) -> tuple[Array, Array]:
-        """Standardised features of the logged rows, on the device."""
-        return self._features("standardised")
-
-    @cached_property
-    def raw_features(self) -> tuple[Array, Array]:
-        """Raw features of the logged rows, on the device."""
-        return self._features("raw")
-
-    @cached_property
-    def _windows(self) -> dict[tuple[str, int], tuple[WindowScaling, tuple[Array, Array]]]:
-        return {}
-
-    def windows(self, name: str, length: int) -> tuple[WindowScaling, tuple[Array, Array]]:
-        """How windows of so many logged rows are described, and the features of all there are, on the device.
-
-        Raises:
-            MadocError: No episode is long enough.
-        """
-        if (name, length) not in self._windows:
-            rows, starts = self.dataset.transitions, self.dataset.episode_starts
-            last = last_rows(len(self.dataset), starts, length)
-            if not len(last):
-                raise MadocError(
-                    f"no episode of {self.dataset.origin} has the {length} rows of a window; take a shorter one"
-                )
-            stretch = logged_stretch(rows, last, length)
-            scaling = WindowScaling.of(self.scalings[name], stretch)
-            window, following = scaling.features(stretch)
-            self._windows[name, length] = scaling, (jnp.asarray(window), jnp.asarray(following))
-        return self._windows[name, length]
-
-    def _features(self, name: str) -> tuple[Array, Array]:
-        pair, following = self.scalings[name].features(self.dataset.transitions)
-        return jnp.asarray(pair), jnp.asarray(following)
+    def features(self) -> LoggedFeatures:
+        """The data as networks see it."""
+        return LoggedFeatures(self.dataset)
 
 
 @dataclass(frozen=True)

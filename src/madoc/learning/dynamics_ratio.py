@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from madoc.data.dataset import spread_of
 from madoc.learning.networks import Network
 from madoc.types import Transitions
 
@@ -55,12 +56,6 @@ class Scaling:
             ((pair - self.pair_offset) / self.pair_scale).astype(np.float32),
             (following / self.next_scale).astype(np.float32),
         )
-
-
-def spread_of(column: Float[np.ndarray, "*rows values"]) -> Float[np.ndarray, " values"]:
-    """Standard deviation of every channel over all rows; 1 for one that never moves."""
-    spread = column.reshape(-1, column.shape[-1]).std(0)
-    return np.where(spread > 1e-8, spread, 1.0)
 
 
 class Discriminators(eqx.Module):

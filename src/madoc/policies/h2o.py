@@ -1,13 +1,14 @@
 """H2O: logged rows and simulated ones together, the simulated ones trusted by their dynamics (arXiv 2206.13464)."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray, PyTree
+from pydantic import Field
 
-from madoc.errors import check_at_least
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, bellman_target, critic_step, fresh
 from madoc.learning.dynamics_ratio import Discriminators, discriminator_loss, log_dynamics_ratio
@@ -18,7 +19,7 @@ from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, UniformPolicy, act_on, start_acting
-from madoc.types import Epoch
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -71,29 +72,29 @@ class H2O:
         replay_capacity: Simulated rows kept.
     """
 
-    hidden: tuple[int, ...] = (256, 256)
-    environments: int = 20
-    epoch_steps: int = 1000
-    updates_per_step: float = 1.0
-    warmup_steps: int = 1000
-    batch: int = 256
-    weight: float = 0.01
-    noise: float = 0.1
-    gap_samples: int = 10
-    gap_spread: float = 1.0
-    bound: float = 2.0
-    pair_bound: float = 10.0
-    discount: float = 0.99
-    target_rate: float = 0.005
-    learning_rate: float = 3e-4
-    replay_capacity: int = 1_000_000
+    hidden: Layers = (256, 256)
+    environments: Count = 20
+    epoch_steps: Count = 1000
+    updates_per_step: NotNegative = 1.0
+    warmup_steps: CountOrZero = 1000
+    batch: Annotated[int, Field(ge=2)] = 256
+    weight: NotNegative = 0.01
+    noise: NotNegative = 0.1
+    gap_samples: Count = 10
+    gap_spread: NotNegative = 1.0
+    bound: NotNegative = 2.0
+    pair_bound: NotNegative = 10.0
+    discount: NotNegative = 0.99
+    target_rate: NotNegative = 0.005
+    learning_rate: NotNegative = 3e-4
+    replay_capacity: Count = 1_000_000
 
     def __post_init__(self) -> None:
-        check_at_least(self, hidden=1, environments=1, batch=2, replay_capacity=1, warmup_steps=0, weight=0.0)
-        check_at_least(self, epoch_steps=self.environments, updates_per_step=0.0, discount=0.0, noise=0.0)
-        check_at_least(
-            self, target_rate=0.0, learning_rate=0.0, gap_samples=1, gap_spread=0.0, bound=0.0, pair_bound=0.0
-        )
+        check_hyperparameters(self)
+        if self.epoch_steps < self.environments:
+            raise MadocError(
+                f"expected epoch_steps of at least the {self.environments} environments, got {self.epoch_steps}"
+            )
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> H2OState:
         """Fresh networks, an empty replay, rows at reset states.

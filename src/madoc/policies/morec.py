@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
+from pydantic import Field
 
-from madoc.errors import MadocError, check_at_least
+from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
 from madoc.learning.dynamics_ensemble import Ensemble, fit, holdout_error
@@ -18,7 +20,7 @@ from madoc.learning.networks import adam, scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.imagination import Dreamers, Dreaming, Filter, dream, fall_asleep
-from madoc.types import Epoch
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -92,41 +94,36 @@ class MOREC:
         replay_capacity: Imagined rows kept.
     """
 
-    hidden: tuple[int, ...] = (256, 256)
-    model_hidden: tuple[int, ...] = (200, 200, 200, 200)
-    models: int = 7
-    elites: int = 5
-    model_updates: int = 20_000
-    discriminator_hidden: tuple[int, ...] = (128, 128)
-    discriminators: int = 40
-    discriminator_updates: int = 8000
-    noise: float = 0.1
-    samples: int = 2
+    hidden: Layers = (256, 256)
+    model_hidden: Layers = (200, 200, 200, 200)
+    models: Count = 7
+    elites: Count = 5
+    model_updates: Count = 20_000
+    discriminator_hidden: Layers = (128, 128)
+    discriminators: Count = 40
+    discriminator_updates: CountOrZero = 8000
+    noise: NotNegative = 0.1
+    samples: Count = 2
     threshold: float = 0.6
-    horizon: int = 100
-    penalty: float = 2.5
-    real: float = 0.05
-    imagined_per_update: int = 20
-    imagined_rows: int = 200
-    epoch_updates: int = 100
-    holdout_every: int = 100
-    batch: int = 256
-    discount: float = 0.99
-    target_rate: float = 0.005
-    model_learning_rate: float = 1e-3
-    policy_learning_rate: float = 1e-4
-    critic_learning_rate: float = 3e-4
-    replay_capacity: int = 100_000
+    horizon: Count = 100
+    penalty: NotNegative = 2.5
+    real: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.05
+    imagined_per_update: Count = 20
+    imagined_rows: Count = 200
+    epoch_updates: Count = 100
+    holdout_every: Annotated[int, Field(ge=2)] = 100
+    batch: Annotated[int, Field(ge=2)] = 256
+    discount: NotNegative = 0.99
+    target_rate: NotNegative = 0.005
+    model_learning_rate: NotNegative = 1e-3
+    policy_learning_rate: NotNegative = 1e-4
+    critic_learning_rate: NotNegative = 3e-4
+    replay_capacity: Count = 100_000
 
     def __post_init__(self) -> None:
-        check_at_least(self, hidden=1, model_hidden=1, discriminator_hidden=1, models=self.elites, elites=1)
-        check_at_least(self, model_updates=1, discriminators=1, discriminator_updates=0, samples=1, horizon=1)
-        check_at_least(self, noise=0.0, penalty=0.0, real=0.0, epoch_updates=1, holdout_every=2, batch=2)
-        check_at_least(self, imagined_per_update=1, imagined_rows=1, replay_capacity=1, discount=0.0)
-        check_at_least(self, target_rate=0.0, model_learning_rate=0.0)
-        check_at_least(self, policy_learning_rate=0.0, critic_learning_rate=0.0)
-        if self.real >= 1.0:
-            raise MadocError(f"expected a share of logged rows below 1 for MOREC, got {self.real}")
+        check_hyperparameters(self)
+        if self.models < self.elites:
+            raise MadocError(f"expected at least as many models as elites, {self.elites}, got {self.models}")
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> MORECState:
         """Fresh networks, an empty replay, rows at logged observations.

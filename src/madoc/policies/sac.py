@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, PRNGKeyArray
 
-from madoc.errors import check_at_least
 from madoc.evaluation import evaluate
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
@@ -16,7 +15,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, UniformPolicy, act_on, start_acting
 from madoc.policies.systems import UniformParameters
-from madoc.types import Epoch
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -64,25 +63,27 @@ class SAC:
         judge_episodes: Episodes it is judged by. Their control steps are counted, but not against the budget.
     """
 
-    hidden: tuple[int, ...] = (256, 256)
-    environments: int = 20
-    epoch_steps: int = 1000
-    updates_per_step: float = 1.0
-    warmup_steps: int = 5000
-    batch: int = 256
-    discount: float = 0.99
-    target_rate: float = 0.005
-    learning_rate: float = 3e-4
-    replay_capacity: int = 1_000_000
-    cloning: float | None = None
+    hidden: Layers = (256, 256)
+    environments: Count = 20
+    epoch_steps: Count = 1000
+    updates_per_step: NotNegative = 1.0
+    warmup_steps: CountOrZero = 5000
+    batch: Count = 256
+    discount: NotNegative = 0.99
+    target_rate: NotNegative = 0.005
+    learning_rate: NotNegative = 3e-4
+    replay_capacity: Count = 1_000_000
+    cloning: NotNegative | None = None
     randomize: bool = False
-    judge_every: int = 10_000
-    judge_episodes: int = 10
+    judge_every: CountOrZero = 10_000
+    judge_episodes: Count = 10
 
     def __post_init__(self) -> None:
-        check_at_least(self, hidden=1, environments=1, batch=1, replay_capacity=1, warmup_steps=0, cloning=0.0)
-        check_at_least(self, epoch_steps=self.environments, updates_per_step=0.0, discount=0.0)
-        check_at_least(self, target_rate=0.0, learning_rate=0.0, judge_every=0, judge_episodes=1)
+        check_hyperparameters(self)
+        if self.epoch_steps < self.environments:
+            raise MadocError(
+                f"expected epoch_steps of at least the {self.environments} environments, got {self.epoch_steps}"
+            )
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> SACState:
         """Fresh networks, an empty replay, rows at reset states.

@@ -49,7 +49,7 @@ class Bench:
     @cached_property
     def scaling(self) -> Scaling:
         """Of the rows kept."""
-        return self.problem.scalings["standardised"]
+        return self.problem.features.standardised
 
     @property
     def measure(self) -> str:

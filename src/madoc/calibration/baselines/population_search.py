@@ -33,9 +33,10 @@ def draw_windows(problem: CalibrationProblem, steps: int, count: int, key: PRNGK
     Raises:
         MadocError: No state can be rebuilt, or no episode is long enough.
     """
-    possible = first_rows(problem.dataset, problem.logged_rows, steps)
+    states, rows = problem.states.exact()
+    possible = first_rows(problem.dataset, rows, steps)
     chosen = possible[np.asarray(jax.random.randint(key, (count,), 0, len(possible)))]
-    return windows_at(problem.dataset, problem.logged_states[chosen], problem.logged_rows[chosen], steps)
+    return windows_at(problem.dataset, states[chosen], rows[chosen], steps)
 
 
 def mean_with_failures(costs: Float[np.ndarray, "candidates windows"]) -> Float[np.ndarray, " candidates"]:

@@ -22,10 +22,9 @@ from madoc.calibration.least_squares.lengthening import (
 from madoc.calibration.least_squares.logged_states import LoggedState, LoggedStates
 from madoc.calibration.least_squares.noise import consecutive_residuals, takes_turns
 from madoc.data import Dataset
-from madoc.errors import check_at_least
 from madoc.identification.information import half_width, identifiability, sandwich
 from madoc.identification.losses import Loss
-from madoc.types import Epoch, Metrics
+from madoc.types import Count, Epoch, Metrics, NotNegative, check_hyperparameters
 
 InitialStates = Literal["logged", "estimated"]
 LOGGED_HORIZON = 1
@@ -94,17 +93,16 @@ class LeastSquares:
     """
 
     initial_states: InitialStates | None = None
-    horizon: int | None = None
+    horizon: Count | None = None
     loss: Loss = "cauchy"
-    windows: int | None = None
-    searches: int = 3
-    search_windows: int | None = None
-    search_epochs: int = 8
-    tolerance: float = 1e-7
+    windows: Count | None = None
+    searches: Count = 3
+    search_windows: Count | None = None
+    search_epochs: Count = 8
+    tolerance: NotNegative = 1e-7
 
     def __post_init__(self) -> None:
-        counts = ("horizon", "windows", "searches", "search_windows", "search_epochs")
-        check_at_least(self, **dict.fromkeys(counts, 1), tolerance=0.0)
+        check_hyperparameters(self)
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> LeastSquaresState:
         """Windows drawn, searches at their starts.

@@ -20,7 +20,6 @@ from madoc.simulation.rollout import (
     roll,
     unbiased_starts,
 )
-from madoc.simulation.velocities import refuse_unseen_positions
 from madoc.types import Policy
 
 StartMode = Literal["policy", "logged", "replay"]
@@ -37,10 +36,8 @@ def starts_of(problem: CalibrationProblem, mode: StartMode) -> Starts:
     """
     if mode == "policy":
         return reset_states(problem.simulator)
-    if mode == "logged" and problem.states.kind != "exact":
-        refuse_unseen_positions(problem.simulator.task)
-        return chosen_states(problem.states.guesses()[0])
-    return chosen_states(problem.logged_states)
+    logged = problem.states
+    return chosen_states(logged.states if mode == "logged" and logged.starts_known else logged.exact()[0])
 
 
 def collect(
@@ -68,8 +65,8 @@ def collect(
     simulator = problem.simulator
     system = simulator.bind(simulator.parameters.to_physical(draws))
     if mode == "replay":
-        states, actions = problem.logged_states, problem.logged_actions
-        rows = walkers.age.shape[1]
+        states, logged = problem.states.exact()
+        actions, rows = np.asarray(problem.dataset.transitions.action)[logged], walkers.age.shape[1]
         return replay_actions(system, simulator.task, states, actions, rows=rows, key=keys[0]), walkers
     starts = starts_of(problem, mode)
     if mode == "logged":  # every walker stands at a logged state
