@@ -172,13 +172,14 @@ def check_hyperparameters(method: object) -> None:
     Raises:
         MadocError: Names the first such field, what is expected of it, and what it was.
     """
-    for name, adapter in _adapters(method.__class__).items():
+    kind: type = type(method)
+    for name, adapter in _adapters(kind).items():
         try:
             adapter.validate_python(getattr(method, name))
         except ValidationError as error:
             problem = error.errors()[0]
             expected = problem["msg"].removeprefix("Input should be ")
-            owner = f"{name} of {type(method).__name__}"
+            owner = f"{name} of {kind.__name__}"
             raise MadocError(f"expected {owner} to be {expected}, got {problem['input']!r}") from None
 
 

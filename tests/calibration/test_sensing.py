@@ -93,7 +93,7 @@ def test_too_few_readings_for_the_states_are_refused(log):
     [
         ({"window": 0}, "window"),
         ({"window": 2, "starts": "replay"}, "expected window 1 or none, got 2"),
-        ({"sensor_noise": -0.1}, "expected sensor_noise of 0 or more"),
+        ({"sensor_noise": -0.1}, "expected sensor_noise of Madoc to be greater than or equal to 0, got -0.1"),
     ],
 )
 def test_impossible_windows_and_noise_are_refused(wrong, sentence):

@@ -198,7 +198,7 @@ class Madoc:
 
     def estimate(self, problem: CalibrationProblem, state: MadocState) -> Estimate:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
-        space, best = problem.simulator.parameters, state.watch.best
+        space, best, starts = problem.simulator.parameters, state.watch.best, self._start_mode(problem)
         unit, std = np.tanh(np.asarray(best.mean, np.float64)), np.exp(np.asarray(best.log_std, np.float64))
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
@@ -208,9 +208,7 @@ class Madoc:
             failures=state.failures,
             warnings=(
                 *watch.warnings(state.watch, unit, space.names),
-                *said_of_observations(
-                    problem, self._window(problem), self._deviation(problem), self._start_mode(problem)
-                ),
+                *said_of_observations(problem, self._window(problem), self._deviation(problem), starts),
             ),
         )
 
