@@ -5,14 +5,11 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Float
 
-_AT_END = 0.98
-"""Of [-1, 1]: from here on an estimate stands at the end of its range."""
 
-
-def at_end_of_range(unit: Float[np.ndarray, " d"], names: tuple[str, ...]) -> tuple[str, ...]:
-    """Which estimates in [-1, 1] stand at an end."""
-    found = [name for name, value in zip(names, unit, strict=True) if abs(value) > _AT_END]
-    return (f"at the end of its range: {', '.join(found)}; widen the range or doubt the model",) if found else ()
+def at_end_of_range(unit: Float[np.ndarray, " d"], names: tuple[str, ...], *, beyond: float = 0.98) -> tuple[str, ...]:
+    """Name the estimates in [-1, 1] whose absolute value is larger than `beyond`."""
+    ends = [name for name, value in zip(names, unit, strict=True) if abs(value) > beyond]
+    return (f"at the end of its range: {', '.join(ends)}; widen the range or doubt the model",) if ends else ()
 
 
 def exploded(failures: int, control_steps: int) -> tuple[str, ...]:

@@ -56,9 +56,7 @@ def fresh_clone(
 
 
 def cloning_loss(
-    policy: TanhGaussianPolicy,
-    observation: Float[Array, "rows observation"],
-    action: Float[Array, "rows action"],
+    policy: TanhGaussianPolicy, observation: Float[Array, "rows observation"], action: Float[Array, "rows action"]
 ) -> Float[Array, ""]:
     """Mean negative log-likelihood of the data's actions under the policy."""
     return -log_density(action, *policy.distribution(observation)).mean()

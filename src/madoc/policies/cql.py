@@ -115,11 +115,7 @@ class CQL:
                 self._descent,
             )
             learner, of_policy = actor_step(learner, observation, of_actor, self._descent, combine)
-            return learner, {
-                "critic_loss": loss,
-                "conservative_gap": gap,
-                "value_target": target.mean(),
-            } | of_policy
+            return learner, {"critic_loss": loss, "conservative_gap": gap, "value_target": target.mean()} | of_policy
 
         return scan_updates(update, learner, key, count)
 

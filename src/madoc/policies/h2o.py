@@ -1,6 +1,6 @@
 """H2O: logged rows and simulated ones together, the simulated ones trusted by their dynamics (arXiv 2206.13464)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import equinox as eqx
@@ -18,7 +18,7 @@ from madoc.learning.networks import adam, descend, scalars, scan_updates
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, UniformPolicy, act_on, start_acting
+from madoc.policies.interaction import Interaction, explore_or_act, start_acting
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
@@ -116,29 +116,26 @@ class H2O:
     def step(self, problem: PolicyProblem, state: H2OState) -> tuple[H2OState, Epoch]:
         """Act for `epoch_steps` control steps, then update."""
         of_acting, of_update, key = jax.random.split(state.key, 3)
-        explores = state.interaction.control_steps < self.warmup_steps
-        policy = UniformPolicy(problem.simulator.action_size) if explores else self.policy(state)
-        interaction, metrics = act_on(problem, state.interaction, policy, of_acting, control_steps=self.epoch_steps)
+        interaction, epoch, due = explore_or_act(
+            problem,
+            state.interaction,
+            self.policy(state),
+            of_acting,
+            control_steps=self.epoch_steps,
+            warmup_steps=self.warmup_steps,
+            updates_per_step=self.updates_per_step,
+        )
         learning = state.learning
-        acted = interaction.control_steps - state.interaction.control_steps
         if interaction.control_steps >= self.warmup_steps:
-            count = round(self.updates_per_step * acted)
             learning, losses = self._update(
-                learning, interaction.replay, problem.logged, problem.features, of_update, count
+                learning, interaction.replay, problem.logged, problem.features, of_update, due
             )
-            metrics |= scalars(losses)
-        epoch = Epoch(metrics, control_steps=acted, stage="exploring" if explores else "learning")
+            epoch = replace(epoch, metrics=epoch.metrics | scalars(losses))
         return H2OState(learning, interaction, key), epoch
 
     @eqx.filter_jit
     def _update(
-        self,
-        learning: Learning,
-        seen: replay.Replay,
-        logged: Batch,
-        features: Features,
-        key: PRNGKeyArray,
-        count: int,
+        self, learning: Learning, seen: replay.Replay, logged: Batch, features: Features, key: PRNGKeyArray, count: int
     ) -> tuple[Learning, dict[str, Array]]:
         """`count` updates of discriminators, critics, policy and temperature."""
 
@@ -158,7 +155,7 @@ class H2O:
         self, learning: Learning, real: Batch, simulated: Batch, features: Features, key: PRNGKeyArray
     ) -> tuple[Discriminators, PyTree, dict[str, Array]]:
         """One step of the discriminators, on noisy inputs."""
-        described = [part for rows in (real, simulated) for part in _described(features, rows)]
+        described = [part for rows in (real, simulated) for part in features.described(rows)]
         keys = jax.random.split(key, len(described))
         noisy = [
             part + self.noise * jax.random.normal(part_key, part.shape)
@@ -185,7 +182,7 @@ class H2O:
     ) -> tuple[ActorCritic, dict[str, Array]]:
         """One step of the critics, without entropy in the backup."""
         of_real, of_simulated, of_gap = jax.random.split(key, 3)
-        pair, following = _described(features, simulated)
+        pair, following = features.described(simulated)
         ratio = dynamics_ratio(log_dynamics_ratio(discriminators, pair, following))
         gap = dynamics_gap(
             discriminators, pair, following, spread=self.gap_spread, samples=self.gap_samples, key=of_gap
@@ -221,8 +218,3 @@ class H2O:
     def policy(self, state: H2OState) -> TanhGaussianPolicy:
         """The policy learnt so far; deterministic without a key."""
         return state.learning.learner.policy
-
-
-def _described(features: Features, rows: Batch) -> tuple[Array, Array]:
-    observation = rows["observation"]
-    return features.pair(observation, rows["action"]), features.change(observation, rows["next_observation"])

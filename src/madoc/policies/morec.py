@@ -196,7 +196,7 @@ class MOREC:
     def _update_models(
         self, ensemble: Ensemble, optimiser: PyTree, logged: Batch, features: Features, key: PRNGKeyArray
     ) -> tuple[Ensemble, PyTree, Int[Array, " elites"], dict[str, Array]]:
-        pair, change = _described(features, logged)
+        pair, change = features.described(logged)
         reward = (logged["reward"] - features.reward_offset) / features.reward_scale
         rows = (pair, jnp.concatenate([change, reward[:, None]], axis=-1))
         ensemble, optimiser, metrics = fit(
@@ -225,7 +225,7 @@ class MOREC:
     ) -> tuple[Opposition, dict[str, Array]]:
         return oppose(
             adversary,
-            _described(features, logged),
+            features.described(logged),
             key,
             optimiser=adam(self.model_learning_rate),
             batch=self.batch,
@@ -305,8 +305,3 @@ class MOREC:
     def policy(self, state: MORECState) -> TanhGaussianPolicy:
         """The policy learnt so far; deterministic without a key."""
         return state.learner.policy
-
-
-def _described(features: Features, logged: Batch) -> tuple[Array, Array]:
-    observation = logged["observation"]
-    return features.pair(observation, logged["action"]), features.change(observation, logged["next_observation"])

@@ -13,7 +13,7 @@ from madoc.learning.networks import scalars, scan_updates
 from madoc.learning.sac_losses import cloned_actor_loss, cloning_error
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, UniformPolicy, act_on, start_acting
+from madoc.policies.interaction import Interaction, explore_or_act, start_acting
 from madoc.policies.systems import UniformParameters
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
@@ -105,25 +105,27 @@ class SAC:
     def step(self, problem: PolicyProblem, state: SACState) -> tuple[SACState, Epoch]:
         """Act for `epoch_steps` control steps, then update, then judge the policy where that is due."""
         of_acting, of_update, of_judging, key = jax.random.split(state.key, 4)
-        explores = state.interaction.control_steps < self.warmup_steps
-        policy = UniformPolicy(problem.simulator.action_size) if explores else state.learner.policy
-        interaction, metrics = act_on(
-            self._place(problem), state.interaction, policy, of_acting, control_steps=self.epoch_steps
+        interaction, epoch, due = explore_or_act(
+            self._place(problem),
+            state.interaction,
+            state.learner.policy,
+            of_acting,
+            control_steps=self.epoch_steps,
+            warmup_steps=self.warmup_steps,
+            updates_per_step=self.updates_per_step,
         )
         learner = state.learner
-        acted, judging = interaction.control_steps - state.interaction.control_steps, 0
         if interaction.control_steps >= self.warmup_steps:
-            count = round(self.updates_per_step * acted)
             logged = problem.logged if self.cloning is not None else None
-            learner, losses = self._update(learner, interaction.replay, logged, of_update, count)
-            metrics |= scalars(losses)
+            learner, losses = self._update(learner, interaction.replay, logged, of_update, due)
+            epoch = replace(epoch, metrics=epoch.metrics | scalars(losses))
         following = replace(state, learner=learner, interaction=interaction, key=key)
-        due = self.judge_every and interaction.control_steps >= state.judged + self.judge_every
-        if due and learner is not state.learner:
-            following, mean_return, judging = self._judge(problem, following, of_judging)
-            metrics |= {"judged_return": mean_return}
-        stage = "exploring" if explores else "learning"
-        return following, Epoch(metrics, control_steps=acted + judging, unbudgeted=judging, stage=stage)
+        judges = self.judge_every and interaction.control_steps >= state.judged + self.judge_every
+        if judges and learner is not state.learner:
+            following, mean_return, spent = self._judge(problem, following, of_judging)
+            metrics = epoch.metrics | {"judged_return": mean_return}
+            epoch = replace(epoch, metrics=metrics, control_steps=epoch.control_steps + spent, unbudgeted=spent)
+        return following, epoch
 
     def _judge(self, problem: PolicyProblem, state: SACState, key: PRNGKeyArray) -> tuple[SACState, float, int]:
         """Keep the policy if no earlier one's mean return was as high; also that return, and the control steps."""

@@ -175,12 +175,7 @@ class RunLog:
     def append(self, metrics: Metrics, *, stage: str, spent: int, seconds: float) -> None:
         """Add one epoch. A NaN or infinite metric is logged as null."""
         finite = {name: value if np.isfinite(value) else None for name, value in metrics.items()}
-        line = {
-            self._count: spent,
-            "seconds": round(seconds, 3),
-            "stage": stage,
-            "metrics": finite,
-        }
+        line = {self._count: spent, "seconds": round(seconds, 3), "stage": stage, "metrics": finite}
         self._lines.write(json_text(line, what="metrics.jsonl").encode() + b"\n")
         self._lines.flush()
         for name, value in finite.items():

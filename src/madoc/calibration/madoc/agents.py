@@ -8,14 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from madoc.calibration.madoc.actors import (
-    Actors,
-    actor_loss,
-    divergence,
-    draw_parameters,
-    initial_actors,
-    prior_weight,
-)
+from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_parameters, initial_actors, prior_weight
 from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap

@@ -167,13 +167,7 @@ class Madoc:
         groups = self._group_count(problem)
         of_policy, of_vae, of_agents, of_start, key = jax.random.split(key, 5)
         vae = GroupingVAE(count, window, following, self.hidden, key=of_vae)
-        agents = self.agents.init(
-            window=window,
-            observation=following,
-            parameters=count,
-            groups=groups,
-            key=of_agents,
-        )
+        agents = self.agents.init(window=window, observation=following, parameters=count, groups=groups, key=of_agents)
         return MadocState(
             clone=fresh_clone(
                 problem.dataset.transitions, self.hidden, learning_rate=self.learning_rate, key=of_policy

@@ -71,27 +71,14 @@ def collect(
     starts = starts_of(problem, mode)
     if mode == "logged":  # every walker stands at a logged state
         starts, walkers = unbiased_starts(system, starts), replace(walkers, state=system.unbiased(walkers.state))
-    return roll(
-        system,
-        simulator.task,
-        policy,
-        walkers,
-        steps=steps,
-        starts=starts,
-        key=keys[0],
-        restart_key=keys[1],
-    )
+    return roll(system, simulator.task, policy, walkers, steps=steps, starts=starts, key=keys[0], restart_key=keys[1])
 
 
 def empty_rows(problem: CalibrationProblem, scaling: WindowScaling, capacity: int) -> replay.Replay:
     """A buffer of features, the draw each row was simulated under, and which parameter was moved for it."""
     window, following = scaling.sizes
     return replay.empty(
-        capacity,
-        pair=(window,),
-        following=(following,),
-        parameters=(len(problem.simulator.parameters),),
-        identity=(),
+        capacity, pair=(window,), following=(following,), parameters=(len(problem.simulator.parameters),), identity=()
     )
 
 

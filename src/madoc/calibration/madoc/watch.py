@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 
+from madoc.calibration.cautions import at_end_of_range
 from madoc.calibration.madoc.actors import Actors
 from madoc.types import Metrics
 
@@ -108,7 +109,4 @@ def warnings(watch: Watch, unit: np.ndarray, names: tuple[str, ...]) -> tuple[st
             f"the discriminators are sure of {watch.at_bound:.0%} of the simulated rows (reward at its bound), "
             "so the reward has no slope; start rollouts at logged states, or narrow the ranges"
         )
-    at_end = [name for name, value in zip(names, unit, strict=True) if abs(value) > AT_END]
-    if at_end:
-        found.append(f"at the end of its range: {', '.join(at_end)}; widen the range or doubt the model")
-    return tuple(found)
+    return *found, *at_end_of_range(unit, names, beyond=AT_END)

@@ -15,12 +15,7 @@ from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines import evolution
-from madoc.calibration.baselines.cma_es.mean_embedding import (
-    CosineFeatures,
-    adjusted,
-    cosine_features,
-    discrepancies,
-)
+from madoc.calibration.baselines.cma_es.mean_embedding import CosineFeatures, adjusted, cosine_features, discrepancies
 from madoc.calibration.baselines.population_search import (
     SearchState,
     draw_windows,

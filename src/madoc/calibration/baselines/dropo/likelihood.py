@@ -19,9 +19,7 @@ def truncated_noise(key: PRNGKeyArray, pairs: int, dimensions: int) -> Float[np.
 
 
 def parameter_draws(
-    mean: Float[np.ndarray, "candidates d"],
-    std: Float[np.ndarray, "candidates d"],
-    noise: Float[np.ndarray, "draws d"],
+    mean: Float[np.ndarray, "candidates d"], std: Float[np.ndarray, "candidates d"], noise: Float[np.ndarray, "draws d"]
 ) -> Float[np.ndarray, "candidates draws d"]:
     """ξ = μ + σ ε, put on the wall where it leaves the box [-1, 1]."""
     return np.clip(mean[:, None] + std[:, None] * noise, -1.0, 1.0)
