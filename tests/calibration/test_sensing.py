@@ -8,7 +8,7 @@ from madoc import simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, Madoc
 from madoc.calibration.least_squares.calibrator import horizon_of
 from madoc.calibration.madoc.collection import sensed
-from madoc.calibration.madoc.sensing import noise_deviation, said_of_observations, window_length
+from madoc.calibration.madoc.sensing import noise_deviation, observation_warnings, window_length
 from madoc.data import Disturbance, disturb, observed_task
 from madoc.errors import MadocError
 from madoc.simulation.rollout import Rollout
@@ -44,9 +44,9 @@ def test_simulated_readings_carry_the_noise_that_the_data_says_it_has(log):
     change = clean.typical_change
     np.testing.assert_allclose(noise_deviation(noisy, None), 0.1 * change, rtol=0.05)
     np.testing.assert_allclose(noise_deviation(noisy, "estimated"), 0.1 * change, rtol=0.3)
-    (told,) = said_of_observations(noisy, 1, noise_deviation(noisy, None), "logged")
+    (told,) = observation_warnings(noisy, 1, noise_deviation(noisy, None), "logged")
     assert told == "simulated observations were given sensor noise of 9.9 % of a step's change"
-    assert said_of_observations(clean, 1, noise_deviation(clean, None), "logged") == ()
+    assert observation_warnings(clean, 1, noise_deviation(clean, None), "logged") == ()
 
 
 def test_a_reading_that_ends_a_row_begins_the_next():

@@ -59,9 +59,9 @@ def test_what_looks_most_real_is_what_happens():
 
 def test_what_looks_unreal_ends():
     # even the better candidate, change 1, has D = sigmoid(-3), r = 0.0486 < 0.1
-    dreamers, rows, told = imagined(slope=-3.0, steps=1)
+    dreamers, rows, metrics = imagined(slope=-3.0, steps=1)
     assert rows["terminated"].all()
-    assert told["stopped"] == 1.0
+    assert metrics["stopped"] == 1.0
     assert set(np.asarray(dreamers.observation)[:, 0].tolist()) <= {0.0, 10.0}
     assert (np.asarray(dreamers.age) == 0).all()
 
@@ -75,9 +75,9 @@ def test_a_fall_ends_and_the_horizon_only_starts_again():
 
 
 def test_uncertainty_costs():
-    _, rows, told = imagined(slope=1.0, steps=1, penalty=1e6)
-    np.testing.assert_allclose(rows["reward"], 1.0 - 1e6 * told["penalty"], rtol=1e-4)
-    assert told["penalty"] > 0
+    _, rows, metrics = imagined(slope=1.0, steps=1, penalty=1e6)
+    np.testing.assert_allclose(rows["reward"], 1.0 - 1e6 * metrics["penalty"], rtol=1e-4)
+    assert metrics["penalty"] > 0
 
 
 def test_imagined_observations_stay_near_the_logged_ones():

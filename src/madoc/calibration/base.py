@@ -1,4 +1,4 @@
-"""What a calibrator is given, what it must offer, and what it returns."""
+"""The problem that a calibrator is given, its protocol, and the estimate it returns."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,7 +18,7 @@ from madoc.types import Method, State
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """Find the parameters under which the simulator moves as the data does.
+    """A log and the simulator whose parameters are to be estimated from it.
 
     The data's true parameters, where it carries any, are dropped here: no method can read them.
 
@@ -73,15 +73,15 @@ class CalibrationProblem:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What is known to keep the simulator from moving as the data does, one sentence each."""
+        """Known reasons why the simulator cannot move exactly as the data does, one sentence each."""
         recorded, simulated = self.dataset.physics, self.simulator.task.physics
         gap = (
             f"the data was recorded in {recorded} physics and the simulator's is {simulated}: "
             "the estimate will make up for the difference"
         )
         gaps = () if recorded in ("unknown", simulated) else (gap,)
-        told = (finding.sentence for finding in self.dataset.findings if finding.level == "warning")
-        return (*gaps, *self.dataset.disturbance.sentences(), *told)
+        findings = (finding.sentence for finding in self.dataset.findings if finding.level == "warning")
+        return (*gaps, *self.dataset.disturbance.sentences(), *findings)
 
     def require_pairs(self) -> None:
         """Refuse data in which it is not known which next observation followed which row.
@@ -108,16 +108,16 @@ class CalibrationProblem:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a calibrator believes, in physical units.
+    """An estimate of all parameters, in physical units.
 
     Attributes:
-        mean: Value of each parameter, shape (d,).
-        std: Its spread under the calibration distribution, shape (d,).
+        mean: Estimated value of each parameter.
+        std: Standard deviation of each parameter under the method's distribution.
         groups: Parameters calibrated together, as indices; one group of all where a method has none.
         failures: Simulated rows that exploded and were left out.
         warnings: What a user should know about it, one sentence each.
-        covariance: Its joint spread, shape (d, d), where the method knows it; the diagonal is `std` squared.
-        interval: 95 % confidence interval of each, columns low and high, where the method knows it.
+        covariance: Joint covariance of the parameters, None where the method has none; its diagonal is `std` squared.
+        interval: 95 % confidence interval of each parameter, columns low and high; None where the method has none.
     """
 
     mean: Float[np.ndarray, " d"]
@@ -131,10 +131,10 @@ class Estimate:
 
 @runtime_checkable
 class EmbedsParameters(Protocol):
-    """What a method may have besides: it learns which parameters act alike, and can show it."""
+    """An addition to the protocol for methods that learn which parameters act alike."""
 
     def embeddings(self, problem: CalibrationProblem, state: Any) -> Float[np.ndarray, "d latent"] | None:
-        """One vector a parameter, near for those that act alike; None while nothing is learnt of it."""
+        """One vector for each parameter, close together for those that act alike; None before anything is learnt."""
         ...
 
 

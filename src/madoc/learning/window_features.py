@@ -1,7 +1,7 @@
 """Several rows as one: what a discriminator is shown where a single observation does not determine the state.
 
-Not in the paper, whose robots show all of their state. Where velocities are hidden, (s, a) says little of s'; the last
-few observations and actions say as much as a state does.
+Not in the paper, whose robots show all of their state. Where velocities are hidden, (s, a) does not determine s'; the
+last few observations and actions do about as well as a state.
 """
 
 from dataclasses import dataclass, replace

@@ -46,7 +46,7 @@ class H2OState:
 class H2O:
     """Dynamics-aware hybrid offline-and-online learning: SAC on half logged, half simulated rows.
 
-    Two discriminators tell logged from simulated transitions. Their ratio weighs the Bellman error of simulated rows,
+    Two discriminators classify transitions as logged or simulated. Their ratio weighs the Bellman error of simulated rows,
     and values are held down where simulated and real dynamics differ. Unlike the authors', policy and critics see
     standardised observations, and the discriminators (s, a) and s' - s, for which their input noise of 0.1 is a tenth
     of the spread.
@@ -63,9 +63,8 @@ class H2O:
         gap_samples: Next states drawn for the dynamics gap of a row.
         gap_spread: How wide, in units of a step's change.
         bound: Of the logits that s' adds to those of (s, a).
-        pair_bound: Of the logits of (s, a). The authors' is 2, as the other: that cannot say all that (s, a) tell while
-            the policy is where no data is, s' then says it in their place, and the ratio takes any simulated row for
-            false.
+        pair_bound: Of the logits of (s, a). The authors' is 2, like the other: too narrow where the policy is far
+            from the data. The logits of s' then make up for it, and the ratio rejects every simulated row.
         discount: γ.
         target_rate: τ of the target critics.
         learning_rate: Adam's, for everything.
@@ -143,15 +142,17 @@ class H2O:
             of_logged, of_simulated, of_noise, of_critics, of_actor = jax.random.split(key, 5)
             real = draw_rows(logged, of_logged, self.batch // 2)
             simulated = replay.sample(seen, of_simulated, self.batch // 2)
-            discriminators, optimiser, told = self._tell_apart(learning, real, simulated, features, of_noise)
+            discriminators, optimiser, of_ratio = self._update_discriminators(
+                learning, real, simulated, features, of_noise
+            )
             learner, of_values = self._value(learning.learner, discriminators, real, simulated, features, of_critics)
             observation = jnp.concatenate([real["observation"], simulated["observation"]])
             learner, of_policy = actor_step(learner, observation, of_actor, self._descent)
-            return Learning(learner, discriminators, optimiser), told | of_values | of_policy
+            return Learning(learner, discriminators, optimiser), of_ratio | of_values | of_policy
 
         return scan_updates(update, learning, key, count)
 
-    def _tell_apart(
+    def _update_discriminators(
         self, learning: Learning, real: Batch, simulated: Batch, features: Features, key: PRNGKeyArray
     ) -> tuple[Discriminators, PyTree, dict[str, Array]]:
         """One step of the discriminators, on noisy inputs."""

@@ -19,7 +19,7 @@ from madoc.learning.features import Features
 from madoc.learning.networks import adam, scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.imagination import Dreamers, Dreaming, Filter, dream, fall_asleep
+from madoc.policies.imagination import Filter, Imagination, ImaginedRows, dream, start_imagining
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
@@ -46,7 +46,7 @@ class MORECState:
     opposition: Opposition
     learner: ActorCritic
     replay: replay.Replay
-    dreamers: Dreamers
+    dreamers: ImaginedRows
     key: PRNGKeyArray
     preparing: int
 
@@ -129,7 +129,7 @@ class MOREC:
         """Fresh networks, an empty replay, rows at logged observations.
 
         Raises:
-            MadocError: No data, too little, data without rewards, or a task whose falls an observation cannot tell.
+            MadocError: No data, too little, data without rewards, or a task whose state an observation does not determine.
         """
         task = problem.simulator.task
         require_data(problem, rows=max(self.batch, self.holdout_every))
@@ -158,7 +158,7 @@ class MOREC:
             adversary,
             fresh(*sizes, hidden=self.hidden, descent=self._descent, features=problem.features, key=keys[2]),
             replay.empty(self.replay_capacity, **columns, reward=(), terminated=()),
-            fall_asleep(problem.logged["observation"], self.imagined_rows, keys[3]),
+            start_imagining(problem.logged["observation"], self.imagined_rows, keys[3]),
             keys[4],
             0,
         )
@@ -239,7 +239,7 @@ class MOREC:
         task = problem.simulator.task
         assert task.state_from_observation is not None
         believed = Filter(state.elites, state.opposition.past)
-        dreamers, rows, told = self._dream(
+        dreamers, rows, imagined = self._dream(
             (task.terminated, task.state_from_observation),
             state.ensemble,
             believed,
@@ -251,7 +251,7 @@ class MOREC:
         )
         seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
         learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
-        return replace(state, learner=learner, replay=seen, dreamers=dreamers), told | metrics
+        return replace(state, learner=learner, replay=seen, dreamers=dreamers), imagined | metrics
 
     @eqx.filter_jit
     def _dream(
@@ -261,10 +261,10 @@ class MOREC:
         believed: Filter,
         features: Features,
         policy: TanhGaussianPolicy,
-        dreamers: Dreamers,
+        dreamers: ImaginedRows,
         logged: Array,
         key: PRNGKeyArray,
-    ) -> tuple[Dreamers, Batch, dict[str, Array]]:
+    ) -> tuple[ImaginedRows, Batch, dict[str, Array]]:
         terminated, to_state = ends
         return dream(
             ensemble,
@@ -274,7 +274,7 @@ class MOREC:
             dreamers,
             logged=logged,
             terminated=lambda observation: terminated(to_state(observation)),
-            settings=Dreaming(self.samples, self.threshold, self.horizon, self.penalty),
+            settings=Imagination(self.samples, self.threshold, self.horizon, self.penalty),
             steps=-(-self.epoch_updates * self.imagined_per_update // self.imagined_rows),
             key=key,
         )

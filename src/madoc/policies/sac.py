@@ -131,13 +131,13 @@ class SAC:
         """Keep the policy if no earlier one's mean return was as high; also that return, and the control steps."""
         of_systems, of_episodes = jax.random.split(key)
         systems = self._place(problem).systems(of_systems, self.judge_episodes)
-        found = evaluate(
+        evaluation = evaluate(
             state.learner.policy, problem.simulator, systems, key=of_episodes, episodes=self.judge_episodes
         )
-        mean = float(found.returns.mean())
+        mean = float(evaluation.returns.mean())
         if not state.judged or mean > state.best_return:
             state = replace(state, best=state.learner.policy, best_return=mean)
-        return replace(state, judged=state.interaction.control_steps), mean, int(found.lengths.sum())
+        return replace(state, judged=state.interaction.control_steps), mean, int(evaluation.lengths.sum())
 
     @eqx.filter_jit
     def _update(

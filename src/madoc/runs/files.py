@@ -95,7 +95,7 @@ def _unwritable(value: Any, place: str) -> str | None:
         inner = (_unwritable(child, f"{place}[{index}]") for index, child in enumerate(value))
     else:
         return f"{place} is a {type(value).__name__}, expected a number, string, list, dict or null"
-    return next((found for found in inner if found), None)
+    return next((place for place in inner if place), None)
 
 
 def _sync_folder(folder: Path) -> None:

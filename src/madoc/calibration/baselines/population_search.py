@@ -1,4 +1,4 @@
-"""What searches by CMA-ES share: their state, the rows they replay, the cost of a failure, the estimate."""
+"""What methods that search by CMA-ES share: state, replayed windows, cost of failed simulations, estimate."""
 
 from dataclasses import dataclass, replace
 
@@ -59,7 +59,7 @@ def next_generation(
     control_steps: int,
     tolerance: float,
 ) -> tuple[SearchState, Epoch]:
-    """The state once the candidates' costs are known, and the epoch that has found them out."""
+    """Update the search with the candidates' costs; also the epoch that evaluated them."""
     search = evolution.tell(state.search, candidates, costs)
     metrics = {"cost": float(costs.min()), "deviation": evolution.widest_deviation(search)}
     epoch = Epoch(metrics, control_steps, converged=evolution.settled(search, tolerance))

@@ -1,4 +1,4 @@
-"""What calibration updates: discriminators, group critics, actors, their prior; and the update itself."""
+"""The networks and distributions that calibration trains, and one update of all of them."""
 
 from dataclasses import dataclass, replace
 
@@ -15,16 +15,16 @@ from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_lo
 from madoc.learning.networks import adam, descend, moving_average, scan_updates
 
 AT_BOUND = 0.95
-"""A reward past this share of its bound is counted as saturated."""
+"""Share of the reward's bound past which a reward counts as saturated."""
 BLUR_RANGE = (0.01, 0.3)
-"""Shares of a step's spread; it starts at the largest. Below the smallest the networks cannot follow s', and are as
-unsure as if the domains were the same."""
+"""Limits of the blur, in units of a step's standard deviation; it starts at the upper one. Below the lower one the
+networks cannot resolve differences in s'."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Agents:
-    """What updates change.
+    """Everything that updates change.
 
     Attributes:
         discriminators: Tell logged from simulated rows.
@@ -34,7 +34,7 @@ class Agents:
         prior: Its moving average, the p of Eq. (13).
         average: A moving average of the actors for reading the estimate.
         log_blur: Log of the noise on s' features that both discriminators see.
-        updates: How many there were.
+        updates: Number of updates so far.
     """
 
     discriminators: Discriminators
@@ -186,7 +186,7 @@ class AgentSettings:
     def _steer_blur(
         self, agents: Agents, reward: Float[Array, " rows"], share: Float[Array, " rows"]
     ) -> tuple[Agents, dict[str, Array]]:
-        """More blur where the discriminators are too sure, less where they cannot tell."""
+        """Widen the blur if the mean |reward| is above its set size, narrow it if below."""
         size = (share * jnp.abs(reward)).mean()
         surplus = jnp.clip(size - self.reward_size, -1.0, 1.0)
         log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *np.log(BLUR_RANGE))

@@ -18,7 +18,7 @@ from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.agents import BLUR_RANGE, Agents, AgentSettings
 from madoc.calibration.madoc.collection import Features, StartMode, collect, empty_rows, remember, sensed, starts_of
 from madoc.calibration.madoc.grouping import GroupingVAE
-from madoc.calibration.madoc.sensing import noise_deviation, said_of_observations, window_length
+from madoc.calibration.madoc.sensing import noise_deviation, observation_warnings, window_length
 from madoc.calibration.madoc.value_decomposition import Mixing
 from madoc.calibration.madoc.watch import Watch
 from madoc.errors import MadocError
@@ -31,7 +31,7 @@ from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hy
 
 Grouping = Literal["learned", "one", "each"]
 GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
-"""Parameter draws an epoch, and control steps a row lives under one draw, by start mode."""
+"""Parameter draws per epoch, and control steps of a row under one draw, by start mode."""
 PAPER: dict[str, Any] = {
     "starts": "policy",
     "features": "raw",
@@ -66,7 +66,7 @@ PAPER: dict[str, Any] = {
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MadocState:
-    """Everything Madoc carries. `labels` are groups by parameter; counts are epochs done of each stage."""
+    """Everything Madoc carries. `labels` are the parameters' groups, `grouped` counts epochs of grouping."""
 
     clone: Clone
     vae: GroupingVAE
@@ -92,11 +92,11 @@ class Madoc:
         group_count: Learned groups; None takes the task's own number.
         starts: `policy` (free running from resets, the paper's), `logged` (short rollouts from logged states
             under the clone; velocities from positions where they are hidden) or `replay` (one step from logged state
-            and action). None takes `logged` where the log tells the states, else `policy`.
+            and action). None takes `logged` where states are known, else `policy`.
         window: Rows (s, a) that the discriminators see before s'; None takes 1 where an observation determines the
             state, as the paper does, else 3.
-        sensor_noise: Put on simulated observations, as a share of a step's typical change; None takes what the data
-            says of itself, `estimated` looks for it in the data.
+        sensor_noise: Put on simulated observations, as a share of a step's typical change; None takes the share that
+            the data declares, `estimated` estimates it from the data.
         features: `standardised` (s, a) and s' - s, or `raw` as the paper's.
         hidden: Units per layer of clone and VAE.
         cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
@@ -193,16 +193,16 @@ class Madoc:
     def estimate(self, problem: CalibrationProblem, state: MadocState) -> Estimate:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
         space, best, starts = problem.simulator.parameters, state.watch.best, self._start_mode(problem)
-        unit, std = np.tanh(np.asarray(best.mean, np.float64)), np.exp(np.asarray(best.log_std, np.float64))
+        scaled, std = np.tanh(np.asarray(best.mean, np.float64)), np.exp(np.asarray(best.log_std, np.float64))
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
-            mean=space.to_physical(unit),
-            std=(1.0 - unit**2) * std * (space.high - space.low) / 2.0,
+            mean=space.to_physical(scaled),
+            std=(1.0 - scaled**2) * std * (space.high - space.low) / 2.0,
             groups=tuple(tuple(group) for group in groups),
             failures=state.failures,
             warnings=(
-                *watch.warnings(state.watch, unit, space.names),
-                *said_of_observations(problem, self._window(problem), self._deviation(problem), starts),
+                *watch.warnings(state.watch, scaled, space.names),
+                *observation_warnings(problem, self._window(problem), self._deviation(problem), starts),
             ),
         )
 
@@ -352,6 +352,6 @@ class Madoc:
 
 
 def _out_of_step(walkers: Walkers, max_age: int) -> Walkers:
-    """Rows that did not all start at once: ages spread evenly, so that time limits do not fall together."""
+    """Walkers whose ages are spread evenly, so that they do not reach the time limit together."""
     count = walkers.age.size
     return replace(walkers, age=(np.arange(count) * max_age // count).reshape(walkers.age.shape))

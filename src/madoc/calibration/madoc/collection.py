@@ -1,4 +1,4 @@
-"""Where Madoc's simulated rows come from: three ways to start, and the buffer they are kept in."""
+"""How Madoc simulates rows: three ways to start rollouts, and the replay buffer of their features."""
 
 from dataclasses import replace
 from typing import Literal
@@ -27,12 +27,12 @@ Features = Literal["standardised", "raw"]
 
 
 def starts_of(problem: CalibrationProblem, mode: StartMode) -> Starts:
-    """Where rows start and start again: at the task's resets (`policy`), else at logged states.
+    """Where rollouts start, and start again: at resets of the task (`policy`), else at logged states.
 
-    Where logged states cannot be rebuilt, their velocities are taken from positions.
+    Where velocities are not observed, those of `logged` starts are finite differences of positions.
 
     Raises:
-        MadocError: Positions are not known either, or not all of them.
+        MadocError: Some positions are not observed, or states to replay from are not exact.
     """
     if mode == "policy":
         return reset_states(problem.simulator)
@@ -106,9 +106,9 @@ def remember(
 
 
 def sensed(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:
-    """The rollout as sensors that noisy would have shown it; a reading that ends one row begins the next.
+    """The rollout with sensor noise on its observations; each observation is the same at the end and start of rows.
 
-    What the policy acted on stays as it was.
+    The policy acted on observations without noise.
     """
     if not deviation.any():
         return rollout

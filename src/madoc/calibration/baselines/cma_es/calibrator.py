@@ -149,7 +149,7 @@ class CmaEs:
         return CmaEsState(inner, clouds, actor), epoch
 
     def estimate(self, problem: CalibrationProblem, state: CmaEsState) -> Estimate:
-        """Centre and covariance of the search. The covariance says where it looks, not how sure it may be."""
+        """Centre and covariance of the search. The covariance is the search's, no measure of uncertainty."""
         return estimate_from_search(problem, state.inner)
 
     def _acts(self, problem: CalibrationProblem) -> bool:

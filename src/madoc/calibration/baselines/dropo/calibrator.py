@@ -35,7 +35,7 @@ ENTROPY_WEIGHT = 0.1
 def distribution_of(
     candidate: Float[np.ndarray, "*candidates both"],
 ) -> tuple[Float[np.ndarray, "*candidates d"], Float[np.ndarray, "*candidates d"]]:
-    """μ and σ of candidates: the first half is μ, the second says where log σ lies between its ends."""
+    """μ and σ of candidates: the first half is μ, the second places log σ between its limits."""
     count = candidate.shape[-1] // 2
     low, high = np.log(DEVIATIONS)
     return candidate[..., :count], np.exp(low + (candidate[..., count:] + 1.0) / 2.0 * (high - low))

@@ -53,8 +53,8 @@ def negative_log_likelihood(
     whole = np.where(failed[..., None, None], eye, covariance + epsilon * eye)
     centre = np.where(failed[..., None], 0.0, mean)
     distance = (centre * np.linalg.solve(whole, centre[..., None])[..., 0]).sum(-1)
-    found = 0.5 * (values * np.log(2.0 * np.pi) + np.linalg.slogdet(whole)[1] + distance)
-    return np.where(failed, np.nan, found)
+    negative = 0.5 * (values * np.log(2.0 * np.pi) + np.linalg.slogdet(whole)[1] + distance)
+    return np.where(failed, np.nan, negative)
 
 
 def entropy(std: Float[np.ndarray, "candidates d"]) -> Float[np.ndarray, " candidates"]:

@@ -2,7 +2,7 @@
 
 Gur, Nachum and Faust 2021, "Offline tuning of simulators". Only its abstract and appendix D.2 of Jiang et al. 2024
 could be had: a distribution over simulator parameters, a divergence between the (s, a) of data and simulator, and a
-bandit's policy gradient. Everything else here is our choice, and said so where it is made.
+bandit's policy gradient. Everything else is our choice, and marked as such where it is made.
 """
 
 from dataclasses import dataclass, replace
@@ -124,14 +124,14 @@ class Oted:
     def estimate(self, problem: CalibrationProblem, state: OtedState) -> Estimate:
         """The averaged distribution through tanh: its centre, and its deviation to first order."""
         space, average = problem.simulator.parameters, state.average
-        unit = np.tanh(average.mean)
-        std = (1.0 - unit**2) * np.exp(average.log_std) * (space.high - space.low) / 2.0
+        scaled = np.tanh(average.mean)
+        std = (1.0 - scaled**2) * np.exp(average.log_std) * (space.high - space.low) / 2.0
         return Estimate(
-            mean=space.to_physical(unit),
+            mean=space.to_physical(scaled),
             std=std,
             groups=(tuple(range(len(space))),),
             failures=state.failures,
-            warnings=at_end_of_range(unit, space.names),
+            warnings=at_end_of_range(scaled, space.names),
             covariance=np.diag(std**2),
         )
 
