@@ -61,8 +61,8 @@ class Scaling:
 class Discriminators(eqx.Module):
     """f_sa and f_sas, each two logits (target, source), bounded by a tanh (appendix C, Jiang et al. 2024: both by 2).
 
-    A wider bound of f_sa keeps the reward clean: where simulated (s, a) are far from logged ones, f_sas makes up for what
-    a narrowly bounded f_sa cannot express, and that looks like a difference in dynamics.
+    A wider bound of f_sa keeps the reward clean: where simulated (s, a) are far from logged ones, f_sas makes up for
+    what a narrowly bounded f_sa cannot express, and that looks like a difference in dynamics.
 
     Attributes:
         pair: f_sa's network.

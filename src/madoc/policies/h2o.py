@@ -46,8 +46,8 @@ class H2OState:
 class H2O:
     """Dynamics-aware hybrid offline-and-online learning: SAC on half logged, half simulated rows.
 
-    Two discriminators classify transitions as logged or simulated. Their ratio weighs the Bellman error of simulated rows,
-    and values are held down where simulated and real dynamics differ. Unlike the authors', policy and critics see
+    Two discriminators classify transitions as logged or simulated. Their ratio weighs the Bellman error of simulated
+    rows, and values are held down where simulated and real dynamics differ. Unlike the authors', policy and critics see
     standardised observations, and the discriminators (s, a) and s' - s, for which their input noise of 0.1 is a tenth
     of the spread.
 

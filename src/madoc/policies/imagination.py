@@ -77,7 +77,7 @@ def imagine(
     believed: Filter,
     features: Features,
     policy: Policy,
-    rows_under_way: ImaginedRows,
+    under_way: ImaginedRows,
     *,
     logged: Float[Array, "logged observation"],
     terminated: Callable[[Array], Bool[Array, " rows"]],
@@ -95,9 +95,9 @@ def imagine(
     low, high = logged.min(0), logged.max(0)
     low, high = low - (high - low), high + (high - low)
 
-    def step(rows_under_way: ImaginedRows, key: PRNGKeyArray) -> tuple[ImaginedRows, tuple[Batch, dict[str, Array]]]:
+    def step(under_way: ImaginedRows, key: PRNGKeyArray) -> tuple[ImaginedRows, tuple[Batch, dict[str, Array]]]:
         of_action, of_sample, of_restart = jax.random.split(key, 3)
-        observation = rows_under_way.observation
+        observation = under_way.observation
         action = policy(observation, of_action)
         pair = features.pair(observation, action)
         mean, std = ensemble(pair)
@@ -124,7 +124,7 @@ def imagine(
             "next_observation": following,
             "terminated": ends.astype(jnp.float32),
         }
-        again = ends | (rows_under_way.age + 1 >= settings.horizon)
+        again = ends | (under_way.age + 1 >= settings.horizon)
         fresh = _some(logged, len(observation), of_restart)
         state = jnp.where(jnp.broadcast_to(again[:, None], fresh.shape), fresh, following)
         metrics = {
@@ -133,11 +133,11 @@ def imagine(
             "penalty": penalty.mean(),
             "imagined_reward": reward.mean(),
         }
-        return ImaginedRows(state, jnp.where(again, 0, rows_under_way.age + 1)), (row, metrics)
+        return ImaginedRows(state, jnp.where(again, 0, under_way.age + 1)), (row, metrics)
 
-    rows_under_way, (rows, metrics) = jax.lax.scan(step, rows_under_way, jax.random.split(key, steps))
+    under_way, (rows, metrics) = jax.lax.scan(step, under_way, jax.random.split(key, steps))
     flat = {name: column.reshape(-1, *column.shape[2:]) for name, column in rows.items()}
-    return rows_under_way, flat, jax.tree.map(jnp.mean, metrics)
+    return under_way, flat, jax.tree.map(jnp.mean, metrics)
 
 
 def _some(logged: Array, rows: int, key: PRNGKeyArray) -> Array:

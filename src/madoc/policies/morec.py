@@ -19,7 +19,7 @@ from madoc.learning.features import Features
 from madoc.learning.networks import adam, scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.imagination import Filter, Imagination, ImaginedRows, dream, start_imagining
+from madoc.policies.imagination import Filter, Imagination, ImaginedRows, imagine, start_imagining
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
@@ -35,7 +35,7 @@ class MORECState:
         opposition: What becomes the dynamics reward.
         learner: SAC.
         replay: Imagined rows.
-        dreamers: Where imagined rows stand.
+        under_way: Imagined rows and where they stand.
         key: The random key.
         preparing: Updates of models and discriminators so far.
     """
@@ -46,7 +46,7 @@ class MORECState:
     opposition: Opposition
     learner: ActorCritic
     replay: replay.Replay
-    dreamers: ImaginedRows
+    under_way: ImaginedRows
     key: PRNGKeyArray
     preparing: int
 
@@ -129,7 +129,7 @@ class MOREC:
         """Fresh networks, an empty replay, rows at logged observations.
 
         Raises:
-            MadocError: No data, too little, data without rewards, or a task whose state an observation does not determine.
+            MadocError: No data, too little, data without rewards, or observations that do not determine the state.
         """
         task = problem.simulator.task
         require_data(problem, rows=max(self.batch, self.holdout_every))
@@ -235,43 +235,43 @@ class MOREC:
 
     def _learn(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
         """Imagine, then update the policy."""
-        of_dreams, of_updates = jax.random.split(state.key)
+        of_imagination, of_updates = jax.random.split(state.key)
         task = problem.simulator.task
         assert task.state_from_observation is not None
         believed = Filter(state.elites, state.opposition.past)
-        dreamers, rows, imagined = self._dream(
+        under_way, rows, imagined = self._imagine(
             (task.terminated, task.state_from_observation),
             state.ensemble,
             believed,
             problem.features,
             state.learner.policy,
-            state.dreamers,
+            state.under_way,
             problem.logged["observation"],
-            of_dreams,
+            of_imagination,
         )
         seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
         learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
-        return replace(state, learner=learner, replay=seen, dreamers=dreamers), imagined | metrics
+        return replace(state, learner=learner, replay=seen, under_way=under_way), imagined | metrics
 
     @eqx.filter_jit
-    def _dream(
+    def _imagine(
         self,
         ends: tuple[Callable, Callable],
         ensemble: Ensemble,
         believed: Filter,
         features: Features,
         policy: TanhGaussianPolicy,
-        dreamers: ImaginedRows,
+        under_way: ImaginedRows,
         logged: Array,
         key: PRNGKeyArray,
     ) -> tuple[ImaginedRows, Batch, dict[str, Array]]:
         terminated, to_state = ends
-        return dream(
+        return imagine(
             ensemble,
             believed,
             features,
             policy,
-            dreamers,
+            under_way,
             logged=logged,
             terminated=lambda observation: terminated(to_state(observation)),
             settings=Imagination(self.samples, self.threshold, self.horizon, self.penalty),

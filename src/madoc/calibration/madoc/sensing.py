@@ -12,7 +12,7 @@ HIDDEN_WINDOW = 3
 
 
 def window_length(problem: CalibrationProblem, asked: int | None, starts: str) -> int:
-    """Window length in rows: the one asked for, else 1 where an observation determines the state or rows are replayed."""
+    """Window length in rows: the one asked for, else 1 where observations determine states or rows are replayed."""
     seen = problem.states.kind == "exact"
     return asked or (1 if seen or starts == "replay" else HIDDEN_WINDOW)
 
