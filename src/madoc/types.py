@@ -129,7 +129,7 @@ class MethodEntry(Generic[Made]):
     summary: str = ""
     paper: str = ""
     year: int = 0
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, object] = field(default_factory=dict)
     recognised_by: tuple[str, ...] | None = None
     shown: tuple[str, ...] = ()
     unit: Unit = "control steps"
@@ -137,12 +137,12 @@ class MethodEntry(Generic[Made]):
     needs_data: bool = True
     needs_parameters: bool = True
 
-    def make(self, **changes: Any) -> Made:
+    def make(self, **changes: object) -> Made:
         """The method, with some hyperparameters changed."""
         return self.kind(**{**self.settings, **changes})
 
     @property
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, object]:
         """The hyperparameters by which a method is recognised as this one."""
         names = self.settings if self.recognised_by is None else self.recognised_by
         return {name: self.settings[name] for name in names}
@@ -184,7 +184,7 @@ def check_hyperparameters(method: object) -> None:
 
 
 @cache
-def _adapters(kind: type) -> dict[str, TypeAdapter[Any]]:
+def _adapters(kind: type) -> dict[str, TypeAdapter[object]]:
     """What checks each field of a dataclass."""
     hints = get_type_hints(kind, include_extras=True)
     checked = {name: hint for name, hint in hints.items() if not is_dataclass(hint)}

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -133,7 +133,7 @@ class Estimate:
 class EmbedsParameters(Protocol):
     """An addition to the protocol for methods that learn which parameters act alike."""
 
-    def embeddings(self, problem: CalibrationProblem, state: Any) -> Float[np.ndarray, "d latent"] | None:
+    def embeddings(self, problem: CalibrationProblem, state: object) -> Float[np.ndarray, "d latent"] | None:
         """One vector for each parameter, close together for those that act alike; None before anything is learnt."""
         ...
 

@@ -1,7 +1,6 @@
 """Run a calibrator on a problem: refuse what cannot work, spend the budget, report the estimate."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
@@ -120,5 +119,4 @@ def _parameters(space: ParameterSpace, estimate: Estimate) -> dict[str, Paramete
 
 def seed_of(key: PRNGKeyArray) -> int:
     """The seed that `jax.random.key` was given (its low word)."""
-    data: Any = jax.random.key_data(key)
-    return int(data[-1])
+    return int(np.asarray(jax.random.key_data(key))[-1])

@@ -1,7 +1,6 @@
 """Every calibrator by the name that `madoc methods` lists."""
 
 from collections.abc import Mapping
-from typing import Any
 
 from madoc.calibration.base import Calibrator
 from madoc.calibration.baselines.cma_es.calibrator import CmaEs
@@ -33,7 +32,7 @@ def _entry(
     summary: str,
     paper: str,
     year: int,
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, object] | None = None,
     recognised_by: tuple[str, ...] | None = None,
 ) -> MethodEntry[Calibrator]:
     simulates = kind is not Uncalibrated

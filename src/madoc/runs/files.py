@@ -42,7 +42,7 @@ def remove_leftovers(folder: Path) -> None:
         leftover.unlink(missing_ok=True)
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: object) -> None:
     """Write `value` as readable strict JSON, whole or not at all.
 
     Raises:
@@ -53,7 +53,7 @@ def write_json(path: Path, value: Any) -> None:
         stream.write(content.encode())
 
 
-def json_text(value: Any, *, what: str, indent: int | None = None) -> str:
+def json_text(value: object, *, what: str, indent: int | None = None) -> str:
     """Strict JSON on one line, or indented.
 
     Raises:
@@ -80,7 +80,7 @@ def read_json(path: Path) -> Any:
         raise MadocError(f"{path} is not valid JSON ({error}); restore it or delete it") from error
 
 
-def _unwritable(value: Any, place: str) -> str | None:
+def _unwritable(value: object, place: str) -> str | None:
     """Where in a nested value, and what, JSON cannot express."""
     if value is None or isinstance(value, bool | int | str):
         return None
