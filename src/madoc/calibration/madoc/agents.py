@@ -13,6 +13,7 @@ from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, va
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
 from madoc.learning.networks import adam, descend, moving_average, scan_updates
+from madoc.types import Count, Layers, NotNegative, check_hyperparameters
 
 AT_BOUND = 0.95
 """Share of the reward's bound past which a reward counts as saturated."""
@@ -77,26 +78,29 @@ class AgentSettings:
         blur_rate: How fast it is steered.
     """
 
-    hidden: tuple[int, ...] = (128, 128)
-    critic_hidden: tuple[int, ...] = (64, 64)
-    bound: float = 2.0
-    pair_bound: float = 10.0
+    hidden: Layers = (128, 128)
+    critic_hidden: Layers = (64, 64)
+    bound: NotNegative = 2.0
+    pair_bound: NotNegative = 10.0
     weigh_overlap: bool = True
-    dropout: float = 0.0
-    batch: int = 256
-    actor_batch: int = 64
-    discriminator_rate: float = 1e-3
-    critic_rate: float = 1e-3
-    actor_rate: float = 3e-3
-    judge_rate: float = 0.01
-    entropy_weight: float = 0.05
-    prior_time: float = 2e5
-    prior_largest: float = 10.0
-    prior_rate: float = 0.1
-    prior_every: int = 10
-    average_rate: float = 1e-3
-    reward_size: float = 1.0
-    blur_rate: float = 3e-3
+    dropout: NotNegative = 0.0
+    batch: Count = 256
+    actor_batch: Count = 64
+    discriminator_rate: NotNegative = 1e-3
+    critic_rate: NotNegative = 1e-3
+    actor_rate: NotNegative = 3e-3
+    judge_rate: NotNegative = 0.01
+    entropy_weight: NotNegative = 0.05
+    prior_time: NotNegative = 2e5
+    prior_largest: NotNegative = 10.0
+    prior_rate: NotNegative = 0.1
+    prior_every: Count = 10
+    average_rate: NotNegative = 1e-3
+    reward_size: NotNegative = 1.0
+    blur_rate: NotNegative = 3e-3
+
+    def __post_init__(self) -> None:
+        check_hyperparameters(self)
 
     def init(self, *, window: int, observation: int, parameters: int, groups: int, key: PRNGKeyArray) -> Agents:
         """Fresh networks; actors and prior at N(0, 1). `window` is the size of what stands for (s, a)."""
