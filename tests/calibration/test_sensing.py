@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from madoc import simulation
-from madoc.calibration import CalibrationProblem, LeastSquares, Madoc
+from madoc.calibration import CalibrationProblem, CmaEs, LeastSquares, Madoc, Oted
 from madoc.calibration.least_squares.calibrator import horizon_of
 from madoc.calibration.madoc.collection import sensed
 from madoc.calibration.madoc.sensing import noise_deviation, observation_warnings, window_length
@@ -36,6 +36,16 @@ def test_windows_are_as_long_as_the_observation_wants(log):
     assert window_length(hidden, None, "replay") == 1
     with pytest.raises(MadocError, match=r"no episode .* has the 301 rows of a window; take a shorter one"):
         seen.features.windows("standardised", 301)
+
+
+def test_rollouts_start_at_logged_states_where_those_are_known(log):
+    seen, hidden = problem_of(log), problem_of(log, hidden_velocities=True)
+    blind = CalibrationProblem(
+        log, simulation.make(replace(WHOLE, state_from_observation=None, posture=None), threads=1)
+    )
+    assert [Madoc()._start_mode(problem) for problem in (seen, hidden, blind)] == ["logged", "logged", "policy"]
+    assert [Oted()._anew(problem) for problem in (seen, hidden, blind)] == [True, False, False]
+    assert [CmaEs("distribution")._acts(problem) for problem in (seen, hidden, blind)] == [False, True, True]
 
 
 def test_simulated_readings_carry_the_noise_that_the_data_says_it_has(log):

@@ -113,7 +113,7 @@ class Estimate:
     Attributes:
         mean: Estimated value of each parameter.
         std: Standard deviation of each parameter under the method's distribution.
-        groups: Parameters calibrated together, as indices; one group of all where a method has none.
+        groups: Indices of parameters that were calibrated together; empty is one group of all.
         failures: Simulated rows that exploded and were left out.
         warnings: What a user should know about it, one sentence each.
         covariance: Joint covariance of the parameters, None where the method has none; its diagonal is `std` squared.
@@ -122,7 +122,7 @@ class Estimate:
 
     mean: Float[np.ndarray, " d"]
     std: Float[np.ndarray, " d"]
-    groups: tuple[tuple[int, ...], ...]
+    groups: tuple[tuple[int, ...], ...] = ()
     failures: int = 0
     warnings: tuple[str, ...] = field(default=())
     covariance: Float[np.ndarray, "d d"] | None = None

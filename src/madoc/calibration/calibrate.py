@@ -74,7 +74,7 @@ def calibrate(
         control_steps=finished.control_steps + probing,
         seconds=round(finished.seconds, 3),
         seed=seed_of(key),
-        groups=[[space.names[index] for index in group] for group in estimate.groups],
+        groups=[[space.names[index] for index in group] for group in estimate.groups or [range(len(space))]],
         parameters=_parameters(space, estimate),
         warnings=without_repeats(
             (*estimate.warnings, *exploded(estimate.failures, finished.control_steps)), problem.doubts

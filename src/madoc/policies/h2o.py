@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray, PyTree
 from pydantic import Field
 
+from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, bellman_target, critic_step, fresh
 from madoc.learning.dynamics_ratio import Discriminators, discriminator_loss, log_dynamics_ratio

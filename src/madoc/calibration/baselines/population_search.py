@@ -74,7 +74,6 @@ def estimate_from_search(problem: CalibrationProblem, state: SearchState) -> Est
     return Estimate(
         mean=space.to_physical(state.search.mean),
         std=np.sqrt(np.diag(covariance)),
-        groups=(tuple(range(len(space))),),
         failures=state.failures,
         warnings=at_end_of_range(state.search.mean, space.names),
         covariance=covariance,

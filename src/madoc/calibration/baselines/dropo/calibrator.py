@@ -105,7 +105,6 @@ class Dropo:
         return Estimate(
             mean=space.to_physical(mean),
             std=std,
-            groups=(tuple(range(len(space))),),
             failures=state.failures,
             warnings=at_end_of_range(mean, space.names),
             covariance=np.diag(std**2),

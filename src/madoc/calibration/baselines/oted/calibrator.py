@@ -129,7 +129,6 @@ class Oted:
         return Estimate(
             mean=space.to_physical(scaled),
             std=std,
-            groups=(tuple(range(len(space))),),
             failures=state.failures,
             warnings=at_end_of_range(scaled, space.names),
             covariance=np.diag(std**2),
