@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from madoc.data import Dataset, typical_change
 from madoc.errors import MadocError
@@ -46,20 +46,6 @@ class CalibrationProblem:
     def states(self) -> LoggedStates:
         """What the data tells of the simulator's states."""
         return states_of(self.dataset, self.simulator)
-
-    @property
-    def logged_states(self) -> Float[np.ndarray, "states state"]:
-        """States rebuilt exactly from logged observations.
-
-        Raises:
-            MadocError: Observations do not determine them.
-        """
-        return self.states.exact()[0]
-
-    @property
-    def logged_rows(self) -> Int[np.ndarray, " states"]:
-        """The rows of the data that `logged_states` were rebuilt from, ascending."""
-        return self.states.exact()[1]
 
     @cached_property
     def typical_change(self) -> Float[np.ndarray, " observation"]:
