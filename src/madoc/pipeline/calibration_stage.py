@@ -19,7 +19,7 @@ from madoc.pipeline.folders import ENDED, restored_path, stored_path, working_fo
 from madoc.pipeline.keys import seed_key, stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
 from madoc.runs.files import read_json
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.tasks import Task
 from madoc.verdict import Assessment, Bench, assess, judge
 from madoc.verdict.evidence import evidence, save_evidence
@@ -78,7 +78,7 @@ class Prepared:
 
     order: CalibrationOrder
     dataset: Dataset
-    simulator: CpuSimulator
+    simulator: Simulator
     truth: dict[str, float] | None
 
     @cached_property

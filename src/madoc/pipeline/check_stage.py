@@ -14,7 +14,7 @@ from madoc.errors import MadocError
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.forecast import Forecast, forecast
 from madoc.pipeline.keys import stage_key
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def check_logs(
     return Checked(space, diagnosis, forecast(CalibrationProblem(dataset, simulator), budget=budget))
 
 
-def checked(dataset: Dataset, simulator: CpuSimulator) -> Dataset:
+def checked(dataset: Dataset, simulator: Simulator) -> Dataset:
     """The dataset with all that checking it told, for the warnings of a result.
 
     Raises:

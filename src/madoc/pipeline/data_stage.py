@@ -16,7 +16,7 @@ from madoc.pipeline.keys import stage_key
 from madoc.policies.behaviours import QUALITIES, record_quality
 from madoc.runs.files import read_json
 from madoc.runs.progress import bar
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.tasks import TASKS, Task
 
 
@@ -55,7 +55,7 @@ def absolute_source(source: Source) -> Source:
 class Target:
     """What a policy is for: the simulator at the true parameters."""
 
-    simulator: CpuSimulator
+    simulator: Simulator
     parameters: np.ndarray
 
 

@@ -10,7 +10,7 @@ from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibration_stage import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
 from madoc.runs.files import read_json
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.simulation.mjcf import save_mjcf
 from madoc.simulation.write import nominal_values
 
@@ -78,7 +78,7 @@ def provenance_of(calibrated: Calibrated) -> Provenance:
     )
 
 
-def _stepping(simulator: CpuSimulator) -> dict[str, Any]:
+def _stepping(simulator: Simulator) -> dict[str, Any]:
     """How the model is stepped to move as it was calibrated to."""
     task, steps = simulator.task, simulator.task.frame_skip
     channels = [
