@@ -8,19 +8,6 @@ class MadocError(ValueError):
     """Bad input or a refused problem. The command line prints its sentence and exits with code 2."""
 
 
-def check_at_least(owner: object, **minima: float) -> None:
-    """Refuse attributes of a hyperparameter object that are below their minimum; None is let through.
-
-    Raises:
-        MadocError: One is too small.
-    """
-    for name, minimum in minima.items():
-        value = getattr(owner, name)
-        smallest = min(value, default=minimum) if isinstance(value, tuple) else value
-        if smallest is not None and not smallest >= minimum:
-            raise MadocError(f"expected {name} of at least {minimum:g} for {type(owner).__name__}, got {value}")
-
-
 def unknown_name(what: str, name: str, known: Iterable[str]) -> MadocError:
     """The refusal of a name that is not among the known ones; it points at the nearest."""
     names = list(known)

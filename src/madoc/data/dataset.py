@@ -158,5 +158,10 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
 def typical_change(dataset: Dataset) -> Float[np.ndarray, " observation"]:
     """Standard deviation of each channel's change in a control step, in its unit; 1 for one that never moves."""
     logged = dataset.transitions
-    spread = (np.asarray(logged.next_observation) - logged.observation).std(0)
+    return spread_of(np.asarray(logged.next_observation) - logged.observation)
+
+
+def spread_of(rows: Float[np.ndarray, "*rows values"]) -> Float[np.ndarray, " values"]:
+    """Standard deviation of every channel over all rows; 1 for one that never moves."""
+    spread = rows.reshape(-1, rows.shape[-1]).std(0)
     return np.where(spread > 1e-8, spread, 1.0)

@@ -1,7 +1,7 @@
 """`--method auto`: what the data allows, one method after another, compared on the hold-out; the best is kept."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +37,13 @@ class Candidate:
     Attributes:
         name: In `CALIBRATORS`.
         most: Share of the budget that it may have; what it leaves is there for those after it, up to their own.
-        hidden: Hyperparameters that differ where the log does not tell where rollouts may start.
     """
 
     name: str
     most: float
-    hidden: Mapping[str, Any] = field(default_factory=dict)
 
 
-CANDIDATES = (Candidate("least-squares", most=2 / 3), Candidate("madoc", most=1 / 2, hidden={"starts": "policy"}))
+CANDIDATES = (Candidate("least-squares", most=2 / 3), Candidate("madoc", most=1 / 2))
 """In the order they are tried: seconds before minutes."""
 AUTO_BUDGET = 600_000
 """Control steps of all candidates together, unless told otherwise; the last has what it has alone."""
@@ -115,14 +113,8 @@ def candidates_for(prepared: Prepared, changes: Mapping[str, Any]) -> dict[str, 
     Raises:
         MadocError: A hyperparameter is not given as `madoc.updates`, or as `make_method`.
     """
-    hidden = not prepared.problem.states.starts_known
     mine = _changes_by_candidate(changes)
-    return {
-        candidate.name: make_method(
-            CALIBRATORS, candidate.name, (dict(candidate.hidden) if hidden else {}) | mine[candidate.name]
-        )
-        for candidate in CANDIDATES
-    }
+    return {candidate.name: make_method(CALIBRATORS, candidate.name, mine[candidate.name]) for candidate in CANDIDATES}
 
 
 def _changes_by_candidate(changes: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

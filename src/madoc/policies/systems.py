@@ -37,8 +37,8 @@ class UniformParameters:
 
     def draw(self, key: PRNGKeyArray, count: int) -> Float[np.ndarray, "count parameters"]:
         """Physical values of `count` systems."""
-        unit = jax.random.uniform(key, (count, self.size), minval=-1.0, maxval=1.0)
-        return self.space.to_physical(np.asarray(unit))
+        scaled = jax.random.uniform(key, (count, self.size), minval=-1.0, maxval=1.0)
+        return self.space.to_physical(np.asarray(scaled))
 
 
 @dataclass(frozen=True)

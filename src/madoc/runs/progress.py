@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from madoc.types import Metrics
 
 LINE_SECONDS = 10.0
-"""Least time between two plain lines of one stage."""
+"""Seconds between two plain lines of one stage, at least."""
 
 _WINDOW_SECONDS = 30.0
-"""Rate and time left are those of this last while."""
+"""Seconds over which the rate and the time left are averaged."""
 
 
 @dataclass(frozen=True)

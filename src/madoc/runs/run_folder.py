@@ -125,7 +125,7 @@ class RunFolder:
         now = _flat({key: value for key, value in spec.items() if key not in _FREE})
         for key in [*then, *now]:
             if key not in then or key not in now or then[key] != now[key]:
-                was, is_now = (_shortened(said.get(key, "not given")) for said in (then, now))
+                was, is_now = (_shortened(spec.get(key, "not given")) for spec in (then, now))
                 raise MadocError(
                     f"cannot resume {self.path}: {key} was {was}, is now {is_now}; "
                     "resume with the same settings or choose another --out"
@@ -175,12 +175,7 @@ class RunLog:
     def append(self, metrics: Metrics, *, stage: str, spent: int, seconds: float) -> None:
         """Add one epoch. A NaN or infinite metric is logged as null."""
         finite = {name: value if np.isfinite(value) else None for name, value in metrics.items()}
-        line = {
-            self._count: spent,
-            "seconds": round(seconds, 3),
-            "stage": stage,
-            "metrics": finite,
-        }
+        line = {self._count: spent, "seconds": round(seconds, 3), "stage": stage, "metrics": finite}
         self._lines.write(json_text(line, what="metrics.jsonl").encode() + b"\n")
         self._lines.flush()
         for name, value in finite.items():
@@ -202,13 +197,13 @@ def count_name(unit: Unit) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of what decides a run's bits, by name."""
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for name, package in {"madoc": "madoc-calibration", "jax": "jax", "mujoco": "mujoco"}.items():
         try:
-            found[name] = metadata.version(package)
+            versions[name] = metadata.version(package)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            versions[name] = "not installed"
+    return versions
 
 
 def _lock(path: Path) -> filelock.BaseFileLock:

@@ -69,7 +69,7 @@ class Bench:
     @property
     def scaling(self) -> Scaling:
         """Scaling of observations and actions by the rows calibrated to."""
-        return self.problem.scalings["standardised"]
+        return self.problem.features.standardised
 
     @property
     def change(self) -> Float[np.ndarray, " observation"]:

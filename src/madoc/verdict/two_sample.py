@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from sklearn.ensemble import HistGradientBoostingClassifier
@@ -16,10 +14,10 @@ from madoc.calibration.holdout import Area
 from madoc.data import Dataset
 from madoc.data.dataset import starts_after
 from madoc.identification.windows import evenly
-from madoc.learning.cloning import clone
+from madoc.learning.cloning import continue_cloning, fresh_clone
 from madoc.learning.dynamics_ratio import Scaling
-from madoc.learning.networks import adam
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.learning.window_features import LoggedFeatures
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import begin, reset_states, roll
 from madoc.types import Transitions
@@ -125,31 +123,13 @@ def replayed(
 def behaviour(kept: Dataset, key: PRNGKeyArray) -> TanhGaussianPolicy:
     """A clone of the policy that acted in the log, to act in the simulator where logged states cannot be rebuilt."""
     epochs, updates, batch, rate = CLONING
-    logged = kept.transitions
     of_policy, of_batches = jax.random.split(key)
-    observation = np.asarray(logged.observation)
-    policy = TanhGaussianPolicy(
-        observation.shape[1],
-        logged.action.shape[1],
-        (64, 64),
-        key=of_policy,
-        offset=observation.mean(0),
-        scale=np.maximum(observation.std(0), 1e-3),
-    )
-    optimiser = adam(rate)
-    state = optimiser.init(eqx.filter(policy, eqx.is_array))
-    pairs = jnp.asarray(logged.observation, jnp.float32), jnp.asarray(logged.action, jnp.float32)
+    clone = fresh_clone(kept.transitions, (64, 64), learning_rate=rate, key=of_policy)
+    pairs = LoggedFeatures(kept).pairs
     for epoch in range(epochs):
-        policy, state, _ = clone(
-            policy,
-            state,
-            pairs,
-            jax.random.fold_in(of_batches, epoch),
-            optimiser=optimiser,
-            batch=batch,
-            count=updates,
-        )
-    return policy
+        of_epoch = jax.random.fold_in(of_batches, epoch)
+        clone, _ = continue_cloning(clone, pairs, of_epoch, learning_rate=rate, batch=batch, updates=updates)
+    return clone.policy
 
 
 def rolled(

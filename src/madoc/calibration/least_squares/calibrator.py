@@ -24,10 +24,9 @@ from madoc.calibration.least_squares.lengthening import (
 from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.statistics import alternation, consecutive_residuals
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
-from madoc.errors import check_at_least
 from madoc.identification.information import half_width, identifiability, sandwich
 from madoc.identification.losses import Loss
-from madoc.types import Epoch
+from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
 
 InitialStates = Literal["logged", "estimated"]
 Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening"]
@@ -98,17 +97,16 @@ class LeastSquares:
     """
 
     initial_states: InitialStates | None = None
-    horizon: int | None = None
+    horizon: Count | None = None
     loss: Loss = "cauchy"
-    windows: int | None = None
-    searches: int = 3
-    search_windows: int | None = None
-    search_epochs: int = 8
-    tolerance: float = 1e-7
+    windows: Count | None = None
+    searches: Count = 3
+    search_windows: Count | None = None
+    search_epochs: Count = 8
+    tolerance: NotNegative = 1e-7
 
     def __post_init__(self) -> None:
-        counts = ("horizon", "windows", "searches", "search_windows", "search_epochs")
-        check_at_least(self, **dict.fromkeys(counts, 1), tolerance=0.0)
+        check_hyperparameters(self)
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> LeastSquaresState:
         """Draw windows, and put the searches at their starts.

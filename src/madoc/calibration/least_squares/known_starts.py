@@ -36,7 +36,7 @@ class KnownStarts:
             MadocError: No state can be rebuilt, no episode is long enough, or there are fewer values than parameters.
         """
         pick = first_rows if horizon == 1 else disjoint_windows
-        possible = pick(problem.dataset, problem.logged_rows, horizon)
+        possible = pick(problem.dataset, problem.states.exact()[1], horizon)
         count, values = len(problem.simulator.parameters), problem.simulator.task.observation_size
         windows = min(most, len(possible))
         if windows * horizon * values < count:
@@ -44,7 +44,7 @@ class KnownStarts:
                 f"expected at least as many logged values as parameters, got {windows} windows of {horizon} rows "
                 f"with {values} values for {count} parameters; give it more rows or fewer parameters"
             )
-        return problem.logged_rows[possible]
+        return problem.states.exact()[1][possible]
 
     def guesses(self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"]) -> Float[np.ndarray, "0 0"]:
         """None: there is nothing to guess."""
@@ -56,7 +56,7 @@ class KnownStarts:
 
     def windows(self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int) -> "KnownWindows":
         """The windows that begin at the given rows."""
-        states = problem.logged_states[np.searchsorted(problem.logged_rows, rows)]
+        states = problem.states.exact()[0][np.searchsorted(problem.states.exact()[1], rows)]
         return KnownWindows(problem, windows_at(problem.dataset, states, rows, horizon), self.loss)
 
 
