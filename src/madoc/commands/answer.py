@@ -10,6 +10,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from madoc.calibration import CalibrationResult
+    from madoc.pipeline.records import EvaluationRecord
 
 EXIT_CODES: Mapping[str, int] = {
     "finished": 0,
@@ -46,7 +47,7 @@ class Answer:
         status: A key of `EXIT_CODES`.
     """
 
-    json: Mapping[str, Any]
+    json: Mapping[str, object]
     text: tuple[RenderableType, ...]
     status: str = "finished"
 
@@ -70,32 +71,28 @@ class Command(Protocol):
         ...
 
     def run(self) -> Answer:
-        """Do it."""
+        """Carry the command out."""
         ...
 
 
-def evaluation_table(evaluation: Mapping[str, Any]) -> Table:
-    """Returns in the target, a row a policy."""
-    episodes = evaluation["episodes"]
-    table = Table(title=f"{evaluation['task']}: returns in the target, {episodes} episodes", title_justify="left")
+def evaluation_text(evaluation: "EvaluationRecord") -> tuple[RenderableType, ...]:
+    """Returns in the target, a row for each policy, and how near the calibrated one comes to that of the truth."""
+    title = f"{evaluation.task}: returns in the target, {evaluation.episodes} episodes"
+    table = Table(title=title, title_justify="left")
     table.add_column("policy learnt")
     for heading in ("return ± std", "normalized", "length"):
         table.add_column(heading, justify="right")
-    for name, row in evaluation["policies"].items():
+    for name, row in evaluation.policies.items():
         table.add_row(
             PLACE_NAMES.get(name, name),
             f"{row['return']:,.1f} ± {row['return_std']:,.1f}",
             f"{row['normalized']:.1f}",
             f"{row['length']:.0f}",
         )
-    return table
-
-
-def evaluation_text(evaluation: Mapping[str, Any]) -> tuple[RenderableType, ...]:
-    """The table, and how near the calibrated policy comes to that of the truth."""
-    share = evaluation.get("calibrated_percent_of_truth")
-    line = () if share is None else (f"calibrated: {share:.1f} % of the return of the policy learnt at the truth",)
-    return (evaluation_table(evaluation), *line)
+    share = evaluation.calibrated_percent_of_truth
+    if share is None:
+        return (table,)
+    return table, f"calibrated: {share:.1f} % of the return of the policy learnt at the truth"
 
 
 def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
@@ -107,7 +104,7 @@ def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
 
 
 def candidates_table(rows: Sequence[Mapping[str, Any]], result: "CalibrationResult") -> Table:
-    """What `auto` has tried, a row a method, those it did not run with the reason."""
+    """The methods that `auto` has tried, one row each; those it did not run have the reason."""
     predicted = (result.holdout or {}).get("measure") == "prediction"
     measure = "error / mid-range's" if predicted else "told apart, area - ½"
     table = Table(title="methods compared on the hold-out", title_justify="left")
@@ -137,10 +134,10 @@ def calibration_status(result: "CalibrationResult") -> str:
 
 
 def left_behind(path: Path, what: str) -> str:
-    """A line on what was left where."""
+    """A line that says which file or folder was left where."""
     return f"{what}: {path}"
 
 
 def page_line(page: Path | None) -> tuple[str, ...]:
-    """Where a run's page is, if it could be written."""
+    """A line that says where the run's page is, if it could be written."""
     return () if page is None else (left_behind(page, "report"),)

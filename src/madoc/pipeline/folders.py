@@ -4,19 +4,18 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from madoc.errors import MadocError
 from madoc.runs.files import read_json
 from madoc.runs.run_folder import RunFolder
 
 ENDED = ("finished", "converged")
-"""How a stage ends whose successor may start."""
+"""The statuses of a stage after which the next one may start."""
 
 
 @contextmanager
 def working_folder(
-    path: Path, spec: dict[str, Any], *, resume: bool, keep: str = "checkpoint.npz"
+    path: Path, spec: dict[str, object], *, resume: bool, keep: str = "checkpoint.npz"
 ) -> Iterator[RunFolder]:
     """The locked folder of a run, new or, with `resume`, as it was left.
 
