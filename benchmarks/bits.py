@@ -22,7 +22,7 @@ MADOC = [sys.executable, "-m", "madoc"]
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ROWS = 4000
 SMALL = ["--set", "cloning_epochs=5", "grouping_epochs=2"]
-NETWORKS = "hidden=[32, 32]"
+SMALL_NETWORKS = ["--set", "hidden=[32, 32]"]
 
 RECORDED = {
     "clean": [],
@@ -66,13 +66,13 @@ CALIBRATIONS = {
 """By the name of the cell: the data, the method, its budget, and more options."""
 
 POLICIES = {
-    "sac": (6_000, ["--set", NETWORKS, "updates=50"]),
-    "sac-bc": (6_000, ["--set", NETWORKS, "updates=50"]),
-    "dr-bc": (6_000, ["--set", NETWORKS, "updates=50"]),
-    "h2o": (4_000, ["--set", NETWORKS, "updates=50"]),
-    "bc": (2_000, []),
-    "cql": (2_000, ["--set", NETWORKS]),
-    "morec": (2_000, []),
+    **dict.fromkeys(
+        ("sac", "sac-bc", "dr-bc"), (4_000, [*SMALL_NETWORKS, "warmup_steps=1000", "updates_per_step=0.2"])
+    ),
+    "h2o": (4_000, [*SMALL_NETWORKS, "warmup_steps=1000", "updates_per_step=0.1"]),
+    "bc": (2_000, SMALL_NETWORKS),
+    "cql": (2_000, [*SMALL_NETWORKS, "critic_hidden=[32, 32]"]),
+    "morec": (2_000, [*SMALL_NETWORKS, "model_updates=200", "discriminator_updates=400", "model_hidden=[32, 32]"]),
 }
 """By learner: its budget, and more options."""
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from madoc import simulation
-from madoc.calibration import CalibrationProblem, evolution
+from madoc.calibration import CalibrationProblem
+from madoc.calibration.baselines import evolution
 from madoc.calibration.baselines.population_search import (
     SearchState,
     draw_windows,
