@@ -1,6 +1,6 @@
 """Judging: returns in a system, the normalized score, the calibration error. Only here is truth read."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import jax
@@ -42,7 +42,7 @@ class Returns:
 def evaluate(
     policy: Policy,
     simulator: Simulator,
-    parameters: Float[np.ndarray, "*systems parameters"],
+    parameters: Float[np.ndarray, "*systems parameters"] | Mapping[str, float],
     *,
     key: PRNGKeyArray,
     episodes: int = 10,
@@ -51,12 +51,13 @@ def evaluate(
 ) -> Returns:
     """Returns of whole episodes, all of them at a time; an episode that explodes ends there.
 
-    Parameters of several systems share the episodes out among them, as evenly as whole episodes allow: at least one
-    each. `advance` is told how many of the task's `max_episode_steps` have passed.
+    The parameters are physical values of one system, by name or as a vector, or of several, one in each row. Several
+    systems share the episodes out among them as evenly as whole episodes allow, with at least one each. `advance` is
+    told how many of the task's `max_episode_steps` have passed.
     """
     task = simulator.task
     of_start, of_action = jax.random.split(key)
-    system = simulator.bind(np.atleast_2d(parameters))
+    system = simulator.bind(np.atleast_2d(simulator.parameters.vector(parameters)))
     rows = -(-episodes // system.count)
     state = reset_states(simulator)(of_start, system.count * rows).reshape(system.count, rows, -1)
     alive = np.ones((system.count, rows), dtype=bool)

@@ -1,8 +1,7 @@
 """A calibrated simulator as a Gymnasium environment, for people who train with what they already use.
 
-Importing this module registers `madoc/Hopper`, `madoc/HalfCheetah`, `madoc/Walker2d` and `madoc/Ant`.
-Gymnasium 1.0 dropped plugin entry points, so somebody has to import it; the id itself can:
-`gymnasium.make("madoc.gymnasium_environment:madoc/Hopper", parameters={...})`.
+`import madoc` registers `madoc/Hopper`, `madoc/HalfCheetah`, `madoc/Walker2d` and `madoc/Ant`; where nobody imports it,
+the id can: `gymnasium.make("madoc:madoc/Hopper", parameters={...})`.
 """
 
 from collections.abc import Mapping
@@ -14,15 +13,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-import madoc.tasks
-from madoc import robots
+from madoc import ENVIRONMENTS, robots
 from madoc.errors import MadocError
 from madoc.simulation.cpu import CpuSimulator
 from madoc.simulation.rollout import reset_states
 from madoc.tasks.base import Task
-
-ROBOTS = {"Hopper": "hopper", "HalfCheetah": "halfcheetah", "Walker2d": "walker2d", "Ant": "ant"}
-"""Environment names, and the tasks they are. In all of them a state's first coordinate is the torso's x."""
 
 Parameters = Mapping[str, float] | Float[np.ndarray, " parameters"] | None
 """Physical values by name or in the task's order; None is mid-range, the uncalibrated robot."""
@@ -46,7 +41,8 @@ class CalibratedEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(self, task: Task | str | Path, *, parameters: Parameters = None, physics: str | None = None) -> None:
         self.task = task if isinstance(task, Task) else robots.resolve(task, physics)
-        self.parameters = _vector(self.task, parameters)
+        space = self.task.parameters
+        self.parameters = space.middle if parameters is None else space.vector(parameters)
         simulator = CpuSimulator(self.task, threads=1)
         self._system = simulator.bind(self.parameters[None])
         self._starts = reset_states(simulator)
@@ -102,33 +98,4 @@ class CalibratedEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         return np.array(self._system.observe(self._state[None, None])[0, 0])
 
     def _position(self) -> dict[str, Any]:
-        return {"x_position": float(self._state[0])} if self.task.name in ROBOTS.values() else {}
-
-
-def register() -> None:
-    """Make the robots known to `gymnasium.make` as `madoc/Hopper` and so on; again is harmless."""
-    for name, task in ROBOTS.items():
-        if f"madoc/{name}" not in gymnasium.registry:
-            gymnasium.register(
-                f"madoc/{name}",
-                entry_point="madoc.gymnasium_environment:CalibratedEnvironment",
-                max_episode_steps=madoc.tasks.make(task).max_episode_steps,
-                kwargs={"task": task},
-            )
-
-
-def _vector(task: Task, parameters: Parameters) -> np.ndarray:
-    if parameters is None:
-        return task.parameters.middle
-    if isinstance(parameters, Mapping):
-        return task.parameters.vector(dict(parameters))
-    values = np.array(parameters, dtype=np.float64)
-    if values.shape != (len(task.parameters),):
-        raise MadocError(
-            f"expected {len(task.parameters)} parameter values for {task.name} "
-            f"({', '.join(task.parameters.names)}), got an array of shape {values.shape}"
-        )
-    return values
-
-
-register()
+        return {"x_position": float(self._state[0])} if self.task.name in ENVIRONMENTS.values() else {}

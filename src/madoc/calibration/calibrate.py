@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
 from madoc.calibration.cautions import told_once
@@ -24,10 +24,10 @@ def calibrate(
     *,
     key: PRNGKeyArray,
     budget: int,
-    truth: Mapping[str, float] | None = None,
+    truth: Mapping[str, float] | Float[np.ndarray, " d"] | None = None,
     folder: RunFolder | None = None,
     resume: bool = False,
-    quiet: bool = True,
+    quiet: bool = False,
     checkpoint_every: float = 30.0,
 ) -> CalibrationResult:
     """Calibrate, and judge the estimate against the truth where that is given.
@@ -37,7 +37,7 @@ def calibrate(
         problem: Data and simulator.
         key: The only source of randomness.
         budget: Simulated control steps, of any kind.
-        truth: The target's physical values by name; only the finished estimate is compared with them.
+        truth: The target's physical values, by name or as a vector; only the finished estimate is compared with them.
         folder: Where to keep logs, checkpoints and `result.json`.
         resume: Go on from the folder's checkpoint.
         quiet: Show no progress.
@@ -47,7 +47,7 @@ def calibrate(
         MadocError: The method refuses the problem, a parameter changes no next state, or `loop.run` refuses.
     """
     space = problem.simulator.parameters
-    known = None if truth is None else space.vector(dict(truth))
+    known = None if truth is None else space.vector(truth)
     idle = method.converged(method.init(problem, key)) is not None
     # A method that has ended before its first epoch simulates nothing, so nothing is spent on its behalf either.
     probing = 0 if idle else refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0))

@@ -3,6 +3,6 @@
 The names are in `__init__.pyi`; each is imported when it is first used, so the command line reads its options quickly.
 """
 
-import lazy_loader
+from madoc import lazily
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazily(__name__)

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass, replace
-from typing import NoReturn, TypeVar, get_type_hints
+from typing import Any, NoReturn, TypeVar, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -48,10 +48,10 @@ def hyperparameters(method: object) -> dict[str, object]:
     return asdict(method)  # type: ignore[call-overload]
 
 
-def _types(kind: type, prefix: str = "") -> dict[str, object]:
+def _types(kind: type, prefix: str = "") -> dict[str, Any]:
     """The type of each hyperparameter; those of a part of the method are named `part.name`."""
     hints = get_type_hints(kind)
-    types: dict[str, object] = {}
+    types: dict[str, Any] = {}
     for row in fields(kind):
         hint = hints[row.name]
         if isinstance(hint, type) and is_dataclass(hint) and not prefix:
@@ -61,12 +61,12 @@ def _types(kind: type, prefix: str = "") -> dict[str, object]:
     return types
 
 
-def _typed(name: str, value: object, hint: object, method: str) -> object:
+def _typed(name: str, value: object, hint: Any, method: str) -> object:
     """A value as the type that a hyperparameter has."""
     refusal: ValidationError | None = None
     for candidate in _readings(value):
         try:
-            typed: object = TypeAdapter[object](hint).validate_python(candidate)
+            typed: object = TypeAdapter(hint).validate_python(candidate)
         except ValidationError as error:
             refusal = refusal or error
             continue

@@ -9,8 +9,8 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from jaxtyping import PRNGKeyArray
 
-from madoc.runs import checkpoint
 from madoc.errors import MadocError
+from madoc.runs import checkpoint
 from madoc.runs.interruption import interruptible
 from madoc.runs.progress import Moment, display
 from madoc.runs.run_folder import RunFolder, RunLog, count_name
