@@ -24,7 +24,8 @@ from madoc import tasks
 from madoc.calibration import CalibrationResult
 from madoc.data.targets import paper_truth
 from madoc.evaluation import evaluate
-from madoc.pipeline.methods import make_method, parse_settings
+from madoc.pipeline.methods import make_method
+from madoc.pipeline.orders import parse_settings
 from madoc.policies import LEARNERS, NormalParameters, PolicyProblem, UniformParameters, learn_policy
 from madoc.simulation.cpu import CpuSimulator
 
@@ -50,7 +51,7 @@ def main() -> None:
     revision = commit()
     RESULTS.mkdir(parents=True, exist_ok=True)
     for robot, name, seed in product(arguments.robots, arguments.methods, arguments.seeds):
-        method = make_method(LEARNERS, name, parse_settings(arguments.set))
+        method = make_method(LEARNERS, name, parse_settings((tuple(arguments.set),)))
         for at in arguments.at if method.needs_parameters else ["-"]:
             where = f"{at}-{arguments.calibrator}" if at in ("calibrated", "distribution") else at
             words = [robot, name, *([where] if at != "-" else []), arguments.budget, *arguments.set, seed]
