@@ -1,6 +1,7 @@
+from . import logs as logs
 from .dataset import Dataset as Dataset
-from .dataset import logged_states as logged_states
 from .dataset import subsample as subsample
+from .dataset import typical_change as typical_change
 from .disturbance import Disturbance as Disturbance
 from .disturbing import disturb as disturb
 from .disturbing import hide_velocities as hide_velocities
