@@ -6,7 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from madoc.data import Dataset, typical_change
 from madoc.errors import MadocError
@@ -15,9 +15,7 @@ from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.window_features import WindowScaling, last_rows, logged_stretch
 from madoc.simulation.base import Simulator
-from madoc.types import Metrics
-
-State = Any
+from madoc.types import Method, State
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ class CalibrationProblem:
         told = (finding.sentence for finding in self.dataset.findings if finding.level == "warning")
         return (*gaps, *self.dataset.disturbance.sentences(), *told)
 
-    def require_pairs(self, method: str) -> None:
+    def require_pairs(self) -> None:
         """Refuse data in which it is not known which next observation followed which row.
 
         Raises:
@@ -100,7 +98,7 @@ class CalibrationProblem:
         """
         if self.dataset.disturbance.shuffled == "next_observations":
             raise MadocError(
-                f"{method} compares each row's next observation with a simulated one, and those of "
+                f"this method compares each row's next observation with a simulated one, and those of "
                 f"{self.dataset.origin} are shuffled; take a method that compares distributions"
             )
 
@@ -167,6 +165,7 @@ class Estimate:
         mean: Value of each parameter, shape (d,).
         std: Its spread under the calibration distribution, shape (d,).
         groups: Parameters calibrated together, as indices; one group of all where a method has none.
+        failures: Simulated rows that exploded and were left out.
         warnings: What a user should know about it, one sentence each.
         covariance: Its joint spread, shape (d, d), where the method knows it; the diagonal is `std` squared.
         interval: 95 % confidence interval of each, columns low and high, where the method knows it.
@@ -175,6 +174,7 @@ class Estimate:
     mean: Float[np.ndarray, " d"]
     std: Float[np.ndarray, " d"]
     groups: tuple[tuple[int, ...], ...]
+    failures: int = 0
     warnings: tuple[str, ...] = field(default=())
     covariance: Float[np.ndarray, "d d"] | None = None
     interval: Float[np.ndarray, "d 2"] | None = None
@@ -184,48 +184,14 @@ class Estimate:
 class EmbedsParameters(Protocol):
     """What a method may have besides: it learns which parameters act alike, and can show it."""
 
-    def embeddings(self, problem: CalibrationProblem, state: State) -> Float[np.ndarray, "d latent"] | None:
+    def embeddings(self, problem: CalibrationProblem, state: Any) -> Float[np.ndarray, "d latent"] | None:
         """One vector a parameter, near for those that act alike; None while nothing is learnt of it."""
         ...
 
 
-class Calibrator(Protocol):
-    """A method. It holds hyperparameters only; what it carries is in its state."""
-
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        ...
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics worth a place beside the progress bar."""
-        ...
-
-    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> State:
-        """A cheap start: networks, buffers, the random key."""
-        ...
-
-    def step(self, problem: CalibrationProblem, state: State) -> tuple[State, Metrics]:
-        """One epoch."""
-        ...
+class Calibrator(Method[CalibrationProblem, State], Protocol[State]):
+    """A method that estimates parameters."""
 
     def estimate(self, problem: CalibrationProblem, state: State) -> Estimate:
         """The best estimate so far."""
-        ...
-
-    def control_steps(self, state: State) -> int:
-        """Simulated control steps spent, of any kind."""
-        ...
-
-    def stage(self, state: State) -> str:
-        """A word for what it is doing."""
-        ...
-
-    def progress(self, state: State, budget: int) -> float:
-        """Share of all its stages done, in [0, 1]."""
-        ...
-
-    def converged(self, state: State) -> str | None:
-        """A sentence once it has stopped by itself."""
         ...

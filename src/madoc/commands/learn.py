@@ -61,8 +61,9 @@ class Learn:
         """Where the policy was learnt, in words."""
         from madoc.pipeline.methods import make_method
         from madoc.policies import LEARNERS
+        from madoc.types import entry_of
 
-        method = make_method(LEARNERS, self.order.method)
-        if method.needs_parameters:
+        entry = entry_of(make_method(LEARNERS, self.order.method, self.order.changes), LEARNERS)
+        if entry.needs_parameters:
             return PLACE_NAMES[self.order.at]
-        return PLACE_NAMES["uniform"] if method.unit == "control steps" else "from the data alone"
+        return PLACE_NAMES["uniform"] if entry.unit == "control steps" else "from the data alone"

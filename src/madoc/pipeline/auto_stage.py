@@ -1,6 +1,5 @@
 """`--method auto`: what the data allows, one method after another, compared on the hold-out; the best is kept."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,7 +34,7 @@ def calibrate_auto(out: Path, prepared: Prepared, *, resume: bool = False, quiet
     Raises:
         MadocError: Every candidate refuses, or a hyperparameter is not given as `madoc.updates`.
     """
-    methods = candidates_for(prepared.order.search.changes)
+    methods = candidates_for(prepared)
     spec = prepared.spec(out) | {"hyperparameters": {name: hyperparameters(made) for name, made in methods.items()}}
     with working_folder(out, spec, resume=resume, keep=COMPARISON) as folder:
         if ended(out, COMPARISON) and read_json(out / COMPARISON).get("budget") == prepared.budget:
@@ -69,14 +68,18 @@ def calibrate_auto(out: Path, prepared: Prepared, *, resume: bool = False, quiet
         return best
 
 
-def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator]:
+def candidates_for(prepared: Prepared) -> dict[str, Calibrator]:
     """The candidates by name, with hyperparameters changed that are named as `madoc.updates`.
+
+    Where the log does not tell where rollouts may start, Madoc starts them at resets.
 
     Raises:
         MadocError: A hyperparameter is named otherwise, or as `make_method`.
     """
     changed: dict[str, dict[str, object]] = {name: {} for name in CANDIDATES}
-    for setting, value in changes.items():
+    if not prepared.problem.states.starts_known:
+        changed["madoc"]["starts"] = "policy"
+    for setting, value in prepared.order.search.changes.items():
         whole, _, part = setting.partition(".")
         name = whole.replace("_", "-")
         if name not in changed or not part:

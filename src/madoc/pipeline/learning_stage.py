@@ -16,7 +16,7 @@ from madoc.pipeline.data_stage import load_source, read_truth
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
-from madoc.pipeline.orders import Place, PolicyOrder, parse_settings
+from madoc.pipeline.orders import Place, PolicyOrder
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
@@ -28,6 +28,7 @@ from madoc.policies import (
     require_reward,
 )
 from madoc.simulation import CpuSimulator
+from madoc.types import entry_of
 
 PLACES: tuple[str, ...] = get_args(Place)
 """Where a policy may be learnt: at the estimate, over the calibrated distribution, over the whole box, in the
@@ -49,10 +50,11 @@ def learn_in(
     Raises:
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
-    method = make_method(LEARNERS, order.method, parse_settings(order.set))
+    method = make_method(LEARNERS, order.method, order.changes)
+    entry = entry_of(method, LEARNERS)
     if order.budget < 1:
-        raise MadocError(f"expected a budget of at least 1 {method.unit.removesuffix('s')}, got {order.budget}")
-    if not method.needs_parameters and order.at != PLACES[0]:
+        raise MadocError(f"expected a budget of at least 1 {entry.unit.removesuffix('s')}, got {order.budget}")
+    if not entry.needs_parameters and order.at != PLACES[0]:
         raise MadocError(
             f"{order.method} does not learn at given parameters, so --at {order.at} would change nothing; leave it out"
         )
@@ -60,7 +62,7 @@ def learn_in(
     key = stage_key(order.seed, "learning")
     truth = read_truth(order.truth) or calibrated.spec.truth
     simulator, parameters = _system(calibrated, order.at, truth)
-    dataset = _logged(calibrated, order.method) if method.needs_data else None
+    dataset = _logged(calibrated, order.method) if entry.needs_data else None
     spec = {
         "command": "learn",
         "task": calibrated.task.name,
@@ -82,7 +84,7 @@ def learn_in(
 
 def policy_folder_name(at: str, method: str) -> str:
     """`policy-calibrated`, with the method behind it unless that is SAC; `policy-cql` where the place is no matter."""
-    if not make_method(LEARNERS, method).needs_parameters:
+    if not LEARNERS[method].needs_parameters:
         return f"policy-{method}"
     return f"policy-{at}" if method == "sac" else f"policy-{at}-{method}"
 

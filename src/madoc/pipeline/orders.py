@@ -172,6 +172,11 @@ class PolicyOrder:
     truth: Path | None = None
     """JSON file {parameter: value}, for --at truth. Default: what the run remembers."""
 
+    @property
+    def changes(self) -> dict[str, str]:
+        """Hyperparameters that differ from the method's own, by name."""
+        return parse_settings(self.set)
+
 
 @dataclass(frozen=True)
 class EvaluationOrder:

@@ -28,7 +28,7 @@ def selftest_of(order: SelftestOrder, *, quiet: bool = False) -> Selftest:
         raise MadocError(f"expected at least 1 truth to plant, got {order.truths}")
     prepared = prepare(calibration)
     if prepared.method == AUTO:
-        methods = list(candidates_for(order.search.changes).values())
+        methods = list(candidates_for(prepared).values())
     else:
         methods = [make_method(CALIBRATORS, prepared.method, order.search.changes)]
     key = stage_key(order.search.seed, "selftest")

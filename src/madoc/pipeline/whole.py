@@ -57,7 +57,7 @@ def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = F
         if result.status not in ENDED:
             return replace(summary, status=result.status, sentence=f"calibration: {result.sentence}")
         truth_known = calibrated.spec.truth is not None
-        compared = order.yardsticks and truth_known and make_method(LEARNERS, order.learner).needs_parameters
+        compared = order.yardsticks and truth_known and LEARNERS[order.learner].needs_parameters
         places: tuple[Place, ...] = ("calibrated", "midrange", "truth") if compared else ("calibrated",)
         for at in places:
             policy = _learn(order, calibrated, at, out / f"policy-{at}", quiet=quiet)
