@@ -18,13 +18,14 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-import yaml
+from ruamel.yaml import YAML
 
 from calibration import commit
 from madoc import robots
 from madoc.pipeline import CalibrationOrder, Search, Source, calibrate_in
 from madoc.pipeline.auto_stage import CANDIDATES
 from madoc.pipeline.preparation import AUTO_BUDGET
+from madoc.robots.document import yaml_text
 
 RESULTS = Path(__file__).parent / "results" / "planted"
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -182,14 +183,14 @@ def base(robot: str) -> dict:
     """The robot's spec, its model named by its whole path."""
     if robot == "hopper":
         return deepcopy(HOPPER)
-    spec = yaml.safe_load((EXAMPLES / robot / f"{robot}.yaml").read_text())
+    spec = YAML(typ="safe").load(EXAMPLES / robot / f"{robot}.yaml")
     spec.pop("log", None)
     return spec | {"model": str(EXAMPLES / robot / spec["model"])}
 
 
 def write(path: Path, spec: dict) -> Path:
     """A spec file."""
-    path.write_text(yaml.safe_dump(spec, sort_keys=False))
+    path.write_text(yaml_text(spec))
     return path
 
 

@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import yaml
+from ruamel.yaml import YAML
 
 from calibration import commit
 from madoc import pipeline, robots, simulation
@@ -95,7 +95,7 @@ def published(folder: Path) -> dict[str, dict[str, float]]:
     """
     found = {}
     for file in sorted(folder.glob("*.yaml")):
-        given = yaml.safe_load(file.read_text())
+        given = YAML(typ="safe").load(file)
         mass, length, inertia = given["mass"], given["length"], given.get("inertia")
         if isinstance(inertia, float):
             mass, length = (mass * length) ** 2 / inertia, inertia / (mass * length)

@@ -28,3 +28,29 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> MadocError:
     near = ending or difflib.get_close_matches(name, names, n=1)
     hint = f"; did you mean {near[0]}?" if near else ";"
     return MadocError(f"unknown {what} {name!r}{hint} there are: {', '.join(names)}")
+
+
+def nearest(wanted: str, names: Iterable[str]) -> list[str]:
+    """At most three of the names: those that contain the wanted one first, then those spelled like it."""
+    known = list(names)
+    by_case = {name.lower(): name for name in known}
+    close = [by_case[name] for name in difflib.get_close_matches(wanted.lower(), list(by_case), n=3, cutoff=0.5)]
+    containing = [name for name in known if wanted and wanted.lower() in name.lower()]
+    return list(dict.fromkeys([*containing, *close]))[:3]
+
+
+def nearest_hint(wanted: str, names: Iterable[str], *, none: str = "there is none") -> str:
+    """The end of an error about an unknown name: the nearest names, else the first of all, else `none`."""
+    known = list(names)
+    near = nearest(wanted, known)
+    if near:
+        return f"nearest: {', '.join(near)}"
+    return f"there are: {listed(known)}" if known else none
+
+
+def listed(names: Iterable[str], most: int = 12) -> str:
+    """Names for a sentence: at most `most`, then how many more there are."""
+    known = list(names)
+    if not known:
+        return "none"
+    return ", ".join(known[:most]) + (f" and {len(known) - most} more" if len(known) > most else "")

@@ -388,7 +388,7 @@ def test_names_and_paths_resolve(tmp_path, monkeypatch):
     assert robots.resolve("hopper").physics == "legacy"
     assert robots.resolve("hopper", "modern").physics == "modern"
     assert robots.resolve(str(path)).name == robots.resolve(path, "modern").name == "two_link_arm"
-    with pytest.raises(MadocError, match="legacy physics is that of Madoc's own robots"):
+    with pytest.raises(MadocError, match="legacy physics exists only for Madoc's own robots"):
         robots.resolve(path, "legacy")
     with pytest.raises(MadocError, match=r"did you mean hopper\?.*or give the path of a robot's spec file"):
         robots.resolve("hoper")

@@ -9,7 +9,7 @@ from madoc.data import Dataset
 from madoc.data.findings import Finding
 from madoc.errors import MadocError
 from madoc.robots import Robot
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.tasks import Task
 
 AT_LIMIT = 1.0 - 1e-6
@@ -98,7 +98,7 @@ def channels_of(dataset: Dataset, task: Task, robot: Robot | None = None) -> tup
     return (*signals, *actions)
 
 
-def channel_findings(dataset: Dataset, simulator: CpuSimulator, channels: tuple[Channel, ...]) -> list[Finding]:
+def channel_findings(dataset: Dataset, simulator: Simulator, channels: tuple[Channel, ...]) -> list[Finding]:
     """Too few rows, channels that never move, actions at their limits, positions that contradict their speeds."""
     found = _size_findings(dataset, len(simulator.parameters))
     for kind in ("signal", "action"):
@@ -144,7 +144,7 @@ def _limit_findings(channel: Channel, unit_action: Float[np.ndarray, " rows"]) -
     return []
 
 
-def _speed_findings(dataset: Dataset, simulator: CpuSimulator) -> list[Finding]:
+def _speed_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
     """Positions that do not change by their speeds times the control step: another unit or sign, wrapped angles."""
     task = simulator.task
     if task.state_from_observation is None:

@@ -12,7 +12,7 @@ from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, 
 from madoc.diagnosis.explanation import Explanation, action_findings, explain, explanation_findings
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.robots import Robot
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.simulation.sensitivity import insensitive
 
 
@@ -50,7 +50,7 @@ class Diagnosis:
         return any(finding.level == "fatal" for finding in self.findings)
 
 
-def check(dataset: Dataset, simulator: CpuSimulator, *, robot: Robot | None = None, seed: int = 0) -> Diagnosis:
+def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None, seed: int = 0) -> Diagnosis:
     """Look at a log and a model before any solving.
 
     Args:

@@ -12,7 +12,7 @@ from madoc.data.findings import Finding
 from madoc.diagnosis.channels import Channel, action_names
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import HORIZONS, Windows, drawn, longest_fit, rows_that_fit, windows_at
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.tasks import Task
 
 WINDOWS = 64
@@ -55,7 +55,7 @@ class Explanation:
 
 def explain(
     dataset: Dataset,
-    simulator: CpuSimulator,
+    simulator: Simulator,
     states: Float[np.ndarray, "states state"],
     rows: Int[np.ndarray, " states"],
     *,
@@ -114,7 +114,7 @@ def explanation_findings(found: Explanation, channels: tuple[Channel, ...]) -> l
 
 def action_findings(
     dataset: Dataset,
-    simulator: CpuSimulator,
+    simulator: Simulator,
     states: Float[np.ndarray, "states state"],
     rows: Int[np.ndarray, " states"],
     found: Explanation,
@@ -169,7 +169,7 @@ def action_findings(
 
 def _errors(
     dataset: Dataset,
-    simulator: CpuSimulator,
+    simulator: Simulator,
     windows: Windows,
     rows: Int[np.ndarray, " windows"],
     draws: Float[np.ndarray, "draws d"],

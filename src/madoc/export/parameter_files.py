@@ -4,10 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from madoc.calibration.result import ParameterEstimate
 from madoc.parameters import FIELDS, Parameter
+from madoc.robots.document import yaml_text
 from madoc.runs.files import replacing
 from madoc.simulation.mjcf import Change
 
@@ -172,6 +171,5 @@ def _flat(values: list[float]) -> float | list[float]:
 
 
 def _write(path: Path, comment: str, content: object) -> None:
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None)
     with replacing(path) as stream:
-        stream.write(f"# {comment}\n{text}".encode())
+        stream.write(f"# {comment}\n{yaml_text(content)}".encode())

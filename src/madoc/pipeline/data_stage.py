@@ -19,7 +19,7 @@ from madoc.policies.behaviours import QUALITIES, record_quality
 from madoc.robots import Robot
 from madoc.runs.files import read_json
 from madoc.runs.progress import bar
-from madoc.simulation import CpuSimulator, Simulator
+from madoc.simulation import Simulator
 from madoc.tasks import TASKS, Task
 
 
@@ -67,7 +67,7 @@ class Machine:
         same = self.robot is not None or physics == self.task.physics
         return self if same else Machine(tasks.make(self.task.name, physics))
 
-    def at(self, truth: Mapping[str, float]) -> tuple[CpuSimulator, np.ndarray]:
+    def at(self, truth: Mapping[str, float]) -> tuple[Simulator, np.ndarray]:
         """The target: a simulator of all parameters that the truth names, calibrated or not, and their values."""
         simulator = simulation.make(replace(self.task, parameters=self.task.parameters.select(list(truth))))
         return simulator, simulator.parameters.vector(truth)

@@ -8,7 +8,7 @@ from madoc.export import Exported, Provenance, save_onnx, save_patch, save_rando
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibration_stage import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.simulation.mjcf import save_mjcf
 from madoc.simulation.write import nominal_values
 
@@ -75,7 +75,7 @@ def provenance_of(calibrated: Calibrated) -> Provenance:
     )
 
 
-def _stepping(simulator: CpuSimulator) -> dict[str, object]:
+def _stepping(simulator: Simulator) -> dict[str, object]:
     """How the model is stepped to move as it was calibrated to."""
     task, steps = simulator.task, simulator.task.frame_skip
     channels = [

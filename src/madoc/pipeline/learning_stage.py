@@ -27,7 +27,7 @@ from madoc.policies import (
     learn_policy,
     require_reward,
 )
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.types import entry_of
 
 PLACES: tuple[str, ...] = get_args(Place)
@@ -107,7 +107,7 @@ def _logged(calibrated: Calibrated, method: str) -> Dataset:
 
 def _system(
     calibrated: Calibrated, at: str, truth: Mapping[str, float] | None
-) -> tuple[CpuSimulator, np.ndarray | ParameterDistribution]:
+) -> tuple[Simulator, np.ndarray | ParameterDistribution]:
     """The simulator to learn in, and its physical values, or the distribution to draw them from."""
     if at not in PLACES:
         raise unknown_name("place to learn at", at, PLACES)
@@ -131,7 +131,7 @@ def _calibrated_distribution(space: ParameterSpace, result: CalibrationResult) -
     return NormalParameters(space, result.mean, np.diag(result.std**2) if joint is None else np.asarray(joint))
 
 
-def _described(simulator: CpuSimulator, parameters: np.ndarray | ParameterDistribution) -> dict[str, float]:
+def _described(simulator: Simulator, parameters: np.ndarray | ParameterDistribution) -> dict[str, float]:
     """Parameters by name for spec.json: a value, or the mean (mid-range of a box) of what they are drawn from."""
     if isinstance(parameters, NormalParameters):
         parameters = parameters.mean

@@ -16,7 +16,7 @@ from madoc.pipeline.folders import stored_path
 from madoc.pipeline.keys import seed_key, stage_key
 from madoc.pipeline.orders import AUTO, CalibrationOrder
 from madoc.pipeline.records import DataRecord
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.tasks import Task
 from madoc.verdict import Bench
 
@@ -51,7 +51,7 @@ class Prepared:
     holdout: float | None
     machine: Machine
     dataset: Dataset
-    simulator: CpuSimulator
+    simulator: Simulator
     truth: dict[str, float] | None
 
     @property

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import Float
+from ruamel.yaml import YAML, YAMLError
 
 from madoc.errors import MadocError
 from madoc.runs.files import read_json
@@ -112,9 +112,9 @@ class Run:
         """Units of signals by name, as far as the spec of a robot of one's own says them."""
         robot = self.spec.get("robot") or {}
         try:
-            signals = yaml.safe_load(robot.get("spec", "")) or {}
-            return {row["name"]: str(row["unit"]) for row in signals["signals"] if "unit" in row}
-        except (yaml.YAMLError, KeyError, TypeError):
+            spec = YAML(typ="safe").load(robot.get("spec", "")) or {}
+            return {row["name"]: str(row["unit"]) for row in spec["signals"] if "unit" in row}
+        except (YAMLError, KeyError, TypeError):
             return {}
 
     @cached_property

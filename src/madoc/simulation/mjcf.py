@@ -54,21 +54,12 @@ def spec_at(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> t
     """
     spec = simulator.task.spec()
     nominal = _compiled(spec)
-    bound = bound_model(simulator, values)
+    bound = simulator.model(values)
     changes: list[Change] = []
     for group, write in _GROUPS.items():
         changes += write(spec, group, nominal, bound)
     _refuse_difference(bound, _compiled(spec), "written into its spec")
     return spec, changes
-
-
-def bound_model(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
-    """The compiled model that a bound system steps."""
-    models = getattr(simulator.bind(np.asarray(values, dtype=np.float64)[None]), "models", None)
-    if models is None:
-        raise MadocError(f"{type(simulator).__name__} steps no MuJoCo model that could be written as MJCF")
-    model: mujoco.MjModel = models[0]
-    return model
 
 
 def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], path: Path) -> list[Change]:
@@ -96,7 +87,7 @@ def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], pa
         read_back = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise MadocError(f"MuJoCo does not read back the model it wrote to {path}: {error}") from error
-    _refuse_difference(bound_model(simulator, values), read_back, f"read back from {path}")
+    _refuse_difference(simulator.model(values), read_back, f"read back from {path}")
     return changes
 
 

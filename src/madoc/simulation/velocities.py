@@ -22,7 +22,7 @@ def velocities_between(
         after: The same, later.
         steps: Control steps between them, at least 1.
     """
-    model = task.compile()
+    model = task.model
     seconds = steps * task.frame_skip * model.opt.timestep
     start, end = before[:, : model.nq], after[:, : model.nq]
     if model.nq == model.nv:
@@ -37,7 +37,7 @@ def with_velocities(
     task: Task, states: Float[np.ndarray, "rows state"], velocities: Float[np.ndarray, "rows velocity"]
 ) -> Float[np.ndarray, "rows state"]:
     """(qpos, qvel) with the given velocities where it has none (NaN)."""
-    positions = task.compile().nq
+    positions = task.model.nq
     padded = np.concatenate([states[:, :positions], np.nan_to_num(velocities)], axis=-1)
     return np.where(np.isnan(states), padded, states)
 
@@ -46,7 +46,7 @@ def missing_velocities(task: Task) -> Int[np.ndarray, " velocities"]:
     """Where in a state the velocities stand that an observation does not tell, of a task with a `posture`."""
     assert task.posture is not None
     unknown = np.isnan(np.asarray(task.posture(np.zeros(task.observation_size))))
-    positions = task.compile().nq
+    positions = task.model.nq
     return positions + np.flatnonzero(unknown[positions:])
 
 
@@ -54,7 +54,7 @@ def unseen_positions(task: Task) -> tuple[str, ...]:
     """Joints of which an observation does not show every coordinate, so that their velocity is not in its changes."""
     if task.posture is None:
         return ()
-    model = task.compile()
+    model = task.model
     blind = np.isnan(np.asarray(task.posture(np.zeros((1, task.observation_size)))))[0, : model.nq]
     if task.sense is None:
         state = np.concatenate([model.qpos0, np.zeros(model.nv)])

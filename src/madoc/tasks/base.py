@@ -1,9 +1,11 @@
 """What a task is: a model, and pure batched functions between state, observation, reward and end."""
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import jax
 import mujoco
@@ -13,7 +15,20 @@ from madoc.errors import MadocError
 from madoc.parameters import Parameter, ParameterSpace
 
 Batch = Any
-"""A NumPy or JAX array with any leading axes; task functions work on both, so every backend shares them."""
+"""A NumPy or JAX array with any leading axes; the functions of a task work on both, so every backend shares them."""
+
+Span = tuple[float, float]
+"""Lower and upper end of a range."""
+
+_MODELS: WeakKeyDictionary[Callable[[], mujoco.MjSpec], mujoco.MjModel] = WeakKeyDictionary()
+"""Compiled models by the function that builds their spec; a model is dropped together with its function."""
+
+
+def compiled_model(spec: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
+    """The model of a spec, compiled once for each function that builds it. It is shared, so nobody may change it."""
+    if spec not in _MODELS:
+        _MODELS[spec] = spec().compile()
+    return _MODELS[spec]
 
 
 def healthy_reward(state: Batch, action: Batch, next_state: Batch, healthy: Batch, *, dt: float, cost: float) -> Batch:
@@ -28,9 +43,6 @@ def scaled_friction(spec: Callable[[], mujoco.MjSpec], factor: float) -> mujoco.
     for geom in changed.geoms:
         geom.friction[0] *= factor
     return changed
-
-
-Span = tuple[float, float]
 
 
 def paper_space(gravity: Span, masses: dict[str, Span], dampings: dict[str, Span]) -> ParameterSpace:
@@ -97,7 +109,8 @@ class Task:
         signals: Names of the observation's values; empty where they have none.
         sense: (state, sensordata) -> observation, where it reads the model's sensors.
         rewarded: Whether `reward` says anything; without it nothing can be learnt or judged.
-        source: What makes this task again (`robots.restore`), as JSON; None where its name does.
+        source: The files of a robot's spec as JSON, from which `robots.restore` makes the task again; None for a task
+            that its name determines.
         posture: observation -> (qpos, qvel) as far as it tells, NaN elsewhere; None where it tells no position.
     """
 
@@ -129,11 +142,16 @@ class Task:
     @property
     def action_size(self) -> int:
         """Values per action."""
-        return len(self.actions) or int(self.compile().nu)
+        return len(self.actions) or int(self.model.nu)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model at nominal parameters, compiled once and shared: read it, and `compile` one to change."""
+        return compiled_model(self.spec)
 
     def compile(self) -> mujoco.MjModel:
-        """A fresh model at nominal parameters."""
-        return self.spec().compile()
+        """A copy of the model at nominal parameters, free to be changed."""
+        return copy.copy(self.model)
 
     def with_level(self, level: str) -> "Task":
         """The same task searched in its `easy`, `normal` or `hard` ranges (the paper's appendix D).

@@ -3,11 +3,11 @@
 from typing import Any
 
 import numpy as np
-import yaml
 
 from madoc.report.reading import MetricLog, Run
 from madoc.report.sections.base import Section
 from madoc.report.words import count, duration, number
+from madoc.robots.document import yaml_text
 
 
 def policies(run: Run) -> Section:
@@ -76,7 +76,7 @@ def asked(run: Run) -> Section:
     """What the run was asked, and with which versions."""
     robot = run.spec.get("robot") or {}
     spec = {name: value for name, value in run.spec.items() if name not in ("versions", "robot")}
-    texts = [("The run's spec", yaml.safe_dump(spec, sort_keys=False, allow_unicode=True, default_flow_style=None))]
+    texts = [("The run's spec", yaml_text(spec, width=80))]
     if robot:
         texts.insert(0, (f"The robot: {robot.get('file', 'its spec file')}", str(robot.get("spec", ""))))
     data = {"texts": texts, "versions": list(run.spec.get("versions", {}).items())}
