@@ -9,8 +9,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import madoc.tasks
-from madoc.errors import MadocError
 from madoc import ENVIRONMENTS, register_environments
+from madoc.errors import MadocError
 from madoc.gymnasium_environment import CalibratedEnvironment
 from madoc.simulation.cpu import CpuSimulator
 from own_robots import CART_SPEC, write_robot

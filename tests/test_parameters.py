@@ -158,5 +158,5 @@ def test_values_by_name_or_in_order_are_one_vector():
         assert SPACE.vector(given).tolist() == SPACE.middle.tolist()
     several = np.stack([SPACE.low, SPACE.high])
     assert (SPACE.vector(several) == several).all()
-    with pytest.raises(MadocError, match=rf"expected {len(SPACE)} parameter values \(.*\), got an array of shape \(1,\)"):
+    with pytest.raises(MadocError, match=r"parameter values \(.*\), got an array of shape \(1,\)"):
         SPACE.vector([1.0])

@@ -32,6 +32,7 @@ from .pipeline import RunOrder as RunOrder
 from .pipeline import Search as Search
 from .pipeline import Source as Source
 from .pipeline import calibrate_in as calibrate_in
+from .pipeline import read_calibration as read_calibration
 from .pipeline import record as record
 from .pipeline import run_all as run_all
 from .policies import BC as BC
@@ -46,6 +47,7 @@ from .policies import learn_policy as learn_policy
 from .policies import load_policy as load_policy
 from .policies import save_policy as save_policy
 from .runs.run_folder import RunFolder as RunFolder
+from .verdict import assess as assess
 
 ENVIRONMENTS: dict[str, str]
 

@@ -80,6 +80,7 @@ def calibrate(
         warnings=told_once((*estimate.warnings, *exploded(estimate.failures, finished.control_steps)), problem.doubts),
         error=None if known is None else calibration_error(estimate.mean, known, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
+        problem=problem,
     )
     if folder is not None:
         if isinstance(method, EmbedsParameters):

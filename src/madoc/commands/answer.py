@@ -1,15 +1,16 @@
 """What a command returns, and the options all commands share."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from rich.console import RenderableType
 from rich.table import Table
 
 if TYPE_CHECKING:
     from madoc.calibration import CalibrationResult
+    from madoc.calibration.holdout import HoldOut
     from madoc.pipeline.records import EvaluationRecord
 
 EXIT_CODES: Mapping[str, int] = {
@@ -98,39 +99,38 @@ def evaluation_text(evaluation: "EvaluationRecord") -> tuple[RenderableType, ...
 def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
     """The verdict, the table, the comparison of methods, and the rest in lines."""
     verdict = (result.verdict_line(),) if result.verdict else ()
-    rows = (result.holdout or {}).get("candidates")
-    compared = (candidates_table(rows, result),) if rows else ()
+    compared = (candidates_table(result.holdout),) if result.holdout and result.holdout.candidates else ()
     return (*verdict, result.table(), *compared, result.summary())
 
 
-def candidates_table(rows: Sequence[Mapping[str, Any]], result: "CalibrationResult") -> Table:
-    """The methods that `auto` has tried, one row each; those it did not run have the reason."""
-    predicted = (result.holdout or {}).get("measure") == "prediction"
-    measure = "error / mid-range's" if predicted else "told apart, area - ½"
+def candidates_table(holdout: "HoldOut") -> Table:
+    """The methods that `auto` has compared, a row each; those it did not run with the reason."""
+    from madoc.calibration.holdout import NotRun
+
+    measure = "area - ½" if holdout.measure == "told apart" else "error / mid-range's"
     table = Table(title="methods compared on the hold-out", title_justify="left")
     table.add_column("method", no_wrap=True)
     for heading in (measure, "95 %", "control steps", "s"):
         table.add_column(heading, justify="right")
     table.add_column("verdict")
-    for row in rows:
-        if "not_run" in row:
-            table.add_row(row["method"], "", "", "", "", row["not_run"])
+    for row in holdout.candidates:
+        if isinstance(row, NotRun):
+            table.add_row(row.method, "", "", "", "", row.not_run)
             continue
-        kept = " (kept)" if row["method"] == result.method else ""
         table.add_row(
-            row["method"],
-            f"{row['score']:.3g}",
-            "[{:.3g}, {:.3g}]".format(*row["interval"]),
-            f"{row['control_steps']:,}",
-            f"{row['seconds']:.0f}",
-            row["verdict"] + kept,
+            row.method,
+            f"{row.score:.3g}",
+            "[{:.3g}, {:.3g}]".format(*row.interval),
+            f"{row.control_steps:,}",
+            f"{row.seconds:.0f}",
+            row.verdict + (" (kept)" if row.method == holdout.chosen else ""),
         )
     return table
 
 
 def calibration_status(result: "CalibrationResult") -> str:
     """The key of `EXIT_CODES` that a calibration ends with: its verdict, where it has one."""
-    return result.verdict["word"] if result.verdict else result.status
+    return result.verdict.word if result.verdict else result.status
 
 
 def left_behind(path: Path, what: str) -> str:

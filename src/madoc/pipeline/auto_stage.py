@@ -1,9 +1,10 @@
 """`--method auto`: what the data allows, one method after another, compared on the hold-out; the best is kept."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from madoc.calibration import CALIBRATORS, CalibrationResult, Calibrator
+from madoc.calibration.holdout import NotRun, Tried
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.folders import ended, holds_run, working_folder
 from madoc.pipeline.keys import seed_key
@@ -40,30 +41,31 @@ def calibrate_auto(out: Path, prepared: Prepared, *, resume: bool = False, quiet
         if ended(out, COMPARISON) and read_json(out / COMPARISON).get("budget") == prepared.budget:
             return CalibrationResult.from_json(read_json(folder.result))
         folder.result.unlink(missing_ok=True)
-        rows: list[dict[str, object]] = []
+        rows: list[Tried | NotRun] = []
         tried: list[tuple[CalibrationResult, Assessment]] = []
         for name, share in CANDIDATES.items():
             left = prepared.budget - sum(result.control_steps for result, _ in tried)
             reason = _reason_to_stop(tried, left) or _refusal(methods[name], prepared)
             if reason:
-                rows.append({"method": name, "not_run": reason})
+                rows.append(NotRun(name, reason))
                 continue
             part = replace(prepared, method=name, budget=max(1, min(round(share * prepared.budget), left)))
             place = out / name
             result, assessment = calibrate_prepared(place, part, methods[name], resume=holds_run(place), quiet=quiet)
             if assessment is None:  # interrupted or diverged
                 if result.status == "diverged" and tried:
-                    rows.append({"method": name, "not_run": result.sentence})
+                    rows.append(NotRun(name, result.sentence))
                     continue
                 return result
             tried.append((result, assessment))
             rows.append(_row(result, assessment))
-            folder.write_json(COMPARISON, {"candidates": rows})
+            folder.write_json(COMPARISON, {"candidates": [asdict(row) for row in rows]})
         if not tried:
-            raise MadocError("; ".join(f"{row['method']}: {row['not_run']}" for row in rows))
+            raise MadocError("; ".join(f"{row.method}: {row.not_run}" for row in rows if isinstance(row, NotRun)))
         best = _joined(tried, rows)
         leave_evidence(out, prepared, best)
-        folder.write_json(COMPARISON, {"candidates": rows, "chosen": best.method, "budget": prepared.budget})
+        compared = {"candidates": [asdict(row) for row in rows], "chosen": best.method, "budget": prepared.budget}
+        folder.write_json(COMPARISON, compared)
         folder.write_json("result.json", best.to_json())
         return best
 
@@ -91,10 +93,10 @@ def candidates_for(prepared: Prepared) -> dict[str, Calibrator]:
 def _reason_to_stop(tried: list[tuple[CalibrationResult, Assessment]], left: int) -> str:
     """Why no other candidate is needed, or none can be tried; empty to go on."""
     for result, assessment in tried:
-        word = result.verdict["word"] if result.verdict else ""
+        word = assessment.verdict.word
         if word == "DATA_REJECTED":
             return "the data was rejected, and no method changes that"
-        if word == "CALIBRATED" and explains_all(assessment):
+        if word == "CALIBRATED" and explains_all(assessment.holdout):
             return f"{result.method} explains the hold-out down to its noise"
     return "" if left > 0 else "the budget is spent"
 
@@ -108,24 +110,25 @@ def _refusal(method: Calibrator, prepared: Prepared) -> str:
     return ""
 
 
-def _row(result: CalibrationResult, assessment: Assessment) -> dict[str, object]:
+def _row(result: CalibrationResult, assessment: Assessment) -> Tried:
     """A line of the comparison."""
-    return {
-        "method": result.method,
-        "score": assessment.score,
-        "interval": list(assessment.relative_interval),
-        "verdict": result.verdict["word"] if result.verdict else "",
-        "control_steps": result.control_steps,
-        "seconds": result.seconds,
-    }
+    holdout = assessment.holdout
+    return Tried(
+        method=result.method,
+        score=holdout.score,
+        interval=holdout.score_interval,
+        verdict=assessment.verdict.word,
+        control_steps=result.control_steps,
+        seconds=result.seconds,
+    )
 
 
-def _joined(tried: list[tuple[CalibrationResult, Assessment]], rows: list[dict[str, object]]) -> CalibrationResult:
+def _joined(tried: list[tuple[CalibrationResult, Assessment]], rows: list[Tried | NotRun]) -> CalibrationResult:
     """The best result with the cost of all."""
-    best, assessment = min(tried, key=lambda pair: pair[1].score)
+    best, assessment = min(tried, key=lambda pair: pair[1].holdout.score)
     return replace(
         best,
         control_steps=sum(result.control_steps for result, _ in tried),
         seconds=round(sum(result.seconds for result, _ in tried), 3),
-        holdout=assessment.report | {"candidates": rows, "chosen": best.method},
+        holdout=replace(assessment.holdout, candidates=tuple(rows), chosen=best.method),
     )

@@ -60,6 +60,7 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dic
 
 def provenance_of(calibrated: Calibrated) -> Provenance:
     """Where an estimate comes from, as its run folder remembers it."""
+    verdict = calibrated.result.verdict
     stored, whole = calibrated.spec.data, calibrated.folder.resolve()
     data = (
         {} if stored is None else {"paths": list(stored.paths), "rows": stored.rows, "fingerprint": stored.fingerprint}
@@ -70,7 +71,7 @@ def provenance_of(calibrated: Calibrated) -> Provenance:
         seed=calibrated.seed,
         data=data,
         versions=calibrated.spec.versions,
-        verdict=calibrated.result.verdict,
+        verdict=None if verdict is None else verdict.to_json(),
         warnings=calibrated.result.warnings,
     )
 

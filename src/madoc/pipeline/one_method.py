@@ -8,7 +8,7 @@ from madoc.pipeline.folders import ENDED, working_folder
 from madoc.pipeline.keys import seed_key
 from madoc.pipeline.methods import hyperparameters
 from madoc.pipeline.preparation import Prepared
-from madoc.verdict import Assessment, assess, judge
+from madoc.verdict import Assessment, assess
 from madoc.verdict.evidence import evidence, save_evidence
 
 
@@ -39,8 +39,8 @@ def calibrate_prepared(
         )
         if prepared.holdout is None or result.status not in ENDED:
             return result, None
-        assessment = assess(prepared.bench, result.mean, result.interval)
-        result = replace(result, verdict=judge(assessment).to_json(), holdout=assessment.report)
+        assessment = assess(result, prepared.bench)
+        result = replace(result, verdict=assessment.verdict, holdout=assessment.holdout)
         leave_evidence(out, prepared, result)
         folder.write_json("result.json", result.to_json())
         return result, assessment

@@ -20,8 +20,6 @@ from madoc.simulation import Simulator
 from madoc.tasks import Task
 from madoc.verdict import Bench
 
-FEWEST_HELD = 10
-"""The fewest held-out rows that a verdict is made of: perfect predictions of fewer are no surer than chance."""
 HOLDOUT = 0.2
 """Share of the rows that `auto` holds out unless told otherwise, as cross-validation in five folds does."""
 BUDGET = 300_000
@@ -63,12 +61,8 @@ class Prepared:
     def bench(self) -> Bench:
         """What results are judged on."""
         split = hold_out(self.dataset, self.holdout or HOLDOUT, stage_key(self.seed, "hold-out"))
-        if len(split.held) < FEWEST_HELD:
-            raise MadocError(
-                f"expected at least {FEWEST_HELD} rows held out to judge a result by, got {len(split.held)} of "
-                f"{len(self.dataset)}; log more, or hold out a larger share with --holdout"
-            )
-        return Bench(split, self.simulator, stage_key(self.seed, "verdict"))
+        problem = CalibrationProblem(split.kept, self.simulator)
+        return Bench(problem, split.held, stage_key(self.seed, "verdict"), split.sentence)
 
     @cached_property
     def problem(self) -> CalibrationProblem:

@@ -9,8 +9,8 @@ from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import make_method
 from madoc.pipeline.orders import AUTO, CalibrationOrder, SelftestOrder
 from madoc.pipeline.preparation import check_order, prepare
-from madoc.verdict.assessment import sensor_noise
 from madoc.verdict.bench import signal_names
+from madoc.verdict.predicted import sensor_noise
 from madoc.verdict.selftest import Selftest, selftest
 
 

@@ -31,9 +31,9 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
         mean: The estimate in physical units.
         control_step: Seconds.
     """
-    held = bench.split.held
-    names = {"signals": np.array(signal_names(bench.simulator.task)), "scale": bench.scaling.next_scale}
-    if not bench.rebuilds:
+    held = bench.held_out
+    names = {"signals": np.array(signal_names(bench.simulator.task)), "scale": bench.change}
+    if not bench.states_known:
         rows = np.arange(len(held))
         stretch, first = _stretches(bench, rows)
         measured = _measured(bench, first, stretch)
@@ -45,7 +45,7 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     unit = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
     points = np.stack([np.zeros(len(unit)), unit])
     before, after = _simulated(bench, points, windows, measured)
-    single = bench.replays.residuals(points, bench.replays.single_steps())[:, :, 0] * bench.scaling.next_scale
+    single = bench.replays.residuals(points, bench.replays.single_steps())[:, :, 0] * bench.change
     return (
         names
         | _placed(bench, first, steps, control_step)
@@ -62,19 +62,19 @@ def save_evidence(path: Path, arrays: dict[str, Any]) -> None:
 
 def _stretches(bench: Bench, rows: np.ndarray) -> tuple[int, np.ndarray]:
     """How long the stretches are, and the rows of the hold-out they begin at."""
-    held = bench.split.held
+    held = bench.held_out
     ends = held.episode_ends[held.episode_of(rows)]
     steps = int(min(TRACE_STEPS, (ends - rows).max()))
     return steps, rows[evenly(first_rows(held, rows, steps), TRACES)]
 
 
 def _placed(bench: Bench, first: np.ndarray, steps: int, control_step: float) -> dict[str, Any]:
-    episode = bench.split.held.episode_of(first)
+    episode = bench.held_out.episode_of(first)
     return {"time": control_step * np.arange(steps + 1), "episode": episode, "row": first}
 
 
 def _measured(bench: Bench, first: np.ndarray, steps: int) -> Float[np.ndarray, "stretches times observation"]:
-    logged = bench.split.held.transitions
+    logged = bench.held_out.transitions
     following = np.asarray(logged.next_observation)[first[:, None] + np.arange(steps)]
     return np.concatenate([np.asarray(logged.observation)[first][:, None], following], axis=1)
 
@@ -82,6 +82,6 @@ def _measured(bench: Bench, first: np.ndarray, steps: int) -> Float[np.ndarray, 
 def _simulated(
     bench: Bench, points: np.ndarray, windows: Windows, measured: np.ndarray
 ) -> Float[np.ndarray, "points stretches times observation"]:
-    residuals = bench.replays.residuals(points, windows) * bench.scaling.next_scale
+    residuals = bench.replays.residuals(points, windows) * bench.change
     start = np.broadcast_to(measured[:, :1], (len(points), *measured[:, :1].shape))
     return np.concatenate([start, measured[:, 1:] + residuals], axis=2)

@@ -12,6 +12,7 @@ from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import StratifiedKFold
 from threadpoolctl import threadpool_limits
 
+from madoc.calibration.holdout import Area
 from madoc.data import Dataset
 from madoc.data.dataset import starts_after
 from madoc.identification.windows import evenly
@@ -65,17 +66,7 @@ class Sample:
         return Sample(self.before[rows], self.after[rows], self.episodes[rows])
 
 
-@dataclass(frozen=True)
-class Told:
-    """How well logged and simulated rows are told apart: the area under the curve and its 95 % interval."""
-
-    area: float
-    low: float
-    high: float
-    rows: int
-
-
-def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Told:
+def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Area:
     """Cross-validated area under the curve of rows that the classifier has not seen.
 
     Too few rows for that tell nothing: an area of 0.5, its interval from 0 to 1.
@@ -89,9 +80,9 @@ def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Told:
     real, simulated = (part.take(evenly(np.arange(len(part)), MOST_ROWS)) for part in (real, simulated))
     count = len(real) + len(simulated)
     if not len(simulated):
-        return Told(1.0, 1.0, 1.0, count)  # nothing of the simulator is left to compare: it is no robot at all
+        return Area(1.0, (1.0, 1.0), count)  # nothing of the simulator is left to compare: it is no robot at all
     if min(len(real), len(simulated)) < FOLDS:
-        return Told(0.5, 0.0, 1.0, count)
+        return Area(0.5, (0.0, 1.0), count)
     label = np.repeat([True, False], [len(real), len(simulated)])
     before = np.concatenate([real.before, simulated.before])
     after = np.concatenate([real.after, simulated.after])
@@ -102,7 +93,7 @@ def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Told:
         weight = np.where(label, 1.0, odds / odds[~label].mean())
     scores = _unseen(np.concatenate([before, after], axis=1), label, weight)
     area = area_under_curve(scores, label, weight)
-    return Told(area, *_interval(scores, label, weight), len(label))
+    return Area(area, _interval(scores, label, weight), len(label))
 
 
 def replayed(
