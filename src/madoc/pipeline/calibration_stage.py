@@ -47,12 +47,15 @@ class Calibrated:
         return self.result.seed if self.spec.seed is None else self.spec.seed
 
 
-def calibrate_in(out: Path, order: CalibrationOrder, *, resume: bool = False, quiet: bool = False) -> CalibrationResult:
+def calibrate_in(
+    out: str | Path, order: CalibrationOrder, *, resume: bool = False, quiet: bool = False
+) -> CalibrationResult:
     """Calibrate, judge the result where rows are held out, and leave a run folder.
 
     Raises:
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
+    out = Path(out)
     check_order(order, out)
     if method_of(order) == AUTO:
         return calibrate_auto(out, prepare(order), resume=resume, quiet=quiet)
@@ -65,7 +68,7 @@ def default_folder(order: CalibrationOrder) -> Path:
     return Path("runs") / f"{Path(order.task).stem}-{method_of(order)}-{order.search.seed}"
 
 
-def read_calibration(path: Path, *, physics: str | None = None) -> Calibrated:
+def read_calibration(path: str | Path, *, physics: str | None = None) -> Calibrated:
     """A finished calibration: a run folder of `madoc calibrate` or `madoc run`, or a bare `result.json`.
 
     Args:
@@ -75,6 +78,7 @@ def read_calibration(path: Path, *, physics: str | None = None) -> Calibrated:
     Raises:
         MadocError: There is none, or it has not ended.
     """
+    path = Path(path)
     folder = path if path.is_dir() else path.parent
     if (folder / "calibration" / "spec.json").exists() and path.is_dir():
         folder = folder / "calibration"
