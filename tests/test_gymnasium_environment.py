@@ -140,7 +140,7 @@ def test_a_fall_terminates(hopper):
 def test_an_explosion_truncates_at_the_last_good_state():
     environment = CalibratedEnvironment("hopper")
     before, _ = environment.reset(seed=0)
-    environment._state[7] = 1e11
+    environment._episodes.state[0, 7] = 1e11
     observation, reward, terminated, truncated, info = environment.step(np.zeros(3, dtype=np.float32))
     assert (terminated, truncated, info["failed"]) == (False, True, True)
     assert np.isfinite(observation).all()

@@ -54,6 +54,7 @@ def register_environments() -> None:
             gymnasium.register(
                 f"madoc/{name}",
                 entry_point="madoc.gymnasium_environment:CalibratedEnvironment",
+                vector_entry_point="madoc.gymnasium_environment:CalibratedVectorEnvironment",
                 max_episode_steps=EPISODE_STEPS,
                 kwargs={"task": task},
             )
