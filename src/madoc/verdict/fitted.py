@@ -4,19 +4,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from madoc.calibration.holdout import AgainstChance, Fitted, PredictionErrors
+from madoc.calibration.holdout import AgainstChance, Fitted
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.losses import loss_slope, scale_of
 from madoc.identification.replay import slopes_at
 from madoc.verdict.bench import Bench, common_fields, signal_names
 from madoc.verdict.fitted_starts import FITTED, FittedReplays
-from madoc.verdict.statistics import (
-    better_than_chance,
-    interval_of,
-    prediction_errors,
-    relative_to_first,
-    resampled,
-)
+from madoc.verdict.statistics import best_of, better_than_chance, prediction_errors
 from madoc.verdict.systematic import explained_at_end
 
 NEARBY_STEPS = 6
@@ -41,26 +35,14 @@ def fitted(
     nearby, searching = _nearby_best(replays, unit)
     points = np.concatenate([np.zeros((1, len(unit))), unit[None], nearby])
     residuals = replays.residuals(points, replays.starts(points))
-    size = replays.magnitudes(residuals)
-    means = size.mean((0, -1))
-    relative = relative_to_first(means)
-    best = 1 + int(np.argmin(relative[1:]))
+    sizes = replays.magnitudes(residuals)
+    best = best_of(sizes)
     noise = replays.deviation(residuals[best])
     alone = replays.with_noise_alone(points[best], residuals[best], noise, jax.random.fold_in(bench.key, 2))
-    floor = replays.magnitudes(alone)[:, 0]
-    noise_alone = relative_to_first(np.stack([means[0], floor.mean((0, -1))]))[1]
-    low, high = interval_of(relative_to_first(resampled(size.mean(-1), replays.episodes))[:, 1])
     fitting = (len(points) + 1) * replays.fit_cost
     predicting = residuals[:, :, 1:, 0].size + alone[:, :, 1:, 0].size
-    signals = signal_names(bench.simulator.task)[: len(noise)]
-    mid_range, estimate, nearby_error, noise_error = (
-        prediction_errors(kind, replays.episodes, replays.horizons, signals)
-        for kind in (size[:, 0], size[:, 1], size[:, best], floor)
-    )
-    readings = replays.readings
-    start_and_actions = np.concatenate(
-        [readings.observed[:, 0], readings.observed[:, 1], readings.actions.reshape(len(readings), -1)], axis=1
-    )
+    observed, actions = replays.readings.observed, replays.readings.actions
+    start_and_actions = np.concatenate([observed[:, 0], observed[:, 1], actions.reshape(len(actions), -1)], axis=1)
     return Fitted(
         **common_fields(
             bench,
@@ -72,16 +54,14 @@ def fitted(
             noise=noise,
             control_steps=searching + fitting + predicting,
         ),
-        errors=PredictionErrors(
-            mid_range=mid_range,
-            estimate=estimate,
-            nearby_best=nearby_error,
-            noise=noise_error,
-            relative=float(relative[1]),
-            relative_interval=(float(low), float(high)),
-            nearby_relative=float(max(relative[best], min(relative[1], noise_alone))),
-            windows=len(readings),
-            failed_windows=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
+        errors=prediction_errors(
+            sizes,
+            replays.magnitudes(alone)[:, 0],
+            best,
+            episodes=replays.episodes,
+            horizons=replays.horizons,
+            signals=signal_names(bench.simulator.task)[: len(noise)],
+            failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
         ),
         explained=explained_at_end(start_and_actions, residuals[best]),
         fitted_steps=FITTED,

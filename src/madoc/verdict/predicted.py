@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from madoc.calibration.holdout import Predicted, PredictionErrors
+from madoc.calibration.holdout import Predicted
 from madoc.identification import noise as sensors
 from madoc.identification.states import logged_states
 from madoc.verdict.bench import Bench, common_fields, signal_names
 from madoc.verdict.prediction import nearby_best
-from madoc.verdict.statistics import interval_of, prediction_errors, relative_to_first, resampled
+from madoc.verdict.statistics import best_of, prediction_errors, relative_to_first
 from madoc.verdict.systematic import autocorrelation, explained, explained_at_end
 from madoc.verdict.two_sample import replayed, tell_apart
 
@@ -23,20 +23,15 @@ def predicted(bench: Bench, unit: Float[np.ndarray, " d"], interval: Float[np.nd
         unit: The estimate in [-1, 1].
         interval: Its 95 % intervals in physical units, if known.
     """
-    replays = bench.replays
-    nearby, spent = nearby_best(replays, unit)
-    points = np.concatenate([np.zeros((1, len(unit))), unit[None], nearby])
+    replays, mid_range = bench.replays, np.zeros(len(unit))
+    nearby, searching = nearby_best(replays, unit)
+    points = np.concatenate([mid_range[None], unit[None], nearby])
     residuals = replays.residuals(points)
-    size = replays.magnitudes(residuals)
-    means, draws = size.mean((0, -1)), resampled(size.mean(-1), replays.episodes)
-    relative = relative_to_first(means)
-    best = 1 + int(np.argmin(relative[1:]))
+    sizes = replays.magnitudes(residuals)
+    best = best_of(sizes)
     single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
-    floor = replays.magnitudes(noisy)[:, 0]
-    noise_alone = relative_to_first(np.stack([means[0], floor.mean((0, -1))]))[1]
-    low, high = interval_of(relative_to_first(draws)[:, 1])
-    systems = {"the simulator at mid-range": points[0], "the simulator at the best parameters nearby": points[best]}
+    systems = {"the simulator at mid-range": mid_range, "the simulator at the best parameters nearby": points[best]}
     common = common_fields(
         bench,
         unit,
@@ -45,33 +40,27 @@ def predicted(bench: Bench, unit: Float[np.ndarray, " d"], interval: Float[np.nd
         residual=single.size,
         by_model=tuple(bench.against_chance(name, _simulated(bench, point)) for name, point in systems.items()),
         noise=single.noise,
-        control_steps=spent + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps,
-    )
-    signals = signal_names(bench.simulator.task)
-    mid_range, estimate, nearby_error, noise = (
-        prediction_errors(kind, replays.episodes, replays.horizons, signals)
-        for kind in (size[:, 0], size[:, 1], size[:, best], floor)
+        control_steps=searching + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps,
     )
     area_at_mid_range, area_at_estimate = (
         tell_apart(*replayed(replays, bench.scaling, part, noisy[0]), overlap=False) for part in residuals[:2]
     )
-    start_and_actions = np.concatenate(
-        [replays.observation, replays.windows.actions.reshape(len(replays.windows), -1)], axis=1
-    )
+    actions = replays.windows.actions.reshape(len(replays.windows), -1)
     return Predicted(
         **common,
-        errors=PredictionErrors(
-            mid_range=mid_range,
-            estimate=estimate,
-            nearby_best=nearby_error,
-            noise=noise,
-            relative=float(relative[1]),
-            relative_interval=(float(low), float(high)),
-            nearby_relative=float(max(relative[best], min(relative[1], noise_alone))),
-            windows=len(replays.windows),
-            failed_windows=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
+        errors=prediction_errors(
+            sizes,
+            replays.magnitudes(noisy)[:, 0],
+            best,
+            episodes=replays.episodes,
+            horizons=replays.horizons,
+            signals=signal_names(bench.simulator.task),
+            failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
         ),
-        explained=max(single.explained, explained_at_end(start_and_actions, residuals[best])),
+        explained=max(
+            single.explained,
+            explained_at_end(np.concatenate([replays.observation, actions], axis=1), residuals[best]),
+        ),
         autocorrelation=single.autocorrelation,
         area_at_mid_range=area_at_mid_range,
         area_at_estimate=area_at_estimate,
@@ -85,8 +74,8 @@ def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
     """
     if not bench.states_known:
         return sensors.difference_noise(bench.problem.dataset)
-    middle = np.zeros((1, len(bench.simulator.parameters)))
-    points = np.concatenate([middle, nearby_best(bench.replays, middle[0])[0]])
+    mid_range = np.zeros((1, len(bench.simulator.parameters)))
+    points = np.concatenate([mid_range, nearby_best(bench.replays, mid_range[0])[0]])
     sizes = bench.replays.magnitudes(bench.replays.residuals(points)).mean((0, -1))
     best = points[int(np.argmin(relative_to_first(sizes)))]
     return _single_steps(bench, best).noise * bench.change

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import rankdata
 
-from madoc.calibration.holdout import PredictionError
+from madoc.calibration.holdout import PredictionError, PredictionErrors
 
 NEGLIGIBLE = 1e-3
 """Residual in typical changes of a signal in one step. No sensor is as good, and no use of a model notices less."""
@@ -52,22 +52,62 @@ def interval_of(draws: Float[np.ndarray, "resamples *kinds"]) -> Float[np.ndarra
 
 
 def prediction_errors(
+    sizes: Float[np.ndarray, "windows points horizons signals"],
+    floor: Float[np.ndarray, "windows horizons signals"],
+    best: int,
+    *,
+    episodes: Int[np.ndarray, " windows"],
+    horizons: Sequence[int],
+    signals: Sequence[str],
+    failed: int,
+) -> PredictionErrors:
+    """Prediction errors of several points at each horizon, with confidence intervals.
+
+    Args:
+        sizes: Absolute residuals: at mid-range, at the estimate, then at points near it.
+        floor: Absolute residuals that noise alone would leave.
+        best: The point, not mid-range, with the smallest errors.
+        episodes: The episode of each window.
+        horizons: Control steps ahead.
+        signals: Their names.
+        failed: Number of windows that failed in simulation at the estimate.
+    """
+    means, draws = sizes.mean((0, -1)), resampled(sizes.mean(-1), episodes)
+    relative = relative_to_first(means)
+    noise_alone = relative_to_first(np.stack([means[0], floor.mean((0, -1))]))[1]
+    low, high = interval_of(relative_to_first(draws)[:, 1])
+    mid_range, estimate, nearby_best, noise = (
+        _by_horizon(kind, episodes, horizons, signals) for kind in (sizes[:, 0], sizes[:, 1], sizes[:, best], floor)
+    )
+    return PredictionErrors(
+        mid_range=mid_range,
+        estimate=estimate,
+        nearby_best=nearby_best,
+        noise=noise,
+        relative=float(relative[1]),
+        relative_interval=(float(low), float(high)),
+        nearby_relative=float(max(relative[best], min(relative[1], noise_alone))),
+        windows=len(sizes),
+        failed_windows=failed,
+    )
+
+
+def best_of(sizes: Float[np.ndarray, "windows points horizons signals"]) -> int:
+    """The point with the smallest errors; the first, mid-range, is not one of the candidates."""
+    return 1 + int(np.argmin(relative_to_first(sizes.mean((0, -1)))[1:]))
+
+
+def _by_horizon(
     sizes: Float[np.ndarray, "windows horizons signals"],
     episodes: Int[np.ndarray, " windows"],
     horizons: Sequence[int],
     signals: Sequence[str],
 ) -> tuple[PredictionError, ...]:
-    """The mean absolute residual at each horizon, with its confidence interval."""
-    low, high = interval_of(resampled(sizes.mean(-1), episodes))
-    return tuple(
-        PredictionError(
-            horizon,
-            float(sizes[:, index].mean()),
-            (float(low[index]), float(high[index])),
-            dict(zip(signals, sizes[:, index].mean(0).tolist(), strict=True)),
-        )
-        for index, horizon in enumerate(horizons)
-    )
+    low, high = interval_of(resampled(sizes.mean(-1), episodes)).tolist()
+    by_signal = [dict(zip(signals, row, strict=True)) for row in sizes.mean(0).tolist()]
+    means = [float(sizes[:, index].mean()) for index in range(len(horizons))]
+    columns = zip(horizons, means, zip(low, high, strict=True), by_signal, strict=True)
+    return tuple(PredictionError(*row) for row in columns)
 
 
 def relative_to_first(errors: Float[np.ndarray, "*draws points horizons"]) -> Float[np.ndarray, "*draws points"]:
