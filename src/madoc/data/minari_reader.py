@@ -1,4 +1,4 @@
-"""Minari datasets (Younis et al. 2024): a directory of episodes, or the id of one on this machine."""
+"""Minari datasets (Younis et al. 2024): a directory of episodes, or the id of a dataset on this machine."""
 
 import re
 import warnings
@@ -27,7 +27,7 @@ NAMES_HERE = {
 
 
 def recognises(path: Path) -> bool:
-    """Whether the path is a Minari directory, or no path but an id such as `mujoco/hopper/expert-v0`."""
+    """Whether the path is a Minari directory, or an id such as `mujoco/hopper/expert-v0`."""
     if path.exists():
         return _data_directory(path) is not None
     return ID.fullmatch(path.as_posix()) is not None
@@ -73,7 +73,7 @@ def download(dataset_id: str) -> None:
     minari = _import_minari()
     try:
         minari.load_dataset(dataset_id, download=True)
-    except Exception as error:  # whatever the host's client raises is one thing to the user: it did not come
+    except Exception as error:  # the client of the host raises errors of many types
         raise MadocError(
             f"cannot download Minari dataset {dataset_id!r} ({error}); check its id and the network"
         ) from error
@@ -89,8 +89,7 @@ def _import_minari() -> Any:
 
 def _data_directory(path: Path) -> Path | None:
     """The folder with the metadata: the path itself or its `data`."""
-    found = [folder for folder in (path / "data", path) if (folder / "metadata.json").is_file()]
-    return found[0] if found else None
+    return next((folder for folder in (path / "data", path) if (folder / "metadata.json").is_file()), None)
 
 
 def local_directory(path: Path) -> Path:

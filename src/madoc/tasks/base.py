@@ -12,13 +12,10 @@ import mujoco
 from jaxtyping import PRNGKeyArray
 
 from madoc.errors import MadocError
-from madoc.parameters import Parameter, ParameterSpace
+from madoc.parameters import ParameterSpace
 
 Batch = Any
 """A NumPy or JAX array with any leading axes; the functions of a task work on both, so every backend shares them."""
-
-Span = tuple[float, float]
-"""Lower and upper end of a range."""
 
 _MODELS: WeakKeyDictionary[Callable[[], mujoco.MjSpec], mujoco.MjModel] = WeakKeyDictionary()
 """Compiled models by the function that builds their spec; a model is dropped together with its function."""
@@ -31,29 +28,12 @@ def compiled_model(spec: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
     return _MODELS[spec]
 
 
-def healthy_reward(state: Batch, action: Batch, next_state: Batch, healthy: Batch, *, dt: float, cost: float) -> Batch:
-    """Speed along the first coordinate (m/s), 1 where healthy, less `cost` times the squared action."""
-    speed = (next_state[..., 0] - state[..., 0]) / dt
-    return speed + healthy - cost * (action**2).sum(-1)
-
-
 def scaled_friction(spec: Callable[[], mujoco.MjSpec], factor: float) -> mujoco.MjSpec:
     """The spec with every geom's sliding friction times `factor`; a contact takes the larger of its two."""
     changed = spec()
     for geom in changed.geoms:
         geom.friction[0] *= factor
     return changed
-
-
-def paper_space(gravity: Span, masses: dict[str, Span], dampings: dict[str, Span]) -> ParameterSpace:
-    """The paper's kind of box: gravity, masses of bodies (kg), damping of joints (N·m·s/rad), in this order."""
-    return ParameterSpace(
-        (
-            Parameter("gravity", "", *gravity),
-            *(Parameter("body_mass", body, *span) for body, span in masses.items()),
-            *(Parameter("dof_damping", joint, *span) for joint, span in dampings.items()),
-        )
-    )
 
 
 @dataclass(frozen=True)
