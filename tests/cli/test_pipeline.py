@@ -5,8 +5,10 @@ import pytest
 
 from madoc import tasks
 from madoc.calibration import CALIBRATORS
+from madoc.commands.main import _parse
+from madoc.data import Disturbance
 from madoc.errors import MadocError
-from madoc.pipeline import CalibrationOrder, Search, Source, fingerprint, split_name
+from madoc.pipeline import CalibrationOrder, Reading, Search, Source, fingerprint, split_name
 from madoc.pipeline.data_stage import Machine
 from madoc.pipeline.folders import ended, restored_path, stored_path, working_folder
 from madoc.pipeline.keys import seed_key, stage_key
@@ -30,6 +32,18 @@ def test_hyperparameters_are_read_as_what_they_are():
     assert method.starts == "replay"
     assert method.agents.bound == 3.0
     assert hyperparameters(method)["agents"]["bound"] == 3.0
+
+
+def test_what_the_command_line_reads_is_the_order_that_the_pipeline_carries_out():
+    words = "calibrate hopper --data a.npz b.npz --noise 0.1 --hide-velocities --level easy --budget 5 --set updates=2"
+    reading = Reading(disturbance=Disturbance(noise=0.1, hidden_velocities=True))
+    search = Search(level="easy", budget=5, set=(("updates=2",),))
+    expected = CalibrationOrder("hopper", Source(("a.npz", "b.npz"), reading=reading), search)
+    assert _parse(words.split()).order == expected
+    asked = _parse(["selftest", "hopper", "--data", "a.npz"]).order
+    assert (asked.search.method, asked.search.budget, asked.truths) == ("auto", 400_000, 3)
+    with pytest.raises(MadocError, match="--friction"):
+        _parse(["calibrate", "hopper", "--data", "a.npz", "--friction", "1.2"])
 
 
 def test_a_preset_keeps_its_own_values():
