@@ -182,23 +182,16 @@ class Judged(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Predicted(Judged):
-    """The hold-out replayed from logged states: states can be rebuilt from what was logged.
+class JudgedByErrors(Judged):
+    """What the measures that predict the hold-out have in common.
 
     Attributes:
-        errors: Of the replays.
-        explained: Share of the squared residuals at the best parameters nearby that state and action explain.
-        autocorrelation: Of those residuals from step to step.
-        area_at_mid_range: How well a classifier tells replays at mid-range from logged windows.
-        area_at_estimate: The same for replays at the estimate.
+        errors: Of the predictions.
+        explained: Share of the squared residuals at the best parameters nearby that what came before explains.
     """
 
     errors: PredictionErrors
     explained: float
-    autocorrelation: float
-    area_at_mid_range: Area
-    area_at_estimate: Area
-    measure: Literal["predicted"] = "predicted"
 
     @property
     def score(self) -> float:
@@ -212,29 +205,33 @@ class Predicted(Judged):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fitted(Judged):
-    """Stretches of the hold-out predicted from states fitted to the stretches before: velocities are hidden.
+class Predicted(JudgedByErrors):
+    """The hold-out replayed from logged states: states can be rebuilt from what was logged.
 
     Attributes:
-        errors: Of the predictions; a horizon counts control steps behind the fitted stretch.
-        explained: Share of the squared last residuals at the best parameters nearby that readings and actions explain.
+        autocorrelation: Of the residuals at the best parameters nearby, from step to step.
+        area_at_mid_range: How well a classifier tells replays at mid-range from logged windows.
+        area_at_estimate: The same for replays at the estimate.
+    """
+
+    autocorrelation: float
+    area_at_mid_range: Area
+    area_at_estimate: Area
+    measure: Literal["predicted"] = "predicted"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted(JudgedByErrors):
+    """Stretches of the hold-out predicted from states fitted to the stretches before: velocities are hidden.
+
+    A horizon of the errors counts control steps behind the fitted stretch.
+
+    Attributes:
         fitted_steps: Control steps of a fitted stretch.
     """
 
-    errors: PredictionErrors
-    explained: float
     fitted_steps: int
     measure: Literal["fitted"] = "fitted"
-
-    @property
-    def score(self) -> float:
-        """Prediction error over that of mid-range."""
-        return self.errors.relative
-
-    @property
-    def score_interval(self) -> tuple[float, float]:
-        """Its interval."""
-        return self.errors.relative_interval
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,7 +46,7 @@ def holdout(run: Run) -> Section:
             log=True,
         )
         data["legend"] = [(line.colour, line.name) for line in lines]
-    return Section("holdout", title, f"Held out: {held.split}." if held.split else "", data)
+    return Section("holdout", title, f"{held.split[:1].upper()}{held.split[1:]}." if held.split else "", data)
 
 
 def _error_line(name: str, errors: Sequence[PredictionError], colour: str, *, dashed: bool = False) -> Line:
