@@ -76,7 +76,7 @@ class Episodes:
     def reset(self, chosen: Bool[np.ndarray, " rows"], generators: Sequence[np.random.Generator]) -> None:
         """Start the chosen rows at the task's own noise, and at new parameters where a distribution was given.
 
-        Each row draws from its own generator, so an episode does not depend on the other rows.
+        Each row draws from its own generator, so that an episode does not depend on the other rows.
         """
         rows: list[int] = np.flatnonzero(chosen).tolist()
         seeds = np.zeros(len(chosen), dtype=np.uint32)

@@ -3,7 +3,8 @@
 import re
 import warnings
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from madoc.data.validation import as_flags, as_matrix, as_vector, check_lengths,
 from madoc.errors import MadocError
 from madoc.tasks import Task
 from madoc.types import Transitions
+
+if TYPE_CHECKING:
+    from minari import EpisodeData
 
 ID = re.compile(r"[\w-]+(/[\w-]+)*-v\d+")
 # Ant-v5: 27 values of state, then 78 contact forces, which the state determines.
@@ -79,7 +83,7 @@ def download(dataset_id: str) -> None:
         ) from error
 
 
-def _import_minari() -> Any:
+def _import_minari() -> ModuleType:
     try:
         import minari
     except ImportError as error:
@@ -117,7 +121,7 @@ def local_directory(path: Path) -> Path:
     return directory
 
 
-def read_episodes(directory: Path) -> tuple[list[Any], str]:
+def read_episodes(directory: Path) -> tuple[list["EpisodeData"], str]:
     """All episodes, and the id of their environment (empty if not recorded).
 
     Raises:
@@ -149,7 +153,7 @@ def _join(parts: list[np.ndarray], name: str) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _observation(episode: Any, task: Task) -> np.ndarray:
+def _observation(episode: "EpisodeData", task: Task) -> np.ndarray:
     if isinstance(episode.observations, dict | tuple):
         raise MadocError(
             f"expected observations of {task.name} as one array, got a {type(episode.observations).__name__} "

@@ -43,7 +43,8 @@ class Machine:
             MadocError: There is no such robot, or its spec is refused.
         """
         if robots.is_spec_path(name) and physics != "legacy":
-            return cls.of(robots.load(name))
+            robot = robots.load(name)
+            return cls(robot.task, robot)
         return cls(robots.resolve(name, physics))
 
     @classmethod
@@ -54,13 +55,9 @@ class Machine:
             MadocError: The spec names no robot, or keeps one that cannot be made.
         """
         if spec.robot is not None:
-            return cls.of(robots.restore_robot(spec.robot))
+            robot = robots.restore_robot(spec.robot)
+            return cls(robot.task, robot)
         return cls(tasks.make(spec.task, spec.physics or "legacy"))
-
-    @classmethod
-    def of(cls, robot: Robot) -> "Machine":
-        """A robot of one's own that has been read."""
-        return cls(robot.task, robot)
 
     def in_physics(self, physics: str) -> "Machine":
         """The same robot in other physics; one's own has its own alone."""

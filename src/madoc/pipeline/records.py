@@ -99,10 +99,7 @@ class EvaluationRecord:
 
     def to_json(self) -> dict[str, object]:
         """Its fields; the share is left out where it is not known."""
-        fields = asdict(self)
-        return (
-            fields if self.calibrated_percent_of_truth is not None else without(fields, "calibrated_percent_of_truth")
-        )
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -155,8 +152,3 @@ def read_record(kind: type[Record], path: Path) -> Record:
 def read_spec(folder: Path) -> SpecRecord:
     """The `spec.json` of a folder; one with nothing in it where there is no such file."""
     return read_record(SpecRecord, folder / "spec.json") if (folder / "spec.json").exists() else SpecRecord()
-
-
-def without(fields: Mapping[str, object], *names: str) -> dict[str, object]:
-    """A dictionary without some of its keys."""
-    return {name: value for name, value in fields.items() if name not in names}

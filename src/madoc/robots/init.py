@@ -1,4 +1,4 @@
-"""The first spec of a robot: written from its model, with comments that explain every part, and loadable as it is."""
+"""The first spec of a robot, written from its model: it loads as it is, and comments explain every part."""
 
 import os
 import re
@@ -29,7 +29,7 @@ _PARTS = {
 
 
 def write_spec(model: Path, out: Path) -> None:
-    """Write the spec of a model's robot to a new file.
+    """Write a first spec for a model to a new file.
 
     Raises:
         MadocError: The file is there already, the folder is not, or the model cannot be used.
@@ -51,7 +51,7 @@ def write_spec(model: Path, out: Path) -> None:
 
 
 def spec_text(model: Path, out: Path) -> str:
-    """The commented spec of a model's robot, for a file at `out`.
+    """The text of a first spec for a model, with comments, for a file at `out`.
 
     Raises:
         MadocError: The model cannot be read, or nothing in it has a name.
@@ -136,7 +136,7 @@ def _sensors(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _unnamed(model: mujoco.MjModel) -> Iterator[str]:
-    """What cannot be used because it has no name."""
+    """Comments on joints, actuators and sensors that cannot be used because they have no name."""
     for what, count in (("joint", model.njnt), ("actuator", model.nu), ("sensor", model.nsensor)):
         missing = count - len(element_names(model, what))
         if missing:
@@ -168,10 +168,10 @@ def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Itera
 
 
 def _parameters(model: mujoco.MjModel, joints: list[str]) -> Iterator[str]:
-    """Masses, stiffness, damping and friction, gains; friction, gains, and all past the first few, as comments."""
-    found = [*_masses(model), *_stiffness(model, joints), *_of_joints(model, joints), *_gains(model), *_contacts(model)]
+    """Parameters of bodies, joints, actuators and contacts; those less likely to matter are written as comments."""
+    rows = [*_masses(model), *_stiffness(model, joints), *_of_joints(model, joints), *_gains(model), *_contacts(model)]
     active = 0
-    for fields, comment, wanted in found:
+    for fields, comment, wanted in rows:
         active += wanted
         yield f"  {'' if wanted and active <= _ACTIVE else '# '}- {_mapping(**fields)}  # {comment}"
 
@@ -191,7 +191,7 @@ def _masses(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
 
 
 def _stiffness(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
-    """Of joints that have a spring."""
+    """Stiffness of joints that have a spring."""
     for joint in joints:
         index = model.joint(joint).id
         value = float(np.atleast_1d(model.jnt_stiffness[index])[0])
@@ -201,7 +201,7 @@ def _stiffness(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Field
 
 
 def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
-    """Damping and dry friction; a joint that nothing drives or damps may be no joint of the machine, as of a root."""
+    """Damping and dry friction of joints; those neither driven nor damped are comments, as they may be a root's."""
     on_joints = np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     # Through tendons an actuator may drive any joint.
     driven = set(model.actuator_trnid[:, 0]) if model.nu and on_joints.all() else set(range(model.njnt))
@@ -212,7 +212,7 @@ def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Field
                 continue
             dof = model.jnt_dofadr[index]
             value = float(getattr(model, field)[dof])
-            # Where the model says nothing: what would stop the joint, and all that hangs on it, in 0.1 s.
+            # Where the model has none: the damping that would stop the joint and all bodies on it in 0.1 s.
             high = 2 * value if value > 0 else 10 * float(model.dof_M0[dof])
             slide = is_slide(model, index)
             units = ("N·s/m", "N") if slide else ("N·m·s/rad", "N·m")
@@ -242,7 +242,7 @@ def _around(field: str, element: str, value: float) -> Fields:
 
 
 def _round(value: float) -> float:
-    """Two digits: a range is no measurement."""
+    """The value with two digits, which are enough for a range."""
     return float(np.format_float_positional(value, precision=2, fractional=False)) if value > 0 else value
 
 

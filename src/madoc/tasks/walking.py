@@ -42,10 +42,8 @@ def walking_task(
 ) -> Task:
     """A robot of the paper, from Gymnasium's model file.
 
-    Args:
-        name: Name of the task.
+    Args as the attributes of `Task`, and:
         file: A file of Gymnasium's MuJoCo assets.
-        physics: `legacy` or `modern`.
         bodies: Bodies whose mass is calibrated.
         joints: Joints whose damping is calibrated.
         ranges: The box by level; `normal` is the task's own.
@@ -53,12 +51,6 @@ def walking_task(
         velocities: Number of velocities in a state.
         root: Number of leading positions that an observation leaves out.
         clipped: Whether observed velocities are clipped.
-        frame_skip: Physics steps per control step.
-        reward: (state, action, next_state) -> reward.
-        terminated: next_state -> whether the task has ended there.
-        reset_noise: (key, count) -> offsets of the initial state.
-        groups: Number of parameter groups in the paper.
-        reference_returns: Returns of (random, expert) of D4RL.
         total_mass: The model's masses are scaled to this sum in kg.
     """
     spaces = {level: _space(bodies, joints, spans) for level, spans in ranges.items()}
