@@ -11,7 +11,7 @@ from madoc.errors import MadocError
 
 @dataclass(frozen=True)
 class Field:
-    """What may be calibrated: which kind of element it belongs to, its unit and its physical bound.
+    """A kind of parameter: the elements it belongs to, its unit and its physical bound.
 
     Attributes:
         element: `body`, `joint`, `geom`, `actuator` or `signal`; None where it belongs to the whole robot.

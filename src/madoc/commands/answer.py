@@ -26,7 +26,7 @@ EXIT_CODES: Mapping[str, int] = {
     "DATA_REJECTED": 13,
     "NOT_RECOVERABLE": 14,
 }
-"""Exit codes by how a run ended, or by its verdict where it has one; 2 is a refusal."""
+"""Exit codes by the status of a run, or by its verdict where it has one; 2 is a refusal."""
 
 PLACE_NAMES: Mapping[str, str] = {
     "calibrated": "at the calibrated parameters",
@@ -44,7 +44,7 @@ class Answer:
 
     Attributes:
         json: What `--json` prints.
-        text: What is printed without it, one after another.
+        text: What is printed without `--json`, one part after another.
         status: A key of `EXIT_CODES`.
     """
 

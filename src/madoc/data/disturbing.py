@@ -1,4 +1,4 @@
-"""Disturbances: what real logs suffer from, put into clean ones on purpose, and told by the data ever after."""
+"""Disturbances of real logs (noise, hidden velocities, lost order), put into clean data, which remembers them."""
 
 from dataclasses import replace
 
@@ -24,13 +24,13 @@ def disturb(dataset: Dataset, disturbance: Disturbance, task: Task, key: PRNGKey
 
     Args:
         dataset: What to disturb.
-        disturbance: How.
-        task: Its robot, with all that a clean observation shows.
-        key: Randomness of the noise and of the order.
+        disturbance: The noise, hidden velocities and order to put into it.
+        task: The robot, with all values of a clean observation.
+        key: The source of randomness, for the noise and the order.
 
     Raises:
-        MadocError: The data is disturbed in the same way already, the task's velocities cannot be told apart, or they
-            are not to be had from positions.
+        MadocError: The data is disturbed in the same way already, velocities are not the last values of the task's
+            observations, or they cannot be computed from positions.
     """
     _refuse_twice(dataset, disturbance)
     of_noise, of_order = jax.random.split(key)
@@ -47,7 +47,7 @@ def disturb(dataset: Dataset, disturbance: Disturbance, task: Task, key: PRNGKey
 
 
 def observed_task(task: Task, dataset: Dataset) -> Task:
-    """The robot as the data shows it: without hidden velocities, with those that were put in from positions."""
+    """The robot with the observations of the data: without hidden velocities, with those made from positions."""
     known = dataset.disturbance
     if known.velocities == "differences":
         return task if task.velocities else show_velocities(task)
@@ -82,7 +82,7 @@ def _joined(positions: Float[np.ndarray, "*rows positions"], velocities: np.ndar
 def noise_of(
     dataset: Dataset, share: float, key: PRNGKeyArray
 ) -> tuple[Float[np.ndarray, "rows observation"], Float[np.ndarray, "rows observation"]]:
-    """Normal noise for observations and next observations, its deviation a share of each channel's change in a step.
+    """Normal noise for observations and next observations, its standard deviation a share of a step's typical change.
 
     A sensor is read once a step: where a row's next observation is the next row's observation, both carry the same
     noise.
@@ -140,7 +140,7 @@ def _with_observations(dataset: Dataset, shown: slice) -> Dataset:
 
 
 def _shuffle_rows(dataset: Dataset, order: Int[np.ndarray, " rows"]) -> Dataset:
-    """Every row an episode of its own: nothing is known of what came before or after it."""
+    """Make every row an episode of its own, in random order: what came before or after it is lost."""
     starts = np.arange(len(dataset))
     names = dataset.run_names
     if names is not None:
@@ -151,7 +151,7 @@ def _shuffle_rows(dataset: Dataset, order: Int[np.ndarray, " rows"]) -> Dataset:
 
 
 def _shuffle_next_observations(dataset: Dataset, order: Int[np.ndarray, " rows"]) -> Dataset:
-    """Which next observation belongs to which row is lost, and with it the order of the rows."""
+    """Lose which next observation belongs to which row, and with it the order of the rows."""
     loose = _shuffle_rows(dataset, order)
     following = np.asarray(dataset.transitions.next_observation)
     return replace(loose, transitions=replace(loose.transitions, next_observation=following))

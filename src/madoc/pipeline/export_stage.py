@@ -1,4 +1,4 @@
-"""Export as a stage: a finished calibration as files for others' tools."""
+"""Export as a stage: a finished calibration as files for other tools."""
 
 from pathlib import Path
 
@@ -77,7 +77,7 @@ def provenance_of(calibrated: Calibrated) -> Provenance:
 
 
 def _stepping(simulator: Simulator) -> dict[str, object]:
-    """How the model is stepped to move as it was calibrated to."""
+    """How the model must be stepped to move as it was calibrated to."""
     task, steps = simulator.task, simulator.task.frame_skip
     channels = [
         {

@@ -21,9 +21,9 @@ def working_folder(
 
     Args:
         path: The folder.
-        spec: What is asked.
-        resume: Go on with the run it holds.
-        keep: The first file worth keeping: a new folder refused before it has one is taken away again.
+        spec: The settings of the run.
+        resume: Go on with the run that the folder holds.
+        keep: The first file worth keeping: a new folder is deleted if the run is refused before it has that file.
 
     Raises:
         MadocError: As `RunFolder.create` and `RunFolder.open`.

@@ -9,7 +9,7 @@ from madoc.calibration import CalibrationProblem, LeastSquares, Madoc
 from madoc.errors import MadocError
 
 REFINING_EPOCHS = 6
-"""Steps on all windows that least squares usually takes."""
+"""Number of steps on all windows that least squares usually takes."""
 PREPARATION = 1.15
 """Time of a whole run of Madoc over that of its calibrating epochs, as cloning and grouping come first: measured with
 the defaults on Hopper."""
@@ -20,10 +20,10 @@ class Forecast:
     """A method's time, or why it would refuse.
 
     Attributes:
-        method: Its name.
-        seconds: Expected; None where it refuses.
-        control_steps: It would simulate, at most.
-        refusal: A sentence; empty where it does not refuse.
+        method: Name of the method.
+        seconds: Expected duration; None where the method refuses the data.
+        control_steps: The most control steps that it would simulate.
+        refusal: Why it refuses the data; empty where it does not.
     """
 
     method: str
@@ -37,7 +37,7 @@ class Forecast:
 
     @property
     def sentence(self) -> str:
-        """In words."""
+        """The forecast in words."""
         if self.seconds is None:
             return f"{self.method} would refuse: {self.refusal}"
         return f"{self.method}: about {_duration(self.seconds)} for {self.control_steps:,} control steps"
