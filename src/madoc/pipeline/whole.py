@@ -42,6 +42,7 @@ def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = F
     Raises:
         MadocError: The order cannot be carried out.
     """
+    order = replace(order, search=replace(order.search, method=order.search.method or "madoc"))
     if order.data is not None:
         order = replace(order, data=_source(order).absolute().paths[0])
     machine = Machine.named(split_name(order.name)[0], order.search.physics)
