@@ -206,10 +206,10 @@ def _physical(unit_action: Float[np.ndarray, "rows action"], task: Task) -> Floa
 
 
 def refuse_fatal(findings: tuple[Finding, ...]) -> None:
-    """Stop what a fatal finding makes pointless.
+    """Refuse a log that has a fatal finding.
 
     Raises:
-        MadocError: There is one; it is the sentence.
+        MadocError: It has one; its sentence is the message.
     """
     fatal = [finding for finding in findings if finding.level == "fatal"]
     if fatal:

@@ -3,13 +3,13 @@
 import jax
 
 from madoc.calibration import CALIBRATORS
+from madoc.diagnosis.channels import signal_names
 from madoc.errors import MadocError
 from madoc.pipeline.auto_stage import candidates_for
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import make_method
 from madoc.pipeline.orders import AUTO, CalibrationOrder, SelftestOrder
 from madoc.pipeline.preparation import check_order, prepare
-from madoc.verdict.bench import signal_names
 from madoc.verdict.predicted import sensor_noise
 from madoc.verdict.selftest import Selftest, selftest
 

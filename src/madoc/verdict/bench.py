@@ -12,6 +12,7 @@ from sklearn.neighbors import NearestNeighbors
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.holdout import AgainstChance, Area
 from madoc.data import Dataset
+from madoc.diagnosis.channels import signal_names
 from madoc.errors import MadocError
 from madoc.identification.excitation import expected_half_widths
 from madoc.identification.noise import difference_noise
@@ -20,7 +21,6 @@ from madoc.identification.windows import consecutive_rows, evenly
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
-from madoc.tasks import Task
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance, shares_of_ranges
@@ -151,11 +151,6 @@ class Bench:
             noise=difference_noise(self.problem.dataset),
         )
         return tell_apart(self.view.sample(held), self.view.sample(simulated), overlap=True)
-
-
-def signal_names(task: Task) -> tuple[str, ...]:
-    """Names of the values of an observation."""
-    return task.signals or tuple(f"observation[{index}]" for index in range(task.observation_size))
 
 
 class CommonFields(TypedDict):

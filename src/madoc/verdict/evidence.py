@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from madoc.diagnosis.channels import signal_names
 from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, first_rows, longest_fit, readings_at, windows_at
 from madoc.runs.files import replacing
-from madoc.verdict.bench import Bench, signal_names
+from madoc.verdict.bench import Bench
 
 TRACES = 6
 """Largest number of stretches that are drawn."""

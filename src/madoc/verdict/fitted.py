@@ -5,10 +5,11 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.holdout import AgainstChance, Fitted
+from madoc.diagnosis.channels import signal_names
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.losses import loss_slope, scale_of
 from madoc.identification.replay import slopes_at
-from madoc.verdict.bench import Bench, common_fields, signal_names
+from madoc.verdict.bench import Bench, common_fields
 from madoc.verdict.fitted_starts import FITTED, FittedReplays
 from madoc.verdict.statistics import best_of, better_than_chance, prediction_errors
 from madoc.verdict.systematic import explained_at_end

@@ -6,9 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.holdout import Predicted
+from madoc.diagnosis.channels import signal_names
 from madoc.identification import noise as sensors
 from madoc.identification.states import logged_states
-from madoc.verdict.bench import Bench, common_fields, signal_names
+from madoc.verdict.bench import Bench, common_fields
 from madoc.verdict.prediction import nearby_best
 from madoc.verdict.statistics import best_of, prediction_errors, relative_to_first
 from madoc.verdict.systematic import autocorrelation, explained, explained_at_end

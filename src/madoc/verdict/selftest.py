@@ -13,7 +13,7 @@ from madoc.calibration.result import CalibrationResult
 from madoc.data import Dataset, Disturbance, disturb, hide_velocities
 from madoc.data.dataset import starts_after
 from madoc.errors import MadocError
-from madoc.identification.states import logged_states
+from madoc.identification.states import states_of
 from madoc.identification.windows import successive_windows
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import reset_states
@@ -32,7 +32,7 @@ LONGEST = 1000
 
 @dataclass(frozen=True)
 class Planted:
-    """One parameter of one planted truth, the first being 1; `interval` and `covered` where the method says one."""
+    """One parameter of one planted truth, counted from 1; `interval` and `covered` where the method has intervals."""
 
     name: str
     unit: str
@@ -84,31 +84,31 @@ def plant(
 ) -> Dataset:
     """The log as it would be if the simulator at `truth` were the robot: its actions, its starts, its noise.
 
-    From a logged state every `STRETCH` rows; where none can be rebuilt, from resets at the beginning of each episode.
+    Replays begin at a logged state every `STRETCH` rows; where states cannot be rebuilt, at a reset for each episode.
     Every replay is an episode, and ends where its simulation failed or the task ended. Where the log's velocities are
-    differences of its positions, so are the planted ones.
+    finite differences of its positions, so are the planted ones.
 
     Args:
-        dataset: Whose actions.
-        simulator: What is planted in.
-        truth: Physical values.
-        noise: Deviation of the sensors' noise, in their units.
-        key: Of the resets and the noise.
+        dataset: The log whose actions are replayed.
+        simulator: The model.
+        truth: Physical values of its parameters.
+        noise: Standard deviation of the sensors' noise, in their units.
+        key: Randomness of the resets and the noise.
 
     Raises:
         MadocError: Not one row could be simulated.
     """
     of_start, of_noise = jax.random.split(key)
     system, task = simulator.bind(truth[None]), simulator.task
-    if task.state_from_observation is None:
+    states = states_of(dataset, simulator)
+    if states.kind != "exact":
         first = dataset.episode_starts
         lengths = np.minimum(dataset.episode_ends - first, LONGEST)
         state = reset_states(simulator)(of_start, len(first))[None]
     else:
-        states, rows = logged_states(dataset, task)
-        chosen, lengths = successive_windows(dataset, rows, STRETCH)
-        first = rows[chosen]
-        state = system.unbiased(states[None, chosen])
+        chosen, lengths = successive_windows(dataset, states.rows, STRETCH)
+        first = states.rows[chosen]
+        state = system.unbiased(states.states[None, chosen])
     logged = np.asarray(dataset.transitions.action)
     alive, frames = np.ones(len(first), dtype=bool), []
     for step in range(int(lengths.max())):
@@ -161,7 +161,7 @@ def selftest(
     budget: int,
     quiet: bool = True,
 ) -> Selftest:
-    """Plant a truth a key, and calibrate to what it makes of the log with the first method that does not refuse.
+    """Plant one truth for each key, and calibrate to its data with the first method that does not refuse it.
 
     Raises:
         MadocError: Every method refuses, or nothing can be planted.
@@ -176,9 +176,9 @@ def selftest(
         method = _first_willing(methods, problem, of_method)
         result = calibrate(method, problem, key=of_method, budget=budget, quiet=quiet)
         if result.status == "interrupted":
-            raise KeyboardInterrupt  # what was broken off says nothing of the data
+            raise KeyboardInterrupt  # an interrupted calibration says nothing of the data
         if result.status == "diverged":
-            raise MadocError(f"truth {index} could not be looked for: {result.sentence}")
+            raise MadocError(f"truth {index} could not be calibrated to: {result.sentence}")
         name, spent = result.method, spent + result.control_steps
         rows += _rows(result, truth, index)
     worst = {parameter: max(row.percent_of_range for row in rows if row.name == parameter) for parameter in space.names}
