@@ -90,8 +90,8 @@ class Expression:
 
     def affine(self) -> Sum | None:
         """Coefficients and constant where the expression is a weighted sum of what it reads; else None."""
-        found = _affine(self._root)
-        return None if found is None else ({read: weight for read, weight in found[0].items() if weight}, found[1])
+        whole = _affine(self._root)
+        return None if whole is None else ({read: weight for read, weight in whole[0].items() if weight}, whole[1])
 
 
 def parse(text: str, *, names: Collection[str] | None = None) -> Expression:

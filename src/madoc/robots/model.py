@@ -194,12 +194,10 @@ def _mesh_path(name: str, model: Path) -> Path:
     inside = PurePosixPath(bare).parts[1:] if name.startswith("package://") else PurePosixPath(bare).parts
     candidates = [model.parent / bare, *(folder.joinpath(*inside) for folder in model.parents[:3])]
     candidates.append(model.parent / PurePosixPath(bare).name)
-    found = [path for path in candidates if path.is_file()]
-    if not found:
-        raise MadocError(
-            f"{model.name} refers to {name}, which is neither beside it nor in its package; check the path"
-        )
-    return found[0]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise MadocError(f"{model.name} refers to {name}, which is neither beside it nor in its package; check the path")
 
 
 def _from(file: Path, folder: Path) -> str:

@@ -26,41 +26,33 @@ def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
     Raises:
         MadocError: The model lacks an element, a quantity is calibrated twice, or one value would have two units.
     """
-    found: list[Parameter] = []
+    parameters: list[Parameter] = []
     for index, given in enumerate(draft.spec.parameters):
-        place = ("parameters", index)
         _check_elements(draft, model, index)
         parameter = given.parameter(_unit_of(draft, model, index))
-        names = [row.name for row in found]
-        if parameter.name in names:
-            line = draft.document.line(("parameters", names.index(parameter.name)))
-            raise draft.document.error(
-                place, f"the parameter {parameter.name} is on line {line} already; name: one of them"
-            )
-        for other, row in enumerate(found):
-            shared = set(row.elements) & set(parameter.elements) if parameter.elements else {""} - set(row.elements)
-            if FIELDS[row.field].element is not None and parameter.field == row.field and shared:
-                line = draft.document.line(("parameters", other))
-                raise draft.document.error(
-                    place,
-                    f"{parameter.field} of {min(shared)!r} is calibrated by line {line} already; keep one of them",
-                )
-        _check_exclusive(draft, place, parameter, found)
-        found.append(parameter)
-    return ParameterSpace(tuple(found))
+        for other, earlier in enumerate(parameters):
+            _check_distinct(draft, index, parameter, other, earlier)
+        parameters.append(parameter)
+    return ParameterSpace(tuple(parameters))
 
 
-def _check_exclusive(draft: Draft, place: tuple[str, int], parameter: Parameter, found: list[Parameter]) -> None:
-    """Refuse two parameters of one quantity, of which the one written last would win."""
-    pairs = ({"body_mass", "body_mass_and_inertia"}, {"body_inertia", "body_mass_and_inertia"})
-    for other, row in enumerate(found):
-        both = {row.field, parameter.field} in pairs and set(row.elements) & set(parameter.elements)
-        again = row.field == parameter.field and FIELDS[row.field].element is None
-        if both or again:
-            line = draft.document.line(("parameters", other))
-            raise draft.document.error(
-                place, f"{parameter.field} and {row.field} of line {line} are one thing; keep one"
-            )
+def _check_distinct(draft: Draft, index: int, parameter: Parameter, other: int, earlier: Parameter) -> None:
+    """Refuse two parameters of one name or of one quantity, of which the one written last would win."""
+    line = draft.document.line(("parameters", other))
+    shared = set(earlier.elements) & set(parameter.elements)
+    whole_robot = FIELDS[earlier.field].element is None
+    exclusive = ({"body_mass", "body_mass_and_inertia"}, {"body_inertia", "body_mass_and_inertia"})
+    if parameter.name == earlier.name:
+        problem = f"the parameter {parameter.name} is on line {line} already; name: one of them"
+    elif parameter.field == earlier.field and shared:
+        problem = f"{parameter.field} of {min(shared)!r} is calibrated by line {line} already; keep one of them"
+    elif ({earlier.field, parameter.field} in exclusive and shared) or (
+        parameter.field == earlier.field and whole_robot
+    ):
+        problem = f"{parameter.field} and {earlier.field} of line {line} are one thing; keep one"
+    else:
+        return
+    raise draft.document.error(("parameters", index), problem)
 
 
 def _check_elements(draft: Draft, model: mujoco.MjModel, index: int) -> None:
