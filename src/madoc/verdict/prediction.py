@@ -64,9 +64,7 @@ class Replays:
         self, residuals: Float[np.ndarray, "systems windows steps observation"]
     ) -> Float[np.ndarray, "windows systems horizons observation"]:
         """|residual| at the horizons, windows first; a failed window counts as the worst that did not fail."""
-        size = np.abs(residuals[:, :, np.array(self.horizons) - 1])
-        worst = np.maximum(np.nanmax(np.where(np.isfinite(size), size, 0.0), axis=(0, 1)), WORST)
-        return np.moveaxis(np.where(np.isfinite(size), size, worst), 0, 1)
+        return magnitudes(residuals[:, :, np.array(self.horizons) - 1])
 
     def noise_floor(
         self, held: Dataset, unit: Float[np.ndarray, " d"], deviation: Float[np.ndarray, " observation"]
@@ -93,6 +91,15 @@ class Replays:
         """The first step of each window alone."""
         windows = self.windows
         return replace(windows, actions=windows.actions[:, :1], following=windows.following[:, :1])
+
+
+def magnitudes(
+    residuals: Float[np.ndarray, "systems windows horizons channels"],
+) -> Float[np.ndarray, "windows systems horizons channels"]:
+    """|residual|, windows first; a failed window counts as the worst that did not fail, and at least as `WORST`."""
+    size = np.abs(residuals)
+    worst = np.maximum(np.nanmax(np.where(np.isfinite(size), size, 0.0), axis=(0, 1)), WORST)
+    return np.moveaxis(np.where(np.isfinite(size), size, worst), 0, 1)
 
 
 def replays_of(held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " observation"]) -> Replays:
