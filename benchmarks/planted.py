@@ -22,8 +22,9 @@ from ruamel.yaml import YAML
 
 from calibration import commit
 from madoc import robots
-from madoc.pipeline import AUTO_BUDGET, CalibrationOrder, Source, calibrate_auto_in, calibrate_in
+from madoc.pipeline import CalibrationOrder, Search, Source, calibrate_in
 from madoc.pipeline.auto_stage import CANDIDATES
+from madoc.pipeline.preparation import AUTO_BUDGET
 from madoc.robots.document import yaml_text
 
 RESULTS = Path(__file__).parent / "results" / "planted"
@@ -84,7 +85,7 @@ def main() -> None:
     arguments = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     if arguments.coverage:
-        cover(arguments.coverage, round(CANDIDATES[0].most * arguments.budget))
+        cover(arguments.coverage, round(CANDIDATES["least-squares"] * arguments.budget))
         return
     for robot in arguments.robots:
         for situation in arguments.situations:
@@ -113,9 +114,9 @@ def planted(folder: Path, robot: str, situation: str, seed: int, budget: int) ->
         del known["parameters"][WRONG]
     logs = record(folder, machine, truth, noise=NOISE if situation == "noise" else 0.0, seed=seed)
     spec = write(folder / "known.yaml", known)
-    order = CalibrationOrder(task=str(spec), source=Source((str(logs),)), method="auto", budget=budget, seed=seed)
+    order = CalibrationOrder(str(spec), Source((str(logs),)), Search(method="auto", budget=budget, seed=seed))
     start = time.monotonic()
-    result = calibrate_auto_in(folder / "run", order).to_json()
+    result = calibrate_in(folder / "run", order).to_json()
     return {
         "robot": robot,
         "situation": situation,
@@ -147,9 +148,8 @@ def cover(problems: int, budget: int) -> None:
             drawn = space.low + random.uniform(0.15, 0.85, len(space)) * (space.high - space.low)
             truth = dict(zip(space.names, drawn.tolist(), strict=True))
             logs = record(folder, machine, truth, noise=NOISE, seed=problem)
-            source = Source((str(logs),))
-            spec = str(folder / "known.yaml")
-            order = CalibrationOrder(spec, source, method="least-squares", budget=budget, seed=problem)
+            search = Search(method="least-squares", budget=budget, seed=problem)
+            order = CalibrationOrder(str(folder / "known.yaml"), Source((str(logs),)), search)
             result = calibrate_in(folder / "run", order).to_json()
         rows.append({"status": result["status"], "commit": commit(), "parameters": compared(result, truth)})
         covered = [row["covered"] for said in rows for row in said["parameters"].values()]

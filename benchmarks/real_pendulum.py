@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent
 PENDULUM = ROOT.parent / "examples" / "pendulum"
 CALIBRATED_TO, HELD_OUT = "ilqr", ("ddp", "energy_shaping", "sac")
 HORIZON = 20
-SETTINGS = {"horizon": "10", "windows": "400"}
+SETTINGS = ("horizon=10", "windows=400")
 
 
 def main() -> None:
@@ -74,8 +74,7 @@ def calibrated(data: Path, folder: Path) -> dict:
     order = pipeline.CalibrationOrder(
         task=str(PENDULUM / "pendulum.yaml"),
         source=pipeline.Source((str(runs),)),
-        method="least-squares",
-        changes=SETTINGS,
+        search=pipeline.Search(method="least-squares", set=(SETTINGS,)),
         holdout=0.25,
     )
     result = pipeline.calibrate_in(folder / "run", order).to_json()

@@ -10,8 +10,9 @@ from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import madoc.tasks
+from madoc import ENVIRONMENTS
 from madoc.errors import MadocError
-from madoc.gymnasium_environment import ROBOTS, CalibratedVectorEnvironment
+from madoc.gymnasium_environment import CalibratedVectorEnvironment
 from madoc.policies.systems import NormalParameters
 from own_robots import CART_SPEC, write_robot
 
@@ -27,7 +28,7 @@ def spread(task, share=0.1):
     return NormalParameters(task.parameters, task.parameters.middle, np.diag(width**2))
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_spaces_and_metadata_are_those_of_a_vector_environment(name):
     environment = gymnasium.make_vec(f"madoc/{name}", num_envs=COPIES)
     assert isinstance(environment, CalibratedVectorEnvironment)

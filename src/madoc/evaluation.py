@@ -1,6 +1,6 @@
 """Evaluation: returns in a system, the normalized score, the calibration error. No other module reads the truth."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import jax
@@ -42,7 +42,7 @@ class Returns:
 def evaluate(
     policy: Policy,
     simulator: Simulator,
-    parameters: Float[np.ndarray, "*systems parameters"],
+    parameters: Float[np.ndarray, "*systems parameters"] | Mapping[str, float],
     *,
     key: PRNGKeyArray,
     episodes: int = 10,
@@ -51,12 +51,13 @@ def evaluate(
 ) -> Returns:
     """Returns of whole episodes, simulated at the same time; an episode whose simulation fails ends there.
 
-    Each of several systems gets the same number of episodes, at least one and together at least `episodes`. `advance`
-    is called with the number of control steps, of the task's `max_episode_steps`, that have passed.
+    The parameters are physical values of one system, by name or as a vector, or of several, one in each row. Each of
+    several systems gets the same number of episodes, at least one and together at least `episodes`. `advance` is called
+    with the number of control steps, of the task's `max_episode_steps`, that have passed.
     """
     task = simulator.task
     of_start, of_action = jax.random.split(key)
-    system = simulator.bind(np.atleast_2d(parameters))
+    system = simulator.bind(np.atleast_2d(simulator.parameters.vector(parameters)))
     rows = -(-episodes // system.count)
     state = reset_states(simulator)(of_start, system.count * rows).reshape(system.count, rows, -1)
     alive = np.ones((system.count, rows), dtype=bool)

@@ -1,8 +1,7 @@
 """A calibrated simulator as a Gymnasium environment, single and vectorised, to train with other libraries.
 
-Importing this module registers `madoc/Hopper`, `madoc/HalfCheetah`, `madoc/Walker2d` and `madoc/Ant`, for
-`gymnasium.make` and for `gymnasium.make_vec`. Gymnasium 1.0 dropped plugin entry points, but an id can name the module:
-`gymnasium.make("madoc.gymnasium_environment:madoc/Hopper", parameters={...})`.
+`import madoc` registers `madoc/Hopper`, `madoc/HalfCheetah`, `madoc/Walker2d` and `madoc/Ant`, for `gymnasium.make` and
+for `gymnasium.make_vec`; where nobody imports it, the id can: `gymnasium.make("madoc:madoc/Hopper", parameters={...})`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,14 +17,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-import madoc.tasks
-from madoc import robots, simulation
+from madoc import ENVIRONMENTS, robots, simulation
 from madoc.errors import MadocError
 from madoc.simulation.base import System
 from madoc.tasks.base import Task
-
-ROBOTS = {"Hopper": "hopper", "HalfCheetah": "halfcheetah", "Walker2d": "walker2d", "Ant": "ant"}
-"""Environment names and their tasks. The first coordinate of their states is the x position of the torso."""
 
 Information = dict[str, object]
 """The `info` of Gymnasium."""
@@ -66,7 +61,8 @@ class Episodes:
         self._simulator = simulation.make(self.task, threads=threads)
         drawn = parameters is not None and hasattr(parameters, "draw")
         self._distribution: Distribution | None = parameters if drawn else None  # type: ignore[assignment]
-        values = self.task.parameters.middle if drawn else _vector(self.task, parameters)  # type: ignore[arg-type]
+        space = self.task.parameters
+        values = space.middle if drawn or parameters is None else space.vector(parameters)  # type: ignore[arg-type]
         self.parameters = np.tile(values, (rows, 1))
         self.state = np.tile(self._simulator.initial_state, (rows, 1))
         # One system with many rows where all have the same parameters, else one system a row.
@@ -130,7 +126,7 @@ class Episodes:
 
     def position(self) -> dict[str, np.ndarray]:
         """`x_position` of the project's robots, m; empty for others."""
-        return {"x_position": self.state[:, 0].copy()} if self.task.name in ROBOTS.values() else {}
+        return {"x_position": self.state[:, 0].copy()} if self.task.name in ENVIRONMENTS.values() else {}
 
 
 class CalibratedEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -290,19 +286,6 @@ class CalibratedVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         self._ended = self._ended & ~chosen
 
 
-def register() -> None:
-    """Make the robots known to `gymnasium.make` and `make_vec` as `madoc/Hopper` and so on; again is harmless."""
-    for name, task in ROBOTS.items():
-        if f"madoc/{name}" not in gymnasium.registry:
-            gymnasium.register(
-                f"madoc/{name}",
-                entry_point="madoc.gymnasium_environment:CalibratedEnvironment",
-                vector_entry_point="madoc.gymnasium_environment:CalibratedVectorEnvironment",
-                max_episode_steps=madoc.tasks.make(task).max_episode_steps,
-                kwargs={"task": task},
-            )
-
-
 def _of_row(info: Mapping[str, np.ndarray]) -> Information:
     """The info of the only row."""
     return {name: values[0].item() for name, values in info.items()}
@@ -312,20 +295,3 @@ def _masked(info: Mapping[str, np.ndarray], of: Bool[np.ndarray, " num_envs"]) -
     """The info of a vectorised environment: each array, 0 outside the copies it is of, beside their mask."""
     values = {name: np.where(of, array, np.zeros((), array.dtype)) for name, array in info.items()}
     return {**values, **{f"_{name}": of.copy() for name in info}}
-
-
-def _vector(task: Task, parameters: Mapping[str, float] | np.ndarray | None) -> Float[np.ndarray, " parameters"]:
-    if parameters is None:
-        return task.parameters.middle
-    if isinstance(parameters, Mapping):
-        return task.parameters.vector(dict(parameters))
-    values = np.array(parameters, dtype=np.float64)
-    if values.shape != (len(task.parameters),):
-        raise MadocError(
-            f"expected {len(task.parameters)} parameter values for {task.name} "
-            f"({', '.join(task.parameters.names)}), got an array of shape {values.shape}"
-        )
-    return values
-
-
-register()

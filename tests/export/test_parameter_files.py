@@ -4,7 +4,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from madoc.calibration import ParameterEstimate
-from madoc.export import Found, Provenance, save_patch, save_randomization, save_sysid_parameters
+from madoc.export import Exported, Provenance, save_patch, save_randomization, save_sysid_parameters
 from madoc.parameters import Parameter
 from madoc.simulation.mjcf import Change
 
@@ -23,13 +23,13 @@ PROVENANCE = Provenance(
 def found():
     """A mass with an interval, a damping that two joints share, a delay."""
     return [
-        Found(Parameter("body_mass", "cart", 1, 3), ParameterEstimate(2.5, 0.1, 1, 3, "kg", [2.4, 3.2]), (2.0,)),
-        Found(
+        Exported(Parameter("body_mass", "cart", 1, 3), ParameterEstimate(2.5, 0.1, 1, 3, "kg", [2.4, 3.2]), (2.0,)),
+        Exported(
             Parameter("dof_damping", ("left", "right"), 0, 2, label="knees"),
             ParameterEstimate(0.5, 0.5, 0, 2, "N·m·s/rad"),
             (0.4, 0.6),
         ),
-        Found(Parameter("action_delay", "", 0, 0.04), ParameterEstimate(0.01, 0.0, 0, 0.04, "s"), (0.0,)),
+        Exported(Parameter("action_delay", "", 0, 0.04), ParameterEstimate(0.01, 0.0, 0, 0.04, "s"), (0.0,)),
     ]
 
 

@@ -156,9 +156,21 @@ def test_initial_state_and_sizes(hopper):
     assert hopper.bind(np.stack([hopper.parameters.middle] * 4)).count == 4
 
 
-@pytest.mark.parametrize("shape", [(8,), (2, 7), (1, 2, 8)])
-def test_parameters_of_a_wrong_shape_are_refused(hopper, shape):
-    with pytest.raises(MadocError, match=r"expected parameters of shape \(systems, 8\), got \("):
+def test_one_system_by_name_or_as_a_vector(hopper):
+    values = dict(zip(hopper.parameters.names, hopper.parameters.middle.tolist(), strict=True))
+    assert hopper.bind(values).count == hopper.bind(hopper.parameters.middle).count == 1
+
+
+@pytest.mark.parametrize(
+    ("shape", "sentence"),
+    [
+        ((7,), "expected 8 parameter values"),
+        ((2, 7), "expected 8 parameter values"),
+        ((1, 2, 8), r"\(systems, 8\), got"),
+    ],
+)
+def test_parameters_of_a_wrong_shape_are_refused(hopper, shape, sentence):
+    with pytest.raises(MadocError, match=sentence):
         hopper.bind(np.ones(shape))
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
 from madoc.calibration.cautions import exploded, without_repeats
@@ -25,10 +25,10 @@ def calibrate(
     *,
     key: PRNGKeyArray,
     budget: int,
-    truth: Mapping[str, float] | None = None,
+    truth: Mapping[str, float] | Float[np.ndarray, " d"] | None = None,
     folder: RunFolder | None = None,
     resume: bool = False,
-    quiet: bool = True,
+    quiet: bool = False,
     checkpoint_every: float = 30.0,
 ) -> CalibrationResult:
     """Calibrate, and judge the estimate against the truth where that is given.
@@ -38,7 +38,7 @@ def calibrate(
         problem: Data and simulator.
         key: The only source of randomness.
         budget: Simulated control steps, of any kind.
-        truth: The target's physical values by name; only the finished estimate is compared with them.
+        truth: The target's physical values, by name or as a vector; only the finished estimate is compared with them.
         folder: Where to keep logs, checkpoints and `result.json`.
         resume: Go on from the folder's checkpoint.
         quiet: Show no progress.
@@ -48,7 +48,7 @@ def calibrate(
         MadocError: The method refuses the problem, a parameter changes no next state, or `loop.run` refuses.
     """
     space = problem.simulator.parameters
-    true_values = None if truth is None else space.vector(dict(truth))
+    true_values = None if truth is None else space.vector(truth)
     entry = entry_of(method, CALIBRATORS)
     method.init(problem, key)  # a refusal of the method comes before one of the parameters
     probing = refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0)) if entry.simulates else 0

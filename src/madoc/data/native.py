@@ -9,8 +9,9 @@ from typing import TypeVar
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from madoc.data.dataset import Dataset, Disturbance
-from madoc.data.disturbance import observed_task
+from madoc.data.dataset import Dataset
+from madoc.data.disturbance import Disturbance
+from madoc.data.disturbing import observed_task
 from madoc.data.findings import Finding
 from madoc.data.npz import array_names, is_npz, read_arrays
 from madoc.data.validation import NAMES, as_transitions, require_arrays, validate

@@ -197,8 +197,8 @@ class Run:
     def units(self) -> dict[str, str]:
         """Units of signals by name, where the spec of a robot of one's own has them."""
         try:
-            signals = YAML(typ="safe").load(self.spec.robot.spec if self.spec.robot else "") or {}
-            return {row["name"]: str(row["unit"]) for row in signals["signals"] if "unit" in row}
+            spec = YAML(typ="safe").load(self.spec.robot.spec if self.spec.robot else "") or {}
+            return {row["name"]: str(row["unit"]) for row in spec["signals"] if "unit" in row}
         except (YAMLError, KeyError, TypeError):
             return {}
 
@@ -230,8 +230,7 @@ def read_run(path: Path) -> Run:
     if asked.get("command") == "learn":
         raise MadocError(f"{path} holds a policy, not a calibration; name the run folder it was learnt from")
     shown = {name: value for name, value in asked.items() if name not in ("versions", "robot")}
-    text = yaml_text(shown, width=80)
-    spec = _typed(Spec, asked | {"text": text}, folder / "spec.json")
+    spec = _typed(Spec, asked | {"text": yaml_text(shown, width=80)}, folder / "spec.json")
     ended = _object(folder / "result.json")
     result = CalibrationResult.from_json(ended) if "parameters" in ended else None
     method = _folder_of_method(folder, result.holdout.chosen if result and result.holdout else None)

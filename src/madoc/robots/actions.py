@@ -61,7 +61,10 @@ def action_channel(draft: Draft, model: mujoco.MjModel, index: int) -> ActionCha
     """
     action = draft.spec.actions[index]
     name = action.actuator or action.name
-    actuator = int(model.actuator(name).id)
+    actuators = [model.actuator(number).name for number in range(model.nu)]
+    if name not in actuators:  # MuJoCo leaves out an actuator whose target is missing
+        raise draft.document.unknown(("actions", index, "actuator"), "the name of an actuator", name, actuators)
+    actuator = actuators.index(name)
     low, high = action.low, action.high
     if low is None or high is None:
         if not model.actuator_ctrllimited[actuator]:

@@ -1,5 +1,6 @@
 """What a simulator backend provides: a simulator binds parameters, and the systems it returns step states."""
 
+from collections.abc import Mapping
 from typing import Protocol
 
 import mujoco
@@ -65,8 +66,8 @@ class Simulator(Protocol):
         """Time between two actions in s."""
         ...
 
-    def bind(self, parameters: Float[np.ndarray, "systems parameters"]) -> System:
-        """Dynamics at the given physical values, one system for each row."""
+    def bind(self, parameters: Float[np.ndarray, "*systems parameters"] | Mapping[str, float]) -> System:
+        """Dynamics at physical values: those of one system, by name or as a vector, or of one system in each row."""
         ...
 
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:

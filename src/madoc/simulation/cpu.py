@@ -2,7 +2,7 @@
 
 import copy
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import mujoco
@@ -72,14 +72,17 @@ class CpuSimulator:
         """Seconds per control step."""
         return float(self._model.opt.timestep) * self.task.frame_skip
 
-    def bind(self, parameters: Float[np.ndarray, "systems parameters"]) -> "CpuSystem":
-        """Copy the model once for each row of physical values and write them into it.
+    def bind(self, parameters: Float[np.ndarray, "*systems parameters"] | Mapping[str, float]) -> "CpuSystem":
+        """Copy the model once for each system, and write the system's physical values into it.
+
+        Args:
+            parameters: Values of one system, by name or as a vector, or of several, one in each row.
 
         Raises:
             MadocError: Values are not finite, not one per parameter, or below a physical bound.
         """
-        values = np.asarray(parameters, dtype=np.float64)
-        if values.ndim != 2 or values.shape[1] != len(self.parameters):
+        values = np.atleast_2d(self.parameters.vector(parameters))
+        if values.ndim != 2:
             raise MadocError(f"expected parameters of shape (systems, {len(self.parameters)}), got {values.shape}")
         if not np.isfinite(values).all():
             raise MadocError("expected finite parameters, got NaN or infinity")
