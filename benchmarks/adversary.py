@@ -27,7 +27,7 @@ from adversary_cases import CASES, Case, Problem, write
 
 RESULTS = Path(__file__).parent / "results" / "adversary"
 LIMIT = 300.0
-"""s, of one command of the tool; it is stopped beyond that."""
+"""s, of one command of the tool; it is stopped beyond that, and what its first method said is kept."""
 HARMLESS = 0.005
 """Share of a parameter's range; an interval that misses the truth by less is counted, and marked as a near miss."""
 
@@ -103,9 +103,14 @@ def run(case: Case, problem: Problem, *, limit: float, check: bool) -> dict[str,
     started = time.monotonic()
     code, result, error = madoc("calibrate", *asked, "--holdout", "0.2", "--out", str(out), limit=limit)
     seconds = round(time.monotonic() - started, 1)
+    # Where one method does not explain the log, the tool goes on to a slower one; the first one's answer is kept here.
+    first = out / "least-squares" / "result.json"
+    if code is None and first.exists():
+        result = json.loads(first.read_text())
     verdict = result.get("verdict") or {}
     answer: dict[str, Any] = {
         "exit_code": code,
+        "stopped": code is None,
         "verdict": verdict.get("word", "TIME_LIMIT" if code is None else "REFUSED"),
         "sentence": verdict.get("sentence") or error,
         "causes": verdict.get("causes", []),
@@ -167,6 +172,8 @@ def misses(result: dict[str, Any]) -> list[str]:
 def outcome(result: dict[str, Any]) -> str:
     """`false CALIBRATED`, `false alarm`, `unnamed` (invisible and not named), or what was said rightly."""
     word = result["verdict"]
+    if result["verdict"] == "TIME_LIMIT":
+        return word
     if result["invisible"]:
         return f"{word}, named" if named(result, everything=True) else "unnamed"
     if result["honest"]:
@@ -203,6 +210,7 @@ def table(results: list[dict[str, Any]]) -> str:
         f"| cause named in the verdict's sentence | {sum(map(named, deceptions))} | {len(deceptions)} |",
         f"| invisible, and not named anywhere | {count(invisible, 'unnamed')} | {len(invisible)} |",
         f"| false alarms | {len(alarms)} | {len(honest)} |",
+        f"| stopped at the time limit | {sum(result['stopped'] for result in results)} | {len(results)} |",
         f"| refusals of deceptions | {refusals(deceptions)} | {len(deceptions)} |",
         f"| refusals of honest cases | {refusals(honest)} | {len(honest)} |",
         f"| intervals that hold, honest cases | {coverage(honest)} |",
@@ -239,8 +247,8 @@ def count(results: Iterable[dict[str, Any]], what: str) -> int:
 
 
 def refusals(results: Iterable[dict[str, Any]]) -> int:
-    """How many the tool refused or did not finish."""
-    return sum(result["verdict"] in ("REFUSED", "TIME_LIMIT") for result in results)
+    """How many the tool refused to calibrate."""
+    return sum(result["verdict"] == "REFUSED" for result in results)
 
 
 def largest_miss(result: dict[str, Any]) -> float:
@@ -261,8 +269,8 @@ def seconds(results: list[dict[str, Any]]) -> str:
 
 
 def words(results: Iterable[dict[str, Any]]) -> str:
-    """The verdicts of several seeds."""
-    return ", ".join(sorted({result["verdict"] for result in results}))
+    """The verdicts of several seeds; a `…` marks those of a first method, where a second ran into the time limit."""
+    return ", ".join(sorted({result["verdict"] + " …" * result["stopped"] for result in results}))
 
 
 if __name__ == "__main__":

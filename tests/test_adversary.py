@@ -27,7 +27,7 @@ def short(case):
 def answer(case, word, *, miss=0.0, sentence="", check=()):
     return {
         **{"case": case.key, "robot": case.robot.name, "kind": case.kind, "commit": "0", "seconds": 1.0},
-        **{"honest": case.honest, "invisible": case.invisible, "cause": case.cause, "verdict": word},
+        **{"honest": case.honest, "invisible": case.invisible, "cause": case.cause, "verdict": word, "stopped": False},
         **{"sentence": sentence, "causes": [], "warnings": [], "check": list(check)},
         "parameters": {"friction_elbow": {"miss": miss}},
     }

@@ -195,7 +195,7 @@ class Case:
         plant: What the machine does.
         log: How it is logged.
         spec: What the user says of it.
-        cause: Words of which one must stand in the verdict, separated by |; empty for an honest case.
+        cause: Regular expression, in small letters, of which the verdict must hold a match; empty for an honest case.
         invisible: Whether no data can show that something is wrong, so that it can only be named.
     """
 

@@ -5,24 +5,24 @@ from adversary_cases.robots import ARM, BALL, BOX, CART, HULL, LEG, PENDULUM
 
 FRICTION = "friction"
 DRAG = "drag"
-LATE = "delay|lag|late"
-RATE = "rate|spacing|rows are|time step|control_step"
-SIGN = "sign"
-UNIT = "degree|unit"
-COLUMNS = "swap|exchange|columns|other signal|other action"
+LATE = r"delay|\blags?\b|\blate\b"
+RATE = r"\brates?\b|spacing|rows are|time steps?\b|control_step"
+SIGN = r"\bsigns?\b|reversed|inverted"
+UNIT = r"degree|\bunits?\b"
+COLUMNS = "swap|exchange|other signal|other action|other joint"
 GRAVITY = "gravity|constant"
-INERTIA = "inertia|mass|payload"
+INERTIA = r"inertia|\bmass\b|payload"
 SPRING = "spring|stiffness"
-OFFSET = "offset|bias|constant"
-GEAR = "gear|gain|scale"
-RANGE = "outside|end of its range|ends of their ranges|beyond"
-LOOSE = "elastic|flexib|backlash|play|second mass|spring"
+OFFSET = r"offset|\bbias|constant"
+GEAR = r"\bgear|\bgains?\b|\bscale"
+RANGE = "outside|ends? of (its|their|the) range|beyond"
+LOOSE = r"elastic|flexib|backlash|\bplay\b|second mass|spring"
 LIMIT = "saturat|limit|clip"
-DRIFT = "drift|runs differ|between runs|thirds|change over"
-CLOCK = "clock|drift|spacing|rate"
-FORCE = "constant|wind|force|offset|bias"
-CONTACT = "contact|wall|collision"
-BASE = "base|acceleration|periodic"
+DRIFT = r"drift|runs differ|between runs|\bthirds\b|change over"
+CLOCK = r"clock|drift|spacing|\brates?\b"
+FORCE = r"constant|wind|external|offset|\bbias"
+CONTACT = r"contact|\bwall|collision"
+BASE = r"\bbase\b|accelerat|periodic"
 
 POSITIONS = Log(velocities="none")
 NOISY = Log(noise=0.02)
@@ -84,7 +84,9 @@ _PENDULUM = (
     Case(PENDULUM, "drift-friction", Plant(by_run=tuple({"friction": f} for f in (0.2, 0.1, 0.0))), cause=DRIFT),
     Case(PENDULUM, "filtered-speed", log=Log(velocities="filtered"), cause=LATE),
     Case(PENDULUM, "clock-drift", Plant(drift=0.08), Log(nominal_time=True), cause=CLOCK),
-    Case(PENDULUM, "dropped-rows", log=Log(nominal_time=True, dropped=0.03), cause="dropped|missing rows|" + CLOCK),
+    Case(
+        PENDULUM, "dropped-rows", log=Log(nominal_time=True, dropped=0.03), cause="dropped|missing rows|lost|" + CLOCK
+    ),
     Case(PENDULUM, "clipped-speed", log=Log(clip={"hinge_speed": 3.0}), cause=LIMIT),
     Case(PENDULUM, "base-sways", Plant(sway=1.5), cause=BASE),
     Case(PENDULUM, "contact", Plant({"wall": 0.7}), cause=CONTACT),
