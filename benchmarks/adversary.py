@@ -28,6 +28,8 @@ from adversary_cases import CASES, Case, Problem, write
 RESULTS = Path(__file__).parent / "results" / "adversary"
 LIMIT = 300.0
 """s, of one command of the tool; it is stopped beyond that, and what its first method said is kept."""
+PATIENCE = 5.0
+"""s, that a command may still take after its first method's answer, where only that is asked for."""
 HARMLESS = 0.005
 """Share of a parameter's range; an interval that misses the truth by less is counted, and marked as a near miss."""
 
@@ -44,6 +46,9 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--without-check", action="store_true", help="run `madoc calibrate` alone")
+    parser.add_argument(
+        "--first-answer", action="store_true", help="stop where the tool goes on to a second, much slower method"
+    )
     parser.add_argument("--table", action="store_true", help="print the summary of what is there, and run nothing")
     arguments = parser.parse_args()
     if arguments.table:
@@ -59,6 +64,7 @@ def main() -> None:
         commit=measured_commit(),
         limit=arguments.limit,
         check=not arguments.without_check,
+        first_answer=arguments.first_answer,
     )
     with ThreadPoolExecutor(arguments.jobs) as pool:
         for line in pool.map(lambda pair: work(*pair), cells):
@@ -82,29 +88,31 @@ def begins_with(key: str, name: str) -> bool:
     return key == name if name in CASES else key.startswith(name)
 
 
-def cell(case: Case, seed: int, *, folder: Path, commit: str, limit: float, check: bool) -> str:
+def cell(
+    case: Case, seed: int, *, folder: Path, commit: str, limit: float, check: bool, first_answer: bool = False
+) -> str:
     """Run one case unless its file is there; a line of what came out."""
     path = folder / f"{case.key}-{seed}.json"
     if path.exists():
         return ""
     with tempfile.TemporaryDirectory() as temporary:
         problem = write(case, seed, Path(temporary))
-        answer = run(case, problem, limit=limit, check=check)
+        answer = run(problem, limit=limit, check=check, first_answer=first_answer)
     known = {"case": case.key, "robot": case.robot.name, "kind": case.kind, "seed": seed, "commit": commit}
     known |= {"honest": case.honest, "invisible": case.invisible, "cause": case.cause}
     path.write_text(json.dumps(known | answer, indent=1, ensure_ascii=False) + "\n")
     return f"{case.key} {seed}: {outcome(known | answer)}, {answer['seconds']} s"
 
 
-def run(case: Case, problem: Problem, *, limit: float, check: bool) -> dict[str, Any]:
+def run(problem: Problem, *, limit: float, check: bool, first_answer: bool) -> dict[str, Any]:
     """What the tool says of a problem, beside the truth."""
     out = problem.spec.parent / "out"
     asked = [str(problem.spec), "--data", str(problem.logs), "--json", "--quiet"]
-    started = time.monotonic()
-    code, result, error = madoc("calibrate", *asked, "--holdout", "0.2", "--out", str(out), limit=limit)
-    seconds = round(time.monotonic() - started, 1)
     # Where one method does not explain the log, the tool goes on to a slower one; the first one's answer is kept here.
     first = out / "least-squares" / "result.json"
+    enough, started = first if first_answer else None, time.monotonic()
+    code, result, error = madoc("calibrate", *asked, "--holdout", "0.2", "--out", str(out), limit=limit, enough=enough)
+    seconds = round(time.monotonic() - started, 1)
     if code is None and first.exists():
         result = json.loads(first.read_text())
     verdict = result.get("verdict") or {}
@@ -130,17 +138,30 @@ def run(case: Case, problem: Problem, *, limit: float, check: bool) -> dict[str,
     return answer
 
 
-def madoc(*words: str, limit: float) -> tuple[int | None, dict[str, Any], str]:
-    """Exit code (None beyond the limit), the JSON object that was printed, and the last line of standard error."""
+def madoc(*words: str, limit: float, enough: Path | None = None) -> tuple[int | None, dict[str, Any], str]:
+    """Exit code (None if stopped), the JSON object that was printed, and the last line of standard error.
+
+    The command is stopped beyond the limit, or `PATIENCE` after there is a verdict in the file `enough`.
+    """
+    with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen([sys.executable, "-m", "madoc", *words], stdout=output, stderr=errors)
+        end = time.monotonic() + limit
+        while process.poll() is None and time.monotonic() < end:
+            if enough and enough.exists() and '"verdict"' in enough.read_text():
+                end, enough = min(end, time.monotonic() + PATIENCE), None
+            time.sleep(0.2)
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+            return None, {}, "stopped"
+        output.seek(0)
+        errors.seek(0)
+        text, complaint = output.read(), errors.read()
     try:
-        done = subprocess.run([sys.executable, "-m", "madoc", *words], capture_output=True, text=True, timeout=limit)
-    except subprocess.TimeoutExpired:
-        return None, {}, f"stopped after {limit:g} s"
-    try:
-        printed = json.loads(done.stdout)
+        printed = json.loads(text)
     except json.JSONDecodeError:
         printed = {}
-    return done.returncode, printed, printed.get("error") or done.stderr.strip().rpartition("\n")[2]
+    return process.returncode, printed, printed.get("error") or complaint.strip().rpartition("\n")[2]
 
 
 def compared(row: dict[str, Any], truth: tuple[float, float]) -> dict[str, Any]:
@@ -210,7 +231,7 @@ def table(results: list[dict[str, Any]]) -> str:
         f"| cause named in the verdict's sentence | {sum(map(named, deceptions))} | {len(deceptions)} |",
         f"| invisible, and not named anywhere | {count(invisible, 'unnamed')} | {len(invisible)} |",
         f"| false alarms | {len(alarms)} | {len(honest)} |",
-        f"| stopped at the time limit | {sum(result['stopped'] for result in results)} | {len(results)} |",
+        f"| stopped in a second method or at the limit | {sum(result['stopped'] for result in results)} | {len(results)} |",
         f"| refusals of deceptions | {refusals(deceptions)} | {len(deceptions)} |",
         f"| refusals of honest cases | {refusals(honest)} | {len(honest)} |",
         f"| intervals that hold, honest cases | {coverage(honest)} |",
@@ -269,7 +290,7 @@ def seconds(results: list[dict[str, Any]]) -> str:
 
 
 def words(results: Iterable[dict[str, Any]]) -> str:
-    """The verdicts of several seeds; a `…` marks those of a first method, where a second ran into the time limit."""
+    """The verdicts of several seeds; a `…` marks those of a first method, where a second was stopped."""
     return ", ".join(sorted({result["verdict"] + " …" * result["stopped"] for result in results}))
 
 

@@ -136,11 +136,10 @@ def test_the_table_counts():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", ["pendulum.plain", "cart.plain", "pendulum.range-far"])
+@pytest.mark.parametrize("key", ["pendulum.plain", "cart.plain"])
 def test_the_tool_is_run_and_its_answer_kept(key, tmp_path):
     line = adversary.cell(CASES[key], 0, folder=tmp_path, commit="0", limit=200.0, check=True)
     kept = json.loads((tmp_path / f"{key}-0.json").read_text())
     assert key in line
-    assert kept["exit_code"] in (0, 10, 11, 12, 13)
-    assert (kept["verdict"] == "CALIBRATED") == CASES[key].honest
+    assert (kept["exit_code"], kept["verdict"]) == (0, "CALIBRATED")
     assert adversary.cell(CASES[key], 0, folder=tmp_path, commit="0", limit=200.0, check=True) == ""
