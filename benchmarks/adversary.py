@@ -231,7 +231,7 @@ def table(results: list[dict[str, Any]]) -> str:
         f"| cause named in the verdict's sentence | {sum(map(named, deceptions))} | {len(deceptions)} |",
         f"| invisible, and not named anywhere | {count(invisible, 'unnamed')} | {len(invisible)} |",
         f"| false alarms | {len(alarms)} | {len(honest)} |",
-        f"| stopped in a second method or at the limit | {sum(result['stopped'] for result in results)} | {len(results)} |",
+        f"| stopped in a second method or at the limit | {sum(r['stopped'] for r in results)} | {len(results)} |",
         f"| refusals of deceptions | {refusals(deceptions)} | {len(deceptions)} |",
         f"| refusals of honest cases | {refusals(honest)} | {len(honest)} |",
         f"| intervals that hold, honest cases | {coverage(honest)} |",
