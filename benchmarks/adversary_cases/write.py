@@ -7,7 +7,7 @@ import numpy as np
 import yaml
 
 from adversary_cases.case import Case
-from adversary_cases.plant import Run, control_step, record, truth_of
+from adversary_cases.plant import Run, control_step, limits_of, record, truth_of
 
 DEGREES = 180.0 / np.pi
 
@@ -88,32 +88,37 @@ def spec_of(case: Case) -> dict[str, object]:
 
 def logged(case: Case, runs: list[Run], random: np.random.Generator) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Time and columns of each run as its logger writes them."""
-    log, robot = case.log, case.robot
+    log, nominal = case.log, control_step(case)
     tables = []
     for run in runs:
-        positions = np.array([signal.kind == "position" for signal in robot.signals])
-        signals = run.signals.copy()
-        signals[:, ~positions] = velocities(case, run.time, signals)
-        half = np.array([(action.high - action.low) / 2 for action in robot.actions])
-        commands = run.commands + log.action_noise * half * random.standard_normal(run.commands.shape)
-        lows, highs = (np.array([getattr(action, end) for action in robot.actions]) for end in ("low", "high"))
-        table = {
-            signal.name: column * (DEGREES if log.degrees else 1.0)
-            for signal, column in zip(robot.signals, signals.T, strict=True)
-            if signal.kind == "position" or log.velocities != "none"
-        }
-        table |= dict(zip((action.name for action in robot.actions), np.clip(commands, lows, highs).T, strict=True))
-        table = {name: altered(case, name, column) for name, column in table.items()}
-        if log.swap:
-            first, second = log.swap
-            table |= {first: table[second], second: table[first]}
-        nominal = control_step(case)
+        table = columns_of(case, run, random)
         time = nominal * np.arange(len(run.time)) if log.nominal_time else run.time
         time = time + log.jitter * nominal * random.uniform(-0.5, 0.5, len(time))
         kept = random.random(len(time)) >= log.dropped
         time = time[: kept.sum()] if log.nominal_time else time[kept]
         tables.append((time, {name: column[kept] for name, column in table.items()}))
     return tables
+
+
+def columns_of(case: Case, run: Run, random: np.random.Generator) -> dict[str, np.ndarray]:
+    """Signals and commands of a run by the names of their columns."""
+    log, robot = case.log, case.robot
+    positions = np.array([signal.kind == "position" for signal in robot.signals])
+    signals = run.signals.copy()
+    signals[:, ~positions] = velocities(case, run.time, signals)
+    low, high = limits_of(robot)
+    commands = run.commands + log.action_noise * (high - low) / 2 * random.standard_normal(run.commands.shape)
+    table = {
+        signal.name: column * (DEGREES if log.degrees else 1.0)
+        for signal, column in zip(robot.signals, signals.T, strict=True)
+        if signal.kind == "position" or log.velocities != "none"
+    }
+    table |= {action.name: column for action, column in zip(robot.actions, np.clip(commands, low, high).T, strict=True)}
+    table = {name: altered(case, name, column) for name, column in table.items()}
+    if log.swap:
+        first, second = log.swap
+        table |= {first: table[second], second: table[first]}
+    return table
 
 
 def velocities(case: Case, time: np.ndarray, signals: np.ndarray) -> np.ndarray:
