@@ -27,6 +27,7 @@ from madoc.evaluation import evaluate
 from madoc.pipeline.methods import make_method, parse_settings
 from madoc.policies import LEARNERS, NormalParameters, PolicyProblem, UniformParameters, learn_policy
 from madoc.simulation.cpu import CpuSimulator
+from madoc.types import entry_of
 
 RESULTS = Path(__file__).parent / "results" / "policies"
 
@@ -51,7 +52,8 @@ def main() -> None:
     RESULTS.mkdir(parents=True, exist_ok=True)
     for robot, name, seed in product(arguments.robots, arguments.methods, arguments.seeds):
         method = make_method(LEARNERS, name, parse_settings(arguments.set))
-        for at in arguments.at if method.needs_parameters else ["-"]:
+        entry = entry_of(method, LEARNERS)
+        for at in arguments.at if entry.needs_parameters else ["-"]:
             where = f"{at}-{arguments.calibrator}" if at in ("calibrated", "distribution") else at
             words = [robot, name, *([where] if at != "-" else []), arguments.budget, *arguments.set, seed]
             path = RESULTS / ("-".join(map(str, words)).replace(" ", "") + ".json")
@@ -64,7 +66,7 @@ def main() -> None:
                 "calibrator": arguments.calibrator if where != at else None,
                 "seed": seed,
                 "budget": arguments.budget,
-                "unit": method.unit,
+                "unit": entry.unit,
                 "set": arguments.set,
                 "commit": revision,
             }
@@ -80,7 +82,7 @@ def run(method, robot: str, at: str, arguments: argparse.Namespace, seed: int) -
     simulator = CpuSimulator(tasks.make(robot, "legacy"), threads=arguments.threads)
     truth = simulator.parameters.vector(paper_truth(robot))
     dataset = None
-    if method.needs_data:
+    if entry_of(method, LEARNERS).needs_data:
         dataset = recorded(simulator.task, "medium", arguments.transitions, arguments.folder)
         dataset = replace(dataset, true_parameters=None)
     name = f"{robot}-medium-{arguments.calibrator}-{seed}.json"

@@ -169,7 +169,7 @@ def learner_update(name: str, problem: PolicyProblem, width: int) -> float:
                 state.learning, seen, problem.logged, problem.features, key, count
             )
         else:
-            logged = problem.logged if method.needs_data else None
+            logged = problem.logged if method.cloning is not None else None
             run = lambda: method._update(state.learner, seen, logged, key, count)  # noqa: E731
     return (
         best_of(lambda: jax.block_until_ready([leaf for leaf in jax.tree.leaves(run()) if eqx.is_array(leaf)]))[0]

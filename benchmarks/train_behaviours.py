@@ -40,11 +40,12 @@ def main() -> None:
     folder = arguments.out / arguments.robot
     folder.mkdir(parents=True, exist_ok=True)
     state = learner.init(problem, jax.random.key(arguments.seed))
-    started, kept = time.monotonic(), 0
+    started, kept, acted = time.monotonic(), 0, 0
     with (folder / "ladder.jsonl").open("w") as ladder:
-        while learner.control_steps(state) < arguments.steps:
-            state, _ = learner.step(problem, state)
-            if learner.control_steps(state) < (kept + 1) * arguments.every:
+        while acted < arguments.steps:
+            state, epoch = learner.step(problem, state)
+            acted += epoch.control_steps
+            if acted < (kept + 1) * arguments.every:
                 continue
             kept += 1
             policy = learner.policy(state)
@@ -54,7 +55,7 @@ def main() -> None:
             np.savez(folder / f"{kept:04d}.npz", *[np.asarray(leaf) for leaf in leaves])
             row = {
                 "snapshot": kept,
-                "control_steps": learner.control_steps(state),
+                "control_steps": acted,
                 "seconds": round(time.monotonic() - started),
                 "deterministic": returns.summary(),
                 "sampled": sampled.summary(),

@@ -5,13 +5,13 @@ from pathlib import Path
 
 from packaging.specifiers import SpecifierSet
 
-LOCK = Path(__file__).parents[1] / "requirements.lock"
+LOCKS = [Path(__file__).parents[1] / name for name in ("requirements.lock", "requirements-dev.lock")]
 OLDEST = "3.11.0"
 
 
 def locked():
-    """Name and version of every line."""
-    return [line.split("==") for line in LOCK.read_text().splitlines()]
+    """Name and version of every line, of what runs Madoc and of what develops it."""
+    return [line.split("==") for lock in LOCKS for line in lock.read_text().splitlines()]
 
 
 def test_locked_packages_take_the_oldest_python():
@@ -23,4 +23,6 @@ def test_locked_packages_take_the_oldest_python():
 
 def test_the_lock_names_versions_and_no_address():
     assert all(len(parts) == 2 and all(parts) for parts in locked())
-    assert not any(mark in LOCK.read_text() for mark in "/@:")
+    assert not any(mark in lock.read_text() for lock in LOCKS for mark in "/@:")
+    names = [name.lower() for name, _ in locked()]
+    assert len(set(names)) == len(names)

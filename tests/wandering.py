@@ -12,6 +12,7 @@ import numpy as np
 
 from madoc.runs.loop import run
 from madoc.runs.run_folder import RunFolder
+from madoc.types import Epoch
 
 BUDGET = 600
 SPEC = {"method": "wander", "hyperparameters": {"scale": 1.0}, "seed": 0, "budget": BUDGET}
@@ -19,7 +20,7 @@ SPEC = {"method": "wander", "hyperparameters": {"scale": 1.0}, "seed": 0, "budge
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["position", "sum", "buffer", "key", "epoch", "steps", "function"],
+    data_fields=["position", "sum", "buffer", "key", "epoch", "function"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -29,7 +30,6 @@ class Walk:
     buffer: np.ndarray
     key: jax.Array
     epoch: int
-    steps: int
     function: object
 
 
@@ -47,7 +47,7 @@ class Wander:
     converged_epoch: int = 10**9
 
     def init(self, problem, key):
-        return Walk(jnp.zeros(4), np.zeros(4), np.zeros((64, 4), np.float32), key, 0, 0, jnp.tanh)
+        return Walk(jnp.zeros(4), np.zeros(4), np.zeros((64, 4), np.float32), key, 0, jnp.tanh)
 
     def step(self, problem, state):
         time.sleep(self.seconds)
@@ -55,6 +55,7 @@ class Wander:
         position = move(state.position, use)
         mean = float(position.mean())
         state.buffer[state.epoch % 64] = position  # in place, as a replay buffer does
+        clones = state.epoch < self.cloning
         bad = state.epoch == self.bad_epoch
         if bad and self.bad_place == "state":
             position = position * jnp.nan
@@ -64,24 +65,15 @@ class Wander:
             sum=state.sum + np.asarray(position, np.float64),
             key=key,
             epoch=state.epoch + 1,
-            steps=state.steps + (0 if state.epoch < self.cloning else 10),
         )
-        return state, {
-            "mean": float("nan") if bad and self.bad_place == "metric" else mean,
-            "epoch": state.epoch,
-        }
-
-    def control_steps(self, state):
-        return state.steps
-
-    def stage(self, state):
-        return "cloning" if state.epoch < self.cloning else "learning"
-
-    def progress(self, state, budget):
-        return (state.epoch + state.steps) / (self.cloning + budget)
-
-    def converged(self, state):
-        return "it stood still" if state.epoch >= self.converged_epoch else None
+        shown = float("nan") if bad and self.bad_place == "metric" else mean
+        return state, Epoch(
+            {"mean": shown, "epoch": state.epoch},
+            control_steps=0 if clones else 10,
+            stage="cloning" if clones else "learning",
+            fraction=state.epoch / self.cloning if clones else None,
+            converged="it stood still" if state.epoch >= self.converged_epoch else None,
+        )
 
 
 def bits(state):

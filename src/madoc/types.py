@@ -1,14 +1,16 @@
-"""What every room exchanges: transitions, policies, metrics."""
+"""What every room exchanges: transitions, policies, metrics, and the protocol of methods."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Generic, Literal, Protocol, TypeVar
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-Method = TypeVar("Method", covariant=True)
+Problem = TypeVar("Problem", contravariant=True)
+State = TypeVar("State")
+Made = TypeVar("Made")
 
 Unit = Literal["control steps", "updates"]
 """What a budget counts: simulated control steps, or gradient updates where a method does not simulate."""
@@ -51,11 +53,101 @@ class Policy(Protocol):
 
 
 @dataclass(frozen=True)
-class MethodEntry(Generic[Method]):
-    """A line of `madoc methods`: `make` takes the method's hyperparameters as keywords, `unit` is its budget's."""
+class Epoch:
+    """What one call of a method's `step` did; the loop adds these up.
 
-    make: Callable[..., Method]
-    summary: str
-    paper: str
-    year: int
+    Attributes:
+        metrics: Finite scalars for the log and the progress bar.
+        control_steps: Simulated control steps, of any kind.
+        unbudgeted: Those of them that the budget does not count, because nothing is learnt from them.
+        updates: Gradient updates of the result.
+        stage: A word for what the epoch did, such as `cloning`.
+        fraction: Share of the preparation that is done, where the epoch prepares and spends none of the budget.
+        converged: A sentence once the method has stopped by itself.
+    """
+
+    metrics: Metrics = field(default_factory=dict)
+    control_steps: int = 0
+    unbudgeted: int = 0
+    updates: int = 0
+    stage: str = "calibrating"
+    fraction: float | None = None
+    converged: str | None = None
+
+
+class Method(Protocol[Problem, State]):
+    """What calibrators and policy learners have in common: hyperparameters, and functions of a state.
+
+    A state is a pytree of JAX arrays, NumPy arrays, typed random keys, Python numbers, strings and functions.
+    It carries everything the method needs to go on. Its structure, shapes and dtypes stay those of `init`,
+    and a healthy state holds no NaN and no infinity, not even as a marker.
+    """
+
+    def init(self, problem: Problem, key: PRNGKeyArray) -> State:
+        """The state before the first epoch. Cheap, as a resumed run calls it too, for the structure."""
+        ...
+
+    def step(self, problem: Problem, state: State) -> tuple[State, Epoch]:
+        """One epoch, 0.1 to 2 seconds long: the new state, and what was done."""
+        ...
+
+
+@dataclass(frozen=True)
+class MethodEntry(Generic[Made]):
+    """A line of `madoc methods`: what never changes about a method.
+
+    Attributes:
+        name: As `madoc methods` lists it.
+        kind: The method's class.
+        summary: What it does, in half a line.
+        paper: Where it comes from.
+        year: When that was published.
+        settings: Hyperparameters in which it differs from the defaults of its class.
+        recognised_by: Those of them that tell it from other entries of its class; None: all of them.
+        shown: Metrics worth a place beside the progress bar.
+        unit: What its budget counts.
+        simulates: Whether it spends control steps.
+        needs_data: Whether it uses logged data.
+        needs_parameters: Whether the parameters of a policy problem make a difference to it.
+    """
+
+    name: str
+    kind: type[Made]
+    summary: str = ""
+    paper: str = ""
+    year: int = 0
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    recognised_by: tuple[str, ...] | None = None
+    shown: tuple[str, ...] = ()
     unit: Unit = "control steps"
+    simulates: bool = True
+    needs_data: bool = True
+    needs_parameters: bool = True
+
+    def make(self, **changes: Any) -> Made:
+        """The method, with some hyperparameters changed."""
+        return self.kind(**{**self.settings, **changes})
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The hyperparameters by which a method is recognised as this one."""
+        names = self.settings if self.recognised_by is None else self.recognised_by
+        return {name: self.settings[name] for name in names}
+
+
+def entry_of(method: Made, registry: Mapping[str, MethodEntry[Any]]) -> MethodEntry[Made]:
+    """The entry of a registry that describes a method: its class, and as many recognised settings as possible.
+
+    A number such as a weight is recognised at any value but the default, everything else at the entry's own value.
+    A method of another class is named after its class, and has the defaults of an entry.
+    """
+
+    def fits(entry: MethodEntry[Any]) -> bool:
+        return entry.kind is type(method) and all(
+            value == getattr(method, name)
+            or (type(value) is float and getattr(entry.kind(), name) != getattr(method, name))
+            for name, value in entry.identity.items()
+        )
+
+    fitting = [entry for entry in registry.values() if fits(entry)]
+    return max(fitting, key=lambda entry: len(entry.identity), default=MethodEntry(type(method).__name__, type(method)))

@@ -13,6 +13,7 @@ from madoc.calibration.least_squares.estimated_states import STATES_FIRST, Estim
 from madoc.calibration.least_squares.lengthening import begun, hopeless, lengthened, noise_alone, says_more
 from madoc.data import Disturbance, disturb
 from madoc.runs.checkpoint import difference, layout, load, save
+from madoc.types import Epoch
 from own_robots import PENDULUM_SPEC, write_robot
 from robots import PENDULUM, recorded
 
@@ -41,12 +42,13 @@ def searches_of(problem):
 
 
 def ended(method, problem):
-    """The state in which it has nothing left to do."""
-    state = method.init(problem, jax.random.key(0))
-    while method.converged(state) is None and method.control_steps(state) < 2_000_000:
-        state, _ = method.step(problem, state)
-    assert method.converged(state)
-    return state
+    """The state in which it has nothing left to do, and the control steps until then."""
+    state, epoch, spent = method.init(problem, jax.random.key(0)), Epoch(), 0
+    while epoch.converged is None and spent < 2_000_000:
+        state, epoch = method.step(problem, state)
+        spent += epoch.control_steps
+    assert epoch.converged
+    return state, spent
 
 
 def test_longer_windows_begin_where_shorter_ones_do_and_share_no_reading(pendulum):
@@ -106,7 +108,7 @@ def test_where_motion_is_smooth_they_make_noise_matter_less(pendulum):
     widths = []
     for horizon in (horizon_of(problem.dataset), None):
         method = LeastSquares(horizon=horizon)
-        state = ended(method, problem)
+        state, _ = ended(method, problem)
         interval = method.estimate(problem, state).interval
         assert ((interval[:, 0] <= truth) & (truth <= interval[:, 1])).all()
         widths.append(interval[:, 1] - interval[:, 0])
@@ -127,9 +129,9 @@ def test_a_run_killed_on_longer_windows_goes_on_with_the_same_bits(pendulum, tmp
 
 def test_longer_windows_cost_what_they_are_forecast_to(pendulum):
     problem = problem_of(pendulum)
-    state = ended(LeastSquares(), problem)
+    _, spent = ended(LeastSquares(), problem)
     forecast = LeastSquares().whole_run(problem, LeastSquares().init(problem, jax.random.key(0)), refining_epochs=6)
-    assert 0.5 < LeastSquares().control_steps(state) / forecast < 1.5
+    assert 0.5 < spent / forecast < 1.5
 
 
 def test_what_the_model_does_wrong_ends_them(pendulum, tmp_path):
@@ -139,7 +141,7 @@ def test_what_the_model_does_wrong_ends_them(pendulum, tmp_path):
     assert rough != PENDULUM
     of_machine = problem_of(robots.load(write_robot(machine, PENDULUM_SPEC, pendulum=rough)).task, noise=0.1)
     problem = CalibrationProblem(of_machine.dataset, simulation.make(pendulum, threads=1))
-    state = ended(LeastSquares(), problem)
+    state, _ = ended(LeastSquares(), problem)
     assert state.found == 0
     assert state.estimated[1].control_steps > 0
     warnings = LeastSquares().estimate(problem, state).warnings

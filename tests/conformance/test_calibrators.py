@@ -27,6 +27,7 @@ from madoc.errors import MadocError
 from madoc.parameters import Parameter
 from madoc.runs import checkpoint
 from madoc.runs.run_folder import RunFolder
+from madoc.types import Epoch, entry_of
 from robots import ARM_TRUTH, CountingSimulator, recorded, two_link_arm
 
 KEY = jax.random.key(0)
@@ -116,15 +117,23 @@ def without_seconds(result):
 
 
 def through_all_stages(method, problem, *, key=KEY):
-    """Every state, and the stage that made it, until the second epoch of calibration is done."""
+    """Every state, and the epoch that made it, until the second epoch of calibration is done."""
     state = method.init(problem, key)
-    yield "init", state
+    yield Epoch(stage="init"), state
     calibrated = 0
     while calibrated < 2:
-        stage = method.stage(state)
-        calibrated += stage == "calibrating"
-        state, _ = method.step(problem, state)
-        yield stage, state
+        state, epoch = method.step(problem, state)
+        calibrated += epoch.stage == "calibrating"
+        yield epoch, state
+
+
+def until_spent(method, problem):
+    """The epochs until the budget is spent, and the last state."""
+    state, epochs = method.init(problem, KEY), []
+    while sum(epoch.control_steps for epoch in epochs) < BUDGET:
+        state, epoch = method.step(problem, state)
+        epochs.append(epoch)
+    return epochs, state
 
 
 def test_no_calibrator_is_forgotten():
@@ -132,8 +141,8 @@ def test_no_calibrator_is_forgotten():
 
 
 @pytest.mark.parametrize("name", CALIBRATORS)
-def test_a_method_knows_the_name_it_is_listed_under(name):
-    assert CALIBRATORS[name].make().name == name
+def test_a_method_is_recognised_as_the_entry_it_was_made_from(name):
+    assert entry_of(CALIBRATORS[name].make(), CALIBRATORS).name == CALIBRATORS[name].name == name
     assert CALIBRATORS[name].summary
     assert CALIBRATORS[name].paper
     assert 1900 < CALIBRATORS[name].year < 2100
@@ -144,8 +153,8 @@ def test_the_result_is_sound_and_the_budget_kept(method, problem, simulator, tas
     space = task.parameters
     assert result.status in ("finished", "converged")
     assert result.control_steps == simulator.rows
-    spent = [method.control_steps(state) for _, state in through_all_stages(method, problem)]
-    assert BUDGET <= result.control_steps - PROBING < BUDGET + max(np.diff(spent))
+    largest = max(epoch.control_steps for epoch, _ in through_all_stages(method, problem))
+    assert BUDGET <= result.control_steps - PROBING < BUDGET + largest
     assert np.isfinite(result.mean).all()
     assert (space.low <= result.mean).all()
     assert (result.mean <= space.high).all()
@@ -153,7 +162,7 @@ def test_the_result_is_sound_and_the_budget_kept(method, problem, simulator, tas
     assert np.isfinite(result.std).all()
     assert sorted(name for names in result.groups for name in names) == sorted(space.names)
     assert list(result.parameters) == list(space.names)
-    assert result.method == method.name
+    assert result.method == entry_of(method, CALIBRATORS).name
     assert result.error["per_parameter"].keys() == ARM_TRUTH.keys()
     assert str(result)
     told = result.to_json()
@@ -181,25 +190,22 @@ def test_stopped_and_resumed_equals_uninterrupted(method, problem, tmp_path):
 
 def test_the_layout_of_the_state_never_changes(method, problem):
     expected, seen = None, []
-    for stage, state in through_all_stages(method, problem):
+    for epoch, state in through_all_stages(method, problem):
         expected = expected or checkpoint.layout(state)
-        seen.append(stage)
-        assert checkpoint.difference(checkpoint.layout(state), expected) is None, stage
-        assert checkpoint.first_non_finite(state) is None, stage
+        seen.append(epoch.stage)
+        assert checkpoint.difference(checkpoint.layout(state), expected) is None, epoch.stage
+        assert checkpoint.first_non_finite(state) is None, epoch.stage
     assert seen[-1] == "calibrating"
 
 
-def test_metrics_are_finite_numbers_and_progress_grows(method, problem):
-    state = method.init(problem, KEY)
-    done = [method.progress(state, BUDGET)]
-    while method.control_steps(state) < BUDGET:
-        state, metrics = method.step(problem, state)
-        assert all(np.isfinite(value) for value in metrics.values())
-        done.append(method.progress(state, BUDGET))
-    assert done == sorted(done)
-    assert done[0] >= 0.0
-    assert done[-1] == 1.0
-    assert set(method.shown) & metrics.keys()
+def test_metrics_are_finite_numbers_and_the_preparation_costs_no_budget(method, problem):
+    epochs, _ = until_spent(method, problem)
+    assert all(np.isfinite(value) for epoch in epochs for value in epoch.metrics.values())
+    prepared = [epoch.fraction for epoch in epochs if epoch.fraction is not None]
+    assert prepared == sorted(prepared)
+    assert prepared[-1:] in ([], [1.0])
+    assert all(epoch.control_steps == 0 for epoch in epochs if epoch.fraction is not None)
+    assert set(entry_of(method, CALIBRATORS).shown) & epochs[-1].metrics.keys()
 
 
 class Poison:
@@ -249,20 +255,19 @@ class Fragile(CountingSimulator):
 
 def test_draws_that_explode_are_left_out_and_counted(method, dataset, task):
     problem = CalibrationProblem(dataset, Fragile(simulation.make(task, threads=1)))
-    state = method.init(problem, KEY)
-    while method.control_steps(state) < BUDGET:
-        state, _ = method.step(problem, state)
+    epochs, state = until_spent(method, problem)
     assert checkpoint.first_non_finite(state) is None
     estimate = method.estimate(problem, state)
     assert np.isfinite(estimate.mean).all()
-    (warning,) = (told for told in estimate.warnings if "exploded" in told)
-    assert f"of {method.control_steps(state):,} simulated rows" in warning
+    assert 0 < estimate.failures < sum(epoch.control_steps for epoch in epochs)
+    result = calibrate(method, problem, key=KEY, budget=BUDGET)
+    (warning,) = (told for told in result.warnings if "exploded" in told)
+    assert f"{estimate.failures} of {result.control_steps - PROBING:,} simulated rows" in warning
 
 
 def test_nothing_is_traced_again(method, problem, traced):
-    for _, following in through_all_stages(method, problem):
-        state = following
-    assert method.stage(state) == "calibrating"
+    *_, (epoch, state) = through_all_stages(method, problem)
+    assert epoch.stage == "calibrating"
     before = traced()
     for _ in range(10):
         state, _ = method.step(problem, state)

@@ -20,7 +20,9 @@ from madoc.policies import (
     load_policy,
 )
 from madoc.runs import checkpoint
+from madoc.runs.loop import Tally
 from madoc.runs.run_folder import RunFolder
+from madoc.types import entry_of
 from robots import ARM_TRUTH, CountingSimulator, recorded, two_link_arm
 
 KEY = jax.random.key(0)
@@ -53,8 +55,8 @@ METHODS = {
         holdout_every=10,
     ),
 }
-SIMULATING = [name for name, method in METHODS.items() if method.unit == "control steps"]
-FED = [name for name, method in METHODS.items() if method.needs_data]
+SIMULATING = [name for name, entry in LEARNERS.items() if entry.simulates]
+FED = [name for name, entry in LEARNERS.items() if entry.needs_data]
 REWARDED = ["h2o", "cql", "morec"]
 
 
@@ -74,8 +76,18 @@ def problem(dataset, simulator):
 
 
 @pytest.fixture(params=METHODS)
-def method(request):
-    return METHODS[request.param]
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def method(name):
+    return METHODS[name]
+
+
+@pytest.fixture
+def unit(name):
+    return LEARNERS[name].unit
 
 
 def bits(policy):
@@ -94,20 +106,20 @@ def test_no_learner_is_forgotten():
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_a_learner_knows_the_name_it_is_listed_under(name):
-    assert METHODS[name].name == name
+def test_a_learner_is_recognised_as_the_entry_it_was_made_from(name):
+    assert entry_of(METHODS[name], LEARNERS).name == LEARNERS[name].name == name
     assert LEARNERS[name].summary
     assert LEARNERS[name].paper
     assert 1900 < LEARNERS[name].year < 2100
-    assert METHODS[name].unit == LEARNERS[name].unit
+    assert LEARNERS[name].simulates == (LEARNERS[name].unit == "control steps")
 
 
-def test_the_budget_is_kept_and_counted(method, problem, simulator):
+def test_the_budget_is_kept_and_counted(method, unit, problem, simulator):
     learnt = learn_policy(method, problem, key=KEY, budget=BUDGET - 1)
-    assert (learnt.status, learnt.spent, learnt.unit) == ("finished", BUDGET, method.unit)
-    assert learnt.sentence == f"the budget of {BUDGET - 1} {method.unit} is spent"
+    assert (learnt.status, learnt.spent, learnt.unit) == ("finished", BUDGET, unit)
+    assert learnt.sentence == f"the budget of {BUDGET - 1} {unit} is spent"
     assert learnt.control_steps == simulator.rows
-    assert learnt.control_steps >= BUDGET if method.unit == "control steps" else learnt.control_steps == 0
+    assert learnt.control_steps >= BUDGET if unit == "control steps" else learnt.control_steps == 0
     action = learnt.policy(np.zeros((5, 4)))
     assert action.shape == (5, 2)
     assert (abs(action) <= 1.0).all()
@@ -121,7 +133,7 @@ def test_same_seed_same_bits_and_another_seed_others(method, problem):
     assert first != other
 
 
-def test_stopped_and_resumed_equals_uninterrupted(method, problem, tmp_path):
+def test_stopped_and_resumed_equals_uninterrupted(method, unit, problem, tmp_path):
     whole = learn_policy(method, problem, key=KEY, budget=BUDGET)
     with RunFolder.create(tmp_path / "run", {"seed": 0}) as folder:
         for budget in (EPOCH, 3 * EPOCH):  # before the first update, and after some
@@ -133,7 +145,7 @@ def test_stopped_and_resumed_equals_uninterrupted(method, problem, tmp_path):
         assert resumed.control_steps == whole.control_steps
         told = json.loads(folder.result.read_text())
         assert (told["status"], told["control_steps"]) == ("finished", whole.control_steps)
-        assert method.unit == "control steps" or told["updates"] == BUDGET
+        assert unit == "control steps" or told["updates"] == BUDGET
 
 
 def test_the_layout_of_the_state_never_changes(method, problem):
@@ -144,32 +156,30 @@ def test_the_layout_of_the_state_never_changes(method, problem):
         assert checkpoint.first_non_finite(state) is None
 
 
-def test_stages_metrics_and_progress(method, problem):
-    state = method.init(problem, KEY)
-    done, stages, seen = [method.progress(state, BUDGET)], [method.stage(state)], set()
-    while method.spent(state) < BUDGET:
-        state, metrics = method.step(problem, state)
-        assert all(np.isfinite(value) for value in metrics.values())
-        seen |= metrics.keys()
-        done.append(method.progress(state, BUDGET))
-        stages.append(method.stage(state))
-    assert method.converged(state) is None
-    assert done == sorted(done)
-    assert (done[0], done[-1]) == (0.0, 1.0)
-    assert seen >= set(method.shown) - {"return_in_simulator"}
+def test_stages_and_metrics(name, method, unit, problem):
+    state, tally, stages, seen = method.init(problem, KEY), Tally(), [], set()
+    while tally.spent(unit) < BUDGET:
+        state, epoch = method.step(problem, state)
+        tally = tally.plus(epoch)
+        assert all(np.isfinite(value) for value in epoch.metrics.values())
+        assert tally.converged is None
+        seen |= epoch.metrics.keys()
+        stages.append(epoch.stage)
+    assert tally.prepared == (1.0 if name == "morec" else None)
+    assert seen >= set(LEARNERS[name].shown) - {"return_in_simulator"}
     assert list(dict.fromkeys(stages)) == {
         "bc": ["cloning"],
         "cql": ["cloning", "learning"],
         "morec": ["fitting", "opposing", "learning"],
-    }.get(method.name, ["exploring", "learning"])
+    }.get(name, ["exploring", "learning"])
 
 
 def test_nothing_is_traced_again(method, problem, traced):
     state = stepped(method, problem, 4)
-    assert method.stage(state) in ("learning", "cloning")
     before = traced()
     for _ in range(10):
-        state, _ = method.step(problem, state)
+        state, epoch = method.step(problem, state)
+    assert epoch.stage in ("learning", "cloning")
     assert traced() == before
 
 
@@ -220,10 +230,10 @@ def test_parameters_matter_where_a_learner_says_so(name, dataset, simulator):
         bits(learn_policy(method, PolicyProblem(simulator, row, dataset), key=KEY, budget=3 * EPOCH).policy)
         for row in corners(simulator)
     )
-    assert (first != second) == method.needs_parameters
+    assert (first != second) == LEARNERS[name].needs_parameters
 
 
-@pytest.mark.parametrize("name", [name for name in SIMULATING if METHODS[name].needs_parameters])
+@pytest.mark.parametrize("name", [name for name in SIMULATING if LEARNERS[name].needs_parameters])
 def test_environments_that_do_not_fill_the_systems_are_refused(name, dataset, simulator):
     problem = PolicyProblem(simulator, np.stack([simulator.parameters.middle] * 3), dataset)
     with pytest.raises(MadocError, match="expected a multiple of 3 environments for 3 systems, got 4"):
@@ -243,28 +253,28 @@ def test_data_of_another_robot_is_refused(dataset, simulator):
 
 @pytest.mark.parametrize("name", FED)
 def test_no_data_is_refused(name, problem):
-    with pytest.raises(MadocError, match=f"{name} learns from logged data: give it a dataset"):
+    with pytest.raises(MadocError, match="learns from logged data: give it a dataset"):
         learn_policy(METHODS[name], replace(problem, dataset=None), key=KEY, budget=BUDGET)
 
 
 @pytest.mark.parametrize("name", FED)
 def test_too_few_rows_are_refused(name, dataset, problem):
     few = replace(dataset, transitions=dataset.transitions.take(np.arange(5)))
-    with pytest.raises(MadocError, match=f"{name} needs at least .* 16, got 5 in a random policy"):
+    with pytest.raises(MadocError, match=r"needs at least .* 16, got 5 in a random policy"):
         learn_policy(METHODS[name], replace(problem, dataset=few), key=KEY, budget=BUDGET)
 
 
 @pytest.mark.parametrize("name", REWARDED)
 def test_data_without_rewards_is_refused_where_they_are_learnt_from(name, dataset, problem):
     silent = replace(dataset, transitions=replace(dataset.transitions, reward=np.zeros(len(dataset))))
-    with pytest.raises(MadocError, match=f"{name} learns from logged rewards, and every reward .* is 0"):
+    with pytest.raises(MadocError, match=r"learns from logged rewards, and every reward .* is 0"):
         learn_policy(METHODS[name], replace(problem, dataset=silent), key=KEY, budget=BUDGET)
 
 
 @pytest.mark.parametrize("name", REWARDED)
 def test_next_observations_of_other_rows_are_refused_where_they_are_learnt_from(name, dataset, problem):
     torn = replace(dataset, disturbance=Disturbance(shuffled="next_observations"))
-    with pytest.raises(MadocError, match=f"{name} learns from what followed on each action"):
+    with pytest.raises(MadocError, match="learns from what followed on each action"):
         learn_policy(METHODS[name], replace(problem, dataset=torn), key=KEY, budget=BUDGET)
 
 
@@ -292,6 +302,6 @@ def test_without_cloning_data_makes_no_difference(problem):
     assert bits(alone.policy) == bits(learn_policy(METHODS["sac"], problem, key=KEY, budget=BUDGET).policy)
 
 
-def test_no_budget_is_refused(method, problem):
-    with pytest.raises(MadocError, match=f"budget of at least 1 {method.unit[:-1]}, got 0"):
+def test_no_budget_is_refused(method, unit, problem):
+    with pytest.raises(MadocError, match=f"budget of at least 1 {unit[:-1]}, got 0"):
         learn_policy(method, problem, key=KEY, budget=0)

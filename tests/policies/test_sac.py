@@ -8,6 +8,7 @@ from madoc import simulation
 from madoc.evaluation import evaluate
 from madoc.policies import PolicyProblem
 from madoc.policies.sac import SAC
+from madoc.runs.loop import Tally
 from robots import two_link_arm
 
 SMALL = SAC(
@@ -22,14 +23,22 @@ def simulator():
 
 
 def learnt(simulator, **changes):
-    """States after every epoch, and what was told of each."""
+    """The state after every epoch, and the epoch."""
     method = SAC(**{name: getattr(SMALL, name) for name in SMALL.__dataclass_fields__} | changes)
     problem = PolicyProblem(simulator, simulator.parameters.middle)
     state, seen = method.init(problem, jax.random.key(0)), []
     for _ in range(EPOCHS):
-        state, metrics = method.step(problem, state)
-        seen.append((state, metrics))
+        state, epoch = method.step(problem, state)
+        seen.append((state, epoch))
     return method, seen
+
+
+def counted(seen):
+    """What the epochs add up to."""
+    tally = Tally()
+    for _, epoch in seen:
+        tally = tally.plus(epoch)
+    return tally
 
 
 def weights(policy):
@@ -42,7 +51,7 @@ def same(one, other):
 
 def test_the_best_judged_policy_is_handed_back(simulator):
     method, seen = learnt(simulator, judge_every=80, judge_episodes=3)
-    judged = [(metrics["judged_return"], state) for state, metrics in seen if "judged_return" in metrics]
+    judged = [(epoch.metrics["judged_return"], state) for state, epoch in seen if "judged_return" in epoch.metrics]
     assert len(judged) == EPOCHS // 2
     best, then = max(judged, key=lambda pair: pair[0])
     last = seen[-1][0]
@@ -52,17 +61,17 @@ def test_the_best_judged_policy_is_handed_back(simulator):
 
 
 def test_judging_costs_control_steps_but_no_budget(simulator):
-    method, seen = learnt(simulator, judge_every=80, judge_episodes=3)
-    state = seen[-1][0]
-    assert method.spent(state) == EPOCHS * 40
+    _, seen = learnt(simulator, judge_every=80, judge_episodes=3)
+    tally = counted(seen)
+    assert tally.spent("control steps") == EPOCHS * 40
     whole_episodes = EPOCHS // 2 * 3 * simulator.task.max_episode_steps
-    assert method.control_steps(state) == EPOCHS * 40 + whole_episodes
+    assert tally.control_steps == EPOCHS * 40 + whole_episodes
 
 
 def test_the_last_policy_where_nothing_is_judged(simulator):
     method, seen = learnt(simulator, judge_every=0)
     state = seen[-1][0]
-    assert method.control_steps(state) == EPOCHS * 40
+    assert counted(seen).control_steps == EPOCHS * 40
     assert same(method.policy(state), state.learner.policy)
 
 

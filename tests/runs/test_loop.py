@@ -12,8 +12,8 @@ import jax
 import numpy as np
 import pytest
 
-from madoc.runs import checkpoint
 from madoc.errors import MadocError
+from madoc.runs import checkpoint
 from madoc.runs.loop import run
 from madoc.runs.run_folder import RunFolder
 from wandering import BUDGET, SPEC, Wander, bits
@@ -46,9 +46,9 @@ def in_folder(path, *, budget=BUDGET, method=None, resume=False, spec=SPEC, **op
 
 
 def start(path, seconds):
-    folders = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "src")]
+    folders = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "src")]
     return subprocess.Popen(
-        [sys.executable, str(Path(__file__).parent / "wandering.py"), str(path), str(seconds)],
+        [sys.executable, str(Path(__file__).parents[1] / "wandering.py"), str(path), str(seconds)],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(folders), "JAX_PLATFORMS": "cpu"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -252,8 +252,8 @@ def test_an_error_in_a_step_closes_everything(tmp_path):
 
 class Grows(Wander):
     def step(self, problem, state):
-        state, metrics = super().step(problem, state)
-        return type(state)(**{**vars(state), "sum": np.zeros(state.epoch)}), metrics
+        state, epoch = super().step(problem, state)
+        return type(state)(**{**vars(state), "sum": np.zeros(state.epoch)}), epoch
 
 
 def test_a_state_that_changes_shape_is_refused_before_it_is_saved(tmp_path):

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
-from madoc.calibration.cautions import told_once
+from madoc.calibration.cautions import exploded, told_once
+from madoc.calibration.registry import CALIBRATORS
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
 from madoc.parameters import ParameterSpace
@@ -16,10 +17,11 @@ from madoc.runs import loop
 from madoc.runs.files import replacing
 from madoc.runs.run_folder import RunFolder
 from madoc.simulation.sensitivity import refuse_insensitive
+from madoc.types import State, entry_of
 
 
 def calibrate(
-    method: Calibrator,
+    method: Calibrator[State],
     problem: CalibrationProblem,
     *,
     key: PRNGKeyArray,
@@ -48,9 +50,9 @@ def calibrate(
     """
     space = problem.simulator.parameters
     known = None if truth is None else space.vector(dict(truth))
-    idle = method.converged(method.init(problem, key)) is not None
-    # A method that has ended before its first epoch simulates nothing, so nothing is spent on its behalf either.
-    probing = 0 if idle else refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0))
+    entry = entry_of(method, CALIBRATORS)
+    method.init(problem, key)  # a refusal of the method comes before one of the parameters
+    probing = refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0)) if entry.simulates else 0
     finished = loop.run(
         method,
         problem,
@@ -59,14 +61,14 @@ def calibrate(
         folder=folder,
         resume=resume,
         quiet=quiet,
-        description=f"{method.name} on {problem.simulator.task.name}",
-        shown=method.shown,
+        description=f"{entry.name} on {problem.simulator.task.name}",
+        shown=entry.shown,
         checkpoint_every=checkpoint_every,
         trace=lambda state: _trace(space, method.estimate(problem, state)),
     )
     estimate = method.estimate(problem, finished.state)
     result = CalibrationResult(
-        method=method.name,
+        method=entry.name,
         task=problem.simulator.task.name,
         status=finished.status,
         sentence=finished.sentence,
@@ -75,7 +77,7 @@ def calibrate(
         seed=seed_of(key),
         groups=[[space.names[index] for index in group] for group in estimate.groups],
         parameters=_parameters(space, estimate),
-        warnings=told_once(estimate.warnings, problem.doubts),
+        warnings=told_once((*estimate.warnings, *exploded(estimate.failures, finished.control_steps)), problem.doubts),
         error=None if known is None else calibration_error(estimate.mean, known, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
     )

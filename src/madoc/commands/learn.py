@@ -76,8 +76,9 @@ class Learn:
         """Where it learns, in words."""
         from madoc.pipeline.methods import make_method
         from madoc.policies import LEARNERS
+        from madoc.types import entry_of
 
-        method = make_method(LEARNERS, self.method, changes_of(self.set))
-        if method.needs_parameters:
+        entry = entry_of(make_method(LEARNERS, self.method, changes_of(self.set)), LEARNERS)
+        if entry.needs_parameters:
             return PLACE_NAMES[self.at]
-        return PLACE_NAMES["uniform"] if method.unit == "control steps" else "from the data alone"
+        return PLACE_NAMES["uniform"] if entry.unit == "control steps" else "from the data alone"

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from madoc.types import Metrics
+
 Carry = TypeVar("Carry")
 
 
@@ -98,6 +100,11 @@ def scan_updates(
 
     arrays, metrics = jax.lax.scan(body, arrays, jax.random.split(key, count))
     return eqx.combine(arrays, static), jax.tree.map(jnp.mean, metrics)
+
+
+def scalars(metrics: dict[str, Array]) -> Metrics:
+    """The metrics of a scan, off the device."""
+    return {name: float(value) for name, value in metrics.items()}
 
 
 @cache

@@ -52,22 +52,22 @@ def forecast(problem: CalibrationProblem, *, budget: int) -> tuple[Forecast, ...
 
 
 def _least_squares(problem: CalibrationProblem, budget: int) -> Forecast:
-    method = LeastSquares()
+    method, name = LeastSquares(), "least-squares"
     try:
         state = method.init(problem, jax.random.key(0))
     except MadocError as error:
-        return Forecast(method.name, None, 0, str(error))
+        return Forecast(name, None, 0, str(error))
     started = time.monotonic()
-    state, _ = method.step(problem, state)
+    state, epoch = method.step(problem, state)
     seconds = time.monotonic() - started
     total = min(budget, method.whole_run(problem, state, refining_epochs=REFINING_EPOCHS))
-    return Forecast(method.name, seconds / method.control_steps(state) * total, total)
+    return Forecast(name, seconds / epoch.control_steps * total, total)
 
 
 def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
-    starts: Any = "logged" if problem.starts_known else "policy"
+    starts: Any = "logged" if problem.states.starts_known else "policy"
     method = Madoc(groups="one", starts=starts, cloning_epochs=0)
-    name = Madoc().name
+    name = "madoc"
     try:
         state = method.init(problem, jax.random.key(0))
         times = []

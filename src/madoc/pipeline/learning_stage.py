@@ -27,6 +27,7 @@ from madoc.policies import (
     require_reward,
 )
 from madoc.simulation import CpuSimulator
+from madoc.types import entry_of
 
 PLACES = ("calibrated", "distribution", "uniform", "midrange", "truth")
 """Where a policy may be learnt: at the estimate, over the calibrated distribution, over the whole box, in the
@@ -75,9 +76,10 @@ def learn_in(
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
     method = make_method(LEARNERS, order.method, order.changes)
+    entry = entry_of(method, LEARNERS)
     if order.budget < 1:
-        raise MadocError(f"expected a budget of at least 1 {method.unit.removesuffix('s')}, got {order.budget}")
-    if not method.needs_parameters and order.at != PLACES[0]:
+        raise MadocError(f"expected a budget of at least 1 {entry.unit.removesuffix('s')}, got {order.budget}")
+    if not entry.needs_parameters and order.at != PLACES[0]:
         raise MadocError(
             f"{order.method} does not learn at given parameters, so --at {order.at} would change nothing; leave it out"
         )
@@ -86,7 +88,7 @@ def learn_in(
     known = calibrated.truth if truth is None else dict(truth)
     simulator, parameters = _system(calibrated, order.at, known)
     dataset = None
-    if method.needs_data:
+    if entry.needs_data:
         if calibrated.source is None:
             raise MadocError(
                 f"{order.method} learns from logged data, and a bare result names no data; "
@@ -119,7 +121,7 @@ def learn_in(
 
 def policy_folder_name(at: str, method: str) -> str:
     """`policy-calibrated`, with the method behind it unless that is SAC; `policy-cql` where the place is no matter."""
-    if not make_method(LEARNERS, method, {}).needs_parameters:
+    if not LEARNERS[method].needs_parameters:
         return f"policy-{method}"
     return f"policy-{at}" if method == "sac" else f"policy-{at}-{method}"
 

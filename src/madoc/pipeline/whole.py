@@ -94,7 +94,7 @@ def run_all(plan: Plan, out: Path, *, resume: bool = False, quiet: bool = True) 
         if result.status not in ENDED:
             return summary | {"status": result.status, "sentence": f"calibration: {result.sentence}"}
         known = calibrated.truth is not None
-        compared = plan.yardsticks and known and make_method(LEARNERS, plan.learner, {}).needs_parameters
+        compared = plan.yardsticks and known and LEARNERS[plan.learner].needs_parameters
         for at in ("calibrated", "midrange", "truth") if compared else ("calibrated",):
             policy = _policy_stage(plan, calibrated, at, out / f"policy-{at}", quiet=quiet)
             summary["policies"][at] = policy

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.systems import ParameterDistribution
 from madoc.simulation.base import Simulator
 from madoc.tasks.base import Task
-from madoc.types import Metrics, Unit
-
-State = Any
+from madoc.types import Method, State
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ class PolicyProblem:
         return fixed if isinstance(fixed, np.ndarray) else fixed.draw(key, count)
 
 
-def require_data(problem: PolicyProblem, learner: str, *, rows: int, outcomes: bool = True) -> Dataset:
+def require_data(problem: PolicyProblem, *, rows: int, outcomes: bool = True) -> Dataset:
     """The dataset, refused where a learner could not use it.
 
     Raises:
@@ -100,20 +98,20 @@ def require_data(problem: PolicyProblem, learner: str, *, rows: int, outcomes: b
             row, and all rewards are 0 or next observations are another row's.
     """
     if problem.dataset is None:
-        raise MadocError(f"{learner} learns from logged data: give it a dataset")
+        raise MadocError("this learner learns from logged data: give it a dataset")
     if len(problem.dataset) < rows:
         raise MadocError(
-            f"{learner} needs at least as many rows as a batch has, {rows}, got {len(problem.dataset)} in "
+            f"this learner needs at least as many rows as a batch has, {rows}, got {len(problem.dataset)} in "
             f"{problem.dataset.origin}; give it more data or a smaller batch"
         )
     if outcomes and not np.any(problem.dataset.transitions.reward):
         raise MadocError(
-            f"{learner} learns from logged rewards, and every reward in {problem.dataset.origin} is 0; "
+            f"this learner learns from logged rewards, and every reward in {problem.dataset.origin} is 0; "
             "use bc, or a learner that takes its rewards from the simulator"
         )
     if outcomes and problem.dataset.disturbance.shuffled == "next_observations":
         raise MadocError(
-            f"{learner} learns from what followed on each action, and the next observations in "
+            f"this learner learns from what followed on each action, and the next observations in "
             f"{problem.dataset.origin} are not those of their rows; use bc, sac-bc or dr-bc"
         )
     return problem.dataset
@@ -135,62 +133,9 @@ def require_reward(task: Task) -> None:
         raise MadocError(f"{task.name} has no reward, so no policy can be learnt for it; give its spec a reward:")
 
 
-class PolicyLearner(Protocol):
-    """A method. It holds hyperparameters only; what it carries is in its state."""
-
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        ...
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics worth a place beside the progress bar."""
-        ...
-
-    @property
-    def unit(self) -> Unit:
-        """What its budget counts: `control steps` if it simulates, else `updates`."""
-        ...
-
-    @property
-    def needs_data(self) -> bool:
-        """Whether it uses the dataset."""
-        ...
-
-    @property
-    def needs_parameters(self) -> bool:
-        """Whether the problem's parameters make a difference to it."""
-        ...
-
-    def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> State:
-        """A cheap start: networks, buffers, the random key."""
-        ...
-
-    def step(self, problem: PolicyProblem, state: State) -> tuple[State, Metrics]:
-        """One epoch."""
-        ...
+class PolicyLearner(Method[PolicyProblem, State], Protocol[State]):
+    """A method that learns a policy."""
 
     def policy(self, state: State) -> TanhGaussianPolicy:
-        """The policy learnt so far."""
-        ...
-
-    def control_steps(self, state: State) -> int:
-        """Simulated control steps spent."""
-        ...
-
-    def spent(self, state: State) -> int:
-        """What the budget counts: control steps, or updates where it does not simulate."""
-        ...
-
-    def stage(self, state: State) -> str:
-        """A word for what it is doing."""
-        ...
-
-    def progress(self, state: State, budget: int) -> float:
-        """Share of the work done, in [0, 1]."""
-        ...
-
-    def converged(self, state: State) -> str | None:
-        """A sentence once it has stopped by itself."""
+        """The policy learnt so far; deterministic without a key."""
         ...

@@ -9,10 +9,10 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from madoc.errors import check_at_least
 from madoc.learning.cloning import clone
-from madoc.learning.networks import adam
+from madoc.learning.networks import adam, scalars
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, require_data
-from madoc.types import Metrics, Unit
+from madoc.types import Epoch
 
 
 @jax.tree_util.register_dataclass
@@ -23,7 +23,6 @@ class BCState:
     policy: TanhGaussianPolicy
     optimiser: PyTree
     key: PRNGKeyArray
-    updates: int
 
 
 @dataclass(frozen=True)
@@ -45,38 +44,13 @@ class BC:
     def __post_init__(self) -> None:
         check_at_least(self, hidden=1, epoch_updates=1, batch=1, learning_rate=0.0)
 
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "bc"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("cloning_loss",)
-
-    @property
-    def unit(self) -> Unit:
-        """What its budget counts."""
-        return "updates"
-
-    @property
-    def needs_data(self) -> bool:
-        """It learns from nothing else."""
-        return True
-
-    @property
-    def needs_parameters(self) -> bool:
-        """It never simulates."""
-        return False
-
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> BCState:
         """A fresh policy that standardises observations as the data has them.
 
         Raises:
             MadocError: No data, or too little.
         """
-        dataset = require_data(problem, self.name, rows=self.batch, outcomes=False)
+        dataset = require_data(problem, rows=self.batch, outcomes=False)
         of_policy, key = jax.random.split(key)
         observation = np.asarray(dataset.transitions.observation)
         spread = observation.std(0)
@@ -88,9 +62,9 @@ class BC:
             offset=observation.mean(0),
             scale=np.where(spread > 1e-8, spread, 1.0),
         )
-        return BCState(policy, adam(self.learning_rate).init(eqx.filter(policy, eqx.is_array)), key, 0)
+        return BCState(policy, adam(self.learning_rate).init(eqx.filter(policy, eqx.is_array)), key)
 
-    def step(self, problem: PolicyProblem, state: BCState) -> tuple[BCState, Metrics]:
+    def step(self, problem: PolicyProblem, state: BCState) -> tuple[BCState, Epoch]:
         """`epoch_updates` updates."""
         of_update, key = jax.random.split(state.key)
         policy, optimiser, metrics = clone(
@@ -102,29 +76,9 @@ class BC:
             batch=self.batch,
             count=self.epoch_updates,
         )
-        following = BCState(policy, optimiser, key, state.updates + self.epoch_updates)
-        return following, {name: float(value) for name, value in metrics.items()}
+        epoch = Epoch(scalars(metrics), updates=self.epoch_updates, stage="cloning")
+        return BCState(policy, optimiser, key), epoch
 
     def policy(self, state: BCState) -> TanhGaussianPolicy:
         """The policy learnt so far; deterministic without a key."""
         return state.policy
-
-    def control_steps(self, state: BCState) -> int:
-        """None."""
-        return 0
-
-    def spent(self, state: BCState) -> int:
-        """Its budget is updates."""
-        return state.updates
-
-    def stage(self, state: BCState) -> str:
-        """Word for the progress bar."""
-        return "cloning"
-
-    def progress(self, state: BCState, budget: int) -> float:
-        """Share of the budget spent."""
-        return min(1.0, state.updates / budget)
-
-    def converged(self, state: BCState) -> str | None:
-        """It goes on until its budget is spent."""
-        return None

@@ -10,10 +10,10 @@ from madoc.errors import check_at_least
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, bellman_target, critic_step, fresh
 from madoc.learning.cloning import cloning_loss
 from madoc.learning.cql_losses import cql_loss, proposals
-from madoc.learning.networks import scan_updates
+from madoc.learning.networks import scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.types import Metrics, Unit
+from madoc.types import Epoch
 
 
 @jax.tree_util.register_dataclass
@@ -66,38 +66,13 @@ class CQL:
         check_at_least(self, batch=1, discount=0.0, target_rate=0.0)
         check_at_least(self, policy_learning_rate=0.0, critic_learning_rate=0.0)
 
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "cql"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("conservative_gap", "value_target", "temperature")
-
-    @property
-    def unit(self) -> Unit:
-        """What its budget counts."""
-        return "updates"
-
-    @property
-    def needs_data(self) -> bool:
-        """It learns from nothing else."""
-        return True
-
-    @property
-    def needs_parameters(self) -> bool:
-        """It never simulates."""
-        return False
-
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> CQLState:
         """Fresh networks.
 
         Raises:
             MadocError: No data, too little, or data without rewards.
         """
-        require_data(problem, self.name, rows=self.batch)
+        require_data(problem, rows=self.batch)
         of_learner, key = jax.random.split(key)
         learner = fresh(
             problem.simulator.task.observation_size,
@@ -110,14 +85,14 @@ class CQL:
         )
         return CQLState(learner, key, 0)
 
-    def step(self, problem: PolicyProblem, state: CQLState) -> tuple[CQLState, Metrics]:
+    def step(self, problem: PolicyProblem, state: CQLState) -> tuple[CQLState, Epoch]:
         """`epoch_updates` updates."""
         of_update, key = jax.random.split(state.key)
-        learner, metrics = self._update(
-            state.learner, problem.logged, of_update, self._clones(state), self.epoch_updates
-        )
+        clones = state.updates < self.cloning_updates
+        learner, metrics = self._update(state.learner, problem.logged, of_update, clones, self.epoch_updates)
+        stage = "cloning" if clones else "learning"
         following = CQLState(learner, key, state.updates + self.epoch_updates)
-        return following, {name: float(value) for name, value in metrics.items()}
+        return following, Epoch(scalars(metrics), updates=self.epoch_updates, stage=stage)
 
     @eqx.filter_jit
     def _update(
@@ -151,9 +126,6 @@ class CQL:
 
         return scan_updates(update, learner, key, count)
 
-    def _clones(self, state: CQLState) -> bool:
-        return state.updates < self.cloning_updates
-
     @property
     def _descent(self) -> Descent:
         return Descent.by_adam(
@@ -163,23 +135,3 @@ class CQL:
     def policy(self, state: CQLState) -> TanhGaussianPolicy:
         """The policy learnt so far; deterministic without a key."""
         return state.learner.policy
-
-    def control_steps(self, state: CQLState) -> int:
-        """None."""
-        return 0
-
-    def spent(self, state: CQLState) -> int:
-        """Its budget is updates."""
-        return state.updates
-
-    def stage(self, state: CQLState) -> str:
-        """Word for the progress bar."""
-        return "cloning" if self._clones(state) else "learning"
-
-    def progress(self, state: CQLState, budget: int) -> float:
-        """Share of the budget spent."""
-        return min(1.0, state.updates / budget)
-
-    def converged(self, state: CQLState) -> str | None:
-        """It goes on until its budget is spent."""
-        return None

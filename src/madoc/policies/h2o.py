@@ -13,12 +13,12 @@ from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step,
 from madoc.learning.dynamics_ratio import Discriminators, discriminator_loss, log_dynamics_ratio
 from madoc.learning.features import Features
 from madoc.learning.h2o_losses import dynamics_gap, dynamics_ratio, h2o_loss
-from madoc.learning.networks import adam, descend, scan_updates
+from madoc.learning.networks import adam, descend, scalars, scan_updates
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, UniformPolicy, act_on, start_acting
-from madoc.types import Metrics, Unit
+from madoc.types import Epoch
 
 
 @jax.tree_util.register_dataclass
@@ -95,38 +95,13 @@ class H2O:
             self, target_rate=0.0, learning_rate=0.0, gap_samples=1, gap_spread=0.0, bound=0.0, pair_bound=0.0
         )
 
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "h2o"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("return_in_simulator", "dynamics_ratio", "value_target")
-
-    @property
-    def unit(self) -> Unit:
-        """What its budget counts."""
-        return "control steps"
-
-    @property
-    def needs_data(self) -> bool:
-        """Half of every batch."""
-        return True
-
-    @property
-    def needs_parameters(self) -> bool:
-        """It simulates."""
-        return True
-
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> H2OState:
         """Fresh networks, an empty replay, rows at reset states.
 
         Raises:
             MadocError: No data, too little, data without rewards, or fewer environments than systems.
         """
-        require_data(problem, self.name, rows=self.batch)
+        require_data(problem, rows=self.batch)
         of_learner, of_discriminators, of_start, key = jax.random.split(key, 4)
         sizes = problem.simulator.task.observation_size, problem.simulator.action_size
         learner = fresh(*sizes, hidden=self.hidden, descent=self._descent, features=problem.features, key=of_learner)
@@ -137,20 +112,22 @@ class H2O:
         interaction = start_acting(problem, of_start, environments=self.environments, capacity=self.replay_capacity)
         return H2OState(Learning(learner, discriminators, optimiser), interaction, key)
 
-    def step(self, problem: PolicyProblem, state: H2OState) -> tuple[H2OState, Metrics]:
+    def step(self, problem: PolicyProblem, state: H2OState) -> tuple[H2OState, Epoch]:
         """Act for `epoch_steps` control steps, then update."""
         of_acting, of_update, key = jax.random.split(state.key, 3)
         explores = state.interaction.control_steps < self.warmup_steps
         policy = UniformPolicy(problem.simulator.action_size) if explores else self.policy(state)
         interaction, metrics = act_on(problem, state.interaction, policy, of_acting, control_steps=self.epoch_steps)
         learning = state.learning
+        acted = interaction.control_steps - state.interaction.control_steps
         if interaction.control_steps >= self.warmup_steps:
-            count = round(self.updates_per_step * (interaction.control_steps - state.interaction.control_steps))
+            count = round(self.updates_per_step * acted)
             learning, losses = self._update(
                 learning, interaction.replay, problem.logged, problem.features, of_update, count
             )
-            metrics |= {name: float(value) for name, value in losses.items()}
-        return H2OState(learning, interaction, key), metrics
+            metrics |= scalars(losses)
+        epoch = Epoch(metrics, control_steps=acted, stage="exploring" if explores else "learning")
+        return H2OState(learning, interaction, key), epoch
 
     @eqx.filter_jit
     def _update(
@@ -243,26 +220,6 @@ class H2O:
     def policy(self, state: H2OState) -> TanhGaussianPolicy:
         """The policy learnt so far; deterministic without a key."""
         return state.learning.learner.policy
-
-    def control_steps(self, state: H2OState) -> int:
-        """Simulated control steps so far."""
-        return state.interaction.control_steps
-
-    def spent(self, state: H2OState) -> int:
-        """Its budget is control steps."""
-        return state.interaction.control_steps
-
-    def stage(self, state: H2OState) -> str:
-        """Word for the progress bar."""
-        return "learning" if self.spent(state) >= self.warmup_steps else "exploring"
-
-    def progress(self, state: H2OState, budget: int) -> float:
-        """Share of the budget spent."""
-        return min(1.0, self.spent(state) / budget)
-
-    def converged(self, state: H2OState) -> str | None:
-        """It goes on until its budget is spent."""
-        return None
 
 
 def _described(features: Features, rows: Batch) -> tuple[Array, Array]:

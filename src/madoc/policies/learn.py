@@ -6,9 +6,10 @@ from jaxtyping import PRNGKeyArray
 
 from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
 from madoc.policies.files import save_policy
+from madoc.policies.registry import LEARNERS
 from madoc.runs import loop
 from madoc.runs.run_folder import RunFolder
-from madoc.types import Policy, Unit
+from madoc.types import Policy, State, Unit, entry_of
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class LearnedPolicy:
 
 
 def learn_policy(
-    method: PolicyLearner,
+    method: PolicyLearner[State],
     problem: PolicyProblem,
     *,
     key: PRNGKeyArray,
@@ -48,7 +49,7 @@ def learn_policy(
     """Learn until the budget is spent.
 
     The budget is simulated control steps for a learner that simulates and gradient updates for one that does not:
-    `method.unit` says which. With one update per control step, a budget means as many updates for either.
+    the entry in `LEARNERS` says which. With one update per control step, a budget means as many updates for either.
 
     With a folder, `policy.npz` is left there: `madoc.numpy_policy` acts from it without JAX.
 
@@ -56,6 +57,7 @@ def learn_policy(
         MadocError: The robot has no reward, the method refuses the problem, or `loop.run` refuses.
     """
     require_reward(problem.simulator.task)
+    entry = entry_of(method, LEARNERS)
     finished = loop.run(
         method,
         problem,
@@ -64,11 +66,10 @@ def learn_policy(
         folder=folder,
         resume=resume,
         quiet=quiet,
-        description=f"{method.name} on {problem.simulator.task.name}",
-        shown=method.shown,
+        description=f"{entry.name} on {problem.simulator.task.name}",
+        shown=entry.shown,
         checkpoint_every=checkpoint_every,
-        unit=method.unit,
-        spent=method.spent,
+        unit=entry.unit,
     )
     policy = method.policy(finished.state)
     if folder is not None:
@@ -79,6 +80,6 @@ def learn_policy(
         finished.sentence,
         finished.control_steps,
         finished.spent,
-        method.unit,
+        entry.unit,
         round(finished.seconds, 3),
     )

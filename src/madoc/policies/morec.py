@@ -14,11 +14,11 @@ from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step,
 from madoc.learning.dynamics_ensemble import Ensemble, fit, holdout_error
 from madoc.learning.dynamics_reward import Opposition, oppose, opposition
 from madoc.learning.features import Features
-from madoc.learning.networks import adam, scan_updates
+from madoc.learning.networks import adam, scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.imagination import Dreamers, Dreaming, Filter, dream, fall_asleep
-from madoc.types import Metrics, Unit
+from madoc.types import Epoch
 
 
 @jax.tree_util.register_dataclass
@@ -36,7 +36,6 @@ class MORECState:
         dreamers: Where imagined rows stand.
         key: The random key.
         preparing: Updates of models and discriminators so far.
-        updates: Updates of the policy so far.
     """
 
     ensemble: Ensemble
@@ -48,7 +47,6 @@ class MORECState:
     dreamers: Dreamers
     key: PRNGKeyArray
     preparing: int
-    updates: int
 
 
 @dataclass(frozen=True)
@@ -130,31 +128,6 @@ class MOREC:
         if self.real >= 1.0:
             raise MadocError(f"expected a share of logged rows below 1 for MOREC, got {self.real}")
 
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "morec"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("model_error", "dynamics_reward", "value_target")
-
-    @property
-    def unit(self) -> Unit:
-        """What its budget counts."""
-        return "updates"
-
-    @property
-    def needs_data(self) -> bool:
-        """Its models know nothing else."""
-        return True
-
-    @property
-    def needs_parameters(self) -> bool:
-        """It never simulates."""
-        return False
-
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> MORECState:
         """Fresh networks, an empty replay, rows at logged observations.
 
@@ -162,7 +135,7 @@ class MOREC:
             MadocError: No data, too little, data without rewards, or a task whose falls an observation cannot tell.
         """
         task = problem.simulator.task
-        require_data(problem, self.name, rows=max(self.batch, self.holdout_every))
+        require_data(problem, rows=max(self.batch, self.holdout_every))
         if task.state_from_observation is None:
             raise MadocError(
                 f"an observation of {task.name} does not determine its state, so morec cannot tell where an imagined "
@@ -191,15 +164,25 @@ class MOREC:
             fall_asleep(problem.logged["observation"], self.imagined_rows, keys[3]),
             keys[4],
             0,
-            0,
         )
 
-    def step(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, Metrics]:
+    def step(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, Epoch]:
         """`epoch_updates` updates of the models, of the discriminators, or of the policy."""
         key, following = jax.random.split(state.key)
         stages = {"fitting": self._fit, "opposing": self._oppose, "learning": self._learn}
-        state, metrics = stages[self.stage(state)](problem, replace(state, key=key))
-        return replace(state, key=following), {name: float(value) for name, value in metrics.items()}
+        stage = self._stage(state)
+        state, metrics = stages[stage](problem, replace(state, key=key))
+        state = replace(state, key=following)
+        if stage == "learning":
+            return state, Epoch(scalars(metrics), updates=self.epoch_updates, stage=stage)
+        prepared = min(1.0, state.preparing / (self.model_updates + self.discriminator_updates))
+        return state, Epoch(scalars(metrics), stage=stage, fraction=prepared)
+
+    def _stage(self, state: MORECState) -> str:
+        """What the next epoch does."""
+        if state.preparing < self.model_updates:
+            return "fitting"
+        return "opposing" if state.preparing < self.model_updates + self.discriminator_updates else "learning"
 
     def _fit(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
         """Fit the models, and rank them."""
@@ -208,7 +191,7 @@ class MOREC:
         )
         state = replace(state, ensemble=ensemble, ensemble_optimiser=optimiser, elites=elites)
         state = replace(state, preparing=state.preparing + self.epoch_updates)
-        if self.stage(state) == "opposing":
+        if self._stage(state) == "opposing":
             state = replace(state, opposition=replace(state.opposition, generator=ensemble.only(elites[0])))
         return state, metrics
 
@@ -271,8 +254,7 @@ class MOREC:
         )
         seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
         learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
-        state = replace(state, learner=learner, replay=seen, dreamers=dreamers)
-        return replace(state, updates=state.updates + self.epoch_updates), told | metrics
+        return replace(state, learner=learner, replay=seen, dreamers=dreamers), told | metrics
 
     @eqx.filter_jit
     def _dream(
@@ -326,29 +308,6 @@ class MOREC:
     def policy(self, state: MORECState) -> TanhGaussianPolicy:
         """The policy learnt so far; deterministic without a key."""
         return state.learner.policy
-
-    def control_steps(self, state: MORECState) -> int:
-        """None: what it imagines is not simulated."""
-        return 0
-
-    def spent(self, state: MORECState) -> int:
-        """Its budget is updates of the policy."""
-        return state.updates
-
-    def stage(self, state: MORECState) -> str:
-        """Word for the progress bar."""
-        if state.preparing < self.model_updates:
-            return "fitting"
-        return "opposing" if state.preparing < self.model_updates + self.discriminator_updates else "learning"
-
-    def progress(self, state: MORECState, budget: int) -> float:
-        """Share of all its updates done."""
-        total = self.model_updates + self.discriminator_updates + budget
-        return min(1.0, (state.preparing + state.updates) / total)
-
-    def converged(self, state: MORECState) -> str | None:
-        """It goes on until its budget is spent."""
-        return None
 
 
 def _described(features: Features, logged: Batch) -> tuple[Array, Array]:

@@ -10,13 +10,13 @@ from madoc.errors import check_at_least
 from madoc.evaluation import evaluate
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
-from madoc.learning.networks import scan_updates
+from madoc.learning.networks import scalars, scan_updates
 from madoc.learning.sac_losses import cloned_actor_loss, cloning_error
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, UniformPolicy, act_on, start_acting
 from madoc.policies.systems import UniformParameters
-from madoc.types import Metrics, Unit
+from madoc.types import Epoch
 
 
 @jax.tree_util.register_dataclass
@@ -28,7 +28,6 @@ class SACState:
         best: The policy that did best when judged.
         best_return: Its mean return then.
         judged: Control steps of learning at the last judgement; 0 before the first.
-        judging_steps: Control steps that judging has cost.
     """
 
     learner: ActorCritic
@@ -36,7 +35,6 @@ class SACState:
     best: TanhGaussianPolicy
     best_return: float
     judged: int
-    judging_steps: int
     key: PRNGKeyArray
 
 
@@ -86,49 +84,24 @@ class SAC:
         check_at_least(self, epoch_steps=self.environments, updates_per_step=0.0, discount=0.0)
         check_at_least(self, target_rate=0.0, learning_rate=0.0, judge_every=0, judge_episodes=1)
 
-    @property
-    def name(self) -> str:
-        """`sac`; `sac-bc` where it clones, `dr-bc` where it randomizes too."""
-        return "sac" if self.cloning is None else "dr-bc" if self.randomize else "sac-bc"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("return_in_simulator", "temperature")
-
-    @property
-    def unit(self) -> Unit:
-        """What its budget counts."""
-        return "control steps"
-
-    @property
-    def needs_data(self) -> bool:
-        """Only to clone."""
-        return self.cloning is not None
-
-    @property
-    def needs_parameters(self) -> bool:
-        """Not where it randomizes over the whole box."""
-        return not self.randomize
-
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> SACState:
         """Fresh networks, an empty replay, rows at reset states.
 
         Raises:
             MadocError: Cloning without data or with too little, or fewer environments than systems.
         """
-        if self.needs_data:
-            require_data(problem, self.name, rows=self.batch, outcomes=False)
+        if self.cloning is not None:
+            require_data(problem, rows=self.batch, outcomes=False)
         of_learner, of_start, key = jax.random.split(key, 3)
         sizes = problem.simulator.task.observation_size, problem.simulator.action_size
-        features = problem.features if self.needs_data else None
+        features = problem.features if self.cloning is not None else None
         learner = fresh(*sizes, hidden=self.hidden, descent=self._descent, features=features, key=of_learner)
         interaction = start_acting(
             self._place(problem), of_start, environments=self.environments, capacity=self.replay_capacity
         )
-        return SACState(learner, interaction, learner.policy, 0.0, 0, 0, key)
+        return SACState(learner, interaction, learner.policy, 0.0, 0, key)
 
-    def step(self, problem: PolicyProblem, state: SACState) -> tuple[SACState, Metrics]:
+    def step(self, problem: PolicyProblem, state: SACState) -> tuple[SACState, Epoch]:
         """Act for `epoch_steps` control steps, then update, then judge the policy where that is due."""
         of_acting, of_update, of_judging, key = jax.random.split(state.key, 4)
         explores = state.interaction.control_steps < self.warmup_steps
@@ -137,20 +110,22 @@ class SAC:
             self._place(problem), state.interaction, policy, of_acting, control_steps=self.epoch_steps
         )
         learner = state.learner
+        acted, judging = interaction.control_steps - state.interaction.control_steps, 0
         if interaction.control_steps >= self.warmup_steps:
-            count = round(self.updates_per_step * (interaction.control_steps - state.interaction.control_steps))
-            logged = problem.logged if self.needs_data else None
+            count = round(self.updates_per_step * acted)
+            logged = problem.logged if self.cloning is not None else None
             learner, losses = self._update(learner, interaction.replay, logged, of_update, count)
-            metrics |= {name: float(value) for name, value in losses.items()}
+            metrics |= scalars(losses)
         following = replace(state, learner=learner, interaction=interaction, key=key)
         due = self.judge_every and interaction.control_steps >= state.judged + self.judge_every
         if due and learner is not state.learner:
-            following, judged = self._judge(problem, following, of_judging)
-            metrics |= judged
-        return following, metrics
+            following, mean_return, judging = self._judge(problem, following, of_judging)
+            metrics |= {"judged_return": mean_return}
+        stage = "exploring" if explores else "learning"
+        return following, Epoch(metrics, control_steps=acted + judging, unbudgeted=judging, stage=stage)
 
-    def _judge(self, problem: PolicyProblem, state: SACState, key: PRNGKeyArray) -> tuple[SACState, Metrics]:
-        """Keep the policy if no earlier one's mean return was as high."""
+    def _judge(self, problem: PolicyProblem, state: SACState, key: PRNGKeyArray) -> tuple[SACState, float, int]:
+        """Keep the policy if no earlier one's mean return was as high; also that return, and the control steps."""
         of_systems, of_episodes = jax.random.split(key)
         systems = self._place(problem).systems(of_systems, self.judge_episodes)
         found = evaluate(
@@ -159,8 +134,7 @@ class SAC:
         mean = float(found.returns.mean())
         if not state.judged or mean > state.best_return:
             state = replace(state, best=state.learner.policy, best_return=mean)
-        spent = state.judging_steps + int(found.lengths.sum())
-        return replace(state, judged=state.interaction.control_steps, judging_steps=spent), {"judged_return": mean}
+        return replace(state, judged=state.interaction.control_steps), mean, int(found.lengths.sum())
 
     @eqx.filter_jit
     def _update(
@@ -198,23 +172,3 @@ class SAC:
     def policy(self, state: SACState) -> TanhGaussianPolicy:
         """The best policy so far, the latest where none was judged; deterministic without a key."""
         return state.best if state.judged else state.learner.policy
-
-    def control_steps(self, state: SACState) -> int:
-        """Simulated control steps so far, those of judging included."""
-        return state.interaction.control_steps + state.judging_steps
-
-    def spent(self, state: SACState) -> int:
-        """Its budget is control steps to learn from."""
-        return state.interaction.control_steps
-
-    def stage(self, state: SACState) -> str:
-        """Word for the progress bar."""
-        return "learning" if self.spent(state) >= self.warmup_steps else "exploring"
-
-    def progress(self, state: SACState, budget: int) -> float:
-        """Share of the budget spent."""
-        return min(1.0, self.spent(state) / budget)
-
-    def converged(self, state: SACState) -> str | None:
-        """SAC goes on until its budget is spent."""
-        return None

@@ -16,7 +16,7 @@ from madoc.runs.files import json_text, replacing
 
 State = TypeVar("State")
 
-FORMAT = 1
+FORMAT = 2
 """Version of the file's layout: one `.npy` member a leaf, and `checkpoint.json` for all the rest."""
 
 _VALUES: dict[str, tuple[type, Callable[[str], Any]]] = {

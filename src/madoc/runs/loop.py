@@ -4,55 +4,64 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Generic, Literal
 
 from jaxtyping import PRNGKeyArray
 
-from madoc.runs import checkpoint
 from madoc.errors import MadocError
+from madoc.runs import checkpoint
 from madoc.runs.interruption import interruptible
 from madoc.runs.progress import Moment, display
 from madoc.runs.run_folder import RunFolder, RunLog, count_name
-from madoc.types import Metrics, Unit
-
-Problem = TypeVar("Problem", contravariant=True)
-State = TypeVar("State")
+from madoc.types import Epoch, Method, Metrics, Problem, State, Unit
 
 Status = Literal["finished", "converged", "interrupted", "diverged"]
 
+PREPARATION = 0.1
+"""Share of the progress bar for the preparation of a method that has one."""
 
-class Method(Protocol[Problem, State]):
-    """What the loop needs of a calibrator or a policy learner: hyperparameters, and functions of a state.
 
-    A state is a pytree of JAX arrays, NumPy arrays, typed random keys, Python numbers, strings and functions.
-    It carries everything the method needs to go on. Its structure, shapes and dtypes stay those of `init`,
-    and a healthy state holds no NaN and no infinity, not even as a marker.
+@dataclass(frozen=True)
+class Tally:
+    """What the epochs of a run add up to; part of every checkpoint.
+
+    Attributes:
+        control_steps: Simulated control steps.
+        unbudgeted: Those of them that the budget does not count.
+        updates: Gradient updates.
+        stage: Of the last epoch.
+        prepared: Share of the preparation that is done; None where there was none.
+        converged: Why the method stopped by itself.
     """
 
-    def init(self, problem: Problem, key: PRNGKeyArray) -> State:
-        """The state before the first epoch. Cheap: a resumed run calls it too, for the structure."""
-        ...
+    control_steps: int = 0
+    unbudgeted: int = 0
+    updates: int = 0
+    stage: str = ""
+    prepared: float | None = None
+    converged: str | None = None
 
-    def step(self, problem: Problem, state: State) -> tuple[State, Metrics]:
-        """One epoch, 0.1 to 2 seconds: the new state, and finite scalars worth looking at."""
-        ...
+    def plus(self, epoch: Epoch) -> "Tally":
+        """With one more epoch."""
+        return Tally(
+            self.control_steps + epoch.control_steps,
+            self.unbudgeted + epoch.unbudgeted,
+            self.updates + epoch.updates,
+            epoch.stage,
+            self.prepared if epoch.fraction is None else epoch.fraction,
+            epoch.converged,
+        )
 
-    def control_steps(self, state: State) -> int:
-        """Simulated control steps spent so far; 0 for ever where the method does not simulate."""
-        ...
+    def spent(self, unit: Unit) -> int:
+        """What the budget counts."""
+        return self.updates if unit == "updates" else self.control_steps - self.unbudgeted
 
-    def stage(self, state: State) -> str:
-        """What the next step does, in one short word: `cloning`, `grouping`, `calibrating`, `learning`."""
-        ...
-
-    def progress(self, state: State, budget: int) -> float:
-        """How much is done, 0 to 1, stages that simulate nothing included."""
-        ...
-
-    def converged(self, state: State) -> str | None:
-        """None to go on, else a sentence saying why the method stopped by itself."""
-        ...
+    def fraction(self, spent_share: float) -> float:
+        """Share of all work done, given the share of the budget spent."""
+        spent_share = min(spent_share, 1.0)
+        return spent_share if self.prepared is None else PREPARATION * self.prepared + (1 - PREPARATION) * spent_share
 
 
 @dataclass(frozen=True)
@@ -89,7 +98,6 @@ def run(
     shown: Sequence[str] = (),
     checkpoint_every: float = 30.0,
     unit: Unit = "control steps",
-    spent: Callable[[State], int] | None = None,
     trace: Callable[[State], Metrics] | None = None,
 ) -> Finished[State]:
     """Run a method until its budget is spent, it has converged, the user stops it, or a NaN appears.
@@ -110,7 +118,6 @@ def run(
         shown: Metrics shown beside the bar, at most three; the first three if none is named.
         checkpoint_every: Seconds between two checkpoints.
         unit: What the budget counts.
-        spent: How many of them a state has spent; `method.control_steps` where it is None.
         trace: More finite scalars of a state, for the log alone.
 
     Raises:
@@ -122,8 +129,7 @@ def run(
     _check_folder(folder, resume)
     with ExitStack() as stack:
         interruption = stack.enter_context(interruptible())
-        allowance = _Allowance(budget, unit, spent or method.control_steps)
-        session = _Session(method, allowance, method.init(problem, key), folder, resume, trace)
+        session = _Session(method, method.init(problem, key), budget, unit, folder, resume, trace)
         if session.ended(interruption.asked) and session.resumed:
             return session.finish()
         session.begin(stack)
@@ -131,14 +137,13 @@ def run(
         show(session.moment({}))
         due = time.monotonic() + checkpoint_every
         while session.outcome is None:
-            stage = method.stage(session.state)
             try:
                 with interruption.breakable():
-                    state, metrics = method.step(problem, session.state)
+                    state, epoch = method.step(problem, session.state)
             except KeyboardInterrupt:
                 session.abandon()
                 break
-            metrics = session.take(state, metrics, stage)
+            metrics = session.take(state, epoch)
             show(session.moment({name: metrics[name] for name in shown if name in metrics} or metrics))
             if session.ended(interruption.asked) or time.monotonic() >= due:
                 session.save()
@@ -146,34 +151,26 @@ def run(
         return session.finish()
 
 
-@dataclass(frozen=True)
-class _Allowance(Generic[State]):
-    """The budget, what it counts, and how many of them a state has spent."""
-
-    budget: int
-    unit: Unit
-    spent: Callable[[State], int]
-
-
 class _Session(Generic[State]):
-    """A run under way: its state, and what of it is on the disk."""
+    """A run under way: its state, what its epochs add up to, and what of it is on the disk."""
 
     def __init__(
         self,
         method: Method[Any, State],
-        allowance: _Allowance[State],
         state: State,
+        budget: int,
+        unit: Unit,
         folder: RunFolder | None,
         resume: bool,
         trace: Callable[[State], Metrics] | None,
     ) -> None:
         self.state = state
-        self._trace = trace
         self.resumed = resume and folder is not None and folder.checkpoint.exists()
         self.outcome: tuple[Status, str] | None = None
-        self._method = method
-        self._allowance = allowance
-        self._budget, self._unit = allowance.budget, allowance.unit
+        self._tally = Tally()
+        self._trace = trace
+        self._method_name = type(method).__name__
+        self._budget, self._unit = budget, unit
         self._folder = folder
         self._layout = checkpoint.layout(state) if folder else {}
         self._log: RunLog | None = None
@@ -183,16 +180,13 @@ class _Session(Generic[State]):
         self._stopped: float | None = None
         if folder and self.resumed:
             self.state, extra = checkpoint.load(folder.checkpoint, like=state)
+            self._tally = Tally(**extra["tally"])
             self._offset = int(extra["metrics_bytes"])
             self._earlier = float(extra["seconds"])
 
     @property
-    def control_steps(self) -> int:
-        return int(self._method.control_steps(self.state))
-
-    @property
     def spent(self) -> int:
-        return int(self._allowance.spent(self.state))
+        return self._tally.spent(self._unit)
 
     def begin(self, stack: ExitStack) -> None:
         """Open the logs; write the first checkpoint, which refuses a bad state before any budget is spent."""
@@ -208,9 +202,8 @@ class _Session(Generic[State]):
         """Whether there is a reason to stop; the first one found stays the reason."""
         if self.outcome is None:
             spent = self.spent
-            why = self._method.converged(self.state)
-            if why is not None:
-                self.outcome = "converged", why
+            if self._tally.converged is not None:
+                self.outcome = "converged", self._tally.converged
             elif spent >= self._budget:
                 self.outcome = "finished", f"the budget of {self._budget:,} {self._unit} is spent"
             elif interrupted:
@@ -219,19 +212,18 @@ class _Session(Generic[State]):
 
     def moment(self, metrics: Metrics) -> Moment:
         """Where the run stands, for the progress bar."""
-        fraction = min(max(self._method.progress(self.state, self._budget), 0.0), 1.0)
-        return Moment(fraction, self.spent, self._method.stage(self.state), metrics)
+        return Moment(self._tally.fraction(self.spent / self._budget), self.spent, self._tally.stage, metrics)
 
-    def take(self, state: State, metrics: Metrics, stage: str) -> Metrics:
+    def take(self, state: State, epoch: Epoch) -> Metrics:
         """Accept the result of a step, log it, and look at its metrics."""
-        self.state = state
-        metrics = {name: float(value) for name, value in metrics.items()}
+        self.state, self._tally = state, self._tally.plus(epoch)
+        metrics = {name: float(value) for name, value in epoch.metrics.items()}
         if self._log:
             traced = metrics | (self._trace(state) if self._trace else {})
-            self._log.append(traced, stage=stage, spent=self.spent, seconds=self._seconds())
+            self._log.append(traced, stage=epoch.stage, spent=self.spent, seconds=self._seconds())
         for name, value in metrics.items():
             if not math.isfinite(value):
-                self._diverge(f"metric {name} became {value} while {stage}")
+                self._diverge(f"metric {name} became {value} while {epoch.stage}")
                 break
         return metrics
 
@@ -244,9 +236,8 @@ class _Session(Generic[State]):
             elif self._folder and self._log:
                 problem = checkpoint.difference(checkpoint.layout(self.state), self._layout)
                 if problem:
-                    raise MadocError(f"{type(self._method).__name__} changed the layout of its state: {problem}")
-                extra = self._extra() | {"metrics_bytes": self._log.sync()}
-                checkpoint.save(self._folder.checkpoint, self.state, extra)
+                    raise MadocError(f"{self._method_name} changed the layout of its state: {problem}")
+                self._write_state(self._folder.checkpoint, self._log.sync())
 
     def abandon(self) -> None:
         """Stop inside a step. What it may have left half-changed is not saved: the last checkpoint stays."""
@@ -258,15 +249,16 @@ class _Session(Generic[State]):
         if self.outcome is None:
             raise RuntimeError("finish() before the run has ended")
         status, sentence = self.outcome
-        finished = Finished(self.state, status, sentence, self.control_steps, self.spent, self._seconds())
+        control_steps, seconds = self._tally.control_steps, self._seconds()
         if self._folder and not self._folder.result.exists():
-            self._folder.write_json("result.json", {"status": status, "sentence": sentence} | self._extra())
-        return finished
+            counts = {count_name(self._unit): self.spent, "control_steps": control_steps, "seconds": seconds}
+            self._folder.write_json("result.json", {"status": status, "sentence": sentence} | counts)
+        return Finished(self.state, status, sentence, control_steps, self.spent, seconds)
 
     def _diverge(self, what: str) -> None:
         where = ""
         if self._folder:
-            checkpoint.save(self._folder.diverged, self.state, self._extra())
+            self._write_state(self._folder.diverged, self._offset)
             where = f"; the bad state is in {self._folder.diverged}"
             if self._folder.checkpoint.exists():
                 where += f", the last good one in {self._folder.checkpoint}"
@@ -280,8 +272,9 @@ class _Session(Generic[State]):
             self._stopped = time.monotonic()
         return self._earlier + self._stopped - self._started
 
-    def _extra(self) -> dict[str, Any]:
-        return {count_name(self._unit): self.spent, "control_steps": self.control_steps, "seconds": self._seconds()}
+    def _write_state(self, path: Path, metrics_bytes: int) -> None:
+        extra = {"tally": asdict(self._tally), "seconds": self._seconds(), "metrics_bytes": metrics_bytes}
+        checkpoint.save(path, self.state, extra)
 
 
 def _check_folder(folder: RunFolder | None, resume: bool) -> None:

@@ -5,7 +5,7 @@ cost adds an L1 and an L2 distance of trajectories; how they are weighed, and ov
 every channel is in units of its typical change in one step, and both distances count the same.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -23,7 +23,7 @@ from madoc.calibration.baselines.population_search import (
 from madoc.errors import check_at_least
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import first_rows
-from madoc.types import Metrics
+from madoc.types import Epoch
 
 
 def trajectory_cost(
@@ -59,55 +59,30 @@ class Droid:
     def __post_init__(self) -> None:
         check_at_least(self, horizon=1, windows=1, population=4, tolerance=0.0, absolute=0.0, squared=0.0)
 
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "droid"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("cost", "deviation")
-
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
         """The search about mid-range.
 
         Raises:
             MadocError: No state can be rebuilt, no episode is long enough, or the next observations are shuffled.
         """
-        problem.require_pairs(self.name)
+        problem.require_pairs()
         first_rows(problem.dataset, problem.logged_rows, self.horizon)
-        return SearchState(evolution.begin(np.zeros(len(problem.simulator.parameters))), key, 0, 0)
+        return SearchState(evolution.begin(np.zeros(len(problem.simulator.parameters))), key, 0)
 
-    def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Metrics]:
+    def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
         """One generation, all candidates in one batch."""
         of_candidates, of_windows, key = jax.random.split(state.key, 3)
         candidates = evolution.ask(state.search, of_candidates, self.population)
         windows = draw_windows(problem, self.horizon, self.windows, of_windows)
-        scale = problem.scalings["standardised"].next_scale
+        scale = problem.typical_change
         residuals = window_residuals(problem.simulator, windows, candidates, scale)
         by_window = trajectory_cost(residuals, absolute=self.absolute, squared=self.squared)
         costs = mean_with_failures(by_window)
-        spent, failures = by_window.size * self.horizon, int(np.isnan(by_window).sum())
-        following = next_generation(state, key, candidates, costs, spent=spent, failures=failures)
-        return following, {"cost": float(costs.min()), "deviation": evolution.widest_deviation(following.search)}
+        state = replace(state, key=key, failures=state.failures + int(np.isnan(by_window).sum()))
+        return next_generation(
+            state, candidates, costs, control_steps=by_window.size * self.horizon, tolerance=self.tolerance
+        )
 
     def estimate(self, problem: CalibrationProblem, state: SearchState) -> Estimate:
         """The mean of the search, and the covariance of its last candidates: the paper's randomization."""
         return estimate_from_search(problem, state)
-
-    def control_steps(self, state: SearchState) -> int:
-        """Simulated control steps so far."""
-        return state.control_steps
-
-    def stage(self, state: SearchState) -> str:
-        """There is only one."""
-        return "calibrating"
-
-    def progress(self, state: SearchState, budget: int) -> float:
-        """Share of the control steps."""
-        return min(1.0, state.control_steps / budget)
-
-    def converged(self, state: SearchState) -> str | None:
-        """A sentence once the search is narrow."""
-        return evolution.settled(state.search, self.tolerance)

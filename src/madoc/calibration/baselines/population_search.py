@@ -9,18 +9,18 @@ from jaxtyping import Float, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines import evolution
 from madoc.calibration.baselines.evolution import Evolution
-from madoc.calibration.cautions import at_end_of_range, exploded
+from madoc.calibration.cautions import at_end_of_range
 from madoc.identification.windows import Windows, first_rows, windows_at
+from madoc.types import Epoch
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SearchState:
-    """A search under way, its randomness, and what it has spent."""
+    """A search under way, its randomness, and how many simulated rows have exploded."""
 
     search: Evolution
     key: PRNGKeyArray
-    control_steps: int
     failures: int
 
 
@@ -52,21 +52,17 @@ def mean_with_failures(costs: Float[np.ndarray, "candidates windows"]) -> Float[
 
 def next_generation(
     state: SearchState,
-    key: PRNGKeyArray,
     candidates: Float[np.ndarray, "population d"],
     costs: Float[np.ndarray, " population"],
     *,
-    spent: int,
-    failures: int,
-) -> SearchState:
-    """The state once the candidates' costs are known."""
-    return replace(
-        state,
-        search=evolution.tell(state.search, candidates, costs),
-        key=key,
-        control_steps=state.control_steps + spent,
-        failures=state.failures + failures,
-    )
+    control_steps: int,
+    tolerance: float,
+) -> tuple[SearchState, Epoch]:
+    """The state once the candidates' costs are known, and the epoch that has found them out."""
+    search = evolution.tell(state.search, candidates, costs)
+    metrics = {"cost": float(costs.min()), "deviation": evolution.widest_deviation(search)}
+    epoch = Epoch(metrics, control_steps, converged=evolution.settled(search, tolerance))
+    return replace(state, search=search), epoch
 
 
 def estimate_from_search(problem: CalibrationProblem, state: SearchState) -> Estimate:
@@ -78,9 +74,7 @@ def estimate_from_search(problem: CalibrationProblem, state: SearchState) -> Est
         mean=space.to_physical(state.search.mean),
         std=np.sqrt(np.diag(covariance)),
         groups=(tuple(range(len(space))),),
-        warnings=(
-            *at_end_of_range(state.search.mean, space.names),
-            *exploded(state.failures, state.control_steps),
-        ),
+        failures=state.failures,
+        warnings=at_end_of_range(state.search.mean, space.names),
         covariance=covariance,
     )

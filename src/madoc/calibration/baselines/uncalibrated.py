@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.types import Metrics
+from madoc.types import Epoch
 
 
 @jax.tree_util.register_dataclass
@@ -20,7 +20,7 @@ class UncalibratedState:
 
 @dataclass(frozen=True)
 class Uncalibrated:
-    """What is known before any data is looked at. It simulates nothing and has converged before its first epoch.
+    """What is known before any data is looked at. It simulates nothing and converges in its first epoch.
 
     Attributes:
         randomised: False is `nominal`: mid-range without a spread, the simulator as it comes. True is `uniform`:
@@ -29,23 +29,13 @@ class Uncalibrated:
 
     randomised: bool = False
 
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "uniform" if self.randomised else "nominal"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """No metrics."""
-        return ()
-
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> UncalibratedState:
         """Nothing to begin with."""
         return UncalibratedState(key)
 
-    def step(self, problem: CalibrationProblem, state: UncalibratedState) -> tuple[UncalibratedState, Metrics]:
-        """Nothing happens."""
-        return state, {}
+    def step(self, problem: CalibrationProblem, state: UncalibratedState) -> tuple[UncalibratedState, Epoch]:
+        """It has converged, as there is nothing to do."""
+        return state, Epoch(converged="there is nothing to simulate")
 
     def estimate(self, problem: CalibrationProblem, state: UncalibratedState) -> Estimate:
         """The middle of every range, whatever the data says."""
@@ -58,19 +48,3 @@ class Uncalibrated:
             warnings=("nothing was calibrated: this is the middle of every range, whatever the data says",),
             covariance=np.diag(std**2),
         )
-
-    def control_steps(self, state: UncalibratedState) -> int:
-        """None."""
-        return 0
-
-    def stage(self, state: UncalibratedState) -> str:
-        """There is only one."""
-        return "calibrating"
-
-    def progress(self, state: UncalibratedState, budget: int) -> float:
-        """It is done."""
-        return 1.0
-
-    def converged(self, state: UncalibratedState) -> str | None:
-        """Always."""
-        return "there is nothing to simulate"

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.cautions import at_end_of_range, exploded
+from madoc.calibration.cautions import at_end_of_range
 from madoc.calibration.least_squares.estimated_states import STATES_FIRST, EstimatedState, EstimatedStates
 from madoc.calibration.least_squares.lengthening import (
     LENGTHS,
@@ -25,7 +25,7 @@ from madoc.data import Dataset
 from madoc.errors import check_at_least
 from madoc.identification.information import half_width, identifiability, sandwich
 from madoc.identification.losses import Loss
-from madoc.types import Metrics
+from madoc.types import Epoch, Metrics
 
 InitialStates = Literal["logged", "estimated"]
 LOGGED_HORIZON = 1
@@ -106,16 +106,6 @@ class LeastSquares:
         counts = ("horizon", "windows", "searches", "search_windows", "search_epochs")
         check_at_least(self, **dict.fromkeys(counts, 1), tolerance=0.0)
 
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "least-squares"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("residual", "moved")
-
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> LeastSquaresState:
         """Windows drawn, searches at their starts.
 
@@ -123,7 +113,7 @@ class LeastSquares:
             MadocError: No state can be rebuilt and no position is known, no episode is long enough, there are fewer
                 values than unknowns, or the data's next observations are shuffled.
         """
-        problem.require_pairs(self.name)
+        problem.require_pairs()
         phase = self._first_phase(problem)
         return LeastSquaresState(
             logged=None if phase == "estimated" else self._logged(problem).init(problem, key),
@@ -134,8 +124,14 @@ class LeastSquares:
             checking=0,
         )
 
-    def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Metrics]:
+    def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
         """One damped step of the search under way: two simulations, one of slopes, one of the steps tried."""
+        stage = self._stage(state)
+        following, metrics = self._next(problem, state)
+        spent = self._control_steps(following) - self._control_steps(state)
+        return following, Epoch(metrics, spent, stage=stage, converged=self._converged(following))
+
+    def _next(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Metrics]:
         if state.phase == "estimated":
             under_way = state.length if state.length < len(state.estimated) else state.found
             search, metrics = self._estimated(problem, under_way).step(problem, state.estimated[under_way])
@@ -167,10 +163,10 @@ class LeastSquares:
             mean=mean,
             std=np.sqrt(np.diag(covariance)),
             groups=(tuple(range(len(space))),),
+            failures=failures,
             warnings=(
                 *identifiability(found, space.names),
                 *at_end_of_range(unit, space.names),
-                *exploded(failures, self.control_steps(state)),
                 *_said_of_ending(search, state.phase),
                 *self._said_of_states(problem, state),
             ),
@@ -178,7 +174,7 @@ class LeastSquares:
             interval=interval,
         )
 
-    def control_steps(self, state: LeastSquaresState) -> int:
+    def _control_steps(self, state: LeastSquaresState) -> int:
         """Simulated control steps so far."""
         return state.checking + sum(part.control_steps for part in _parts(state))
 
@@ -192,16 +188,12 @@ class LeastSquares:
                 steps += self._estimated(problem, length).whole_run(problem, search, refining_epochs)
         return steps
 
-    def stage(self, state: LeastSquaresState) -> str:
+    def _stage(self, state: LeastSquaresState) -> str:
         """What the next epoch does."""
         search = state.estimated[state.found] if state.phase == "estimated" else state.logged
         return "calibrating" if search is not None and search.refining else "searching"
 
-    def progress(self, state: LeastSquaresState, budget: int) -> float:
-        """Share of the control steps."""
-        return min(1.0, self.control_steps(state) / budget)
-
-    def converged(self, state: LeastSquaresState) -> str | None:
+    def _converged(self, state: LeastSquaresState) -> str | None:
         """A sentence once the steps are too small to matter."""
         search: LoggedState | EstimatedState | None = None
         if state.phase == "estimated":
@@ -215,10 +207,9 @@ class LeastSquares:
 
     def _first_phase(self, problem: CalibrationProblem) -> str:
         """What the first epoch does: `logged`, `estimated`, `starting` from logged for estimated, or `undecided`."""
-        task = problem.simulator.task
         if self.initial_states == "logged":
             return "logged"
-        if task.state_from_observation is None and task.posture is not None:
+        if problem.states.kind != "exact" and len(problem.states.rows):
             return "estimated"
         known = problem.dataset.disturbance
         told = self.initial_states == "estimated" or known.noise > 0 or known.velocities == "differences"
@@ -316,7 +307,7 @@ class LeastSquares:
             return ()
         estimated = state.estimated[state.found]
         noise = problem.dataset.disturbance.noise
-        if problem.simulator.task.state_from_observation is None:
+        if problem.states.kind != "exact":
             why = "states cannot be rebuilt from the data"
         elif problem.dataset.disturbance.velocities == "differences":
             why = "velocities are differences of positions, which are what it compares"

@@ -24,16 +24,44 @@ from madoc.calibration.madoc.watch import Watch
 from madoc.errors import MadocError, check_at_least
 from madoc.learning import replay
 from madoc.learning.cloning import clone
-from madoc.learning.networks import adam
+from madoc.learning.networks import adam, scalars
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.learning.window_features import WindowScaling
 from madoc.simulation.rollout import Walkers, begin
-from madoc.types import Metrics
+from madoc.types import Epoch
 
 Grouping = Literal["learned", "one", "each"]
 GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
 """Parameter draws an epoch, and control steps a row lives under one draw, by start mode."""
-_NAMES = {("learned", "sum"): "madoc-vdn", ("learned", "independent"): "madoc-isac"}
+PAPER: dict[str, Any] = {
+    "starts": "policy",
+    "features": "raw",
+    "hidden": (256, 256),
+    "cloning_epochs": 100,
+    "cloning_updates": 1000,
+    "keep_cloning": True,
+    "grouping_epochs": 200,
+    "grouping_updates": 1000,
+    "updates": 1000,
+    "draws": 10,
+    "horizon": 100,
+    "learning_rate": 3e-4,
+    "replay_capacity": 1_000_000,
+    "patience": 0,
+    "agents": AgentSettings(
+        hidden=(256, 256),
+        pair_bound=2.0,
+        weigh_overlap=False,
+        judge_rate=1.0,
+        dropout=0.2,
+        actor_batch=256,
+        critic_rate=3e-4,
+        actor_rate=3e-4,
+        prior_rate=1e-3,
+        reward_size=0.0,
+    ),
+}
+"""Hyperparameters of the paper (appendix C, and the authors' code) that differ from the defaults."""
 
 
 @jax.tree_util.register_dataclass
@@ -54,7 +82,6 @@ class MadocState:
     key: PRNGKeyArray
     cloned: int
     grouped: int
-    control_steps: int
     failures: int
 
 
@@ -144,49 +171,7 @@ class Madoc:
         The authors' prior is a squared distance of means; Eq. (13)'s KL is kept here. Their code draws a
         parameter vector every 100 control steps of one walker; so does this, for ten walkers at a time.
         """
-        agents = AgentSettings(
-            hidden=(256, 256),
-            pair_bound=2.0,
-            weigh_overlap=False,
-            judge_rate=1.0,
-            dropout=0.2,
-            actor_batch=256,
-            critic_rate=3e-4,
-            actor_rate=3e-4,
-            prior_rate=1e-3,
-            reward_size=0.0,
-        )
-        constants: dict[str, Any] = {
-            "starts": "policy",
-            "features": "raw",
-            "hidden": (256, 256),
-            "cloning_epochs": 100,
-            "cloning_updates": 1000,
-            "keep_cloning": True,
-            "grouping_epochs": 200,
-            "grouping_updates": 1000,
-            "updates": 1000,
-            "draws": 10,
-            "horizon": 100,
-            "learning_rate": 3e-4,
-            "replay_capacity": 1_000_000,
-            "patience": 0,
-            "agents": agents,
-        }
-        return cls(**(constants | changes))
-
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists the variant; raw features without a blur are the paper's own."""
-        if self.features == "raw" and self.agents.reward_size == 0.0:
-            return "madoc-paper"
-        by_groups = {"one": "madoc-s", "each": "madoc-ungrouped", "learned": "madoc"}
-        return _NAMES.get((self.groups, self.mixing), by_groups[self.groups])
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("mismatch", "accuracy_sas", "cloning_loss")
+        return cls(**(PAPER | changes))
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> MadocState:
         """Fresh networks, empty buffers, rows at their starts.
@@ -231,14 +216,13 @@ class Madoc:
             key=key,
             cloned=0,
             grouped=0,
-            control_steps=0,
             failures=0,
         )
 
-    def step(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Metrics]:
+    def step(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         """One epoch of whichever stage is due."""
         do = {"cloning": self._clone, "grouping": self._group, "calibrating": self._calibrate}
-        return do[self.stage(state)](problem, state)
+        return do[self._stage(state)](problem, state)
 
     def estimate(self, problem: CalibrationProblem, state: MadocState) -> Estimate:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
@@ -249,14 +233,9 @@ class Madoc:
             mean=space.to_physical(unit),
             std=(1.0 - unit**2) * std * (space.high - space.low) / 2.0,
             groups=tuple(tuple(group) for group in groups),
+            failures=state.failures,
             warnings=(
-                *watch.warnings(
-                    state.watch,
-                    unit,
-                    space.names,
-                    failures=state.failures,
-                    control_steps=state.control_steps,
-                ),
+                *watch.warnings(state.watch, unit, space.names),
                 *said_of_observations(problem, self._window(problem), self._deviation(problem), self.starts),
             ),
         )
@@ -265,26 +244,13 @@ class Madoc:
         """The VAE's embedding of each parameter, once it has been trained."""
         return np.asarray(state.vae.embeddings(), dtype=np.float64) if state.grouped else None
 
-    def control_steps(self, state: MadocState) -> int:
-        """Simulated control steps so far, grouping included."""
-        return state.control_steps
-
-    def stage(self, state: MadocState) -> str:
+    def _stage(self, state: MadocState) -> str:
         """What the next epoch does."""
         if self._will_clone and state.cloned < self.cloning_epochs:
             return "cloning"
         if 1 < len(state.agents.critics.weight) < len(state.labels) and state.grouped < self.grouping_epochs:
             return "grouping"
         return "calibrating"
-
-    def progress(self, state: MadocState, budget: int) -> float:
-        """Share of the control steps and of the cloning done; cloning counts as a tenth."""
-        cloned = state.cloned / self.cloning_epochs if self._will_clone and self.cloning_epochs else 1.0
-        return min(1.0, 0.1 * cloned + 0.9 * state.control_steps / budget)
-
-    def converged(self, state: MadocState) -> str | None:
-        """A sentence once the mismatch stays as it is."""
-        return watch.stalled(state.watch, self.patience) if self.patience else None
 
     @property
     def _will_clone(self) -> bool:
@@ -313,7 +279,7 @@ class Madoc:
         rows = max(1, self.epoch_steps // (systems * self._geometry(problem)[1]))
         return begin(starts_of(problem, self.starts), key, systems=systems, rows=rows)
 
-    def _clone(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Metrics]:
+    def _clone(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         of_batches, key = jax.random.split(state.key)
         policy, optimiser_state, metrics = clone(
             state.policy,
@@ -325,9 +291,12 @@ class Madoc:
             count=self.cloning_updates,
         )
         cloned = {"policy": policy, "policy_optimiser": optimiser_state, "cloned": state.cloned + 1}
-        return replace(state, key=key, **cloned), _scalars(metrics)
+        following = replace(state, key=key, **cloned)
+        return following, Epoch(
+            scalars(metrics), stage="cloning", fraction=following.cloned / max(1, self.cloning_epochs)
+        )
 
-    def _group(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Metrics]:
+    def _group(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         count = len(problem.simulator.parameters)
         of_draws, of_start, of_action, of_restart, of_batches, key = jax.random.split(state.key, 6)
         scaling, _ = self._windows(problem)
@@ -366,12 +335,11 @@ class Madoc:
             rows=replay.clear(rows) if done else rows,
             key=key,
             grouped=grouped,
-            control_steps=state.control_steps + rollout.valid.size,
             failures=state.failures + rollout.failures,
         )
-        return following, _scalars(metrics)
+        return following, Epoch(scalars(metrics), control_steps=rollout.valid.size, stage="grouping")
 
-    def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Metrics]:
+    def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
         systems, steps = self._geometry(problem)
         scaling, logged = self._windows(problem)
@@ -397,7 +365,7 @@ class Madoc:
             mixing=self.mixing,
             count=self.updates,
         )
-        metrics = _scalars(device_metrics)
+        metrics = scalars(device_metrics)
         watched = watch.observe(
             state.watch, metrics, agents.average, steered_to=self.agents.reward_size, blur_range=BLUR_RANGE
         )
@@ -408,21 +376,17 @@ class Madoc:
             walkers=state.walkers if fresh else walkers,
             watch=watched,
             key=key,
-            control_steps=state.control_steps + rollout.valid.size,
             failures=state.failures + rollout.failures,
         )
         metrics |= {"mismatch": watched.mismatch, "failures": float(following.failures)}
-        if not (self.keep_cloning and self._will_clone):
-            return following, metrics
-        cloned, cloning_metrics = self._clone(problem, following)
-        return replace(cloned, cloned=state.cloned), metrics | cloning_metrics
+        if self.keep_cloning and self._will_clone:
+            cloned, cloning = self._clone(problem, following)
+            following, metrics = replace(cloned, cloned=state.cloned), metrics | cloning.metrics
+        stalled = watch.stalled(watched, self.patience) if self.patience else None
+        return following, Epoch(metrics, control_steps=rollout.valid.size, converged=stalled)
 
 
 def _out_of_step(walkers: Walkers, max_age: int) -> Walkers:
     """Rows that did not all start at once: ages spread evenly, so that time limits do not fall together."""
     count = walkers.age.size
     return replace(walkers, age=(np.arange(count) * max_age // count).reshape(walkers.age.shape))
-
-
-def _scalars(metrics: dict[str, Array]) -> Metrics:
-    return {name: float(value) for name, value in metrics.items()}

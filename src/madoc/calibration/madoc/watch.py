@@ -95,9 +95,7 @@ def stalled(watch: Watch, patience: int) -> str | None:
     )
 
 
-def warnings(
-    watch: Watch, unit: np.ndarray, names: tuple[str, ...], *, failures: int, control_steps: int
-) -> tuple[str, ...]:
+def warnings(watch: Watch, unit: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
     """What a user should know of the estimate `unit` (d,) in [-1, 1], one sentence each."""
     found = []
     if watch.epochs < SETTLING:
@@ -113,9 +111,4 @@ def warnings(
     at_end = [name for name, value in zip(names, unit, strict=True) if abs(value) > AT_END]
     if at_end:
         found.append(f"at the end of its range: {', '.join(at_end)}; widen the range or doubt the model")
-    if failures:
-        found.append(
-            f"{failures} of {control_steps:,} simulated rows exploded and were left out; "
-            "the ranges may hold impossible parameters"
-        )
     return tuple(found)

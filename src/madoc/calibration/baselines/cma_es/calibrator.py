@@ -34,9 +34,10 @@ from madoc.errors import check_at_least
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import first_rows
 from madoc.learning.cloning import clone
+from madoc.learning.networks import scalars
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.rollout import Walkers, begin, reset_states, roll
-from madoc.types import Metrics
+from madoc.types import Epoch
 
 ROWS = {"one-step": 100, "distribution": 500, "policy": 50}
 """Logged rows, or walkers, under each candidate."""
@@ -124,16 +125,6 @@ class CmaEs:
         check_at_least(self, **dict.fromkeys(counts, 1), horizon=2, population=4, tolerance=0.0)
         check_at_least(self, cloning_epochs=0, learning_rate=0.0)
 
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "cma-es" if self.objective == "one-step" else "cma-es-distribution"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("cost", "deviation", "cloning_loss")
-
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> CmaEsState:
         """The search about mid-range; features, clone and walkers where they are needed.
 
@@ -141,22 +132,22 @@ class CmaEs:
             MadocError: States are needed and none can be rebuilt, or pairs are and the next observations are shuffled.
         """
         if self.objective == "one-step":
-            problem.require_pairs(self.name)
+            problem.require_pairs()
         if not self._acts:
             first_rows(problem.dataset, problem.logged_rows, 1)
         of_features, of_actor, key = jax.random.split(key, 3)
         search = evolution.begin(np.zeros(len(problem.simulator.parameters)))
         clouds = None if self.objective == "one-step" else self._begin_clouds(problem, of_features)
         actor = self._begin_actor(problem, of_actor) if self._acts else None
-        return CmaEsState(SearchState(search, key, 0, 0), clouds, actor)
+        return CmaEsState(SearchState(search, key, 0), clouds, actor)
 
-    def step(self, problem: CalibrationProblem, state: CmaEsState) -> tuple[CmaEsState, Metrics]:
+    def step(self, problem: CalibrationProblem, state: CmaEsState) -> tuple[CmaEsState, Epoch]:
         """One generation; before the first, epochs of cloning and one of reading the log."""
         inner, clouds, actor = state.inner, state.clouds, state.actor
-        if actor is not None and self.stage(state) == "cloning":
+        if actor is not None and actor.epochs < self.cloning_epochs:
             return self._clone(problem, state, actor)
-        if clouds is not None and self.stage(state) == "reading":
-            return replace(state, clouds=self._read(problem, clouds)), {}
+        if clouds is not None and not clouds.read:
+            return replace(state, clouds=self._read(problem, clouds)), Epoch(stage="reading")
         of_candidates, of_rows, key = jax.random.split(inner.key, 3)
         candidates = evolution.ask(inner.search, of_candidates, self.population)
         if clouds is None:
@@ -165,32 +156,13 @@ class CmaEs:
             costs, spent, failures = self._replay(problem, clouds, candidates, of_rows)
         else:
             costs, spent, failures, actor = self._act(problem, clouds, actor, candidates, of_rows)
-        inner = next_generation(inner, key, candidates, costs, spent=spent, failures=failures)
-        told = {"cost": float(costs.min()), "deviation": evolution.widest_deviation(inner.search)}
-        return CmaEsState(inner, clouds, actor), told
+        inner = replace(inner, key=key, failures=inner.failures + failures)
+        inner, epoch = next_generation(inner, candidates, costs, control_steps=spent, tolerance=self.tolerance)
+        return CmaEsState(inner, clouds, actor), epoch
 
     def estimate(self, problem: CalibrationProblem, state: CmaEsState) -> Estimate:
         """Centre and covariance of the search. The covariance says where it looks, not how sure it may be."""
         return estimate_from_search(problem, state.inner)
-
-    def control_steps(self, state: CmaEsState) -> int:
-        """Simulated control steps so far."""
-        return state.inner.control_steps
-
-    def stage(self, state: CmaEsState) -> str:
-        """What the next epoch does."""
-        if state.actor is not None and state.actor.epochs < self.cloning_epochs:
-            return "cloning"
-        return "reading" if state.clouds is not None and not state.clouds.read else "calibrating"
-
-    def progress(self, state: CmaEsState, budget: int) -> float:
-        """Share of the control steps and of the cloning done; cloning counts as a tenth."""
-        cloned = state.actor.epochs / self.cloning_epochs if state.actor is not None and self.cloning_epochs else 1.0
-        return min(1.0, 0.1 * cloned + 0.9 * state.inner.control_steps / budget)
-
-    def converged(self, state: CmaEsState) -> str | None:
-        """A sentence once the search is narrow."""
-        return evolution.settled(state.inner.search, self.tolerance)
 
     @property
     def _rows(self) -> int:
@@ -232,7 +204,7 @@ class CmaEs:
         walkers = replace(walkers, age=ages)
         return Actor(policy, self._adam.init(eqx.filter(policy, eqx.is_array)), walkers, 0)
 
-    def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Metrics]:
+    def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Epoch]:
         of_batches, key = jax.random.split(state.inner.key)
         policy, optimiser, metrics = clone(
             actor.policy,
@@ -245,7 +217,7 @@ class CmaEs:
         )
         actor = replace(actor, policy=policy, optimiser=optimiser, epochs=actor.epochs + 1)
         following = replace(state, inner=replace(state.inner, key=key), actor=actor)
-        return following, {name: float(value) for name, value in metrics.items()}
+        return following, Epoch(scalars(metrics), stage="cloning", fraction=actor.epochs / self.cloning_epochs)
 
     def _standardised(
         self, problem: CalibrationProblem, rows: Float[np.ndarray, "*rows values"]
@@ -276,7 +248,7 @@ class CmaEs:
         self, problem: CalibrationProblem, candidates: Float[np.ndarray, "population d"], key: PRNGKeyArray
     ) -> tuple[Float[np.ndarray, " population"], int, int]:
         windows = draw_windows(problem, 1, self._rows, key)
-        scale = problem.scalings["standardised"].next_scale
+        scale = problem.typical_change
         squared = (window_residuals(problem.simulator, windows, candidates, scale) ** 2).mean(-1)
         return mean_with_failures(squared), squared.size, int(np.isnan(squared).sum())
 

@@ -3,7 +3,7 @@
 Tiboni et al. 2023 (arXiv 2201.08434); with an entropy bonus it is E-DROPO (arXiv 2506.10133).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -19,11 +19,11 @@ from madoc.calibration.baselines.dropo.likelihood import (
     truncated_noise,
 )
 from madoc.calibration.baselines.population_search import SearchState, draw_windows, mean_with_failures, next_generation
-from madoc.calibration.cautions import at_end_of_range, exploded
+from madoc.calibration.cautions import at_end_of_range
 from madoc.errors import check_at_least
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import first_rows
-from madoc.types import Metrics
+from madoc.types import Epoch
 
 DEVIATIONS = (1e-3, 0.5)
 """Smallest and largest σ in [-1, 1]. The largest is a quarter of a range, as the authors'."""
@@ -67,46 +67,34 @@ class Dropo:
     def __post_init__(self) -> None:
         check_at_least(self, draws=2, transitions=1, epsilon=1e-12, entropy_weight=0.0, population=4, tolerance=0.0)
 
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "e-dropo" if self.entropy_weight else "dropo"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("cost", "std", "deviation")
-
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
         """The search about mid-range, σ half-way between its ends on a log scale.
 
         Raises:
             MadocError: No state can be rebuilt, or the next observations are shuffled.
         """
-        problem.require_pairs(self.name)
+        problem.require_pairs()
         first_rows(problem.dataset, problem.logged_rows, 1)
-        return SearchState(evolution.begin(np.zeros(2 * len(problem.simulator.parameters))), key, 0, 0)
+        return SearchState(evolution.begin(np.zeros(2 * len(problem.simulator.parameters))), key, 0)
 
-    def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Metrics]:
+    def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
         """One generation: all draws of all candidates in one batch."""
         of_candidates, of_draws, of_windows, key = jax.random.split(state.key, 4)
         candidates = evolution.ask(state.search, of_candidates, self.population)
         mean, std = distribution_of(candidates)
         draws = parameter_draws(mean, std, truncated_noise(of_draws, self.draws // 2, mean.shape[-1]))
         windows = draw_windows(problem, 1, self.transitions, of_windows)
-        scale = problem.scalings["standardised"].next_scale
+        scale = problem.typical_change
         flat = window_residuals(problem.simulator, windows, draws.reshape(-1, draws.shape[-1]), scale)
         residuals = flat.reshape(*draws.shape[:2], *flat.shape[1:])
         by_row = negative_log_likelihood(*moments(residuals), self.epsilon)
         costs = mean_with_failures(by_row) - self.entropy_weight * entropy(std)
         failures = int((~np.isfinite(flat).all(-1)).sum())
         spent = flat.shape[0] * flat.shape[1]
-        following = next_generation(state, key, candidates, costs, spent=spent, failures=failures)
-        return following, {
-            "cost": float(costs.min()),
-            "std": float(distribution_of(following.search.mean)[1].mean()),
-            "deviation": evolution.widest_deviation(following.search),
-        }
+        state = replace(state, key=key, failures=state.failures + failures)
+        state, epoch = next_generation(state, candidates, costs, control_steps=spent, tolerance=self.tolerance)
+        spread = float(distribution_of(state.search.mean)[1].mean())
+        return state, replace(epoch, metrics=epoch.metrics | {"std": spread})
 
     def estimate(self, problem: CalibrationProblem, state: SearchState) -> Estimate:
         """μ and σ at the centre of the search, which is steadier than its best candidate."""
@@ -117,22 +105,7 @@ class Dropo:
             mean=space.to_physical(mean),
             std=std,
             groups=(tuple(range(len(space))),),
-            warnings=(*at_end_of_range(mean, space.names), *exploded(state.failures, state.control_steps)),
+            failures=state.failures,
+            warnings=at_end_of_range(mean, space.names),
             covariance=np.diag(std**2),
         )
-
-    def control_steps(self, state: SearchState) -> int:
-        """Simulated control steps so far."""
-        return state.control_steps
-
-    def stage(self, state: SearchState) -> str:
-        """There is only one."""
-        return "calibrating"
-
-    def progress(self, state: SearchState, budget: int) -> float:
-        """Share of the control steps."""
-        return min(1.0, state.control_steps / budget)
-
-    def converged(self, state: SearchState) -> str | None:
-        """A sentence once the search is narrow."""
-        return evolution.settled(state.search, self.tolerance)

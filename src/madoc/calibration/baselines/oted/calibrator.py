@@ -25,14 +25,14 @@ from madoc.calibration.baselines.oted.bandit import (
     natural_step,
 )
 from madoc.calibration.baselines.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
-from madoc.calibration.cautions import at_end_of_range, exploded
+from madoc.calibration.cautions import at_end_of_range
 from madoc.errors import check_at_least
 from madoc.learning import replay
 from madoc.learning.cloning import clone
-from madoc.learning.networks import Network
+from madoc.learning.networks import Network, scalars
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll, unbiased_starts
-from madoc.types import Metrics
+from madoc.types import Epoch
 
 
 @jax.tree_util.register_dataclass
@@ -50,8 +50,6 @@ class OtedState:
     average: Distribution
     key: PRNGKeyArray
     cloned: int
-    epochs: int
-    control_steps: int
     failures: int
 
 
@@ -100,16 +98,6 @@ class Oted:
         check_at_least(self, **dict.fromkeys(counts, 1), draws=2, horizon=2, cloning_epochs=0)
         check_at_least(self, **dict.fromkeys(("mean_rate", "std_rate", "first_std", "average_rate"), 0.0))
 
-    @property
-    def name(self) -> str:
-        """As `madoc methods` lists it."""
-        return "oted"
-
-    @property
-    def shown(self) -> tuple[str, ...]:
-        """Metrics beside the progress bar."""
-        return ("reward", "std", "cloning_loss")
-
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> OtedState:
         """Fresh networks, the distribution around mid-range, walkers at their starts.
 
@@ -142,14 +130,12 @@ class Oted:
             average=distribution,
             key=key,
             cloned=0,
-            epochs=0,
-            control_steps=0,
             failures=0,
         )
 
-    def step(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Metrics]:
+    def step(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         """One epoch of whichever stage is due."""
-        return (self._clone if self.stage(state) == "cloning" else self._calibrate)(problem, state)
+        return (self._clone if state.cloned < self.cloning_epochs else self._calibrate)(problem, state)
 
     def estimate(self, problem: CalibrationProblem, state: OtedState) -> Estimate:
         """The averaged distribution through tanh: its centre, and its deviation to first order."""
@@ -160,32 +146,10 @@ class Oted:
             mean=space.to_physical(unit),
             std=std,
             groups=(tuple(range(len(space))),),
-            warnings=(
-                *at_end_of_range(unit, space.names),
-                *exploded(state.failures, state.control_steps),
-            ),
+            failures=state.failures,
+            warnings=at_end_of_range(unit, space.names),
             covariance=np.diag(std**2),
         )
-
-    def control_steps(self, state: OtedState) -> int:
-        """Simulated control steps so far."""
-        return state.control_steps
-
-    def stage(self, state: OtedState) -> str:
-        """What the next epoch does."""
-        return "cloning" if state.cloned < self.cloning_epochs else "calibrating"
-
-    def progress(self, state: OtedState, budget: int) -> float:
-        """Share of the control steps and of the cloning done; cloning counts as a tenth."""
-        cloned = state.cloned / self.cloning_epochs if self.cloning_epochs else 1.0
-        return min(1.0, 0.1 * cloned + 0.9 * state.control_steps / budget)
-
-    def converged(self, state: OtedState) -> str | None:
-        """A sentence once the distribution is as narrow as it may become."""
-        spread = _mean_std(state.distribution)
-        if spread > self.smallest_std:
-            return None
-        return f"the distribution has shrunk to a deviation of {spread:.3g} before tanh"
 
     @cached_property
     def _adam(self) -> optax.GradientTransformation:
@@ -203,7 +167,7 @@ class Oted:
         counts = visits(problem.dataset, problem.logged_rows[chosen], self.horizon)
         return chosen_states(problem.logged_states[chosen]), counts
 
-    def _clone(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Metrics]:
+    def _clone(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         of_batches, key = jax.random.split(state.key)
         policy, optimiser_state, metrics = clone(
             state.policy,
@@ -215,9 +179,9 @@ class Oted:
             count=self.cloning_updates,
         )
         following = replace(state, policy=policy, policy_optimiser=optimiser_state, key=key, cloned=state.cloned + 1)
-        return following, {name: float(value) for name, value in metrics.items()}
+        return following, Epoch(scalars(metrics), stage="cloning", fraction=following.cloned / self.cloning_epochs)
 
-    def _calibrate(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Metrics]:
+    def _calibrate(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
         simulator, distribution = problem.simulator, state.distribution
         noise = antithetic_noise(of_draws, self._systems // 2, len(distribution.mean))
@@ -265,13 +229,12 @@ class Oted:
             distribution=moved,
             average=jax.tree.map(lambda slow, fast: slow + self.average_rate * (fast - slow), state.average, moved),
             key=key,
-            epochs=state.epochs + 1,
-            control_steps=state.control_steps + rollout.valid.size,
             failures=state.failures + rollout.failures,
         )
-        told = {name: float(value) for name, value in metrics.items()}
-        return following, told | {"reward": float(rewards.mean()), "std": _mean_std(moved)}
-
-
-def _mean_std(distribution: Distribution) -> float:
-    return float(np.exp(distribution.log_std).mean())
+        std = float(np.exp(moved.log_std).mean())
+        shrunk = f"the distribution has shrunk to a deviation of {std:.3g} before tanh"
+        return following, Epoch(
+            scalars(metrics) | {"reward": float(rewards.mean()), "std": std},
+            control_steps=rollout.valid.size,
+            converged=shrunk if std <= self.smallest_std else None,
+        )
