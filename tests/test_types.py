@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from madoc.calibration import CALIBRATORS, CmaEs, Dropo, LeastSquares, Madoc
+from madoc.errors import MadocError
 from madoc.policies import LEARNERS, SAC
 from madoc.types import entry_of
 
@@ -39,3 +40,23 @@ class Guess:
 def test_a_method_of_ones_own_is_named_after_its_class():
     entry = entry_of(Guess(), CALIBRATORS)
     assert (entry.name, entry.unit, entry.simulates, entry.shown) == ("Guess", "control steps", True, ())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        (lambda: Madoc(updates=0), "expected updates of Madoc to be greater than or equal to 1, got 0"),
+        (lambda: Madoc(hidden=(8, 0)), "expected hidden of Madoc to be greater than or equal to 1, got 0"),
+        (
+            lambda: Madoc(starts="nowhere"),
+            "expected starts of Madoc to be 'policy', 'logged' or 'replay', got 'nowhere'",
+        ),
+        (lambda: Dropo(draws=1), "expected draws of Dropo to be greater than or equal to 2, got 1"),
+        (lambda: SAC(discount=float("nan")), "expected discount of SAC to be greater than or equal to 0, got nan"),
+        (lambda: SAC(batch=1.5), "expected batch of SAC to be a valid integer, got 1.5"),
+        (lambda: SAC(epoch_steps=5), "expected epoch_steps of at least the 20 environments, got 5"),
+    ],
+)
+def test_impossible_hyperparameters_are_refused_in_one_sentence(wrong, sentence):
+    with pytest.raises(MadocError, match=f"^{sentence}$"):
+        wrong()

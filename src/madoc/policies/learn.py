@@ -43,7 +43,7 @@ def learn_policy(
     budget: int,
     folder: RunFolder | None = None,
     resume: bool = False,
-    quiet: bool = True,
+    quiet: bool = False,
     checkpoint_every: float = 60.0,
 ) -> LearnedPolicy:
     """Learn until the budget is spent.

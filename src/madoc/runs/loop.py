@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal
+from typing import Generic, Literal
 
 from jaxtyping import PRNGKeyArray
 
@@ -156,7 +156,7 @@ class _Session(Generic[State]):
 
     def __init__(
         self,
-        method: Method[Any, State],
+        method: object,
         state: State,
         budget: int,
         unit: Unit,
