@@ -128,13 +128,13 @@ def run(problem: Problem, *, limit: float, check: bool, first_answer: bool) -> d
             name: compared(result.get("parameters", {}).get(name, {}), truth) for name, truth in problem.truth.items()
         },
         "control_steps": result.get("control_steps"),
-        "relative_error": (result.get("holdout") or {}).get("relative"),
         "seconds": seconds,
         "check": None,
     }
     if check:
         code, result, error = madoc("check", *asked, "--no-forecast", limit=limit)
-        answer["check"] = [" ".join(map(str, finding.values())) for finding in result.get("findings", [])] or [error]
+        findings = [" ".join(map(str, finding.values())) for finding in result.get("findings", [])]
+        answer["check"] = findings or [error] * bool(error)
     return answer
 
 
