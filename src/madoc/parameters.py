@@ -33,6 +33,7 @@ FIELDS: dict[str, Field] = {
     "body_inertia": Field("body", "kg·m²", 0.0),
     "body_com": Field("body", "m", 0.0),
     "dof_damping": Field("joint", "N·m·s/rad", 0.0),
+    "dof_drag": Field("joint", "N·m·s²/rad²", 0.0),
     "dof_armature": Field("joint", "kg·m²", 0.0),
     "dof_frictionloss": Field("joint", "N·m", 0.0),
     "jnt_stiffness": Field("joint", "N·m/rad", 0.0),

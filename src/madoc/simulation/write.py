@@ -156,6 +156,7 @@ _NUMBERS: dict[str, Callable[[mujoco.MjModel, int], np.ndarray]] = {
     "body_inertia": lambda model, body: model.body_inertia[body].max(keepdims=True),
     "body_com": lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]),
     "dof_damping": lambda model, joint: model.dof_damping[_dofs(model, joint)],
+    "dof_drag": lambda model, joint: model.dof_dampingpoly[_dofs(model, joint), :1],
     "dof_armature": lambda model, joint: model.dof_armature[_dofs(model, joint)],
     "dof_frictionloss": lambda model, joint: model.dof_frictionloss[_dofs(model, joint)],
     "jnt_stiffness": lambda model, joint: model.jnt_stiffness[joint : joint + 1],

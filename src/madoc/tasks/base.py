@@ -28,6 +28,13 @@ def compiled_model(spec: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
     return _MODELS[spec]
 
 
+def scaled_time_step(spec: Callable[[], mujoco.MjSpec], factor: float) -> mujoco.MjSpec:
+    """The spec with the integration step times `factor`."""
+    changed = spec()
+    changed.option.timestep *= factor
+    return changed
+
+
 def scaled_friction(spec: Callable[[], mujoco.MjSpec], factor: float) -> mujoco.MjSpec:
     """The spec with every geom's sliding friction times `factor`; a contact takes the larger of its two."""
     changed = spec()
@@ -146,6 +153,11 @@ class Task:
     def with_friction(self, factor: float) -> "Task":
         """The same task with the friction of every contact times `factor`."""
         return replace(self, spec=partial(scaled_friction, self.spec, factor))
+
+    def with_time_step(self, factor: float, *, substeps: int = 1) -> "Task":
+        """The same task with the integration step times `factor`, and `substeps` times as many a control step."""
+        spec = partial(scaled_time_step, self.spec, factor)
+        return replace(self, spec=spec, frame_skip=self.frame_skip * substeps)
 
     def with_parameters(self, names: list[str]) -> "Task":
         """The same task with only the named parameters calibratable."""
