@@ -104,6 +104,7 @@ class Estimate:
         warnings: What a user should know about it, one sentence each.
         covariance: Joint covariance of the parameters, None where the method has none; its diagonal is `std` squared.
         interval: 95 % confidence interval of each parameter, columns low and high; None where the method has none.
+        settled: Whether the search came to its end; False is a warning that a larger budget would change the estimate.
     """
 
     mean: Float[np.ndarray, " d"]
@@ -113,6 +114,7 @@ class Estimate:
     warnings: tuple[str, ...] = field(default=())
     covariance: Float[np.ndarray, "d d"] | None = None
     interval: Float[np.ndarray, "d 2"] | None = None
+    settled: bool = True
 
 
 @runtime_checkable

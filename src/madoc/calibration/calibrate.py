@@ -81,6 +81,7 @@ def calibrate(
         ),
         error=None if true_values is None else calibration_error(estimate.mean, true_values, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
+        settled=estimate.settled,
         problem=problem,
     )
     if folder is not None:

@@ -12,6 +12,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field, TypeAdapter, ValidationError
 
 from madoc.errors import MadocError
+from madoc.identification.missing_terms import MissingTerm
 
 Word = Literal["CALIBRATED", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
 
@@ -145,6 +146,8 @@ class Judged(ABC):
         against_chance: How well next observations are predicted, by each of several means.
         noise: Standard deviation of the sensors' noise by signal, in its unit, as far as it can be estimated.
         control_steps: Simulated to find all of this.
+        missing_terms: Terms that the model may lack, the most significant first.
+        at_end: Parameters estimated at an end of their range that is no physical bound.
         candidates: The methods that were compared on this hold-out, where several were.
         chosen: The method among them whose estimate was kept.
     """
@@ -157,6 +160,8 @@ class Judged(ABC):
     against_chance: tuple[AgainstChance, ...]
     noise: dict[str, float]
     control_steps: int
+    missing_terms: tuple[MissingTerm, ...] = ()
+    at_end: tuple[str, ...] = ()
     candidates: tuple[Tried | NotRun, ...] = ()
     chosen: str | None = None
 

@@ -2,6 +2,7 @@
 
 import io
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -44,6 +45,7 @@ class CalibrationResult:
         warnings: What to know before trusting it, one sentence each.
         error: Only where the truth was given: `mean_absolute`, `mean_percent_of_range`, `per_parameter`.
         covariance: Rows of the estimates' covariance in physical units, in the task's order, where known.
+        settled: Whether the method's search came to its end; its intervals mean nothing before.
         verdict: What to make of it, where rows were held out to judge it by.
         holdout: The numbers behind the verdict.
         problem: What was calibrated to, while the program runs that calibrated; files do not keep it.
@@ -61,9 +63,21 @@ class CalibrationResult:
     warnings: list[str] = field(default_factory=list)
     error: dict[str, Any] | None = None
     covariance: list[list[float]] | None = None
+    settled: bool = True
     verdict: Verdict | None = None
     holdout: HoldOut | None = None
     problem: CalibrationProblem | None = field(default=None, repr=False, compare=False)
+
+    def with_intervals(self, widened: Mapping[str, float], warning: str) -> "CalibrationResult":
+        """The same result with some 95 % intervals widened, to each side, by so many times their half-width."""
+        parameters = dict(self.parameters)
+        for name, factor in widened.items():
+            row = parameters[name]
+            if row.interval is not None:
+                grown = factor * (row.interval[1] - row.interval[0]) / 2.0
+                low, high = max(row.low, row.interval[0] - grown), min(row.high, row.interval[1] + grown)
+                parameters[name] = replace(row, interval=[low, high])
+        return replace(self, parameters=parameters, warnings=[*self.warnings, warning])
 
     @property
     def mean(self) -> np.ndarray:

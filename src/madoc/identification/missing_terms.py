@@ -61,6 +61,9 @@ CAUSES = {
 DELAY = "actions that take effect later, by a delay or a lag of the actuator"
 SPACING = "rows that are farther apart in time than the spec says"
 INTEGRATION = "the error of the model's integration step"
+DRIFT = "a value that changes over the log"
+SUSPICIOUS = 2.0
+"""|t| from which a term cannot be excluded: 5 % of terms that are not missing reach it by chance."""
 
 
 @dataclass(frozen=True)
@@ -301,37 +304,67 @@ def _scores(
     half_widths: Float[np.ndarray, " d"],
     candidates: list[_Candidate],
 ) -> Iterator[MissingTerm]:
-    """The score test of every candidate, where residuals leave enough windows for one."""
+    """The score test of every candidate, where residuals leave enough windows for one.
+
+    The first columns of the Jacobian are the calibrated parameters', the others the candidates'. If the error of the
+    integration step is significant, it is taken away before the others are tested.
+    """
     windows, count = len(residuals), len(space)
     if windows < _FEWEST + count:
         return
-    by_parameters, _ = np.linalg.qr(jacobian[..., :count].reshape(-1, count))
-
-    def unexplained(column: Float[np.ndarray, " values"]) -> Float[np.ndarray, " values"]:
-        return np.asarray(column - by_parameters @ (by_parameters.T @ column))
-
-    flat = jacobian.reshape(-1, jacobian.shape[-1])
-    y = unexplained(residuals.reshape(-1))
-    for index, candidate in enumerate(candidates):
-        column = flat[:, count + index]
-        z = unexplained(column)
-        power = float(z @ z)
-        if power <= _DISTINCT * float(column @ column):
+    parameters, effects = jacobian[..., :count], jacobian[..., count:]
+    explained_already = parameters
+    for index in sorted(range(len(candidates)), key=lambda index: candidates[index].cause != INTEGRATION):
+        term = _score(residuals, explained_already, effects[..., index], parameters, half_widths, candidates[index])
+        if term is None:
             continue
-        change = -float(z @ y) / power
-        scores = (z * (y + change * z)).reshape(windows, -1).sum(-1)
-        error = float(np.sqrt((scores**2).sum() * windows / (windows - count - 1))) / power
-        value = candidate.nominal + change * candidate.reference
-        if not error > 0.0 or value < candidate.least:
-            continue
-        shift = np.linalg.lstsq(flat[:, :count], -column * change, rcond=None)[0]
-        yield MissingTerm(
-            cause=candidate.cause,
-            parameter=candidate.parameter,
-            value=value,
-            standard_error=error * candidate.reference,
-            unit=candidate.unit,
-            explained=change**2 * power / float(y @ y),
-            t=change / error,
-            shifts=dict(zip(space.names, (shift / half_widths).tolist(), strict=True)),
-        )
+        if term.cause == INTEGRATION and abs(term.t) >= SUSPICIOUS:
+            explained_already = np.concatenate([parameters, effects[..., index : index + 1]], axis=-1)
+        yield replace(term, shifts=dict(zip(space.names, term.shifts.values(), strict=True)))
+    time = np.linspace(-1.0, 1.0, windows)
+    for index, name in enumerate(space.names):
+        width = float(space.high[index] - space.low[index]) / 2.0
+        candidate = _Candidate(DRIFT, name, space.parameters[index].unit, 0.0, width, -np.inf)
+        for shape in (time, time < -1.0 / 3.0, time > 1.0 / 3.0):
+            effect = (shape - np.mean(shape))[:, None] * parameters[..., index]
+            term = _score(residuals, explained_already, effect, parameters, half_widths, candidate)
+            if term is not None:
+                yield replace(term, shifts={name: term.value / width / float(half_widths[index])})
+
+
+def _score(
+    residuals: Float[np.ndarray, "windows values"],
+    explained_already: Float[np.ndarray, "windows values columns"],
+    effect: Float[np.ndarray, "windows values"],
+    parameters: Float[np.ndarray, "windows values d"],
+    half_widths: Float[np.ndarray, " d"],
+    candidate: _Candidate,
+) -> MissingTerm | None:
+    """One candidate's change, its cluster-robust standard error, and how it would move the calibrated parameters.
+
+    None if the columns that explain residuals already imitate the effect, or if the value is not physical.
+    """
+    windows, count = len(residuals), explained_already.shape[-1]
+    basis, _ = np.linalg.qr(explained_already.reshape(-1, count))
+    column, y = effect.reshape(-1), residuals.reshape(-1)
+    z, y = column - basis @ (basis.T @ column), y - basis @ (basis.T @ y)
+    power = float(z @ z)
+    if power <= _DISTINCT * float(column @ column):
+        return None
+    change = -float(z @ y) / power
+    scores = (z * (y + change * z)).reshape(windows, -1).sum(-1)
+    error = float(np.sqrt((scores**2).sum() * windows / (windows - count - 1))) / power
+    value = candidate.nominal + change * candidate.reference
+    if not error > 0.0 or value < candidate.least:
+        return None
+    shift = np.linalg.lstsq(parameters.reshape(len(column), -1), -column * change, rcond=None)[0]
+    return MissingTerm(
+        cause=candidate.cause,
+        parameter=candidate.parameter,
+        value=value,
+        standard_error=error * candidate.reference,
+        unit=candidate.unit,
+        explained=change**2 * power / float(y @ y),
+        t=change / error,
+        shifts={str(index): float(each) for index, each in enumerate(shift / half_widths)},
+    )

@@ -1,6 +1,5 @@
 """One calibrator in a run folder of its own, its result judged where rows are held out."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from madoc.calibration import CalibrationResult, Calibrator, calibrate
@@ -40,7 +39,7 @@ def calibrate_prepared(
         if prepared.holdout is None or result.status not in ENDED:
             return result, None
         assessment = assess(result, prepared.bench)
-        result = replace(result, verdict=assessment.verdict, holdout=assessment.holdout)
+        result = assessment.result
         leave_evidence(out, prepared, result)
         folder.write_json("result.json", result.to_json())
         return result, assessment

@@ -1,6 +1,6 @@
 """An estimate judged on rows that no method has seen, without any truth: `assess` is the whole of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -11,6 +11,7 @@ from madoc.calibration.holdout import HoldOut, Verdict
 from madoc.data import Dataset
 from madoc.errors import MadocError
 from madoc.simulation.base import Simulator
+from madoc.verdict.adequacy import with_widened_intervals
 from madoc.verdict.bench import Bench
 from madoc.verdict.fitted import fitted
 from madoc.verdict.judge import judge
@@ -25,10 +26,12 @@ class Assessment:
     Attributes:
         verdict: What to make of the estimate: a word and a sentence.
         holdout: The numbers behind the verdict.
+        result: The result with both, its intervals widened where the data does not exclude a term the model lacks.
     """
 
     verdict: Verdict
     holdout: HoldOut
+    result: CalibrationResult
 
     def __str__(self) -> str:
         return str(self.verdict)
@@ -66,7 +69,9 @@ def assess(
             f"{', '.join(bench.simulator.parameters.names)}"
         )
     holdout = measured(bench, result.mean, result.interval)
-    return Assessment(judge(holdout), holdout)
+    verdict = judge(holdout, settled=result.settled)
+    widened = replace(with_widened_intervals(result, holdout), verdict=verdict, holdout=holdout)
+    return Assessment(verdict, holdout, widened)
 
 
 def measured(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None = None) -> HoldOut:

@@ -15,17 +15,24 @@ from madoc.data import Dataset
 from madoc.diagnosis.channels import signal_names
 from madoc.errors import MadocError
 from madoc.identification.excitation import expected_half_widths
+from madoc.identification.missing_terms import MissingTerm, missing_terms
 from madoc.identification.noise import difference_noise
 from madoc.identification.states import logged_states
 from madoc.identification.windows import consecutive_rows, evenly
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
+from madoc.verdict.adequacy import widening
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
-from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance, shares_of_ranges
+from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
 from madoc.verdict.two_sample import WindowView, behaviour, rolled, tell_apart
 
+AT_END = 0.98
+"""Position in [-1, 1] of its range; past it, to either side, a parameter counts as pinned to the end."""
+_MOST_TERMS = 5
+"""Number of missing terms that a report keeps, the most significant ones."""
 FEWEST_HELD = 10
 """Smallest number of rows held out, at least 1. With fewer, even perfect predictions could be chance."""
 _NEIGHBOURS = 5000
@@ -164,6 +171,8 @@ class CommonFields(TypedDict):
     against_chance: tuple[AgainstChance, ...]
     noise: dict[str, float]
     control_steps: int
+    missing_terms: tuple[MissingTerm, ...]
+    at_end: tuple[str, ...]
 
 
 def common_fields(
@@ -192,7 +201,12 @@ def common_fields(
     space, problem = bench.simulator.parameters, bench.problem
     residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
     half, spent = expected_half_widths(problem.states, problem.dataset, problem.simulator, at, residual)
-    shares = shares_of_ranges(half, interval, space.high - space.low)
+    own = half if interval is None else np.maximum((interval[:, 1] - interval[:, 0]) / (space.high - space.low), 1e-9)
+    terms: tuple[MissingTerm, ...] = ()
+    if problem.states.kind != "unknown" and problem.dataset.disturbance.shuffled == "none":
+        terms, searching = missing_terms(problem.dataset, problem.states, problem.simulator, unit, own, bench.change)
+        spent += searching
+    shares = np.minimum(np.maximum(half, own * (1.0 + widening(terms, space.names))), 1.0)
     signals = signal_names(bench.simulator.task)[: len(noise)]
     return CommonFields(
         split=bench.split,
@@ -203,4 +217,10 @@ def common_fields(
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
         control_steps=control_steps + spent,
+        missing_terms=terms[:_MOST_TERMS],
+        at_end=tuple(
+            row.name
+            for row, value in zip(space.parameters, unit, strict=True)
+            if abs(value) > AT_END and not (value < 0.0 and row.low <= FIELDS[row.field].minimum)
+        ),
     )

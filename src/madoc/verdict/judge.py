@@ -15,7 +15,12 @@ from madoc.calibration.holdout import (
     Verdict,
     Word,
 )
+from madoc.identification.missing_terms import DRIFT, MissingTerm
+from madoc.verdict.adequacy import missing_term, numerical
+from madoc.verdict.bench import AT_END
 from madoc.verdict.statistics import NEGLIGIBLE
+
+UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
 
 WORDS: dict[Word, str] = {
     "CALIBRATED": "the hold-out is predicted better than by mid-range, about as well as parameters can",
@@ -37,8 +42,6 @@ EXPLAINED = 0.1
 systematic. Noise alone gives at most a few percent."""
 WHITE = 0.2
 """Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
-AT_END = 0.98
-"""Position in [-1, 1] of its range; past it, to either side, a parameter counts as pinned to the end."""
 OPEN = 0.5
 """Share in [0, 1] of its range that a parameter's 95 % interval covers; from it on the parameter counts as open."""
 GAINED = 0.75
@@ -50,13 +53,21 @@ TOLD_APART = 0.65
 come to about 0.55 in the true simulator."""
 
 
-def judge(holdout: HoldOut) -> Verdict:
-    """The first verdict that applies: rejected data, a mismatch, open parameters, no improvement; else calibrated."""
+def judge(holdout: HoldOut, *, settled: bool = True) -> Verdict:
+    """The first verdict that applies: rejected data, a mismatch, open parameters, no improvement; else calibrated.
+
+    Args:
+        holdout: What the hold-out says of the estimate.
+        settled: Whether the search that found it came to its end.
+    """
     return (
         _rejected(holdout)
+        or _missing(holdout)
         or _mismatch(holdout)
+        or _outside(holdout)
         or _open(holdout)
         or _no_improvement(holdout)
+        or (None if settled else Verdict("NO_IMPROVEMENT", f"{_how_good(holdout)}, but {UNSETTLED}"))
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and every parameter is known to within half of its range")
     )
 
@@ -65,7 +76,7 @@ def explains_all(holdout: HoldOut) -> bool:
     """Whether an estimate leaves no more of the hold-out than noise does, at any horizon."""
     if isinstance(holdout, ToldApart):
         return holdout.area_at_estimate.interval[0] <= 0.5
-    return not _beyond_noise(holdout.errors.estimate, holdout.errors.noise)
+    return numerical(holdout) is not None or not _beyond_noise(holdout.errors.estimate, holdout.errors.noise)
 
 
 def _rejected(holdout: HoldOut) -> Verdict | None:
@@ -79,7 +90,56 @@ def _rejected(holdout: HoldOut) -> Verdict | None:
     )
 
 
+def _missing(holdout: HoldOut) -> Verdict | None:
+    """A term that the model lacks and that moves the estimate, with the line that adds it to the spec."""
+    term = missing_term(holdout)
+    if term is None:
+        return None
+    moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
+    effect = " and ".join(f"{name} by {abs(term.shifts[name]):.2g}" for name in moved)
+    value = f"{term.value:.3g} ± {term.standard_error:.1g} {term.unit}".rstrip()
+    if term.cause == DRIFT:
+        return Verdict(
+            "MODEL_MISMATCH",
+            f"{term.parameter} changes over the log, by {value} between its parts (t = {abs(term.t):.0f}), which is "
+            f"{abs(term.shifts[term.parameter]):.2g} half-widths of its interval; calibrate to the runs apart",
+            (term.parameter,),
+        )
+    where = f" ({term.parameter})" if term.parameter else ""
+    return Verdict(
+        "MODEL_MISMATCH",
+        f"the model lacks {term.cause}{where}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
+        f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval; {_remedy(term)}",
+        tuple(moved),
+    )
+
+
+def _remedy(term: MissingTerm) -> str:
+    """What to do about a missing term: the line of the spec that adds it, where there is one."""
+    field, _, element = term.parameter.partition(".")
+    if not field:
+        return "check control_step of the spec against the log's time column"
+    high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
+    low = 0.0 if term.value >= 0.0 else -high
+    named = f", element: {element}" if element else ""
+    return f"add to the spec's parameters: {{field: {field}{named}, low: {low:.2g}, high: {high:.2g}}}"
+
+
+def _outside(holdout: HoldOut) -> Verdict | None:
+    """An estimate at the end of its range, beyond which the true value may lie."""
+    if not holdout.at_end or isinstance(holdout, ToldApart):
+        return None
+    return Verdict(
+        "MODEL_MISMATCH",
+        f"{_at_end(holdout.at_end)}: the true value may lie beyond it, and then the other parameters make up for it; "
+        "widen the range",
+        holdout.at_end,
+    )
+
+
 def _mismatch(holdout: HoldOut) -> Verdict | None:
+    if numerical(holdout) is not None:
+        return None
     match holdout:
         case Predicted():
             reasons = _systematic(holdout.explained, "state and action")

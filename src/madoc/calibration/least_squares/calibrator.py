@@ -173,6 +173,7 @@ class LeastSquares:
             ),
             covariance=covariance,
             interval=interval,
+            settled=settled,
         )
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:
