@@ -18,7 +18,12 @@ NUMERICAL = 0.5
 
 
 def missing_term(holdout: HoldOut) -> MissingTerm | None:
-    """The most significant term that the model certainly lacks and that would move the estimate."""
+    """The most significant term that the model certainly lacks and that would move the estimate.
+
+    None where the integration step explains most of the residuals: beside its error no other can be told.
+    """
+    if numerical(holdout) is not None:
+        return None
     for term in holdout.missing_terms:
         certain = CERTAIN_DRIFT if term.cause == DRIFT else CERTAIN
         if term.cause != INTEGRATION and abs(term.t) >= certain and _largest_shift(term) >= MOVES:
@@ -35,12 +40,14 @@ def numerical(holdout: HoldOut) -> MissingTerm | None:
 def widening(terms: tuple[MissingTerm, ...], names: tuple[str, ...]) -> Float[np.ndarray, " d"]:
     """By how many half-widths each interval must grow to either side to cover a term that cannot be excluded.
 
-    The error of the integration step counts where it is significant, and of the other terms the most significant one.
+    The error of the integration step counts twice where it is significant, as it changes with the length of windows,
+    and of the other terms the most significant one.
     """
     doubtful = [term for term in terms if abs(term.t) >= SUSPICIOUS and term.cause != DRIFT]
     numerical = [term for term in doubtful if term.cause == INTEGRATION]
     physical = [term for term in doubtful if term.cause != INTEGRATION]
-    shifts = [[abs(term.shifts[name]) for name in names] for term in (*numerical, *physical[:1])]
+    counted = (*numerical, *numerical, *physical[:1])
+    shifts = [[abs(term.shifts[name]) for name in names] for term in counted]
     return np.sum(shifts, axis=0) if shifts else np.zeros(len(names))
 
 
