@@ -48,7 +48,7 @@ FIELDS: dict[str, Field] = {
 `body_inertia` is the largest moment of inertia about the centre of mass, the others keep their ratio to it; `body_com`
 is how far the centre of mass is from the body's origin, in the direction it has. `actuator_gain` of a position or
 velocity servo is its kp or kv, and moves the servo's bias with it. `action_delay` is the time from an action to its
-effect, `signal_bias` what a sensor reads too much.
+effect, `signal_bias` what a sensor reads too much. `dof_drag` is damping that grows with the square of the speed.
 """
 
 

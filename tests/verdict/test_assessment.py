@@ -23,7 +23,7 @@ def split():
 @pytest.fixture(scope="module")
 def result(split):
     problem = CalibrationProblem(split.kept, simulation.make(TASK, threads=1))
-    return madoc.calibrate(LeastSquares(), problem, key=jax.random.key(0), budget=30_000)
+    return madoc.calibrate(LeastSquares(), problem, key=jax.random.key(0), budget=100_000)
 
 
 def test_a_result_and_rows_held_out_are_all_it_needs(result, split):

@@ -40,7 +40,7 @@ _STATE_DAMPING = 1e-9
 """Relative damping of initial states, far below the rounding of their differences."""
 _FITS = 4
 """Gauss-Newton steps of the initial states, which begin at logged or differenced ones."""
-_OUTLYING = 8.0
+_OUTLYING = 3.0
 """Mean squared residual of a window over the median window's; above it the window holds an event of its own."""
 _DISTINCT = 1e-3
 """Share of a candidate's squared effect that calibrated parameters cannot imitate; below it the two are one."""

@@ -13,6 +13,7 @@ from madoc.simulation.write import element_names, find_elements
 
 SLIDE_UNITS = {
     "dof_damping": "N·s/m",
+    "dof_drag": "N·s²/m²",
     "dof_armature": "kg",
     "dof_frictionloss": "N",
     "jnt_stiffness": "N/m",

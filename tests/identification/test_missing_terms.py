@@ -1,0 +1,107 @@
+"""The score test of one added term: by hand, and on a pendulum whose friction, drag or timing the model lacks."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from madoc import robots, simulation
+from madoc.data import logs, typical_change
+from madoc.identification import missing_terms as terms
+from madoc.identification.states import states_of
+
+MODEL = """
+<mujoco>
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body name="rod">
+      <joint name="hinge" type="hinge" axis="0 1 0" damping="{damping}{drag}" frictionloss="{friction}"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="hinge" joint="hinge"/></actuator>
+</mujoco>
+"""
+SPEC = """
+madoc: 1
+name: pendulum
+model: model.xml
+control_step: 0.02
+signals:
+  - {name: angle, reads: position(hinge)}
+  - {name: speed, reads: velocity(hinge)}
+actions:
+  - {name: torque, actuator: hinge, low: -1, high: 1}
+parameters:
+  - {field: dof_damping, element: hinge, low: 0, high: 0.5}
+"""
+NOISE = 0.002
+
+
+def plant(folder: Path, *, friction: float = 0.0, drag: float = 0.0, late: int = 0):
+    """A log of the pendulum with a term that the model of its spec lacks, and what the tests need of it."""
+    folder.mkdir(exist_ok=True)
+    (folder / "real.xml").write_text(MODEL.format(damping=0.1, friction=friction, drag=f" {drag} 0" if drag else ""))
+    (folder / "real.yaml").write_text(SPEC.replace("model.xml", "real.xml"))
+    (folder / "model.xml").write_text(MODEL.format(damping=0.1, friction=0, drag=""))
+    (folder / "pendulum.yaml").write_text(SPEC)
+    real = simulation.make(robots.load(folder / "real.yaml").task)
+    system, random = real.bind(np.array([[0.1]])), np.random.default_rng(0)
+    torque = np.repeat(random.uniform(-1, 1, 320), 5)
+    state, angles = real.initial_state[None, None], []
+    for row in range(len(torque)):
+        angles.append(np.asarray(system.observe(state))[0, 0])
+        state = system.step(state, torque[None, None, max(0, row - late)][..., None])
+    seen = np.array(angles) + NOISE * random.standard_normal((len(torque), 2))
+    columns = np.column_stack([0.02 * np.arange(len(torque)), seen, torque])
+    np.savetxt(folder / "log.csv", columns, "%.9g", ",", header="time,angle,speed,torque", comments="")
+    robot = robots.load(folder / "pendulum.yaml")
+    return logs.read([folder / "log.csv"], robot), simulation.make(robot.task)
+
+
+def scores(dataset, simulator, half_width: float = 0.01):
+    point = simulator.parameters.to_unit(np.array([0.1]))
+    states = states_of(dataset, simulator)
+    return terms.missing_terms(dataset, states, simulator, point, np.array([half_width]), typical_change(dataset))[0]
+
+
+def test_a_score_by_hand():
+    """y = -2 z + noise of ±0.1 that is orthogonal to z: the change is 2, and its error that of the noise."""
+    effect = np.array([[1.0, 1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, -1.0]])
+    noise = 0.1 * np.array([[1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, 1.0]])
+    parameters = np.ones((4, 2, 1))
+    candidate = terms._Candidate("a term", "field.joint", "N", 5.0, 3.0, 0.0)
+    found = terms._score(-2.0 * effect + noise, parameters, effect, parameters, np.array([0.5]), candidate)
+    assert found is None or found.standard_error == 0.0  # the noise cancels within every window
+    noise[:, 1] = noise[:, 0]
+    found = terms._score(-2.0 * effect + noise, parameters, effect, parameters, np.array([0.5]), candidate)
+    # Σ_w (z_w · e_w)² = 4 · 0.2², times n / (n - d - 1) = 4 / 2, root over z · z = 8
+    assert found.value == pytest.approx(5.0 + 3.0 * 2.0)
+    assert found.standard_error == pytest.approx(3.0 * np.sqrt(4 * 0.2**2 * 2) / 8)
+    assert found.explained == pytest.approx(32.0 / 32.08)
+    assert found.shifts["0"] == pytest.approx(0.0)  # the effect has no part along the parameter's
+
+
+@pytest.mark.parametrize(
+    ("lacks", "parameter", "value"),
+    [
+        ({"friction": 0.05}, "dof_frictionloss.hinge", 0.05),
+        ({"drag": 0.03}, "dof_drag.hinge", 0.03),
+        ({"late": 1}, "action_delay", 0.02),
+    ],
+    ids=["friction", "drag", "delay"],
+)
+def test_the_missing_term_is_named_with_its_value(tmp_path, lacks, parameter, value):
+    best = scores(*plant(tmp_path, **lacks))[0]
+    assert best.parameter == parameter
+    assert abs(best.t) > 10
+    assert best.value == pytest.approx(value, rel=0.3)
+
+
+def test_a_right_model_lacks_nothing(tmp_path):
+    assert all(abs(term.t) < 5 for term in scores(*plant(tmp_path)))
+
+
+def test_friction_that_puts_energy_in_is_no_candidate(tmp_path):
+    friction = [term for term in scores(*plant(tmp_path)) if term.parameter == "dof_frictionloss.hinge"]
+    assert all(term.value >= 0 for term in friction)
