@@ -135,7 +135,16 @@ def whole_folder(path):
     vectors = np.random.default_rng(0).normal(size=(4, 16))
     np.savez(folder / "embeddings.npz", names=np.array(list(PARAMETERS)), vectors=vectors)
     policy = {"return": 900.0, "return_std": 20.0, "normalized": 28.0, "length": 400.0}
-    write_json(path / "evaluation.json", {"episodes": 3, "policies": {"calibrated": policy, "truth": policy}})
+    write_json(
+        path / "evaluation.json",
+        {
+            "task": "hopper",
+            "physics": "legacy",
+            "episodes": 3,
+            "seed": 0,
+            "policies": {"calibrated": policy, "truth": policy},
+        },
+    )
     return path
 
 

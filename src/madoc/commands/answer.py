@@ -11,7 +11,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from madoc.calibration import CalibrationResult
     from madoc.calibration.holdout import HoldOut
-    from madoc.pipeline.records import EvaluationRecord
+    from madoc.report.records import EvaluationRecord
 
 EXIT_CODES: Mapping[str, int] = {
     "finished": 0,

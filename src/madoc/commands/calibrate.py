@@ -29,7 +29,8 @@ class Calibrate:
 
     def run(self) -> Answer:
         """Calibrate, and leave the run folder."""
-        from madoc.pipeline import calibrate_in, default_folder, leave_report, split_name
+        from madoc.pipeline import calibrate_in, default_folder, split_name
+        from madoc.report import leave_report
 
         if split_name(self.order.task)[1]:
             raise MadocError(f"expected the name of a robot, got {self.order.task!r}; the data is given with --data")

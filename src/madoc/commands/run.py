@@ -11,7 +11,7 @@ from madoc.commands.answer import Answer, Output, evaluation_text, left_behind, 
 from madoc.pipeline.orders import RunOrder
 
 if TYPE_CHECKING:
-    from madoc.pipeline.records import Summary
+    from madoc.report.records import Summary
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class Run:
     def run(self) -> Answer:
         """Do it, and leave the folder."""
         from madoc.calibration import CalibrationResult
-        from madoc.pipeline import leave_report, run_all
+        from madoc.pipeline import run_all
+        from madoc.report import leave_report
 
         out = self.out or Path("runs") / self.order.name
         summary = run_all(self.order, out, resume=self.resume, quiet=self.output.quiet)

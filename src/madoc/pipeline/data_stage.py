@@ -14,8 +14,8 @@ from madoc.data.native import recognises as is_recorded
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import RecordOrder, Source
-from madoc.pipeline.records import SpecRecord
 from madoc.policies.behaviours import QUALITIES, record_quality
+from madoc.report.records import SpecRecord
 from madoc.robots import Robot
 from madoc.runs.files import read_json
 from madoc.runs.progress import bar

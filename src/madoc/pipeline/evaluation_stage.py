@@ -8,8 +8,8 @@ from madoc.evaluation import evaluate
 from madoc.pipeline.data_stage import Machine, read_truth
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import EvaluationOrder
-from madoc.pipeline.records import EvaluationRecord, SpecRecord, read_spec
 from madoc.policies import load_policy
+from madoc.report.records import EvaluationRecord, SpecRecord, read_spec
 from madoc.runs.files import write_json
 from madoc.runs.progress import bar
 

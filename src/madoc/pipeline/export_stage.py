@@ -6,7 +6,7 @@ from madoc import simulation
 from madoc.errors import MadocError
 from madoc.export import Exported, Provenance, save_onnx, save_patch, save_randomization, save_sysid_parameters
 from madoc.numpy_policy import NumpyPolicy
-from madoc.pipeline.calibration_stage import Calibrated, read_calibration
+from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
 from madoc.simulation import Simulator
 from madoc.simulation.mjcf import save_mjcf

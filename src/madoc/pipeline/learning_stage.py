@@ -11,7 +11,7 @@ from madoc.calibration import CalibrationResult
 from madoc.data import Dataset
 from madoc.errors import MadocError, unknown_name
 from madoc.parameters import ParameterSpace
-from madoc.pipeline.calibration_stage import Calibrated
+from madoc.pipeline.calibrated import Calibrated
 from madoc.pipeline.data_stage import load_source, read_truth
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key

@@ -12,10 +12,9 @@ from madoc.data.split import hold_out
 from madoc.diagnosis import check, refuse_fatal
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.data_stage import Machine, fingerprint, load_source, read_truth
-from madoc.pipeline.folders import stored_path
 from madoc.pipeline.keys import seed_key, stage_key
 from madoc.pipeline.orders import AUTO, CalibrationOrder
-from madoc.pipeline.records import DataRecord
+from madoc.report.records import DataRecord, stored_path
 from madoc.simulation import Simulator
 from madoc.tasks import Task
 from madoc.verdict import Bench
@@ -76,7 +75,7 @@ class Prepared:
         return None if self.truth is None else {name: self.truth[name] for name in names}
 
     def spec(self, out: Path) -> dict[str, object]:
-        """What the `spec.json` of the run folder `out` keeps; `records.SpecRecord` reads it."""
+        """What the `spec.json` of the run folder `out` keeps; `SpecRecord` reads it."""
         search, source, task = self.order.search, self.order.source, self.simulator.task
         files = {path: Path(path).expanduser() for path in source.paths}
         stored = DataRecord(

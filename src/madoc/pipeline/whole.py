@@ -6,7 +6,8 @@ from pathlib import Path
 from madoc import data
 from madoc.calibration import CALIBRATORS, CalibrationResult
 from madoc.errors import MadocError
-from madoc.pipeline.calibration_stage import Calibrated, calibrate_in, calibration_ended, read_calibration
+from madoc.pipeline.calibrated import Calibrated, calibration_ended, read_calibration
+from madoc.pipeline.calibration_stage import calibrate_in
 from madoc.pipeline.data_stage import Machine, load_source, read_truth, record_named, split_name
 from madoc.pipeline.evaluation_stage import evaluate_folder
 from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
@@ -23,8 +24,8 @@ from madoc.pipeline.orders import (
     Source,
     parse_settings,
 )
-from madoc.pipeline.records import Summary, read_record
 from madoc.policies import LEARNERS, require_reward
+from madoc.report.records import Summary, read_object, read_record
 from madoc.runs.files import read_json
 
 
@@ -128,7 +129,7 @@ def _learn(order: RunOrder, calibrated: Calibrated, at: Place, folder: Path, *, 
     if not ended(folder, "policy.npz"):
         asked = PolicyOrder(order.learner, at, order.policy_set, order.policy_budget, order.search.seed)
         learn_in(folder, calibrated, asked, resume=holds_run(folder), quiet=quiet)
-    return read_record(dict[str, object], folder / "result.json")
+    return read_object(folder / "result.json")
 
 
 def _beginning(order: RunOrder, calibrated: Calibrated) -> Summary:
