@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from madoc.commands.answer import PLACE_NAMES, Answer, Output, left_behind
+from madoc.commands.answer import PLACE_NAMES, Answer, Output
 from madoc.pipeline.orders import Physics, PolicyOrder
 
 
@@ -53,7 +53,7 @@ class Learn:
         lines = (
             f"{learnt.status}: {learnt.sentence}",
             f"{order.method} {self._place()}: {cost}",
-            left_behind(out / "policy.npz", "policy"),
+            f"policy: {out / 'policy.npz'}",
         )
         return Answer(answer, lines, learnt.status)
 

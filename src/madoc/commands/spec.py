@@ -8,7 +8,7 @@ from rich import box
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from madoc.commands.answer import Answer, Output, left_behind
+from madoc.commands.answer import Answer, Output
 from madoc.errors import MadocError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Init:
             "parameters": len(robot.spec.parameters),
         }
         parts = [f"{count} {what.removesuffix('s') if count == 1 else what}" for what, count in counts.items()]
-        lines = (f"{', '.join(parts)}; edit it, then: madoc spec {out}", left_behind(out, "spec"))
+        lines = (f"{', '.join(parts)}; edit it, then: madoc spec {out}", f"spec: {out}")
         return Answer({"spec": str(out), "name": robot.spec.name, **counts}, lines)
 
 

@@ -16,13 +16,10 @@ from madoc.simulation.write import nominal_values
 def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dict[str, Path]:
     """Leave a finished calibration as MJCF, patch, randomization ranges and parameters for `mujoco.sysid`.
 
-    Args:
-        run: A run folder of `madoc calibrate` or `madoc run`.
-        out: Folder for the files; None takes `export` in the run folder.
-        onnx: Write the run's policies as ONNX too.
+    Policies are written too, as ONNX, if asked. The folder `out` is `export` in the run folder by default.
 
     Returns:
-        The files by what they are.
+        The path of each file by its description.
 
     Raises:
         MadocError: There is no finished calibration, no policy where `onnx` wants one, or a file cannot be written.

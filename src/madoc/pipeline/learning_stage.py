@@ -31,8 +31,7 @@ from madoc.simulation import Simulator
 from madoc.types import entry_of
 
 PLACES: tuple[str, ...] = get_args(Place)
-"""Where a policy may be learnt: at the estimate, over the calibrated distribution, over the whole box, in the
-uncalibrated simulator, in the target itself."""
+"""Where a policy may be learnt, as `PolicyOrder.at` explains."""
 
 
 def learn_in(
@@ -40,12 +39,7 @@ def learn_in(
 ) -> LearnedPolicy:
     """Learn a policy, and leave a run folder with `policy.npz`.
 
-    Args:
-        out: The folder.
-        calibrated: The calibration.
-        order: What to learn, and where; without a truth, the one that the calibration remembers is taken.
-        resume: Go on with the run in the folder.
-        quiet: Show no progress.
+    Without a truth in the order, that of the calibration is taken.
 
     Raises:
         MadocError: The order cannot be carried out; a new folder is then not left behind.
@@ -83,7 +77,7 @@ def learn_in(
 
 
 def policy_folder_name(at: str, method: str) -> str:
-    """`policy-calibrated`, with the method behind it unless that is SAC; `policy-cql` where the place is no matter."""
+    """`policy-calibrated`, and the method's name unless it is SAC; `policy-cql` of a learner without parameters."""
     if not LEARNERS[method].needs_parameters:
         return f"policy-{method}"
     return f"policy-{at}" if method == "sac" else f"policy-{at}-{method}"

@@ -1,4 +1,4 @@
-"""What the stages can be asked: every option is declared here once, with its default and its help text.
+"""The orders of the stages: every option is declared here once, with its default and its help text.
 
 The command line reads these classes, and the stages carry them out. Nothing heavy is imported, so `--help` is quick.
 """
@@ -49,7 +49,7 @@ class Source:
 
     @property
     def words(self) -> str:
-        """The paths as a sentence has them."""
+        """The paths for a sentence."""
         return ", ".join(self.paths)
 
     def absolute(self) -> "Source":
@@ -83,11 +83,7 @@ class Search:
 
     @property
     def changes(self) -> dict[str, str]:
-        """Hyperparameters that differ from the method's own, by name.
-
-        Raises:
-            MadocError: One is not `name=value`, or is given twice.
-        """
+        """Hyperparameters that differ from the method's defaults, as `parse_settings` reads them."""
         return parse_settings(self.set, starts=self.starts)
 
 

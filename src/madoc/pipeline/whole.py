@@ -1,4 +1,4 @@
-"""The main job from one call: data, calibration, policies, evaluation, each stage skipped where it is done."""
+"""All stages in one call: data, calibration, policies, evaluation; a stage that has ended is skipped."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -30,15 +30,14 @@ from madoc.runs.files import read_json
 
 
 def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = False) -> Summary:
-    """Do the main job, and leave a folder with all of it.
+    """Do all stages, and leave a folder with their files.
 
     The folder holds `data.npz`, the run folders `calibration`, `policy-calibrated`, `policy-midrange` and
     `policy-truth`, `evaluation.json` and `summary.json`. Killed at any moment and resumed, the summary is the
     same but for its seconds.
 
     Returns:
-        The summary. Its `status` is `finished`; or that of the stage that was interrupted or diverged, and then
-        it has what there was until that stage.
+        The summary. Its `status` is `finished`, or that of the stage that was interrupted or diverged.
 
     Raises:
         MadocError: The order cannot be carried out.
@@ -79,7 +78,7 @@ def _source(order: RunOrder) -> Source:
 
 
 def _spec(order: RunOrder, machine: Machine) -> dict[str, object]:
-    """The order as `spec.json` keeps it, refused here if any stage would refuse it."""
+    """The order as JSON for `spec.json`; it is refused here already if a later stage would refuse it."""
     require_reward(machine.task)
     if order.data is None and not split_name(order.name)[1]:
         raise MadocError(f"expected TASK-QUALITY to record, as {order.name}-medium, or --data FILE to load")

@@ -9,11 +9,7 @@ from madoc.report.reading import Run, read_run
 
 
 def write_comparison(runs: Sequence[Path], out: Path | None = None) -> Path:
-    """Write one page on several runs: estimates side by side, error, cost, verdict.
-
-    Args:
-        runs: Folders of `madoc calibrate` or `madoc run`.
-        out: The page; None takes `comparison.html` in the working directory.
+    """Write one page on several runs; by default it is `comparison.html` in the working directory.
 
     Raises:
         MadocError: A run cannot be read, or the page cannot be written.

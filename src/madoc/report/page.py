@@ -15,14 +15,7 @@ from madoc.runs.files import replacing
 
 
 def write_report(run: Path, out: Path | None = None) -> Path:
-    """Write the page of one run.
-
-    Args:
-        run: A folder of `madoc calibrate` or `madoc run`, ended or not.
-        out: The page; None takes `report.html` in the folder.
-
-    Returns:
-        Where it is.
+    """Write the page of one run, ended or not; by default it is `report.html` in the run folder.
 
     Raises:
         MadocError: There is no run, a file of it is damaged, or the page cannot be written.
