@@ -3,6 +3,7 @@
 from madoc.policies.base import PolicyLearner
 from madoc.policies.bc import BC
 from madoc.policies.cql import CQL
+from madoc.policies.fast_sac import FastSAC
 from madoc.policies.h2o import H2O
 from madoc.policies.morec import MOREC
 from madoc.policies.sac import SAC
@@ -19,6 +20,15 @@ _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
         "SAC in the calibrated simulator",
         "Haarnoja et al., SAC",
         2018,
+        shown=_SAC_SHOWN,
+        needs_data=False,
+    ),
+    MethodEntry(
+        "fast-sac",
+        FastSAC,
+        "SAC for cheap simulation: the least wall time",
+        "Seo et al., FastTD3",
+        2025,
         shown=_SAC_SHOWN,
         needs_data=False,
     ),
