@@ -18,8 +18,9 @@ import yaml
 
 from calibration import commit
 from madoc import pipeline, robots, simulation
-from madoc.data import Dataset, logged_states, logs
+from madoc.data import Dataset, logs
 from madoc.identification.replay import window_residuals
+from madoc.identification.states import logged_states
 from madoc.identification.windows import first_rows, windows_at
 
 ROOT = Path(__file__).parent

@@ -8,10 +8,10 @@ import pytest
 
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
-from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
 from madoc.data import Disturbance, disturb
 from madoc.errors import MadocError
 from madoc.identification import losses
+from madoc.identification.gauss_newton import damped_step, triangular_factors
 from madoc.identification.information import (
     at_least_noise,
     bread,

@@ -2,24 +2,25 @@ import numpy as np
 import pytest
 
 from madoc.calibration.least_squares.estimated_states import FAILED_WINDOW, clipped_change
-from madoc.calibration.least_squares.noise import channel_deviation, echo, takes_turns, unlike
+from madoc.calibration.least_squares.noise import echo, takes_turns, unlike
+from madoc.identification.noise import channel_noise
 
 
 def test_deviation_is_the_median_over_what_the_states_left():
     # One window, three readings, two channels; of the second, each state took three quarters of the variance.
     residuals = np.array([[[1.0, 1.0], [-2.0, 2.0], [3.0, -3.0]]])
     spare = np.array([[[1.0, 0.25], [1.0, 0.25], [1.0, 0.25]]])
-    np.testing.assert_allclose(channel_deviation(residuals, spare), [1.4826 * 2.0, 1.4826 * 4.0])
+    np.testing.assert_allclose(channel_noise(residuals, spare), [1.4826 * 2.0, 1.4826 * 4.0])
 
 
 def test_readings_that_their_state_explains_say_nothing():
     residuals = np.array([[[1.0], [100.0], [3.0]]])
     spare = np.array([[[1.0], [0.01], [1.0]]])
-    np.testing.assert_allclose(channel_deviation(residuals, spare), [1.4826 * 2.0])
+    np.testing.assert_allclose(channel_noise(residuals, spare), [1.4826 * 2.0])
 
 
 def test_no_channel_is_a_thousand_times_surer_than_another():
-    found = channel_deviation(np.array([[[1.0, 0.0]]]), np.ones((1, 1, 2)))
+    found = channel_noise(np.array([[[1.0, 0.0]]]), np.ones((1, 1, 2)))
     np.testing.assert_allclose(found, 1.4826 * np.array([1.0, 1e-3]))
 
 

@@ -58,17 +58,20 @@ def test_windows_longer_than_any_episode_are_refused(problem):
 
 def test_the_estimate_is_the_search_in_physical_units(problem):
     search = evolution.begin(np.array([0.5, 0.0, -1.0]), deviation=0.1)
-    estimate = estimate_from_search(problem, SearchState(search, jax.random.key(0), 0, 0))
+    estimate = estimate_from_search(problem, SearchState(search, jax.random.key(0), 0))
     assert estimate.mean == pytest.approx([7.0, 1.0, 1.0])
     assert estimate.std == pytest.approx([0.4, 0.1, 0.1])
     assert estimate.covariance == pytest.approx(np.diag([0.16, 0.01, 0.01]))
     assert "at the end of its range: body_mass.cart" in estimate.warnings[0]
 
 
-def test_a_generation_adds_up_what_it_spent():
+def test_a_generation_says_what_it_cost_and_when_the_search_is_narrow():
     key = jax.random.key(0)
-    state = SearchState(evolution.begin(np.zeros(2)), key, 5, 1)
+    state = SearchState(evolution.begin(np.zeros(2)), key, 1)
     candidates = evolution.ask(state.search, key)
-    following = next_generation(state, key, candidates, candidates[:, 0], spent=7, failures=2)
-    assert (following.control_steps, following.failures, following.search.generation) == (12, 3, 1)
+    following, epoch = next_generation(state, candidates, candidates[:, 0], control_steps=7, tolerance=0.0)
+    assert (following.search.generation, epoch.control_steps, epoch.converged) == (1, 7, None)
+    assert epoch.metrics["cost"] == candidates[:, 0].min()
+    _, last = next_generation(state, candidates, candidates[:, 0], control_steps=7, tolerance=1.0)
+    assert last.converged == "after 1 generations every deviation is below 1 of its range"
     assert following.search.mean[0] < 0.0

@@ -266,8 +266,7 @@ def test_draws_that_explode_are_left_out_and_counted(method, dataset, task):
 
 
 def test_nothing_is_traced_again(method, problem, traced):
-    for epoch, following in through_all_stages(method, problem):
-        state = following
+    *_, (epoch, state) = through_all_stages(method, problem)
     assert epoch.stage == "calibrating"
     before = traced()
     for _ in range(10):

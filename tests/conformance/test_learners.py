@@ -260,14 +260,14 @@ def test_no_data_is_refused(name, problem):
 @pytest.mark.parametrize("name", FED)
 def test_too_few_rows_are_refused(name, dataset, problem):
     few = replace(dataset, transitions=dataset.transitions.take(np.arange(5)))
-    with pytest.raises(MadocError, match="needs at least .* 16, got 5 in a random policy"):
+    with pytest.raises(MadocError, match=r"needs at least .* 16, got 5 in a random policy"):
         learn_policy(METHODS[name], replace(problem, dataset=few), key=KEY, budget=BUDGET)
 
 
 @pytest.mark.parametrize("name", REWARDED)
 def test_data_without_rewards_is_refused_where_they_are_learnt_from(name, dataset, problem):
     silent = replace(dataset, transitions=replace(dataset.transitions, reward=np.zeros(len(dataset))))
-    with pytest.raises(MadocError, match="learns from logged rewards, and every reward .* is 0"):
+    with pytest.raises(MadocError, match=r"learns from logged rewards, and every reward .* is 0"):
         learn_policy(METHODS[name], replace(problem, dataset=silent), key=KEY, budget=BUDGET)
 
 

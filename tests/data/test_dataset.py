@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from layouts import make_dataset, with_fields
 
-from madoc.data import logged_states, subsample
+from madoc.data import subsample
 from madoc.data.dataset import close_episodes, starts_after
 from madoc.errors import MadocError
+from madoc.identification.states import logged_states
 
 
 def rewards(dataset):

@@ -9,11 +9,12 @@ from logged_arm import SPEC, TRUTH, arm_of, columns_of, write_csv
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
-from madoc.data import logged_states, logs
+from madoc.data import logs
 from madoc.data.findings import Finding
 from madoc.diagnosis import check, refuse_fatal
 from madoc.diagnosis.excitation import excite
 from madoc.errors import MadocError
+from madoc.identification.states import logged_states
 from madoc.simulation.sensitivity import refuse_insensitive
 from robots import ARM
 
@@ -164,7 +165,7 @@ def test_a_wrong_model(columns, checked, tmp_path):
     assert found.fatal
     level, where, what = findings[0]
     assert (level, where) == ("fatal", "the model")
-    assert "shoulder_speed, elbow_speed 1, 5 or 25 steps ahead better than 'nothing changes' does" in what
+    assert "shoulder_speed, elbow_speed 1, 5 or 20 steps ahead better than 'nothing changes' does" in what
 
 
 def test_hidden_speeds_are_told_and_structure_is_still_looked_at(columns, checked, tmp_path):

@@ -12,8 +12,9 @@ import pytest
 
 import madoc.tasks
 from madoc import robots
-from madoc.data import Dataset, logged_states
+from madoc.data import Dataset
 from madoc.errors import MadocError
+from madoc.identification.states import logged_states
 from madoc.simulation.cpu import CpuSimulator
 from madoc.simulation.sensitivity import insensitive
 from madoc.types import Transitions

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from madoc.runs import checkpoint
 from madoc.errors import MadocError
+from madoc.runs import checkpoint
 
 
 @jax.tree_util.register_dataclass

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 import pytest
 
-from madoc.runs import checkpoint
 from madoc.errors import MadocError
+from madoc.runs import checkpoint
 from madoc.runs.loop import run
 from madoc.runs.run_folder import RunFolder
 from wandering import BUDGET, SPEC, Wander, bits
@@ -46,9 +46,9 @@ def in_folder(path, *, budget=BUDGET, method=None, resume=False, spec=SPEC, **op
 
 
 def start(path, seconds):
-    folders = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "src")]
+    folders = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "src")]
     return subprocess.Popen(
-        [sys.executable, str(Path(__file__).parent / "wandering.py"), str(path), str(seconds)],
+        [sys.executable, str(Path(__file__).parents[1] / "wandering.py"), str(path), str(seconds)],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(folders), "JAX_PLATFORMS": "cpu"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

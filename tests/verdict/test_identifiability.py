@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from madoc.verdict.identifiability import told_shares, widened
+from madoc.identification.excitation import widened
+from madoc.verdict.identifiability import open_shares
 
 
 def test_an_open_direction_is_as_long_as_the_box():
@@ -22,6 +23,6 @@ def test_what_is_told_stays_as_it_is():
 
 def test_shares_are_the_wider_interval_and_at_most_everything():
     interval = np.array([[1.0, 2.0], [0.0, 1.0], [-5.0, 5.0]])
-    shares = told_shares(np.array([0.1, 0.6, 0.2]), interval, np.array([4.0, 4.0, 4.0]))
+    shares = open_shares(np.array([0.1, 0.6, 0.2]), interval, np.array([4.0, 4.0, 4.0]))
     assert shares.tolist() == [0.25, 0.6, 1.0]
-    assert told_shares(np.array([0.1, 3.0]), None, np.ones(2)).tolist() == [0.1, 1.0]
+    assert open_shares(np.array([0.1, 3.0]), None, np.ones(2)).tolist() == [0.1, 1.0]

@@ -4,20 +4,17 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from madoc.data import Dataset, logged_states
-from madoc.data.noise import estimate_noise
-from madoc.data.velocities import states_near
+from madoc.data import Dataset, typical_change
 from madoc.errors import MadocError
+from madoc.identification.noise import regression_noise
+from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.window_features import WindowScaling, last_rows, logged_stretch
 from madoc.simulation.base import Simulator
-from madoc.simulation.rollout import reset_states
-from madoc.simulation.velocities import unseen_positions
 from madoc.types import Method, State
 
 
@@ -48,18 +45,23 @@ class CalibrationProblem:
         object.__setattr__(self, "dataset", replace(self.dataset, true_parameters=None))
 
     @cached_property
-    def _rebuilt(self) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
-        return logged_states(self.dataset, self.simulator.task)
+    def states(self) -> LoggedStates:
+        """What the data tells of the simulator's states."""
+        return states_of(self.dataset, self.simulator)
 
     @property
     def logged_states(self) -> Float[np.ndarray, "states state"]:
-        """States rebuilt from logged observations, where that is exact."""
-        return self._rebuilt[0]
+        """States rebuilt exactly from logged observations.
+
+        Raises:
+            MadocError: Observations do not determine them.
+        """
+        return self.states.exact()[0]
 
     @property
     def logged_rows(self) -> Int[np.ndarray, " states"]:
         """The rows of the data that `logged_states` were rebuilt from, ascending."""
-        return self._rebuilt[1]
+        return self.states.exact()[1]
 
     @cached_property
     def logged_actions(self) -> Float[np.ndarray, "states action"]:
@@ -67,38 +69,14 @@ class CalibrationProblem:
         return np.asarray(self.dataset.transitions.action)[self.logged_rows]
 
     @cached_property
-    def approximate_states(self) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
-        """States near those of logged rows, and which rows: rebuilt ones, else as far as observations tell.
-
-        Velocities that are not observed are differences of positions; positions that are not are the model's initial.
-        """
-        task = self.simulator.task
-        if task.state_from_observation is not None or task.posture is None:
-            return self._rebuilt
-        return states_near(self.dataset, task, self.simulator.initial_state[: self.physical_size])
-
-    @property
-    def physical_size(self) -> int:
-        """Values of (qpos, qvel), the first of a state."""
-        return len(self.simulator.initial_state) - self.simulator.task.pending * self.simulator.action_size
-
-    @property
-    def starts_known(self) -> bool:
-        """Whether rollouts can start where the log was: states rebuilt, or all but velocities, which positions tell."""
-        task = self.simulator.task
-        return task.state_from_observation is not None or (task.posture is not None and not unseen_positions(task))
-
-    @property
-    def measured(self) -> int:
-        """How many of an observation's values, the first ones, were measured and not made from others."""
-        task = self.simulator.task
-        made = self.dataset.disturbance.velocities == "differences"
-        return task.observation_size - task.velocities * made
+    def typical_change(self) -> Float[np.ndarray, " observation"]:
+        """Standard deviation of each channel's change in one control step."""
+        return typical_change(self.dataset)
 
     @cached_property
     def estimated_noise(self) -> Float[np.ndarray, " observation"]:
-        """Deviation of the sensors' noise, as far as the log alone tells."""
-        return estimate_noise(self.dataset)
+        """Standard deviation of the sensors' noise, as far as the log alone tells."""
+        return regression_noise(self.dataset)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -126,17 +104,8 @@ class CalibrationProblem:
 
     @cached_property
     def probe(self) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
-        """States and actions at which every parameter must matter: logged ones, or near them where speeds are hidden.
-
-        Else where the first logged actions lead from a reset, as at rest many parameters have no say.
-        """
-        if self.simulator.task.state_from_observation is not None:
-            return self.logged_states, self.logged_actions
-        if self.starts_known:
-            states, rows = self.approximate_states
-            return states, np.asarray(self.dataset.transitions.action)[rows]
-        actions = np.asarray(self.dataset.transitions.action, dtype=np.float64)[np.arange(64) % len(self.dataset)]
-        return _walked(self.simulator, actions), actions
+        """States and actions at which every parameter must matter."""
+        return probing_rows(self.states, self.dataset, self.simulator)
 
     @cached_property
     def pairs(self) -> tuple[Float[Array, "rows observation"], Float[Array, "rows action"]]:
@@ -186,18 +155,6 @@ class CalibrationProblem:
     def _features(self, name: str) -> tuple[Array, Array]:
         pair, following = self.scalings[name].features(self.dataset.transitions)
         return jnp.asarray(pair), jnp.asarray(following)
-
-
-def _walked(simulator: Simulator, actions: Float[np.ndarray, "rows action"]) -> Float[np.ndarray, "rows state"]:
-    """The states that actions are taken at, one after the other from a reset, at mid-range parameters."""
-    system = simulator.bind(simulator.parameters.middle[None])
-    state = first = reset_states(simulator)(jax.random.key(0), 1)[None]
-    passed = []
-    for action in actions:
-        passed.append(state[0, 0])
-        state = system.step(state, action[None, None])
-        state = state if np.isfinite(state).all() else first
-    return np.stack(passed)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Logged data: `load` reads any known format into a `Dataset`, `save` writes Madoc's own."""
 
-from madoc.data.dataset import Dataset, Disturbance, logged_states, subsample
+from madoc.data.dataset import Dataset, Disturbance, subsample, typical_change
 from madoc.data.disturbance import disturb, hide_velocities, observed_task
 from madoc.data.formats import FORMATS, Format, load
 from madoc.data.native import save
@@ -14,9 +14,9 @@ __all__ = [
     "disturb",
     "hide_velocities",
     "load",
-    "logged_states",
     "observed_task",
     "save",
     "subsample",
+    "typical_change",
     "validate",
 ]

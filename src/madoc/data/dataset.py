@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from madoc.data.findings import Finding
 from madoc.errors import MadocError
-from madoc.tasks import Task
 from madoc.types import Transitions
 
 Shuffled = Literal["none", "rows", "next_observations"]
@@ -156,56 +155,8 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
     return replace(dataset, transitions=transitions, episode_starts=new_starts, run_names=names)
 
 
-def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
-    """Simulator states of the rows whose observation determines them, and which rows those are.
-
-    Root positions that never enter the dynamics are 0. Pending actions are those of the rows before, so the first rows
-    of an episode have no state where a state carries any. Sensors are taken to have no bias: `System.unbiased`.
-
-    Raises:
-        MadocError: The task's observation does not determine its state, or no row can be rebuilt.
-    """
-    if task.state_from_observation is None:
-        wanted = "a state_from_observation" if task.source is None else "signals of every position and velocity"
-        raise MadocError(
-            f"an observation of {task.name} does not determine its state, so nothing can start at logged "
-            f"states; give the task {wanted}, take least-squares, which estimates states where positions are known, or "
-            "start rollouts from the task's reset: madoc or oted with starts=policy"
-        )
-    observation = np.asarray(dataset.transitions.observation, dtype=np.float64)
-    rows = np.arange(len(observation))
-    if task.rebuildable is not None:
-        rows = np.flatnonzero(task.rebuildable(observation))
-    if not len(rows):
-        raise MadocError(
-            f"none of the {len(observation)} logged states of {task.name} can be rebuilt from its "
-            f"observation (every row has a clipped value) in {dataset.origin}; start rollouts from the "
-            "task's reset"
-        )
-    rebuilt = np.asarray(task.state_from_observation(observation[rows]), dtype=np.float64)
-    return with_pending(dataset, task, rebuilt, rows)
-
-
-def with_pending(
-    dataset: Dataset, task: Task, states: Float[np.ndarray, "rows physical"], rows: Int[np.ndarray, " rows"]
-) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
-    """(qpos, qvel) of rows with the actions that are pending there, and which rows have so many behind them.
-
-    Raises:
-        MadocError: None has.
-    """
-    known = _age(dataset)[rows] >= task.pending
-    states, rows = states[known], rows[known]
-    if not len(rows):
-        raise MadocError(
-            f"a state of {task.name} carries the {task.pending} actions before it, and no episode of {dataset.origin} "
-            "has so many before a row; give it data with its rows in order, or a shorter action_delay"
-        )
-    action = np.asarray(dataset.transitions.action, dtype=np.float64)
-    return np.concatenate([states, *(action[rows - back] for back in range(1, task.pending + 1))], axis=-1), rows
-
-
-def _age(dataset: Dataset) -> Int[np.ndarray, " rows"]:
-    """How many rows of its episode come before each row."""
-    rows = np.arange(len(dataset))
-    return rows - dataset.episode_starts[dataset.episode_of(rows)]
+def typical_change(dataset: Dataset) -> Float[np.ndarray, " observation"]:
+    """Standard deviation of each channel's change in a control step, in its unit; 1 for one that never moves."""
+    logged = dataset.transitions
+    spread = (np.asarray(logged.next_observation) - logged.observation).std(0)
+    return np.where(spread > 1e-8, spread, 1.0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.data.dataset import Dataset, with_pending
+from madoc.data.dataset import Dataset
 from madoc.errors import MadocError
 from madoc.simulation.velocities import missing_velocities, velocities_between, with_velocities
 from madoc.tasks import Task
@@ -42,23 +42,6 @@ def moving_states(
         with_velocities(task, here, velocities_between(task, before, there, 2.0 - first)),
         with_velocities(task, there, velocities_between(task, here, beyond, 2.0 - last)),
     )
-
-
-def states_near(
-    dataset: Dataset, task: Task, initial: Float[np.ndarray, " physical"]
-) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
-    """States near those of logged rows, as far as observations tell, and which rows: as `moving_states`.
-
-    Args:
-        dataset: The log.
-        task: The robot.
-        initial: (qpos, qvel) of the model: what positions that are not observed are taken for.
-
-    Raises:
-        MadocError: As `moving_states` and `with_pending`.
-    """
-    states = moving_states(dataset, task)[0]
-    return with_pending(dataset, task, np.where(np.isnan(states), initial, states), np.arange(len(dataset)))
 
 
 def velocity_names(task: Task, addresses: Int[np.ndarray, " values"]) -> tuple[str, ...]:

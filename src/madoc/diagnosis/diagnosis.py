@@ -4,21 +4,16 @@ import time
 from dataclasses import dataclass
 
 import jax
-import numpy as np
-from jaxtyping import Float, PRNGKeyArray
 
-from madoc.data import Dataset, logged_states
+from madoc.data import Dataset
 from madoc.data.findings import Finding, worst_first
-from madoc.data.velocities import states_near
 from madoc.diagnosis.channels import Channel, channel_findings, channels_of
-from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, excite_unseen
+from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, excite_unknown
 from madoc.diagnosis.explanation import Explanation, action_findings, explain, explanation_findings
-from madoc.errors import MadocError
+from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.robots import Robot
 from madoc.simulation import CpuSimulator
-from madoc.simulation.rollout import reset_states
 from madoc.simulation.sensitivity import insensitive
-from madoc.simulation.velocities import unseen_positions
 
 
 @dataclass(frozen=True)
@@ -71,16 +66,12 @@ def check(dataset: Dataset, simulator: CpuSimulator, *, robot: Robot | None = No
     findings = [*dataset.findings, *channel_findings(dataset, simulator, channels)]
     explanation, excitation, spent = None, None, 0
     if not any(finding.level == "fatal" for finding in findings):
-        states, rows, told = _states(dataset, simulator, robot)
-        findings += told
-        actions = np.asarray(dataset.transitions.action)
-        if len(rows):
-            probing = insensitive(simulator, states, actions[rows], key=of_rows)
-        else:
-            probing = insensitive(simulator, *_probe(dataset, simulator, of_rows), key=of_rows)
+        logged = states_of(dataset, simulator)
+        probing = insensitive(simulator, *probing_rows(logged, dataset, simulator), key=of_rows)
         spent += probing[1]
         findings += _insensitive_findings(probing[0])
-        if len(rows):
+        if logged.kind == "exact":
+            states, rows = logged.exact()
             explanation = explain(dataset, simulator, states, rows, key=of_box)
             findings += explanation_findings(explanation, channels)
             about_actions, steps = action_findings(dataset, simulator, states, rows, explanation, key=of_actions)
@@ -89,7 +80,8 @@ def check(dataset: Dataset, simulator: CpuSimulator, *, robot: Robot | None = No
             excitation = excite(dataset, simulator, states, rows, start=start, key=of_windows)
             spent += explanation.control_steps + steps
         else:
-            excitation = excite_unseen(dataset, simulator, key=of_windows)
+            findings.append(_inexact_states_finding(logged, robot))
+            excitation = excite_unknown(dataset, simulator, logged)
         spent += excitation.control_steps
         findings += excitation_findings(excitation, simulator)
     return Diagnosis(
@@ -106,34 +98,15 @@ def check(dataset: Dataset, simulator: CpuSimulator, *, robot: Robot | None = No
     )
 
 
-def _states(
-    dataset: Dataset, simulator: CpuSimulator, robot: Robot | None
-) -> tuple[np.ndarray, np.ndarray, list[Finding]]:
-    """States rebuilt from the log and their rows; none, and why, where that cannot be done."""
-    try:
-        return *logged_states(dataset, simulator.task), []
-    except MadocError as error:
-        reasons = ", ".join(robot.undetermined) if robot is not None and robot.undetermined else str(error)
-        finding = Finding(
-            "note",
-            f"states cannot be rebuilt from the log ({reasons}), so the model was not compared with it, and methods "
-            "that take logged states for true will refuse",
-            "signals",
-            "log the position and the velocity of every joint if you can",
-        )
-        return np.zeros((0, 0)), np.zeros(0, dtype=np.int64), [finding]
-
-
-def _probe(
-    dataset: Dataset, simulator: CpuSimulator, key: PRNGKeyArray
-) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
-    """Where parameters must matter if no state can be rebuilt: near the log's if positions tell, else at resets."""
-    task, actions = simulator.task, np.asarray(dataset.transitions.action)
-    if task.posture is None or unseen_positions(task):
-        return reset_states(simulator)(key, 64), actions[np.arange(64) % len(actions)]
-    physical = len(simulator.initial_state) - task.pending * simulator.action_size
-    states, rows = states_near(dataset, task, simulator.initial_state[:physical])
-    return states, actions[rows]
+def _inexact_states_finding(logged: LoggedStates, robot: Robot | None) -> Finding:
+    reasons = ", ".join(robot.undetermined) if robot is not None and robot.undetermined else logged.reason
+    return Finding(
+        "note",
+        f"states cannot be rebuilt from the log ({reasons}), so the model was not compared with it, and methods "
+        "that take logged states for true will refuse",
+        "signals",
+        "log the position and the velocity of every joint if you can",
+    )
 
 
 def _insensitive_findings(names: list[str]) -> list[Finding]:

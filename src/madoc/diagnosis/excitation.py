@@ -2,31 +2,32 @@
 
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
-from scipy.optimize import lsq_linear
 
-from madoc.data import Dataset
+from madoc.data import Dataset, typical_change
 from madoc.data.findings import Finding
+from madoc.identification.gauss_newton import damped_step, triangular_factors
 from madoc.identification.information import bread, correlated_pairs, half_width, identifiability, meat, sandwich
-from madoc.identification.linearisation import Linearisation, difference_points, linearise
+from madoc.identification.linearisation import difference_points, linearise
 from madoc.identification.replay import window_residuals
-from madoc.identification.windows import Windows, windows_at
-from madoc.simulation import CpuSimulator
-from madoc.simulation.rollout import reset_states
+from madoc.identification.states import LoggedStates, probing_windows
+from madoc.identification.windows import disjoint_windows, drawn, longest_fit, windows_at
+from madoc.simulation.base import Simulator
 
-HORIZONS = (5, 25)
-"""Control steps of a stretch: long ones tell more where sensors are noisy, short ones where the robot is chaotic."""
-WINDOWS = {5: 200, 25: 60}
+WINDOWS = {5: 200, 20: 60}
+"""Windows at most, by their length in control steps.
+
+Long ones tell more where sensors are noisy, short ones where the robot is chaotic.
+"""
 ROUNDS = 3
 """Times the slopes are taken: from the best draw, the residual falls to what no parameter explains within two steps."""
 INSIDE = 0.98
-"""Slopes are taken no nearer to an end of [-1, 1]."""
+"""Largest |parameter| in [-1, 1] at which derivatives are taken: a mass of 0 or the like has none."""
+_DAMPING = 1e-8
+"""Relative damping of the steps: enough to keep directions that the log says nothing of where they are."""
 WIDE = 0.25
 """Of its range: an expected interval with a larger half width says little."""
-_UNSEEN = 25
-"""Control steps simulated from the reset where no state can be rebuilt."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Excitation:
 
 def excite(
     dataset: Dataset,
-    simulator: CpuSimulator,
+    simulator: Simulator,
     states: Float[np.ndarray, "states state"],
     rows: Int[np.ndarray, " states"],
     *,
@@ -72,7 +73,7 @@ def excite(
         key: Draws the stretches.
     """
     of_length = [
-        _excited(dataset, simulator, states, rows, start=start, horizon=horizon, key=key) for horizon in HORIZONS
+        _excited(dataset, simulator, states, rows, start=start, horizon=horizon, key=key) for horizon in WINDOWS
     ]
     spent = sum(found.control_steps for found in of_length)
     spans = simulator.parameters.high - simulator.parameters.low
@@ -82,7 +83,7 @@ def excite(
 
 def _excited(
     dataset: Dataset,
-    simulator: CpuSimulator,
+    simulator: Simulator,
     states: Float[np.ndarray, "states state"],
     rows: Int[np.ndarray, " states"],
     *,
@@ -92,9 +93,11 @@ def _excited(
 ) -> Excitation:
     """As `excite`, over stretches of one length."""
     space = simulator.parameters
-    chosen, steps, available = _apart(dataset, rows, horizon, key)
+    steps = longest_fit(dataset, rows, horizon)
+    disjoint = disjoint_windows(dataset, rows, steps, gap=0)
+    chosen, available = drawn(disjoint, WINDOWS[horizon], key), len(disjoint)
     windows = windows_at(dataset, states[chosen], rows[chosen], steps)
-    scale = _typical_change(dataset)
+    scale = typical_change(dataset)
     unit, best, spent = np.clip(start, -0.9 * INSIDE, 0.9 * INSIDE), None, 0
     for _ in range(ROUNDS):
         points = difference_points(unit)
@@ -104,7 +107,7 @@ def _excited(
             break
         if best is None or (around.residuals**2).mean() < (best.residuals**2).mean():
             best = around
-        unit = _bounded_step(around, unit)
+        unit = unit + damped_step(*triangular_factors(around, 1.0, "linear"), unit, _DAMPING, limit=INSIDE)
     if best is None:
         nothing = np.full(len(space), np.nan)
         sentence = f"the simulation fails in all {len(windows)} stretches tried; look at the ranges and the states"
@@ -123,32 +126,25 @@ def _excited(
     )
 
 
-def excite_unseen(dataset: Dataset, simulator: CpuSimulator, *, key: PRNGKeyArray) -> Excitation:
-    """What goes together, from the model's own reset under stretches of the log's actions: no state can be rebuilt."""
-    of_rows, of_starts = jax.random.split(key)
-    space, task = simulator.parameters, simulator.task
-    steps = int(min(_UNSEEN, (dataset.episode_ends - dataset.episode_starts).max()))
-    rows = np.arange(len(dataset))
-    ends = dataset.episode_ends[dataset.episode_of(rows)]
-    possible = np.flatnonzero(rows + steps <= ends)
-    chosen = possible[np.asarray(jax.random.permutation(of_rows, len(possible)))[: WINDOWS[_UNSEEN]]]
-    starts = reset_states(simulator)(of_starts, len(chosen))
-    actions = np.asarray(dataset.transitions.action)[chosen[:, None] + np.arange(steps)]
-    windows = Windows(starts, actions, np.zeros((len(chosen), steps, task.observation_size)))
+def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates) -> Excitation:
+    """Which estimates would correlate, from states that the log's actions lead to: its own cannot be rebuilt."""
+    space = simulator.parameters
+    steps, count = max(WINDOWS.items())
+    windows = probing_windows(logged, dataset, simulator, steps=steps, count=count)
     points = difference_points(np.zeros(len(space)))
-    around = linearise(points, window_residuals(simulator, windows, points, _typical_change(dataset)))
-    found = sandwich(bread(around, 1.0, "linear"), np.zeros((len(space), len(space))))
+    around = linearise(points, window_residuals(simulator, windows, points, typical_change(dataset)))
+    certainty = sandwich(bread(around, 1.0, "linear"), np.zeros((len(space), len(space))))
     unknown = np.full(len(space), np.nan)
     return Excitation(
         effect=unknown,
         half_width=unknown,
-        pairs=tuple(correlated_pairs(found.correlation, space.names)),
-        sentences=identifiability(found, space.names),
-        control_steps=len(points) * len(windows) * steps,
+        pairs=tuple(correlated_pairs(certainty.correlation, space.names)),
+        sentences=identifiability(certainty, space.names),
+        control_steps=len(points) * len(windows) * windows.steps,
     )
 
 
-def excitation_findings(found: Excitation, simulator: CpuSimulator) -> list[Finding]:
+def excitation_findings(found: Excitation, simulator: Simulator) -> list[Finding]:
     """A warning for each parameter that the log would leave open, and for those it cannot tell apart."""
     space = simulator.parameters
     findings = [Finding("warning", sentence, "parameters") for sentence in found.sentences]
@@ -167,35 +163,3 @@ def excitation_findings(found: Excitation, simulator: CpuSimulator) -> list[Find
             )
         )
     return findings
-
-
-def _bounded_step(around: Linearisation, unit: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
-    """The Gauss-Newton step that stays clear of the box's ends, where a mass of 0 or the like has no slope."""
-    count = len(unit)
-    jacobian, residuals = around.jacobian.reshape(-1, count), around.residuals.reshape(-1)
-    factor = np.linalg.qr(np.column_stack([jacobian, residuals]), mode="r")
-    padded = np.zeros((max(count, len(factor)), count + 1))
-    padded[: len(factor)] = factor
-    step = lsq_linear(padded[:, :count], -padded[:, count], bounds=(-INSIDE - unit, INSIDE - unit)).x
-    return np.clip(unit + step, -INSIDE, INSIDE)
-
-
-def _apart(
-    dataset: Dataset, rows: Int[np.ndarray, " states"], horizon: int, key: PRNGKeyArray
-) -> tuple[Int[np.ndarray, " windows"], int, int]:
-    """Positions in `rows` of stretches that do not overlap, their length, and how many there are in the whole log."""
-    episode = dataset.episode_of(rows)
-    start, end = dataset.episode_starts[episode], dataset.episode_ends[episode]
-    steps = int(min(horizon, (end - rows).max()))
-    possible = np.flatnonzero(((rows - start) % steps == 0) & (rows + steps <= end))
-    if not len(possible):
-        possible = np.flatnonzero(rows + steps <= end)
-    picked = np.asarray(jax.random.permutation(key, len(possible)))[: WINDOWS[horizon]]
-    return possible[np.sort(picked)], steps, len(possible)
-
-
-def _typical_change(dataset: Dataset) -> Float[np.ndarray, " observation"]:
-    """Deviation of each signal's change in a step; 1 for those that never move."""
-    logged = dataset.transitions
-    spread = (np.asarray(logged.next_observation) - np.asarray(logged.observation)).std(0)
-    return np.where(spread > 1e-8, spread, 1.0)

@@ -11,13 +11,12 @@ from madoc.data import Dataset
 from madoc.data.findings import Finding
 from madoc.diagnosis.channels import Channel, action_names
 from madoc.identification.replay import window_residuals
-from madoc.identification.windows import Windows, windows_at
+from madoc.identification.windows import HORIZONS, Windows, drawn, longest_fit, rows_that_fit, windows_at
 from madoc.simulation import CpuSimulator
 from madoc.tasks import Task
 
-HORIZONS = (1, 5, 25)
-"""Control steps ahead."""
 WINDOWS = 64
+"""Windows replayed, at most."""
 CORNERS, DRAWS = 8, 24
 HALF = 0.5
 """Share of the live signals from which what no draw explains is the model, not a signal."""
@@ -72,7 +71,8 @@ def explain(
         key: Draws the stretches and the box.
     """
     of_windows, of_box = jax.random.split(key)
-    chosen, steps = _stretches(dataset, rows, max(HORIZONS), of_windows)
+    steps = longest_fit(dataset, rows, max(HORIZONS))
+    chosen = drawn(rows_that_fit(dataset, rows, steps), WINDOWS, of_windows)
     horizons = tuple(horizon for horizon in HORIZONS if horizon <= steps)
     windows = windows_at(dataset, states[chosen], rows[chosen], steps)
     draws = box_draws(len(simulator.parameters), of_box)
@@ -128,11 +128,9 @@ def action_findings(
     """
     task = simulator.task
     horizon = found.horizons[min(1, len(found.horizons) - 1)]
-    inner = _inside(dataset, rows, horizon)
-    if not len(inner):
+    chosen = drawn(rows_that_fit(dataset, rows, horizon, margin=1), WINDOWS, key)
+    if not len(chosen):
         return [], 0
-    picked = np.asarray(jax.random.permutation(key, len(inner)))[:WINDOWS]
-    chosen = inner[np.sort(picked)]
     windows = windows_at(dataset, states[chosen], rows[chosen], horizon)
     best = np.argsort(found.overall[:, min(1, len(found.horizons) - 1)])[:3]
     draws = found.draws[np.unique(np.append(best, 0))]
@@ -167,24 +165,6 @@ def action_findings(
                 Finding("warning", f"the model explains the log clearly better if {what}", "actions", remedy)
             )
     return findings, tried * len(draws) * len(windows) * horizon
-
-
-def _stretches(
-    dataset: Dataset, rows: Int[np.ndarray, " states"], longest: int, key: PRNGKeyArray
-) -> tuple[Int[np.ndarray, " windows"], int]:
-    """Positions in `rows` where stretches begin, and how long they are: as long as asked, or as there are."""
-    ends = dataset.episode_ends[dataset.episode_of(rows)]
-    steps = int(min(longest, (ends - rows).max()))
-    possible = np.flatnonzero(rows + steps <= ends)
-    picked = np.asarray(jax.random.permutation(key, len(possible)))[:WINDOWS]
-    return possible[np.sort(picked)], steps
-
-
-def _inside(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Int[np.ndarray, " windows"]:
-    """Positions in `rows` with a row of the same episode before a stretch and one after it."""
-    episode = dataset.episode_of(rows)
-    whole = (rows > dataset.episode_starts[episode]) & (rows + steps < dataset.episode_ends[episode])
-    return np.flatnonzero(whole)
 
 
 def _errors(

@@ -1,4 +1,4 @@
-"""Slopes of residuals by central differences; `window_residuals` simulates all of their points in one batch."""
+"""Derivatives of residuals by central differences, whose points are simulated in one batch by `replay`."""
 
 from dataclasses import dataclass
 
@@ -9,13 +9,13 @@ DIFFERENCE = 1e-4
 """Half width of a central difference in [-1, 1].
 
 Its truncation error falls with the square, 1e-8 of the third derivative; rounding of next states (1e-16, and 1e-10
-at contacts, where MuJoCo's solver stops) divided by it stays below 1e-6 of a typical slope.
+at contacts, where MuJoCo's solver stops) divided by it stays below 1e-6 of a typical derivative.
 """
 
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Residuals at a point and their slopes there; windows in which a simulation failed are left out.
+    """Residuals at a point and their derivatives there; windows whose simulation failed are left out.
 
     Attributes:
         residuals: In units of each channel's typical change.
@@ -26,13 +26,35 @@ class Linearisation:
     jacobian: Float[np.ndarray, "windows values d"]
 
     def of(self, kept: Bool[np.ndarray, " windows"]) -> "Linearisation":
-        """Of these windows alone."""
+        """These windows alone."""
         return Linearisation(self.residuals[kept], self.jacobian[kept])
 
     def where(self, kept: Bool[np.ndarray, " windows"]) -> "Linearisation":
-        """Of these windows, the others 0 everywhere."""
+        """All windows, with zeros in those that are not kept."""
         part = kept[:, None]
         return Linearisation(np.where(part, self.residuals, 0.0), np.where(part[..., None], self.jacobian, 0.0))
+
+
+@dataclass(frozen=True)
+class WindowSlopes:
+    """Residuals of windows at a point, and their derivatives there by parameters and by each window's initial state.
+
+    Attributes:
+        residuals: In units of each channel's typical change, or of its noise.
+        by_parameters: Their derivatives by parameters in [-1, 1].
+        by_states: Their derivatives by the window's own initial state, in units of each value's spread.
+        whole: Windows in which no simulation failed; the others are 0 everywhere.
+    """
+
+    residuals: Float[np.ndarray, "windows values"]
+    by_parameters: Float[np.ndarray, "windows values d"]
+    by_states: Float[np.ndarray, "windows values n"]
+    whole: Bool[np.ndarray, " windows"]
+
+    def over(self, deviation: Float[np.ndarray, " values"]) -> "WindowSlopes":
+        """The same with residuals in units of `deviation`."""
+        wide = deviation[:, None]
+        return WindowSlopes(self.residuals / deviation, self.by_parameters / wide, self.by_states / wide, self.whole)
 
 
 def difference_points(unit: Float[np.ndarray, " d"]) -> Float[np.ndarray, "points d"]:
@@ -45,9 +67,34 @@ def linearise(
     points: Float[np.ndarray, "points d"], residuals: Float[np.ndarray, "points windows values"]
 ) -> Linearisation:
     """Central differences between `difference_points`; one-sided where the box ends."""
-    count = points.shape[1]
-    width = np.diagonal(points[1 : count + 1] - points[count + 1 :])
     whole: Bool[np.ndarray, " windows"] = np.isfinite(residuals).all((0, 2))
     seen = residuals[:, whole]
-    slopes = (seen[1 : count + 1] - seen[count + 1 :]) / width[:, None, None]
-    return Linearisation(seen[0], np.moveaxis(slopes, 0, -1))
+    return Linearisation(seen[0], np.moveaxis(_central(points, seen), 0, -1))
+
+
+def slopes_of_windows(
+    points: Float[np.ndarray, "points d"],
+    by_points: Float[np.ndarray, "points windows values"],
+    by_shifts: Float[np.ndarray, "n windows values"],
+) -> WindowSlopes:
+    """Derivatives by parameters and by initial states; the latter are one-sided.
+
+    Args:
+        points: The point alone, or its `difference_points`.
+        by_points: Residuals at these.
+        by_shifts: Residuals at the first point, each value of the initial states in turn moved by `DIFFERENCE`.
+    """
+    whole = np.isfinite(by_points).all((0, 2)) & np.isfinite(by_shifts).all((0, 2))
+    with np.errstate(invalid="ignore"):
+        parts = (by_points[0], _central(points, by_points), (by_shifts - by_points[0]) / DIFFERENCE)
+    residuals, by_parameters, by_states = (np.where(whole[:, None], part, 0.0) for part in parts)
+    return WindowSlopes(residuals, np.moveaxis(by_parameters, 0, -1), np.moveaxis(by_states, 0, -1), whole)
+
+
+def _central(
+    points: Float[np.ndarray, "points d"], residuals: Float[np.ndarray, "points windows values"]
+) -> Float[np.ndarray, "d windows values"]:
+    """Differences of residuals over those of the points, which may be a point without neighbours: then d is 0."""
+    count = len(points) // 2
+    width = np.diagonal(points[1 : count + 1] - points[count + 1 :])
+    return (residuals[1 : count + 1] - residuals[count + 1 :]) / width[:, None, None]

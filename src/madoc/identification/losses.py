@@ -15,7 +15,7 @@ TUNING: dict[Loss, float] = {"linear": 1.0, "huber": 1.345, "soft-l1": 1.345, "c
 """c in standard deviations: 95 % efficient under normal noise (Holland and Welsch 1977); soft-l1 as Huber's."""
 _NORMAL_90 = 1.644854
 _SHARE_OF_TAIL = 0.2
-_NORMAL_MAD = 1.4826
+NORMAL_MAD = 1.4826
 """Standard deviations in a median absolute deviation, for normal noise."""
 _SMALLEST_SCALE = 1e-12
 """Residuals are in units of a channel's typical change; below this they are rounding."""
@@ -83,7 +83,7 @@ def robust_deviation(size: Float[np.ndarray, "*values"]) -> float:
     the largest tenth says, as far as that is less than a step's change and so may be noise.
     """
     tail = min(float(np.percentile(size, 90)), 1.0)
-    return max(_NORMAL_MAD * float(np.median(size)), _SHARE_OF_TAIL * tail / _NORMAL_90)
+    return max(NORMAL_MAD * float(np.median(size)), _SHARE_OF_TAIL * tail / _NORMAL_90)
 
 
 def mean_cost(residuals: Float[np.ndarray, "windows values"], scale: float, loss: Loss) -> float:

@@ -1,22 +1,35 @@
-"""Windows: stretches of logged rows of one episode that can be replayed from a state rebuilt at their first row."""
+"""Windows: stretches of consecutive rows of one episode, to be replayed from the state at their first row.
+
+Every function that picks windows takes `rows`, the ascending rows at which one may begin because a state is known
+there, and returns positions in `rows`.
+"""
 
 from dataclasses import dataclass
 
+import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from madoc.data.dataset import Dataset
 from madoc.errors import MadocError
 
+HORIZONS = (1, 5, 20)
+"""Window lengths, in control steps, at which simulated and logged motion are compared before and after a calibration.
+
+One step shows what most methods fit; an error that is small in each step adds up over many.
+"""
+
+Positions = Int[np.ndarray, " windows"]
+
 
 @dataclass(frozen=True)
 class Windows:
-    """Logged stretches of equal length.
+    """Logged windows of equal length.
 
     Attributes:
         states: Simulator states at the first rows.
-        actions: What was done from there.
-        following: What was observed after each action.
+        actions: The actions taken from there.
+        following: The observation after each action.
     """
 
     states: Float[np.ndarray, "windows state"]
@@ -28,38 +41,8 @@ class Windows:
 
     @property
     def steps(self) -> int:
-        """Control steps of each."""
+        """Length of each window in control steps."""
         return self.actions.shape[1]
-
-
-def first_rows(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Int[np.ndarray, " windows"]:
-    """Which of the given rows can begin a window of `steps` rows: those whose episode goes on for as long.
-
-    Args:
-        dataset: The log.
-        rows: Rows whose state can be rebuilt.
-        steps: Rows of a window.
-
-    Returns:
-        Positions in `rows`.
-
-    Raises:
-        MadocError: No episode is long enough.
-    """
-    found = rows_that_fit(dataset, rows, steps)
-    if not len(found):
-        longest = int((dataset.episode_ends - dataset.episode_starts).max())
-        raise MadocError(
-            f"no stretch of {steps} rows begins at a state that can be rebuilt in {dataset.origin}, whose longest "
-            f"episode has {longest} rows; take a horizon of 1, or data with its rows in order"
-        )
-    return found
-
-
-def rows_that_fit(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Int[np.ndarray, " windows"]:
-    """As `first_rows`; none where no episode is long enough."""
-    episode = dataset.episode_of(rows)
-    return np.flatnonzero(rows + steps <= dataset.episode_ends[episode])
 
 
 def windows_at(
@@ -71,18 +54,52 @@ def windows_at(
     return Windows(states, np.asarray(logged.action)[stretch], np.asarray(logged.next_observation)[stretch])
 
 
-def apart(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Int[np.ndarray, " windows"]:
-    """Which of the given rows begin windows of `steps` rows that share no reading, as many as fit one after the other.
+def readings_at(
+    dataset: Dataset, rows: Int[np.ndarray, " windows"], steps: int
+) -> Float[np.ndarray, "windows readings observation"]:
+    """All observations of the windows that begin at the given rows, the one at the first row included."""
+    logged = dataset.transitions
+    first = np.asarray(logged.observation)[rows]
+    following = np.asarray(logged.next_observation)[rows[:, None] + np.arange(steps)]
+    return np.concatenate([first[:, None], following], axis=1)
 
-    A window reads `steps` + 1 observations; the one after it begins where these end.
 
-    Args:
-        dataset: The log.
-        rows: Rows at which a window may begin, ascending.
-        steps: Rows of a window.
+def rows_that_fit(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int, *, margin: int = 0) -> Positions:
+    """Rows whose episode goes on for `steps` rows, with `margin` rows of the same episode before and after them.
 
-    Returns:
-        Positions in `rows`.
+    None where no episode is long enough.
+    """
+    episode = dataset.episode_of(rows)
+    begins, ends = dataset.episode_starts[episode], dataset.episode_ends[episode]
+    return np.flatnonzero((rows >= begins + margin) & (rows + steps + margin <= ends))
+
+
+def first_rows(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Positions:
+    """Rows whose episode goes on for `steps` rows.
+
+    Raises:
+        MadocError: No episode is long enough.
+    """
+    fitting = rows_that_fit(dataset, rows, steps)
+    if not len(fitting):
+        longest = int((dataset.episode_ends - dataset.episode_starts).max())
+        raise MadocError(
+            f"no stretch of {steps} rows begins at a state that can be rebuilt in {dataset.origin}, whose longest "
+            f"episode has {longest} rows; take a horizon of 1, or data with its rows in order"
+        )
+    return fitting
+
+
+def longest_fit(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> int:
+    """The length of the longest window that fits, at most `steps`."""
+    return int(min(steps, (dataset.episode_ends[dataset.episode_of(rows)] - rows).max()))
+
+
+def disjoint_windows(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int, *, gap: int = 1) -> Positions:
+    """Rows that begin windows of `steps` rows without a common observation, as many as fit one after the other.
+
+    A window has `steps` + 1 observations; the next one begins behind the last of them. With a gap of 0 it begins at the
+    last of them, so that only actions are disjoint.
 
     Raises:
         MadocError: No episode is long enough.
@@ -93,22 +110,41 @@ def apart(dataset: Dataset, rows: Int[np.ndarray, " states"], steps: int) -> Int
     for position, row, own in zip(possible.tolist(), rows[possible].tolist(), episodes.tolist(), strict=True):
         if own != episode or row >= free:
             chosen.append(position)
-            free, episode = row + steps + 1, own
+            free, episode = row + steps + gap, own
     return np.array(chosen)
 
 
-def readings_at(
-    dataset: Dataset, rows: Int[np.ndarray, " windows"], steps: int
-) -> Float[np.ndarray, "windows readings observation"]:
-    """All that was observed in the windows that begin at the given rows, at their first rows too."""
-    logged = dataset.transitions
-    first = np.asarray(logged.observation)[rows]
-    following = np.asarray(logged.next_observation)[rows[:, None] + np.arange(steps)]
-    return np.concatenate([first[:, None], following], axis=1)
+def successive_windows(
+    dataset: Dataset, rows: Int[np.ndarray, " states"], longest: int
+) -> tuple[Positions, Int[np.ndarray, " windows"]]:
+    """Windows that cover the log one after the other, each at most `longest` rows or up to its episode's end.
+
+    Returns:
+        Positions in `rows`, and the length of each window.
+    """
+    chosen, lengths, free = [], [], -1
+    ends = dataset.episode_ends[dataset.episode_of(rows)]
+    for position, (row, end) in enumerate(zip(rows.tolist(), ends.tolist(), strict=True)):
+        if row >= free:
+            chosen.append(position)
+            lengths.append(min(longest, end - row))
+            free = row + lengths[-1]
+    return np.array(chosen), np.array(lengths)
 
 
-def evenly(positions: Int[np.ndarray, " positions"], count: int) -> Int[np.ndarray, " chosen"]:
-    """At most `count` of them, spread evenly."""
+def consecutive_rows(dataset: Dataset, rows: Int[np.ndarray, " states"]) -> Positions:
+    """Rows whose next row, of the same episode, is among `rows` as well."""
+    episode = dataset.episode_of(rows)
+    return np.flatnonzero((np.diff(rows) == 1) & (np.diff(episode) == 0))
+
+
+def drawn(positions: Positions, count: int, key: PRNGKeyArray) -> Positions:
+    """At most `count` of the positions drawn at random, in ascending order."""
+    return positions[np.sort(np.asarray(jax.random.permutation(key, len(positions)))[:count])]
+
+
+def evenly(positions: Positions, count: int) -> Positions:
+    """At most `count` of the positions, spread evenly."""
     if len(positions) <= count:
         return positions
     return positions[np.linspace(0, len(positions) - 1, count).round().astype(np.int64)]

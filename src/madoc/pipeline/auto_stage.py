@@ -113,7 +113,7 @@ def candidates_for(prepared: Prepared, changes: Mapping[str, Any]) -> dict[str, 
     Raises:
         MadocError: A hyperparameter is not given as `madoc.updates`, or as `make_method`.
     """
-    hidden = not prepared.problem.starts_known
+    hidden = not prepared.problem.states.starts_known
     mine = _changes_by_candidate(changes)
     return {
         candidate.name: make_method(

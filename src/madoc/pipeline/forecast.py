@@ -65,7 +65,7 @@ def _least_squares(problem: CalibrationProblem, budget: int) -> Forecast:
 
 
 def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
-    starts: Any = "logged" if problem.starts_known else "policy"
+    starts: Any = "logged" if problem.states.starts_known else "policy"
     method = Madoc(groups="one", starts=starts, cloning_epochs=0)
     name = "madoc"
     try:

@@ -7,11 +7,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from madoc.data import logged_states
-from madoc.verdict import noise as sensors
+from madoc.identification import noise as sensors
+from madoc.identification.states import logged_states
 from madoc.verdict.bench import Bench, signal_names
 from madoc.verdict.fitted_starts import FITTED, FittedReplays
-from madoc.verdict.identifiability import half_widths, told_shares
+from madoc.verdict.identifiability import half_widths, open_shares
 from madoc.verdict.prediction import Replays, nearby_best
 from madoc.verdict.statistics import better_than_chance, interval_of, resampled
 from madoc.verdict.systematic import autocorrelation, explained
@@ -104,7 +104,7 @@ def _by_prediction(bench: Bench, unit: np.ndarray, interval: np.ndarray | None) 
     relative = _over_first(means)
     best = 1 + int(np.argmin(relative[1:]))
     left = _what_is_left(bench, points[best])
-    noisy = sensors.noise_floor(replays, bench.split.held, points[best], left.deviation)
+    noisy = replays.noise_floor(bench.split.held, points[best], left.deviation)
     floor = replays.magnitudes(noisy)[:, 0]
     noise_alone = _over_first(np.stack([means[0], floor.mean((0, -1))]))[1]
     half, probing = half_widths(bench.problem, points[best], np.maximum(left.size, NEGLIGIBLE))
@@ -121,7 +121,7 @@ def _by_prediction(bench: Bench, unit: np.ndarray, interval: np.ndarray | None) 
         },
         explained_share=max(left.explained, _said_of_the_end(bench, residuals[best])),
         correlation=left.autocorrelation,
-        shares=told_shares(half, interval, space.high - space.low),
+        shares=open_shares(half, interval, space.high - space.low),
         follows={
             "the simulator at mid-range": bench.follows(_simulated(bench, points[0])),
             "the simulator at the best parameters nearby": bench.follows(_simulated(bench, points[best])),
@@ -176,7 +176,7 @@ def _what_is_left(bench: Bench, unit: np.ndarray) -> _Left:
     deviation, spent = np.zeros(len(scale)), len(rows)
     if len(first):
         slopes = sensors.own_slopes(bench.simulator, held, unit, rows[first], scale)
-        deviation = sensors.noise_deviation((single - said)[first], (single - said)[first + 1], slopes)
+        deviation = sensors.consecutive_noise((single - said)[first], (single - said)[first + 1], slopes)
         spent += len(first) * (1 + len(scale))
     return _Left(size, share, autocorrelation(single[first], single[first + 1]), deviation, spent)
 
@@ -205,7 +205,7 @@ def _by_fit(bench: Bench, replays: FittedReplays, unit: np.ndarray, interval: np
         },
         explained_share=_said_of_the_last(replays, residuals[1]),
         correlation=0.0,
-        shares=told_shares(half, interval, space.high - space.low),
+        shares=open_shares(half, interval, space.high - space.low),
         follows={"the simulator at the estimate": _follows_behind(replays, residuals[1]), **bench.model_free},
         areas={},
         more={
@@ -259,7 +259,7 @@ def _by_rows(bench: Bench, unit: np.ndarray, interval: np.ndarray | None) -> Ass
         errors={},
         explained_share=0.0,
         correlation=0.0,
-        shares=told_shares(half, interval, space.high - space.low),
+        shares=open_shares(half, interval, space.high - space.low),
         follows=bench.model_free,
         areas=areas,
         more={"noise": dict(zip(signal_names(bench.simulator.task), deviation.tolist(), strict=True))},

@@ -9,14 +9,14 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from sklearn.neighbors import NearestNeighbors
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.data import logged_states
 from madoc.data.split import Split
-from madoc.identification.windows import evenly
+from madoc.identification import noise as sensors
+from madoc.identification.states import logged_states
+from madoc.identification.windows import consecutive_rows, evenly
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
 from madoc.tasks import Task
-from madoc.verdict import noise as sensors
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import better_than_chance
@@ -69,9 +69,9 @@ class Bench:
     @cached_property
     def fitted(self) -> FittedReplays | None:
         """Windows of the hold-out whose starts are to be fitted: where velocities are hidden, and no more than that."""
-        if self.rebuilds or not self.problem.starts_known or self.split.held.disturbance.shuffled != "none":
+        if self.rebuilds or not self.problem.states.starts_known or self.split.held.disturbance.shuffled != "none":
             return None
-        return fitted_replays_of(CalibrationProblem(self.split.held, self.simulator), self.scaling.next_scale)
+        return fitted_replays_of(self.split.held, self.simulator, self.scaling.next_scale)
 
     @cached_property
     def clone(self) -> TanhGaussianPolicy:
@@ -95,7 +95,7 @@ class Bench:
         if not self.rebuilds:
             return evenly(np.arange(len(held)), MOST_WINDOWS)
         rows = logged_states(held, self.simulator.task)[1]
-        pairs = sensors.consecutive(held, rows)
+        pairs = evenly(rows[consecutive_rows(held, rows)], MOST_WINDOWS)
         return np.unique(np.concatenate([pairs, pairs + 1])) if len(pairs) else evenly(rows, MOST_WINDOWS)
 
     @cached_property

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from madoc.data import logged_states
+from madoc.identification.states import logged_states
 from madoc.identification.windows import Windows, evenly, first_rows, windows_at
 from madoc.runs.files import replacing
 from madoc.verdict.bench import Bench, signal_names

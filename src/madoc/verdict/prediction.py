@@ -5,29 +5,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.data import Dataset, logged_states
+from madoc.data import Dataset
+from madoc.identification.gauss_newton import damped_step, triangular_factors
 from madoc.identification.linearisation import difference_points, linearise
 from madoc.identification.losses import scale_of
 from madoc.identification.replay import window_residuals
-from madoc.identification.windows import Windows, evenly, rows_that_fit, windows_at
+from madoc.identification.states import logged_states, states_observed_as
+from madoc.identification.windows import HORIZONS, Windows, evenly, rows_that_fit, windows_at
 from madoc.simulation.base import Simulator
 
-HORIZONS = (1, 5, 20)
-"""Control steps. One shows what a method fits; what is wrong by little in each step adds up over many."""
 MOST_WINDOWS = 400
-"""Mean errors of so many differ by 5 % from those of all where residuals are normal."""
+"""Windows replayed at most: for normal residuals their mean error differs by about 5 % from that of all windows."""
 FEWEST_WINDOWS = 20
-"""A longer horizon is left out where fewer windows are as long, unless there are fewer of one step too."""
+"""Windows of a horizon, without which it is left out; fewer are enough if there are as few of a single step."""
 WORST = 1.0
-"""Steps' changes that a failed window counts for at least."""
+"""Least error, in typical changes of a step, that a window counts for whose simulation failed."""
 NEARBY_STEPS = 8
-"""Gauss-Newton steps from an estimate, at most: enough to come to the bottom of the hollow it lies in."""
+"""Most Gauss-Newton steps from an estimate: enough to come to the local minimum it is near."""
 _STILL = 1e-7
-"""A step in [-1, 1] so small is the last."""
+"""Largest component of a step in [-1, 1] at which the search ends."""
 _DAMPING = 1e-6
 _KEPT = 2
-"""Points looked at over all horizons: the last, and the one before, should the last have left the hollow."""
+"""Points compared over all horizons: the last, and the one before in case the last step left the minimum."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +34,13 @@ class Replays:
     """Windows of the rows held out, as long as the longest horizon.
 
     Attributes:
-        simulator: What replays them.
+        simulator: What simulates them.
         windows: The windows.
-        observation: What was seen where each begins.
-        rows: The row of the hold-out that each begins at.
+        observation: The observation at the first row of each.
+        rows: The first row of each in the hold-out.
         episodes: The episode of each.
-        horizons: Steps after which errors are taken.
-        scale: Typical change of each signal in a step, of the rows kept.
+        horizons: Control steps after which errors are taken.
+        scale: Typical change of each channel in a step, of the rows that methods see.
     """
 
     simulator: Simulator
@@ -55,7 +54,7 @@ class Replays:
     def residuals(
         self, unit: Float[np.ndarray, "systems d"], windows: Windows | None = None
     ) -> Float[np.ndarray, "systems windows steps observation"]:
-        """Simulated less logged observations after every step, in steps' changes; NaN once a window failed."""
+        """Simulated minus logged observations after every step, in typical changes; NaN in windows that failed."""
         replayed = self.windows if windows is None else windows
         flat = window_residuals(self.simulator, replayed, unit, self.scale)
         return flat.reshape(*flat.shape[:2], replayed.steps, len(self.scale))
@@ -68,8 +67,29 @@ class Replays:
         worst = np.maximum(np.nanmax(np.where(np.isfinite(size), size, 0.0), axis=(0, 1)), WORST)
         return np.moveaxis(np.where(np.isfinite(size), size, worst), 0, 1)
 
+    def noise_floor(
+        self, held: Dataset, unit: Float[np.ndarray, " d"], deviation: Float[np.ndarray, " observation"]
+    ) -> Float[np.ndarray, "1 windows steps observation"]:
+        """Prediction errors that noise alone would cause at the given parameters, of the start and of what follows.
+
+        Args:
+            held: The hold-out that the windows are from.
+            unit: Parameters in [-1, 1].
+            deviation: Standard deviation of the noise, in typical changes of a step.
+        """
+        shape = (len(self.windows), self.windows.steps, len(deviation))
+        if not deviation.any():
+            return np.zeros((1, *shape))
+        rng = np.random.default_rng(0)
+        observation = np.asarray(held.transitions.observation)
+        noisy = observation + deviation * self.scale * rng.standard_normal(observation.shape)
+        rebuilt = states_observed_as(held, self.simulator.task, self.rows, noisy)
+        starts = np.where(np.isfinite(rebuilt), rebuilt, self.windows.states)
+        moved = self.residuals(unit[None], replace(self.windows, states=starts))
+        return moved - self.residuals(unit[None]) + deviation * rng.standard_normal(shape)
+
     def single_steps(self) -> Windows:
-        """Only the first step of each window."""
+        """The first step of each window alone."""
         windows = self.windows
         return replace(windows, actions=windows.actions[:, :1], following=windows.following[:, :1])
 

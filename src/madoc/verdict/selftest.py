@@ -11,9 +11,10 @@ from jaxtyping import Float, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Calibrator
 from madoc.calibration.calibrate import calibrate
 from madoc.calibration.result import CalibrationResult
-from madoc.data import Dataset, Disturbance, disturb, hide_velocities, logged_states
+from madoc.data import Dataset, Disturbance, disturb, hide_velocities
 from madoc.data.dataset import starts_after
 from madoc.errors import MadocError
+from madoc.identification.states import logged_states
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import reset_states
 from madoc.types import Transitions

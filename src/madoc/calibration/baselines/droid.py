@@ -74,7 +74,7 @@ class Droid:
         of_candidates, of_windows, key = jax.random.split(state.key, 3)
         candidates = evolution.ask(state.search, of_candidates, self.population)
         windows = draw_windows(problem, self.horizon, self.windows, of_windows)
-        scale = problem.scalings["standardised"].next_scale
+        scale = problem.typical_change
         residuals = window_residuals(problem.simulator, windows, candidates, scale)
         by_window = trajectory_cost(residuals, absolute=self.absolute, squared=self.squared)
         costs = mean_with_failures(by_window)

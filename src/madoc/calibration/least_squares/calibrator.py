@@ -207,10 +207,9 @@ class LeastSquares:
 
     def _first_phase(self, problem: CalibrationProblem) -> str:
         """What the first epoch does: `logged`, `estimated`, `starting` from logged for estimated, or `undecided`."""
-        task = problem.simulator.task
         if self.initial_states == "logged":
             return "logged"
-        if task.state_from_observation is None and task.posture is not None:
+        if problem.states.kind != "exact" and len(problem.states.rows):
             return "estimated"
         known = problem.dataset.disturbance
         told = self.initial_states == "estimated" or known.noise > 0 or known.velocities == "differences"
@@ -308,7 +307,7 @@ class LeastSquares:
             return ()
         estimated = state.estimated[state.found]
         noise = problem.dataset.disturbance.noise
-        if problem.simulator.task.state_from_observation is None:
+        if problem.states.kind != "exact":
             why = "states cannot be rebuilt from the data"
         elif problem.dataset.disturbance.velocities == "differences":
             why = "velocities are differences of positions, which are what it compares"

@@ -7,12 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
-from madoc.calibration.least_squares.elimination import WindowSlopes, eliminate
-from madoc.calibration.least_squares.noise import channel_deviation, echo, noise_ratio, unlike
-from madoc.calibration.least_squares.readings import Readings, slopes_at
+from madoc.calibration.least_squares.noise import echo, noise_ratio, unlike
 from madoc.errors import MadocError
+from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.information import SETTLED, at_least_noise, bread, jackknife_meat, least_share, sandwich
+from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.losses import (
     ALL_FAILED,
     TUNING,
@@ -21,7 +20,9 @@ from madoc.identification.losses import (
     loss_slope,
     loss_value,
 )
-from madoc.identification.windows import apart
+from madoc.identification.noise import channel_noise
+from madoc.identification.replay import Readings, slopes_at
+from madoc.identification.windows import disjoint_windows
 from madoc.types import Metrics
 
 TRIALS = (1e-2, 1.0, 1e2)
@@ -111,11 +112,11 @@ class EstimatedStates:
             MadocError: No position is known, no episode is long enough, or there are fewer readings than unknowns.
         """
         of_windows, of_starts = jax.random.split(key)
-        count, channels = len(problem.simulator.parameters), problem.measured
-        guessed, rows = problem.approximate_states
-        possible = apart(problem.dataset, rows, self.horizon)
+        count, channels = len(problem.simulator.parameters), problem.states.measured
+        guessed, rows = problem.states.guesses()
+        possible = disjoint_windows(problem.dataset, rows, self.horizon)
         drawn = min(self.windows, len(possible))
-        readings, unknowns = drawn * (self.horizon + 1) * channels, count + drawn * problem.physical_size
+        readings, unknowns = drawn * (self.horizon + 1) * channels, count + drawn * problem.states.physical_size
         if readings < unknowns:
             raise MadocError(
                 f"expected at least as many readings as unknowns, got {drawn} windows of {self.horizon} rows with "
@@ -146,7 +147,9 @@ class EstimatedStates:
     def step(self, problem: CalibrationProblem, state: EstimatedState) -> tuple[EstimatedState, Metrics]:
         """One damped step of every search under way: slopes in one simulation, the steps tried in another."""
         running, windows = 1 if state.refining else self.searches, self.window_count(state)
-        readings = Readings.at(problem, state.rows[:windows], self.horizon)
+        readings = Readings.at(
+            problem.dataset, problem.states, state.rows[:windows], self.horizon, problem.typical_change
+        )
         unit, states = state.unit[:running], state.states[:running, :windows]
         slopes = slopes_at(problem.simulator, readings, unit, states)
         plans = [
@@ -161,7 +164,7 @@ class EstimatedStates:
         for index, (plan, move) in enumerate(zip(plans, moves, strict=True)):
             new["unit"][index] = np.clip(unit[index] + plan.steps[move.trial], -1.0, 1.0)
             steps = move.followed[:, None] * plan.state_steps[move.trial]
-            new["states"][index, :windows] += readings.moved(steps, states.shape[2])
+            new["states"][index, :windows] += readings.in_state_units(steps, states.shape[2])
             new["damping"][index] = np.clip(state.damping[index] * move.factor, *DAMPING_RANGE)
             factor = np.select([move.followed == 1.0, move.followed > 0.0], [0.1, 1.0], 10.0)
             new["state_damping"][index, :windows] = np.clip(
@@ -213,7 +216,7 @@ class EstimatedStates:
     def _epoch_steps(self, problem: CalibrationProblem, state: EstimatedState) -> int:
         """Control steps of an epoch of the stage: differences by parameters and states, and the steps tried."""
         running, parameters = 1 if state.refining else self.searches, state.unit.shape[1]
-        columns = 1 + 2 * parameters + problem.physical_size + len(FOLLOWED) * (len(TRIALS) + 1)
+        columns = 1 + 2 * parameters + problem.states.physical_size + len(FOLLOWED) * (len(TRIALS) + 1)
         return running * self.window_count(state) * columns * self.horizon
 
     def _plan(
@@ -372,7 +375,7 @@ def _deviation(
 ) -> Float[np.ndarray, " channels"]:
     """Each channel's noise in windows that are kept."""
     shape = (int(kept.sum()), slopes.residuals.shape[1] // channels, channels)
-    return channel_deviation(slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape))
+    return channel_noise(slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape))
 
 
 def _tried(
@@ -384,7 +387,7 @@ def _tried(
     """Residuals after every step of every search, the windows' states moved along all the way, in part, or not."""
     ways = np.array(FOLLOWED)[:, None, None]
     starts = [
-        state + ways * readings.moved(plan.state_steps, states.shape[2])[:, None]
+        state + ways * readings.in_state_units(plan.state_steps, states.shape[2])[:, None]
         for plan, state in zip(plans, states, strict=True)
     ]
     flat = np.concatenate(starts).reshape(-1, len(FOLLOWED) * len(readings), states.shape[2])

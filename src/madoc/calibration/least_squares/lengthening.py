@@ -10,7 +10,7 @@ import numpy as np
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.estimated_states import STATES_FIRST, EstimatedState
 from madoc.identification.information import half_width, sandwich
-from madoc.identification.windows import apart, evenly, rows_that_fit
+from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
 LENGTHS = (1, 3, 9)
 """Windows' lengths, in those of the first."""
@@ -45,7 +45,7 @@ def lengthened(problem: CalibrationProblem, shorter: EstimatedState, horizon: in
     rows, fewest = np.sort(shorter.rows), FEWEST + count
     if not len(rows_that_fit(problem.dataset, rows, horizon)):
         return None
-    chosen = rows[evenly(apart(problem.dataset, rows, horizon), max(most, fewest))]
+    chosen = rows[evenly(disjoint_windows(problem.dataset, rows, horizon), max(most, fewest))]
     if len(chosen) < fewest:
         return None
     known = np.searchsorted(rows, chosen)

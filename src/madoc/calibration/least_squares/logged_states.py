@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.damped_step import damped_step, triangular_factors
 from madoc.errors import MadocError
+from madoc.identification.gauss_newton import damped_step, triangular_factors
 from madoc.identification.information import SETTLED, bread, meat, sandwich
 from madoc.identification.linearisation import difference_points, linearise
 from madoc.identification.losses import ALL_FAILED, Loss, mean_cost, scale_of
 from madoc.identification.replay import window_residuals
-from madoc.identification.windows import Windows, apart, first_rows, windows_at
+from madoc.identification.windows import Windows, disjoint_windows, first_rows, windows_at
 from madoc.types import Metrics
 
 TRIALS = (1e-2, 1.0, 1e2)
@@ -77,7 +77,7 @@ class LoggedStates:
         of_windows, of_starts = jax.random.split(key)
         count, task = len(problem.simulator.parameters), problem.simulator.task
         # Windows that share readings are not independent, and intervals take them to be.
-        starts = first_rows if self.horizon == 1 else apart
+        starts = first_rows if self.horizon == 1 else disjoint_windows
         possible = starts(problem.dataset, problem.logged_rows, self.horizon)
         drawn = min(self.windows, len(possible))
         if drawn * self.horizon * task.observation_size < count:
@@ -204,7 +204,7 @@ def _simulate_each(
     problem: CalibrationProblem, windows: Windows, points: Float[np.ndarray, "searches points d"]
 ) -> Float[np.ndarray, "searches points windows values"]:
     """Residuals at the points of all searches, in one batch."""
-    scale = problem.scalings["standardised"].next_scale
+    scale = problem.typical_change
     residuals = window_residuals(problem.simulator, windows, points.reshape(-1, points.shape[-1]), scale)
     return residuals.reshape(*points.shape[:2], *residuals.shape[1:])
 

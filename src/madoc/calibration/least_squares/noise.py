@@ -4,38 +4,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.identification.losses import robust_deviation
+from madoc.identification.losses import NORMAL_MAD
 from madoc.identification.replay import window_residuals
-from madoc.identification.windows import windows_at
+from madoc.identification.windows import consecutive_rows, windows_at
 
-_NORMAL_MAD = 1.4826
-"""Standard deviations in a median absolute deviation, for normal noise."""
 LOUDEST = 3.0
 """Deviations of the noise that a residual counts as at most, where residuals are correlated."""
 UNLIKE = 5.0
 """Robust deviations from the middle; of normal values one in two million is farther."""
-_LEAST_SPARE = 0.05
-"""Readings that their window's state explains by more than the rest say nothing of the noise."""
-_LEAST_SHARE = 1e-3
-"""Of the noisiest channel's deviation: no channel counts for more than a million times another."""
 _SMALLEST = 1e-12
 """In units of a channel's typical change; below this it is rounding."""
-
-
-def channel_deviation(
-    residuals: Float[np.ndarray, "windows readings channels"], spare: Float[np.ndarray, "windows readings channels"]
-) -> Float[np.ndarray, " channels"]:
-    """Each channel's noise, from what a fit that absorbed part of it leaves: median |r| / √(1 - leverage).
-
-    A residual's variance is σ² (1 - leverage), whatever was fitted; without the division short windows would look
-    less noisy than they are.
-    """
-    told = spare > _LEAST_SPARE
-    free = np.where(told, residuals / np.sqrt(np.where(told, spare, 1.0)), np.nan)
-    columns = np.abs(free).reshape(-1, free.shape[-1])
-    known = (column[np.isfinite(column)] for column in columns.T)
-    deviation = np.array([robust_deviation(column) if column.size else 0.0 for column in known])
-    return np.maximum(deviation, max(_LEAST_SHARE * float(deviation.max()), _SMALLEST))
 
 
 def unlike(
@@ -57,7 +35,7 @@ def unlike(
     rows = values.reshape(-1, values.shape[-1])
     weights = weights.reshape(rows.shape)
     middle = middle_of(rows)
-    reach = UNLIKE * _NORMAL_MAD * middle_of(np.abs(rows - middle))
+    reach = UNLIKE * NORMAL_MAD * middle_of(np.abs(rows - middle))
     shape = (*values.shape[:-1], 1)
     return middle.reshape(shape), reach.reshape(shape)
 
@@ -87,15 +65,11 @@ def consecutive_residuals(
         unit: Parameters in [-1, 1].
         chosen: Which logged states to take; those without one a row later are left out.
     """
-    rows, dataset = problem.logged_rows, problem.dataset
-    inner = np.ones(len(dataset) + 1, dtype=bool)
-    inner[dataset.episode_starts] = False
-    first = chosen[chosen + 1 < len(rows)]
-    first = first[(rows[first + 1] == rows[first] + 1) & inner[rows[first] + 1]]
+    (states, rows), dataset = problem.states.exact(), problem.dataset
+    first = chosen[np.isin(chosen, consecutive_rows(dataset, rows))]
     both = np.concatenate([first, first + 1])
-    windows = windows_at(dataset, problem.logged_states[both], rows[both], 1)
-    scale = problem.scalings["standardised"].next_scale
-    residuals = window_residuals(problem.simulator, windows, unit[None], scale)[0]
+    windows = windows_at(dataset, states[both], rows[both], 1)
+    residuals = window_residuals(problem.simulator, windows, unit[None], problem.typical_change)[0]
     whole = np.isfinite(residuals).all(-1).reshape(2, -1).all(0)
     before, after = residuals.reshape(2, len(first), -1)[:, whole]
     return (before, after), len(both)
@@ -122,7 +96,7 @@ def takes_turns(before: Residuals, after: Residuals) -> float:
     """
     if not len(before):
         return 0.0
-    most = UNLIKE * _NORMAL_MAD * np.maximum(np.median(np.abs(before), axis=0), _SMALLEST)
+    most = UNLIKE * NORMAL_MAD * np.maximum(np.median(np.abs(before), axis=0), _SMALLEST)
     first, second = (np.clip(part, -most, most) for part in (before, after))
     power = np.sqrt((first**2).mean(0) * (second**2).mean(0))
     turns = np.sort(-(first * second).mean(0) / np.maximum(power, _SMALLEST**2))

@@ -37,9 +37,9 @@ def starts_of(problem: CalibrationProblem, mode: StartMode) -> Starts:
     """
     if mode == "policy":
         return reset_states(problem.simulator)
-    if mode == "logged" and problem.simulator.task.state_from_observation is None:
+    if mode == "logged" and problem.states.kind != "exact":
         refuse_unseen_positions(problem.simulator.task)
-        return chosen_states(problem.approximate_states[0])
+        return chosen_states(problem.states.guesses()[0])
     return chosen_states(problem.logged_states)
 
 

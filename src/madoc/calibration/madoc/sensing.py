@@ -13,7 +13,7 @@ HIDDEN_WINDOW = 3
 
 def window_length(problem: CalibrationProblem, asked: int | None, starts: str) -> int:
     """Rows (s, a) before s': as many as asked for, else 1 where one tells the state or is replayed."""
-    seen = problem.simulator.task.state_from_observation is not None
+    seen = problem.states.kind == "exact"
     return asked or (1 if seen or starts == "replay" else HIDDEN_WINDOW)
 
 
@@ -25,7 +25,7 @@ def noise_deviation(
         return problem.estimated_noise
     share = problem.dataset.disturbance.noise if asked is None else float(asked)
     # Of the clean change: noise of both readings is part of the logged one.
-    return share / np.sqrt(1.0 + 2.0 * share**2) * problem.scalings["standardised"].next_scale
+    return share / np.sqrt(1.0 + 2.0 * share**2) * problem.typical_change
 
 
 def said_of_observations(
@@ -33,11 +33,11 @@ def said_of_observations(
 ) -> tuple[str, ...]:
     """What else the estimate rests on where observations are partial or noisy, one sentence each."""
     found = []
-    if problem.simulator.task.state_from_observation is None:
+    if problem.states.kind != "exact":
         found.append(f"states cannot be rebuilt from the data: discriminators see windows of {window} rows")
         if starts == "logged":
             found.append("rollouts start at states whose velocities were taken from positions, which is not exact")
     if deviation.any():
-        share = 100.0 * np.median(deviation / problem.scalings["standardised"].next_scale)
+        share = 100.0 * np.median(deviation / problem.typical_change)
         found.append(f"simulated observations were given sensor noise of {share:.2g} % of a step's change")
     return tuple(found)

@@ -248,7 +248,7 @@ class CmaEs:
         self, problem: CalibrationProblem, candidates: Float[np.ndarray, "population d"], key: PRNGKeyArray
     ) -> tuple[Float[np.ndarray, " population"], int, int]:
         windows = draw_windows(problem, 1, self._rows, key)
-        scale = problem.scalings["standardised"].next_scale
+        scale = problem.typical_change
         squared = (window_residuals(problem.simulator, windows, candidates, scale) ** 2).mean(-1)
         return mean_with_failures(squared), squared.size, int(np.isnan(squared).sum())
 

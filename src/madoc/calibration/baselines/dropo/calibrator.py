@@ -84,7 +84,7 @@ class Dropo:
         mean, std = distribution_of(candidates)
         draws = parameter_draws(mean, std, truncated_noise(of_draws, self.draws // 2, mean.shape[-1]))
         windows = draw_windows(problem, 1, self.transitions, of_windows)
-        scale = problem.scalings["standardised"].next_scale
+        scale = problem.typical_change
         flat = window_residuals(problem.simulator, windows, draws.reshape(-1, draws.shape[-1]), scale)
         residuals = flat.reshape(*draws.shape[:2], *flat.shape[1:])
         by_row = negative_log_likelihood(*moments(residuals), self.epsilon)

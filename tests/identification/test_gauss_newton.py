@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from madoc.calibration.least_squares.elimination import WindowSlopes, eliminate
+from madoc.identification.gauss_newton import eliminate
+from madoc.identification.linearisation import WindowSlopes
 
 NOTHING = np.zeros(1)
 

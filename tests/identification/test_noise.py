@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 
 from madoc import simulation
-from madoc.data import Dataset, Disturbance, disturb
+from madoc.data import Dataset
+from madoc.identification.noise import clipped, consecutive_noise, difference_noise, own_slopes
 from madoc.types import Transitions
-from madoc.verdict.noise import clipped, consecutive, difference_noise, noise_deviation, own_slopes
 from robots import SPRING_TRUTH, recorded, spring
 
 SPRING = spring(max_episode_steps=100)
@@ -14,25 +14,25 @@ SPRING = spring(max_episode_steps=100)
 def test_the_noise_of_two_steps_by_hand():
     # r_t r_{t+1} = -2 and -4 with slopes 1 and 1: σ² = (2 + 4) / 2.
     first, second, slopes = (np.array([[a], [b]]) for a, b in ((1.0, 2.0), (-2.0, -2.0), (1.0, 1.0)))
-    assert noise_deviation(first, second, slopes) == pytest.approx(np.sqrt(3.0))
+    assert consecutive_noise(first, second, slopes) == pytest.approx(np.sqrt(3.0))
 
 
 def test_a_slope_divides_what_it_carries_on():
     # A = ½: r_t r_{t+1} = -½ σ² = -2, so σ = 2.
-    assert noise_deviation(np.array([[1.0]]), np.array([[-2.0]]), np.array([[0.5]])) == pytest.approx(2.0)
+    assert consecutive_noise(np.array([[1.0]]), np.array([[-2.0]]), np.array([[0.5]])) == pytest.approx(2.0)
 
 
 def test_what_does_not_alternate_is_no_noise():
     same = np.ones((10, 1))
-    assert noise_deviation(same, same, same) == 0.0
-    assert noise_deviation(same, -same, np.zeros((10, 1))) == 0.0
+    assert consecutive_noise(same, same, same) == 0.0
+    assert consecutive_noise(same, -same, np.zeros((10, 1))) == 0.0
 
 
 def test_noise_is_told_from_a_line_with_noisy_readings():
     rng = np.random.default_rng(0)
     noise = 0.3 * rng.standard_normal((4000, 1))
     residuals = 0.9 * noise[:-1] - noise[1:]
-    found = noise_deviation(residuals[:-1], residuals[1:], np.full((3998, 1), 0.9))
+    found = consecutive_noise(residuals[:-1], residuals[1:], np.full((3998, 1), 0.9))
     assert found == pytest.approx(0.3, rel=0.05)
 
 
@@ -72,11 +72,3 @@ def test_the_slopes_of_the_spring_by_itself():
     assert slopes[:, 0] == pytest.approx(1 - stiffness / mass * h**2 * 0.75, abs=1e-3)
     assert slopes[:, 1] == pytest.approx(1 - damping / mass * h, abs=2e-3)
     assert slopes[0] == pytest.approx(slopes[1], abs=1e-9)  # a spring is linear
-
-
-def test_rows_that_follow_each_other_lie_in_one_episode():
-    log = recorded(spring(max_episode_steps=4), SPRING_TRUTH, 12, jax.random.key(0))
-    assert consecutive(log, np.arange(12)).tolist() == [0, 1, 2, 4, 5, 6, 8, 9, 10]
-    assert consecutive(log, np.array([0, 2, 3, 4])).tolist() == [2]
-    lost = disturb(log, Disturbance(shuffled="rows"), spring(), jax.random.key(0))
-    assert not len(consecutive(lost, np.arange(12)))

@@ -2,7 +2,7 @@ import jax
 import numpy as np
 
 from madoc.data import Disturbance, disturb
-from madoc.data.noise import estimate_noise
+from madoc.identification.noise import regression_noise
 from robots import pendulum, recorded
 
 TRUTH = {"body_mass.rod": 1.0, "dof_damping.pivot": 0.2, "actuator_gain.pivot": 1.0}
@@ -12,7 +12,7 @@ def test_noise_is_told_from_motion():
     task = pendulum()
     clean = recorded(task, TRUTH, 2000, jax.random.key(0))
     change = (clean.transitions.next_observation - clean.transitions.observation).std(0)
-    assert (estimate_noise(clean) < 1e-3 * change).all()
+    assert (regression_noise(clean) < 1e-3 * change).all()
     for share in (0.01, 0.1):
         noisy = disturb(clean, Disturbance(noise=share), task, jax.random.key(1))
-        np.testing.assert_allclose(estimate_noise(noisy), share * change, rtol=0.15)
+        np.testing.assert_allclose(regression_noise(noisy), share * change, rtol=0.15)

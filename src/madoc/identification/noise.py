@@ -1,0 +1,190 @@
+"""Every estimator of sensor noise, each with what it assumes; all return one standard deviation a channel.
+
+| estimator | from | assumes |
+|---|---|---|
+| `regression_noise` | the log alone | a quadratic of state and action predicts the next observation |
+| `difference_noise` | the log alone | motion is smooth over five rows |
+| `consecutive_noise` | one-step residuals of consecutive rows | their model errors do not alternate in sign |
+| `residual_noise` | all residuals of a fit | the fit leaves nothing but noise |
+| `channel_noise` | all residuals of a fit | most of them are noise |
+"""
+
+from itertools import combinations_with_replacement
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from madoc.data.dataset import Dataset
+from madoc.identification.losses import NORMAL_MAD, robust_deviation
+from madoc.identification.states import states_observed_as
+from madoc.simulation.base import Simulator
+
+OUTLIER = 5.0
+"""Robust standard deviations at which residuals are clipped; of normal values one in two million is larger.
+
+A contact turns small noise into a large residual.
+"""
+STEP = 1e-3
+"""Change of an observation, in typical changes of a step, by which the derivative of a control step is taken."""
+SLOPE_LIMIT = 2.0
+"""Largest derivative of a channel by itself over a control step; a contact's is larger, and is clipped to it."""
+_MOST_ROWS = 20_000
+"""Rows of a log that the regression looks at; more would hardly change a variance."""
+_LEAST_SLOPE = 0.3
+"""Derivative of the next observation by the one before it, below which a channel's noise counts as 0: unknown."""
+_SHORTEST = 5
+"""Fewest rows of an episode whose second differences have next neighbours; shorter ones are left out."""
+_STANDARD_ERRORS = 3.0
+"""Standard errors that a variance must be above 0; below, the noise counts as 0."""
+_LEAST_SPARE = 0.05
+"""1 - leverage of a reading, from 0 to 1, below which it is left out: its residual is small whatever the noise."""
+_LEAST_SHARE = 1e-3
+"""Of the noisiest channel's deviation: no channel weighs more than a million times as much as another."""
+_SMALLEST = 1e-12
+"""Least deviation, in a channel's typical change in a step; below this it is rounding."""
+
+
+def regression_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:
+    """Noise of a log whose next observations a quadratic of observation and action predicts; 0 where none is seen.
+
+    A reading that is too high raises what is predicted from it: of s' = f(s, a) + e' - F e, fitted by a regression on
+    s, a and their products, the residuals of consecutive rows have the covariance -F σ². What the regression cannot
+    follow has the same sign in consecutive rows and hides noise smaller than itself, so this is a lower bound.
+    """
+    logged = dataset.transitions
+    observation, action, following = (
+        np.asarray(part)[:_MOST_ROWS] for part in (logged.observation, logged.action, logged.next_observation)
+    )
+    count = observation.shape[1]
+    columns = np.concatenate([observation, action], axis=-1)
+    spread = columns.std(0)
+    scale = np.where(spread > 1e-8, spread, 1.0)
+    columns = (columns - columns.mean(0)) / scale
+    products = [columns[:, i] * columns[:, j] for i, j in combinations_with_replacement(range(columns.shape[1]), 2)]
+    inputs = np.column_stack([columns, *products, np.ones(len(columns))])
+    weights = np.linalg.lstsq(inputs, following, rcond=None)[0]
+    residual = following - inputs @ weights
+    slope = np.diagonal(weights[:count]) / scale[:count]
+    inner = np.ones(len(residual), dtype=bool)
+    inner[dataset.episode_starts[dataset.episode_starts < len(residual)]] = False
+    shared = (residual[1:] * residual[:-1])[inner[1:]].mean(0)
+    steep = np.abs(slope) > _LEAST_SLOPE
+    return np.sqrt(np.maximum(0.0, np.where(steep, -shared / np.where(steep, slope, 1.0), 0.0)))
+
+
+def difference_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:
+    """Noise of a log whose motion is smooth, in each channel's unit: from how second differences alternate.
+
+    Noise gives second differences of neighbouring rows the covariance -4 σ² and those of next neighbours σ². Smooth
+    motion gives both the same; a force that is held for a step makes (c₂ - c₁) / 5 smaller, never larger. What is not
+    significantly above 0 counts as 0.
+    """
+    observation = np.asarray(dataset.transitions.observation)
+    parts = [
+        np.diff(observation[start:end], 2, axis=0)
+        for start, end in zip(dataset.episode_starts, dataset.episode_ends, strict=True)
+        if end - start >= _SHORTEST
+    ]
+    if not parts:
+        return np.zeros(observation.shape[1])
+    limited = np.split(clipped(np.concatenate(parts)), np.cumsum([len(part) for part in parts[:-1]]))
+    first = np.concatenate([part[1:-1] * part[:-2] for part in limited])
+    second = np.concatenate([part[2:] * part[:-2] for part in limited])
+    variance = (second - first).mean(0) / 5.0
+    error = (second - first).std(0) / 5.0 / np.sqrt(len(first))
+    return np.asarray(np.sqrt(np.where(variance > _STANDARD_ERRORS * error, variance, 0.0)))
+
+
+def consecutive_noise(
+    first: Float[np.ndarray, "pairs observation"],
+    second: Float[np.ndarray, "pairs observation"],
+    slopes: Float[np.ndarray, "pairs observation"],
+) -> Float[np.ndarray, " observation"]:
+    """Noise from one-step residuals of consecutive rows, whose model errors do not alternate in sign.
+
+    A step from a noisy state leaves r_t = A e_t - e_{t+1}, the next r_{t+1} = A e_{t+1} - e_{t+2}. They share one
+    reading, with opposite signs: E[r_t r_{t+1}] = -A σ². A model error that does not alternate makes the estimate
+    smaller, so it is never taken for noise.
+
+    Args:
+        first: Residuals of the earlier rows.
+        second: Residuals of the later rows.
+        slopes: A, the derivative of each channel by itself over a control step, as from `own_slopes`.
+    """
+    slope = np.clip(slopes, -SLOPE_LIMIT, SLOPE_LIMIT)
+    weight = (slope**2).sum(0)
+    shared = -(slope * first * second).sum(0) / np.where(weight > 0.0, weight, 1.0)
+    return np.sqrt(np.maximum(shared, 0.0))
+
+
+def residual_noise(
+    residuals: Float[np.ndarray, "windows readings channels"], unknowns: int
+) -> Float[np.ndarray, " channels"]:
+    """Noise from residuals of a fit that leaves nothing else: their root mean square over the degrees of freedom.
+
+    Args:
+        residuals: NaN in windows that failed, which are left out; 0 is returned if all of them did.
+        unknowns: Fitted to each window.
+    """
+    residuals = residuals[np.isfinite(residuals).all((1, 2))]
+    values = residuals.shape[1] * residuals.shape[2]
+    freedom = max(1, values - unknowns) / values
+    return np.sqrt((residuals**2).mean((0, 1)) / freedom) if len(residuals) else np.zeros(residuals.shape[-1])
+
+
+def channel_noise(
+    residuals: Float[np.ndarray, "windows readings channels"], spare: Float[np.ndarray, "windows readings channels"]
+) -> Float[np.ndarray, " channels"]:
+    """Noise from residuals of a fit, most of which are noise: median |r| / √(1 - leverage), times 1.4826.
+
+    A residual's variance is σ² (1 - leverage), whatever was fitted; without the division short windows would look
+    less noisy than they are.
+
+    Args:
+        residuals: In units of each channel's typical change in a step.
+        spare: 1 - leverage of each.
+    """
+    free = spare > _LEAST_SPARE
+    scaled = np.where(free, residuals / np.sqrt(np.where(free, spare, 1.0)), np.nan)
+    columns = np.abs(scaled).reshape(-1, scaled.shape[-1])
+    finite = (column[np.isfinite(column)] for column in columns.T)
+    deviation = np.array([robust_deviation(column) if column.size else 0.0 for column in finite])
+    return np.maximum(deviation, max(_LEAST_SHARE * float(deviation.max()), _SMALLEST))
+
+
+def clipped(residuals: Float[np.ndarray, "rows observation"]) -> Float[np.ndarray, "rows observation"]:
+    """Residuals clipped at `OUTLIER` robust standard deviations of their channel; 0 in rows that failed."""
+    finite = np.where(np.isfinite(residuals), residuals, 0.0)
+    limit = OUTLIER * NORMAL_MAD * np.median(np.abs(finite), axis=0)
+    return np.where(limit > 0.0, np.clip(finite, -limit, limit), finite)
+
+
+def own_slopes(
+    simulator: Simulator,
+    dataset: Dataset,
+    unit: Float[np.ndarray, " d"],
+    rows: Int[np.ndarray, " rows"],
+    scale: Float[np.ndarray, " observation"],
+) -> Float[np.ndarray, "rows observation"]:
+    """The derivative of each channel after a control step by the same channel before it; 0 where it is not known.
+
+    Args:
+        simulator: What simulates.
+        dataset: The log.
+        unit: Parameters in [-1, 1].
+        rows: Rows with exact states at which the derivatives are taken.
+        scale: Typical change of each channel in a step.
+    """
+    moves = [np.zeros(len(scale)), *(STEP * np.diag(scale))]
+    observation = np.asarray(dataset.transitions.observation)
+    states = np.stack([states_observed_as(dataset, simulator.task, rows, observation + move) for move in moves])
+    action = np.asarray(dataset.transitions.action)[rows]
+    system = simulator.bind(simulator.parameters.to_physical(unit)[None])
+    flat = states.reshape(1, -1, states.shape[-1])
+    rebuilt = np.isfinite(flat).all(-1, keepdims=True)
+    flat = np.where(rebuilt, flat, np.tile(states[:1], (len(moves), 1, 1)).reshape(flat.shape))
+    after = system.observe(system.step(system.unbiased(flat), np.tile(action, (len(moves), 1))[None]))
+    after = after.reshape(len(moves), len(rows), -1)
+    moved = np.diagonal(after[1:] - after[0], axis1=0, axis2=2) / (STEP * scale)
+    rebuilt = rebuilt.reshape(len(moves), len(rows))[1:].T
+    return np.where(rebuilt & np.isfinite(moved), moved, 0.0)

@@ -1,0 +1,193 @@
+"""What a log tells of the simulator's states: decided once, for diagnosis, calibration and verdict alike."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from madoc.data.dataset import Dataset
+from madoc.data.velocities import moving_states
+from madoc.errors import MadocError
+from madoc.identification.windows import Windows, evenly, longest_fit, rows_that_fit, windows_at
+from madoc.simulation.base import Simulator
+from madoc.simulation.rollout import reset_states
+from madoc.simulation.velocities import unseen_positions
+from madoc.tasks import Task
+
+_PROBED = 64
+"""Logged actions taken from a reset where states are unknown; parameters that matter show within seconds."""
+
+
+@dataclass(frozen=True)
+class LoggedStates:
+    """The simulator states that a log's rows were in, as far as its observations tell.
+
+    Attributes:
+        kind: `exact` where observations determine the states; `approximate` where they show every position and the
+            velocities are finite differences of positions; `unknown` where some position is not observed, or no row
+            can be rebuilt.
+        states: One for each of `rows`. Of an `unknown` log they are initial guesses, with the model's initial value for
+            positions that are not observed, and there are none if no position is observed.
+        rows: The rows of the log the states belong to, ascending.
+        reason: Why the states are not exact, as a sentence; empty if they are.
+        physical_size: Number of values of (qpos, qvel), which come first in a state; pending actions follow.
+        measured: Number of values of an observation, the first ones, that sensors measured; the others were derived
+            from them by finite differences.
+    """
+
+    kind: Literal["exact", "approximate", "unknown"]
+    states: Float[np.ndarray, "states state"]
+    rows: Int[np.ndarray, " states"]
+    reason: str
+    physical_size: int
+    measured: int
+
+    @property
+    def starts_known(self) -> bool:
+        """Whether rollouts can start where the log was: at exact states, or at ones approximate in velocity alone."""
+        return self.kind != "unknown"
+
+    def exact(self) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
+        """The states and their rows.
+
+        Raises:
+            MadocError: The states are not exact.
+        """
+        if self.kind != "exact":
+            raise MadocError(self.reason)
+        return self.states, self.rows
+
+    def guesses(self) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
+        """Initial guesses of the states and their rows, whatever the kind.
+
+        Raises:
+            MadocError: No position is observed, or no row can be rebuilt.
+        """
+        if not len(self.rows):
+            raise MadocError(self.reason)
+        return self.states, self.rows
+
+
+def states_of(dataset: Dataset, simulator: Simulator) -> LoggedStates:
+    """Rebuild the states of a log as exactly as its observations allow."""
+    task = simulator.task
+    size = len(simulator.initial_state)
+    physical = size - task.pending * simulator.action_size
+    derived = task.velocities * (dataset.disturbance.velocities == "differences")
+    rebuilt = LoggedStates(
+        "unknown", np.zeros((0, size)), np.zeros(0, np.int64), "", physical, task.observation_size - derived
+    )
+    try:
+        states, rows = logged_states(dataset, task)
+        return replace(rebuilt, kind="exact", states=states, rows=rows)
+    except MadocError as error:
+        rebuilt = replace(rebuilt, reason=str(error))
+    if task.state_from_observation is not None or task.posture is None:
+        return rebuilt
+    guess = moving_states(dataset, task)[0]
+    guess = np.where(np.isnan(guess), simulator.initial_state[:physical], guess)
+    try:
+        states, rows = with_pending(dataset, task, guess, np.arange(len(dataset)))
+    except MadocError as error:
+        return replace(rebuilt, reason=str(error))
+    return replace(rebuilt, kind="unknown" if unseen_positions(task) else "approximate", states=states, rows=rows)
+
+
+def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
+    """Simulator states of the rows whose observation determines them, and which rows those are.
+
+    Root positions that never enter the dynamics are 0. Pending actions are those of the rows before, so the first rows
+    of an episode have no state if states carry any. Sensors are taken to have no bias; `System.unbiased` corrects it.
+
+    Raises:
+        MadocError: The task's observation does not determine its state, or no row can be rebuilt.
+    """
+    if task.state_from_observation is None:
+        wanted = "a state_from_observation" if task.source is None else "signals of every position and velocity"
+        raise MadocError(
+            f"an observation of {task.name} does not determine its state, so nothing can start at logged "
+            f"states; give the task {wanted}, take least-squares, which estimates states where positions are known, or "
+            "start rollouts from the task's reset: madoc or oted with starts=policy"
+        )
+    observation = np.asarray(dataset.transitions.observation, dtype=np.float64)
+    rows = np.arange(len(observation))
+    if task.rebuildable is not None:
+        rows = np.flatnonzero(task.rebuildable(observation))
+    if not len(rows):
+        raise MadocError(
+            f"none of the {len(observation)} logged states of {task.name} can be rebuilt from its "
+            f"observation (every row has a clipped value) in {dataset.origin}; start rollouts from the "
+            "task's reset"
+        )
+    rebuilt = np.asarray(task.state_from_observation(observation[rows]), dtype=np.float64)
+    return with_pending(dataset, task, rebuilt, rows)
+
+
+def states_observed_as(
+    dataset: Dataset, task: Task, rows: Int[np.ndarray, " rows"], observation: Float[np.ndarray, "all observation"]
+) -> Float[np.ndarray, "rows state"]:
+    """The states of the given rows had the log's observations been others; NaN where they cannot be rebuilt."""
+    other = replace(dataset, transitions=replace(dataset.transitions, observation=observation))
+    states, rebuilt = logged_states(other, task)
+    place = np.minimum(np.searchsorted(rebuilt, rows), len(rebuilt) - 1)
+    return np.where((rebuilt[place] == rows)[:, None], states[place], np.nan)
+
+
+def with_pending(
+    dataset: Dataset, task: Task, states: Float[np.ndarray, "rows physical"], rows: Int[np.ndarray, " rows"]
+) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
+    """Append the pending actions to (qpos, qvel), and keep the rows whose episode has enough rows before them.
+
+    Raises:
+        MadocError: No row has enough rows before it.
+    """
+    age = rows - dataset.episode_starts[dataset.episode_of(rows)]
+    states, rows = states[age >= task.pending], rows[age >= task.pending]
+    if not len(rows):
+        raise MadocError(
+            f"a state of {task.name} carries the {task.pending} actions before it, and no episode of {dataset.origin} "
+            "has so many before a row; give it data with its rows in order, or a shorter action_delay"
+        )
+    action = np.asarray(dataset.transitions.action, dtype=np.float64)
+    return np.concatenate([states, *(action[rows - back] for back in range(1, task.pending + 1))], axis=-1), rows
+
+
+def probing_rows(
+    logged: LoggedStates, dataset: Dataset, simulator: Simulator
+) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
+    """States and actions at which every parameter must matter.
+
+    They are the logged ones, exact or approximate. Where states are unknown they are the states that the first logged
+    actions lead to from a reset at mid-range parameters: at rest many parameters have no effect.
+    """
+    action = np.asarray(dataset.transitions.action)
+    if logged.starts_known:
+        return logged.states, action[logged.rows]
+    actions = action.astype(np.float64)[np.arange(_PROBED) % len(dataset)]
+    system = simulator.bind(simulator.parameters.middle[None])
+    state = first = reset_states(simulator)(jax.random.key(0), 1)[None]
+    visited = []
+    for taken in actions:
+        visited.append(state[0, 0])
+        state = system.step(state, taken[None, None])
+        state = state if np.isfinite(state).all() else first
+    return np.stack(visited), actions
+
+
+def probing_windows(logged: LoggedStates, dataset: Dataset, simulator: Simulator, *, steps: int, count: int) -> Windows:
+    """At most `count` windows from states as in `probing_rows`, each under `steps` logged actions.
+
+    Shorter ones if no episode is as long. Where states are unknown the windows' logged observations are not those of
+    their states: only what changes with the parameters is of use.
+    """
+    if logged.starts_known:
+        steps = longest_fit(dataset, logged.rows, steps)
+        chosen = evenly(rows_that_fit(dataset, logged.rows, steps), count)
+        return windows_at(dataset, logged.states[chosen], logged.rows[chosen], steps)
+    rows = np.arange(len(dataset))
+    steps = longest_fit(dataset, rows, steps)
+    rows = evenly(rows_that_fit(dataset, rows, steps), min(count, _PROBED))
+    states, _ = probing_rows(logged, dataset, simulator)
+    return windows_at(dataset, states[evenly(np.arange(_PROBED), len(rows))], rows, steps)

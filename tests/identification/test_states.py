@@ -1,0 +1,74 @@
+"""What a log tells of states: each kind once, and windows at which every parameter matters."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from madoc import robots, simulation
+from madoc.errors import MadocError
+from madoc.identification.states import probing_windows, states_observed_as, states_of
+from own_robots import CART_SPEC, write_robot
+from robots import SPRING_TRUTH, recorded, spring
+
+SPRING = spring(max_episode_steps=100)
+
+
+def of_cart(folder, hidden):
+    """The states of a log of a cart without one of its two signals."""
+    spec = "\n".join(line for line in CART_SPEC.splitlines() if f"name: {hidden}," not in line)
+    task = robots.load(write_robot(folder, spec)).task
+    log = recorded(task, {"body_mass.cart": 1.0}, 100, jax.random.key(0))
+    simulator = simulation.make(task, threads=1)
+    return states_of(log, simulator), log, simulator
+
+
+def test_observations_that_determine_states_make_them_exact():
+    log = recorded(SPRING, SPRING_TRUTH, 20, jax.random.key(0))
+    logged = states_of(log, simulation.make(SPRING, threads=1))
+    assert (logged.kind, logged.reason, logged.physical_size, logged.measured) == ("exact", "", 2, 2)
+    np.testing.assert_array_equal(logged.exact()[0], log.transitions.observation)
+    np.testing.assert_array_equal(logged.exact()[1], np.arange(20))
+
+
+def test_positions_alone_make_states_approximate(tmp_path):
+    logged, log, _ = of_cart(tmp_path, "speed")
+    assert (logged.kind, logged.starts_known, logged.measured) == ("approximate", True, 1)
+    place = log.transitions.observation[:, 0]
+    np.testing.assert_array_equal(logged.states[:, 0], place)
+    # Over two control steps of 0.02 s between the rows before and behind.
+    np.testing.assert_allclose(logged.states[1:-1, 1], (place[2:] - place[:-2]) / 0.04, atol=1e-9)
+    with pytest.raises(MadocError, match="does not determine its state"):
+        logged.exact()
+
+
+def test_without_positions_states_are_unknown(tmp_path):
+    logged, log, simulator = of_cart(tmp_path, "place")
+    assert (logged.kind, logged.starts_known) == ("unknown", False)
+    windows = probing_windows(logged, log, simulator, steps=5, count=7)
+    assert windows.states.shape == (7, 2)
+    assert windows.steps == 5
+
+
+def test_rows_that_cannot_be_rebuilt_are_said():
+    task = replace(SPRING, rebuildable=lambda observation: observation[..., 0] > 1e9)
+    logged = states_of(recorded(SPRING, SPRING_TRUTH, 20, jax.random.key(0)), simulation.make(task, threads=1))
+    assert logged.kind == "unknown"
+    with pytest.raises(MadocError, match="none of the 20 logged states of spring can be rebuilt"):
+        logged.guesses()
+
+
+def test_states_follow_other_observations():
+    task = replace(SPRING, rebuildable=lambda observation: observation[..., 0] > 0.5)
+    log = recorded(SPRING, SPRING_TRUTH, 3, jax.random.key(0))
+    observation = np.array([[1.0, 2.0], [0.0, 3.0], [0.7, 4.0]])
+    states = states_observed_as(log, task, np.array([0, 1]), observation)
+    np.testing.assert_array_equal(states, [[1.0, 2.0], [np.nan, np.nan]])
+
+
+def test_windows_to_probe_begin_at_logged_states():
+    log = recorded(SPRING, SPRING_TRUTH, 20, jax.random.key(0))
+    simulator = simulation.make(SPRING, threads=1)
+    windows = probing_windows(states_of(log, simulator), log, simulator, steps=8, count=3)
+    np.testing.assert_array_equal(windows.states, log.transitions.observation[[0, 6, 12]])
