@@ -33,6 +33,15 @@ _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
         needs_data=False,
     ),
     MethodEntry(
+        "fast-sac-logged",
+        FastSAC,
+        "fast-sac, half of each batch from the log",
+        "Ball et al., RLPD",
+        2023,
+        {"logged_share": 0.5},
+        shown=_SAC_SHOWN,
+    ),
+    MethodEntry(
         "sac-bc",
         SAC,
         "SAC, cloning the data's actions too",
