@@ -6,7 +6,8 @@ import pytest
 
 from madoc.calibration import CALIBRATORS, CmaEs, Dropo, LeastSquares, Madoc
 from madoc.policies import LEARNERS, SAC
-from madoc.types import entry_of
+from madoc.errors import MadocError
+from madoc.types import Seconds, entry_of, read_budget
 
 
 @pytest.mark.parametrize(
@@ -39,3 +40,24 @@ class Guess:
 def test_a_method_of_ones_own_is_named_after_its_class():
     entry = entry_of(Guess(), CALIBRATORS)
     assert (entry.name, entry.unit, entry.simulates, entry.shown) == ("Guess", "control steps", True, ())
+
+
+@pytest.mark.parametrize(
+    ("written", "budget"),
+    [
+        (300, 300),
+        ("300_000", 300_000),
+        ("300s", Seconds(300.0)),
+        ("0.5 min", Seconds(30.0)),
+        ("2h", Seconds(7200.0)),
+        (Seconds(3.0), Seconds(3.0)),
+    ],
+)
+def test_a_budget_is_a_count_or_a_time(written, budget):
+    assert read_budget(written) == budget
+
+
+@pytest.mark.parametrize("written", ["soon", "3 days", "1.5", "0s", "1.2.3s", Seconds(-1.0)])
+def test_what_is_no_budget_is_refused(written):
+    with pytest.raises(MadocError, match="expected a budget"):
+        read_budget(written)

@@ -119,14 +119,14 @@ class H2O:
         policy = UniformPolicy(problem.simulator.action_size) if explores else self.policy(state)
         interaction, metrics = act_on(problem, state.interaction, policy, of_acting, control_steps=self.epoch_steps)
         learning = state.learning
-        acted = interaction.control_steps - state.interaction.control_steps
+        acted, count = interaction.control_steps - state.interaction.control_steps, 0
         if interaction.control_steps >= self.warmup_steps:
             count = round(self.updates_per_step * acted)
             learning, losses = self._update(
                 learning, interaction.replay, problem.logged, problem.features, of_update, count
             )
             metrics |= scalars(losses)
-        epoch = Epoch(metrics, control_steps=acted, stage="exploring" if explores else "learning")
+        epoch = Epoch(metrics, control_steps=acted, updates=count, stage="exploring" if explores else "learning")
         return H2OState(learning, interaction, key), epoch
 
     @eqx.filter_jit

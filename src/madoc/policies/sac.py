@@ -102,7 +102,7 @@ class SAC:
             self._place(problem), state.interaction, policy, of_acting, control_steps=self.epoch_steps
         )
         learner = state.learner
-        acted, judging = interaction.control_steps - state.interaction.control_steps, 0
+        acted, count, judging = interaction.control_steps - state.interaction.control_steps, 0, 0
         if interaction.control_steps >= self.warmup_steps:
             count = round(self.updates_per_step * acted)
             logged = problem.logged if self.cloning is not None else None
@@ -122,7 +122,7 @@ class SAC:
             following = replace(following, judged=judged)
             metrics |= {"judged_return": mean_return}
         stage = "exploring" if explores else "learning"
-        return following, Epoch(metrics, control_steps=acted + judging, unbudgeted=judging, stage=stage)
+        return following, Epoch(metrics, control_steps=acted + judging, unbudgeted=judging, updates=count, stage=stage)
 
     @eqx.filter_jit
     def _update(
