@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import pytest
 
 from madoc.calibration import CALIBRATORS, CmaEs, Dropo, LeastSquares, Madoc
-from madoc.policies import LEARNERS, SAC
 from madoc.errors import MadocError
+from madoc.policies import LEARNERS, SAC
 from madoc.types import Seconds, entry_of, read_budget
 
 
