@@ -24,7 +24,7 @@ from planted import NOISE, TRUTHS, base, compared, record, write
 
 from calibration import commit
 from madoc import robots
-from madoc.pipeline import CalibrationOrder, Source, calibrate_in
+from madoc.pipeline import CalibrationOrder, Search, Source, calibrate_in
 from madoc.tasks import Task
 
 if not hasattr(sysid, "optimize"):
@@ -65,7 +65,8 @@ def both(folder: Path, robot: str, situation: str, seed: int) -> dict:
     machine, truth = base(robot), TRUTHS[robot]
     logs = record(folder, machine, truth, noise=NOISE if situation == "noise" else 0.0, seed=seed)
     spec = write(folder / "known.yaml", machine)
-    order = CalibrationOrder(str(spec), Source((str(logs),)), method="least-squares", budget=BUDGET, seed=seed)
+    search = Search(method="least-squares", budget=BUDGET, seed=seed)
+    order = CalibrationOrder(str(spec), Source((str(logs),)), search)
     start = clocks()
     result = calibrate_in(folder / "run", order).to_json()
     found = {"madoc": summary(result, truth, clocks() - start) | {"control_steps": result["control_steps"]}}

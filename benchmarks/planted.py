@@ -18,12 +18,14 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-import yaml
+from ruamel.yaml import YAML
 
 from calibration import commit
 from madoc import robots
-from madoc.pipeline import AUTO_BUDGET, CalibrationOrder, Source, calibrate_auto_in, calibrate_in
+from madoc.pipeline import CalibrationOrder, Search, Source, calibrate_in
 from madoc.pipeline.auto_stage import CANDIDATES
+from madoc.pipeline.preparation import AUTO_BUDGET
+from madoc.robots.document import yaml_text
 
 RESULTS = Path(__file__).parent / "results" / "planted"
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -83,7 +85,7 @@ def main() -> None:
     arguments = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     if arguments.coverage:
-        cover(arguments.coverage, round(CANDIDATES[0].most * arguments.budget))
+        cover(arguments.coverage, round(CANDIDATES["least-squares"] * arguments.budget))
         return
     for robot in arguments.robots:
         for situation in arguments.situations:
@@ -112,9 +114,9 @@ def planted(folder: Path, robot: str, situation: str, seed: int, budget: int) ->
         del known["parameters"][WRONG]
     logs = record(folder, machine, truth, noise=NOISE if situation == "noise" else 0.0, seed=seed)
     spec = write(folder / "known.yaml", known)
-    order = CalibrationOrder(task=str(spec), source=Source((str(logs),)), method="auto", budget=budget, seed=seed)
+    order = CalibrationOrder(str(spec), Source((str(logs),)), Search(method="auto", budget=budget, seed=seed))
     start = time.monotonic()
-    result = calibrate_auto_in(folder / "run", order).to_json()
+    result = calibrate_in(folder / "run", order).to_json()
     return {
         "robot": robot,
         "situation": situation,
@@ -146,9 +148,8 @@ def cover(problems: int, budget: int) -> None:
             drawn = space.low + random.uniform(0.15, 0.85, len(space)) * (space.high - space.low)
             truth = dict(zip(space.names, drawn.tolist(), strict=True))
             logs = record(folder, machine, truth, noise=NOISE, seed=problem)
-            source = Source((str(logs),))
-            spec = str(folder / "known.yaml")
-            order = CalibrationOrder(spec, source, method="least-squares", budget=budget, seed=problem)
+            search = Search(method="least-squares", budget=budget, seed=problem)
+            order = CalibrationOrder(str(folder / "known.yaml"), Source((str(logs),)), search)
             result = calibrate_in(folder / "run", order).to_json()
         rows.append({"status": result["status"], "commit": commit(), "parameters": compared(result, truth)})
         covered = [row["covered"] for said in rows for row in said["parameters"].values()]
@@ -182,14 +183,14 @@ def base(robot: str) -> dict:
     """The robot's spec, its model named by its whole path."""
     if robot == "hopper":
         return deepcopy(HOPPER)
-    spec = yaml.safe_load((EXAMPLES / robot / f"{robot}.yaml").read_text())
+    spec = YAML(typ="safe").load(EXAMPLES / robot / f"{robot}.yaml")
     spec.pop("log", None)
     return spec | {"model": str(EXAMPLES / robot / spec["model"])}
 
 
 def write(path: Path, spec: dict) -> Path:
     """A spec file."""
-    path.write_text(yaml.safe_dump(spec, sort_keys=False))
+    path.write_text(yaml_text(spec))
     return path
 
 

@@ -24,7 +24,8 @@ from madoc import tasks
 from madoc.calibration import CalibrationResult
 from madoc.data.targets import paper_truth
 from madoc.evaluation import evaluate
-from madoc.pipeline.methods import make_method, parse_settings
+from madoc.pipeline.methods import make_method
+from madoc.pipeline.orders import parse_settings
 from madoc.policies import LEARNERS, NormalParameters, PolicyProblem, UniformParameters, learn_policy
 from madoc.simulation.cpu import CpuSimulator
 from madoc.types import entry_of
@@ -51,7 +52,7 @@ def main() -> None:
     revision = commit()
     RESULTS.mkdir(parents=True, exist_ok=True)
     for robot, name, seed in product(arguments.robots, arguments.methods, arguments.seeds):
-        method = make_method(LEARNERS, name, parse_settings(arguments.set))
+        method = make_method(LEARNERS, name, parse_settings((tuple(arguments.set),)))
         entry = entry_of(method, LEARNERS)
         for at in arguments.at if entry.needs_parameters else ["-"]:
             where = f"{at}-{arguments.calibrator}" if at in ("calibrated", "distribution") else at

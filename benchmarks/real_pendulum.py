@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import yaml
+from ruamel.yaml import YAML
 
 from calibration import commit
 from madoc import pipeline, robots, simulation
@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent
 PENDULUM = ROOT.parent / "examples" / "pendulum"
 CALIBRATED_TO, HELD_OUT = "ilqr", ("ddp", "energy_shaping", "sac")
 HORIZON = 20
-SETTINGS = {"horizon": "10", "windows": "400"}
+SETTINGS = ("horizon=10", "windows=400")
 
 
 def main() -> None:
@@ -74,8 +74,7 @@ def calibrated(data: Path, folder: Path) -> dict:
     order = pipeline.CalibrationOrder(
         task=str(PENDULUM / "pendulum.yaml"),
         source=pipeline.Source((str(runs),)),
-        method="least-squares",
-        changes=SETTINGS,
+        search=pipeline.Search(method="least-squares", set=(SETTINGS,)),
         holdout=0.25,
     )
     result = pipeline.calibrate_in(folder / "run", order).to_json()
@@ -95,7 +94,7 @@ def published(folder: Path) -> dict[str, dict[str, float]]:
     """
     found = {}
     for file in sorted(folder.glob("*.yaml")):
-        given = yaml.safe_load(file.read_text())
+        given = YAML(typ="safe").load(file)
         mass, length, inertia = given["mass"], given["length"], given.get("inertia")
         if isinstance(inertia, float):
             mass, length = (mass * length) ** 2 / inertia, inertia / (mass * length)

@@ -26,8 +26,7 @@ from madoc.calibration.madoc import grouping
 from madoc.calibration.madoc.agents import AgentSettings
 from madoc.data.targets import paper_truth
 from madoc.learning import replay
-from madoc.learning.cloning import clone
-from madoc.learning.networks import adam
+from madoc.learning.cloning import continue_cloning
 from madoc.policies import LEARNERS, PolicyProblem
 from madoc.policies.behaviours import record_quality
 from madoc.simulation.cpu import CpuSimulator
@@ -153,8 +152,8 @@ def learner_update(name: str, problem: PolicyProblem, width: int) -> float:
     state, key = method.init(problem, jax.random.key(0)), jax.random.key(1)
     if name == "bc":
         pairs = problem.logged["observation"], problem.logged["action"]
-        chosen = {"optimiser": adam(method.learning_rate), "batch": method.batch, "count": count}
-        run = lambda: clone(state.policy, state.optimiser, pairs, key, **chosen)  # noqa: E731
+        chosen = {"learning_rate": method.learning_rate, "batch": method.batch, "updates": count}
+        run = lambda: continue_cloning(state.clone, pairs, key, **chosen)  # noqa: E731
     elif name == "cql":
         run = lambda: method._update(state.learner, problem.logged, key, False, count)  # noqa: E731
     elif name == "morec":
@@ -183,7 +182,7 @@ def calibration_update(method: Madoc) -> float:
     dataset = record_quality(simulator, "medium", transitions=5000, key=jax.random.key(0))
     problem = CalibrationProblem(dataset, simulator)
     state = method.init(problem, jax.random.key(0))
-    features = problem.raw_features if method.features == "raw" else problem.standardised_features
+    _, features = problem.features.windows(method.features, 1)
     members = jnp.asarray(grouping.members(np.arange(14) % 6, 6))
     count = 50
 

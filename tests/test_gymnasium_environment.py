@@ -9,8 +9,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import madoc.tasks
+from madoc import ENVIRONMENTS, register_environments
 from madoc.errors import MadocError
-from madoc.gymnasium_environment import ROBOTS, CalibratedEnvironment, register
+from madoc.gymnasium_environment import CalibratedEnvironment
 from madoc.simulation.cpu import CpuSimulator
 from own_robots import CART_SPEC, write_robot
 
@@ -24,17 +25,17 @@ def hopper():
 # Positions and Ant's and HalfCheetah's velocities have no bound, and any made-up one would be wrong. Gymnasium's
 # own MuJoCo environments give the same two warnings; every other one is an error.
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m..imum value is -?infinity")
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", ENVIRONMENTS)
 @pytest.mark.parametrize("physics", ["legacy", "modern"])
 def test_passes_gymnasiums_checker(name, physics):
     with gymnasium.make(f"madoc/{name}", physics=physics) as environment:
         check_env(environment.unwrapped)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_spaces_and_info(name):
     with gymnasium.make(f"madoc/{name}") as environment:
-        task = madoc.tasks.make(ROBOTS[name])
+        task = madoc.tasks.make(ENVIRONMENTS[name])
         assert environment.observation_space.shape == (task.observation_size,)
         assert environment.observation_space.dtype == np.float64
         assert environment.action_space.dtype == np.float32
@@ -47,19 +48,27 @@ def test_spaces_and_info(name):
         assert info["failed"] is False
 
 
-def test_the_module_in_the_id_registers_in_a_fresh_process():
+@pytest.mark.parametrize("first", ["import gymnasium, madoc", "import madoc, gymnasium", "import gymnasium"])
+def test_the_import_of_madoc_registers_in_either_order_and_the_id_can_import_it(first):
+    name = "madoc/Ant" if "madoc" in first else "madoc:madoc/Ant"
     code = (
-        "import gymnasium\n"
-        "environment = gymnasium.make('madoc.gymnasium_environment:madoc/Ant')\n"
+        f"{first}\n"
+        "import sys\n"
+        "assert 'jax' not in sys.modules and 'mujoco' not in sys.modules\n"
+        f"environment = gymnasium.make({name!r})\n"
         "print(environment.observation_space.shape[0])"
     )
     run = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
     assert (run.returncode, run.stdout.strip()) == (0, "27"), run.stderr
 
 
+def test_a_registered_episode_is_as_long_as_the_tasks():
+    assert {madoc.tasks.make(task).max_episode_steps for task in ENVIRONMENTS.values()} == {madoc.EPISODE_STEPS}
+
+
 def test_registering_again_is_harmless():
     before = dict(gymnasium.registry)
-    register()
+    register_environments()
     assert dict(gymnasium.registry) == before
 
 
@@ -131,7 +140,7 @@ def test_a_fall_terminates(hopper):
 def test_an_explosion_truncates_at_the_last_good_state():
     environment = CalibratedEnvironment("hopper")
     before, _ = environment.reset(seed=0)
-    environment._state[7] = 1e11
+    environment._episodes.state[0, 7] = 1e11
     observation, reward, terminated, truncated, info = environment.step(np.zeros(3, dtype=np.float32))
     assert (terminated, truncated, info["failed"]) == (False, True, True)
     assert np.isfinite(observation).all()
@@ -145,7 +154,7 @@ def test_mistakes_are_refused_in_one_sentence(hopper):
         gymnasium.make("madoc/Hopper", parameters={**values, "body_mass.head": 1.0})
     with pytest.raises(MadocError, match="no value for 'gravity'"):
         gymnasium.make("madoc/Hopper", parameters={})
-    with pytest.raises(MadocError, match=r"expected 8 parameter values for hopper .* got an array of shape \(3,\)"):
+    with pytest.raises(MadocError, match=r"expected 8 parameter values \(gravity, .* got an array of shape \(3,\)"):
         gymnasium.make("madoc/Hopper", parameters=np.zeros(3))
     with pytest.raises(MadocError, match="unknown physics 'old'"):
         gymnasium.make("madoc/Hopper", physics="old")

@@ -149,3 +149,14 @@ def test_an_empty_space_and_a_repeated_name_are_refused():
 def test_frozen():
     with pytest.raises(dataclasses.FrozenInstanceError):
         SPACE.parameters[0].low = 0.0  # type: ignore[misc]
+
+
+def test_values_by_name_or_in_order_are_one_vector():
+    values = dict(zip(SPACE.names, SPACE.middle.tolist(), strict=True))
+    turned = dict(reversed(values.items()))
+    for given in (values, turned, SPACE.middle, SPACE.middle.tolist()):
+        assert SPACE.vector(given).tolist() == SPACE.middle.tolist()
+    several = np.stack([SPACE.low, SPACE.high])
+    assert (SPACE.vector(several) == several).all()
+    with pytest.raises(MadocError, match=r"parameter values \(.*\), got an array of shape \(1,\)"):
+        SPACE.vector([1.0])

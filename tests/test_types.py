@@ -7,7 +7,7 @@ import pytest
 from madoc.calibration import CALIBRATORS, CmaEs, Dropo, LeastSquares, Madoc
 from madoc.errors import MadocError
 from madoc.policies import LEARNERS, SAC
-from madoc.types import Seconds, entry_of, read_budget
+from madoc.types import entry_of
 
 
 @pytest.mark.parametrize(
@@ -43,21 +43,20 @@ def test_a_method_of_ones_own_is_named_after_its_class():
 
 
 @pytest.mark.parametrize(
-    ("written", "budget"),
+    ("wrong", "sentence"),
     [
-        (300, 300),
-        ("300_000", 300_000),
-        ("300s", Seconds(300.0)),
-        ("0.5 min", Seconds(30.0)),
-        ("2h", Seconds(7200.0)),
-        (Seconds(3.0), Seconds(3.0)),
+        (lambda: Madoc(updates=0), "expected updates of Madoc to be greater than or equal to 1, got 0"),
+        (lambda: Madoc(hidden=(8, 0)), "expected hidden of Madoc to be greater than or equal to 1, got 0"),
+        (
+            lambda: Madoc(starts="nowhere"),
+            "expected starts of Madoc to be 'policy', 'logged' or 'replay', got 'nowhere'",
+        ),
+        (lambda: Dropo(draws=1), "expected draws of Dropo to be greater than or equal to 2, got 1"),
+        (lambda: SAC(discount=float("nan")), "expected discount of SAC to be greater than or equal to 0, got nan"),
+        (lambda: SAC(batch=1.5), "expected batch of SAC to be a valid integer, got 1.5"),
+        (lambda: SAC(epoch_steps=5), "expected epoch_steps of at least the 20 environments, got 5"),
     ],
 )
-def test_a_budget_is_a_count_or_a_time(written, budget):
-    assert read_budget(written) == budget
-
-
-@pytest.mark.parametrize("written", ["soon", "3 days", "1.5", "0s", "1.2.3s", Seconds(-1.0)])
-def test_what_is_no_budget_is_refused(written):
-    with pytest.raises(MadocError, match="expected a budget"):
-        read_budget(written)
+def test_impossible_hyperparameters_are_refused_in_one_sentence(wrong, sentence):
+    with pytest.raises(MadocError, match=f"^{sentence}$"):
+        wrong()

@@ -8,19 +8,6 @@ class MadocError(ValueError):
     """Bad input or a refused problem. The command line prints its sentence and exits with code 2."""
 
 
-def check_at_least(owner: object, **minima: float) -> None:
-    """Refuse attributes of a hyperparameter object that are below their minimum; None is let through.
-
-    Raises:
-        MadocError: One is too small.
-    """
-    for name, minimum in minima.items():
-        value = getattr(owner, name)
-        smallest = min(value, default=minimum) if isinstance(value, tuple) else value
-        if smallest is not None and not smallest >= minimum:
-            raise MadocError(f"expected {name} of at least {minimum:g} for {type(owner).__name__}, got {value}")
-
-
 def unknown_name(what: str, name: str, known: Iterable[str]) -> MadocError:
     """The refusal of a name that is not among the known ones; it points at the nearest."""
     names = list(known)
@@ -28,3 +15,29 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> MadocError:
     near = ending or difflib.get_close_matches(name, names, n=1)
     hint = f"; did you mean {near[0]}?" if near else ";"
     return MadocError(f"unknown {what} {name!r}{hint} there are: {', '.join(names)}")
+
+
+def nearest(wanted: str, names: Iterable[str]) -> list[str]:
+    """At most three of the names: those that contain the wanted one first, then those spelled like it."""
+    known = list(names)
+    by_case = {name.lower(): name for name in known}
+    close = [by_case[name] for name in difflib.get_close_matches(wanted.lower(), list(by_case), n=3, cutoff=0.5)]
+    containing = [name for name in known if wanted and wanted.lower() in name.lower()]
+    return list(dict.fromkeys([*containing, *close]))[:3]
+
+
+def nearest_hint(wanted: str, names: Iterable[str], *, none: str = "there is none") -> str:
+    """The end of an error about an unknown name: the nearest names, else the first of all, else `none`."""
+    known = list(names)
+    near = nearest(wanted, known)
+    if near:
+        return f"nearest: {', '.join(near)}"
+    return f"there are: {listed(known)}" if known else none
+
+
+def listed(names: Iterable[str], most: int = 12) -> str:
+    """Names for a sentence: at most `most`, then how many more there are."""
+    known = list(names)
+    if not known:
+        return "none"
+    return ", ".join(known[:most]) + (f" and {len(known) - most} more" if len(known) > most else "")

@@ -1,6 +1,6 @@
-"""Judging: returns in a system, the normalized score, the calibration error. Only here is truth read."""
+"""Evaluation: returns in a system, the normalized score, the calibration error. No other module reads the truth."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import jax
@@ -16,12 +16,12 @@ from madoc.types import Policy
 
 @dataclass(frozen=True)
 class Returns:
-    """Undiscounted returns of episodes, and what they come to on D4RL's scale.
+    """Undiscounted returns of episodes, and D4RL's normalized scores.
 
     Attributes:
-        returns: One return an episode.
-        lengths: Control steps each lasted.
-        normalized: 100 (return - random) / (expert - random), per episode.
+        returns: Return of each episode.
+        lengths: Control steps of each episode.
+        normalized: 100 (return - random) / (expert - random) of each episode.
     """
 
     returns: Float[np.ndarray, " episodes"]
@@ -29,7 +29,7 @@ class Returns:
     normalized: Float[np.ndarray, " episodes"]
 
     def summary(self) -> dict[str, float]:
-        """Means and the spread, for JSON."""
+        """Means and the standard deviation of the return, for JSON."""
         return {
             "return": float(self.returns.mean()),
             "return_std": float(self.returns.std()),
@@ -42,21 +42,22 @@ class Returns:
 def evaluate(
     policy: Policy,
     simulator: Simulator,
-    parameters: Float[np.ndarray, "*systems parameters"],
+    parameters: Float[np.ndarray, "*systems parameters"] | Mapping[str, float],
     *,
     key: PRNGKeyArray,
     episodes: int = 10,
     deterministic: bool = True,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> Returns:
-    """Returns of whole episodes, all of them at a time; an episode that explodes ends there.
+    """Returns of whole episodes, simulated at the same time; an episode whose simulation fails ends there.
 
-    Parameters of several systems share the episodes out among them, as evenly as whole episodes allow: at least one
-    each. `advance` is told how many of the task's `max_episode_steps` have passed.
+    The parameters are physical values of one system, by name or as a vector, or of several, one in each row. Each of
+    several systems gets the same number of episodes, at least one and together at least `episodes`. `advance` is called
+    with the number of control steps, of the task's `max_episode_steps`, that have passed.
     """
     task = simulator.task
     of_start, of_action = jax.random.split(key)
-    system = simulator.bind(np.atleast_2d(parameters))
+    system = simulator.bind(np.atleast_2d(simulator.parameters.vector(parameters)))
     rows = -(-episodes // system.count)
     state = reset_states(simulator)(of_start, system.count * rows).reshape(system.count, rows, -1)
     alive = np.ones((system.count, rows), dtype=bool)

@@ -1,4 +1,4 @@
-"""A saved policy on a robot's computer: NumPy only, no JAX, no pickle."""
+"""A saved policy on a robot's computer: it needs NumPy only, no JAX and no pickle."""
 
 import json
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ class NumpyPolicy:
 
     Attributes:
         task_name: The robot it was learnt for.
-        weights: One matrix (inputs, outputs) a layer.
-        biases: One vector a layer.
-        offset: Taken from the observation first.
-        scale: The observation is then divided by it.
+        weights: Matrix (inputs, outputs) of each layer.
+        biases: Vector of each layer.
+        offset: Subtracted from the observation.
+        scale: Divisor of the observation after that.
     """
 
     task_name: str

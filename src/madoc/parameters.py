@@ -1,6 +1,6 @@
 """Calibratable parameters: their names, units, ranges, and the one map between [-1, 1] and physical values."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from madoc.errors import MadocError
 
 @dataclass(frozen=True)
 class Field:
-    """What may be calibrated: which kind of element it belongs to, its unit and its physical bound.
+    """A kind of parameter: the elements it belongs to, its unit and its physical bound.
 
     Attributes:
         element: `body`, `joint`, `geom`, `actuator` or `signal`; None where it belongs to the whole robot.
@@ -162,15 +162,22 @@ class ParameterSpace:
             raise MadocError(f"no parameter {missing[0]!r} here; there are: {', '.join(known)}")
         return replace(self, parameters=tuple(known[name] for name in names))
 
-    def vector(self, values: dict[str, float]) -> np.ndarray:
-        """Physical values by name as one vector of shape (d,).
+    def vector(self, values: Mapping[str, float] | ArrayLike) -> np.ndarray:
+        """Physical values, by name or in the space's order, as an array of shape (..., d), float64.
 
         Raises:
-            MadocError: A parameter has no value, or a value names no parameter.
+            MadocError: A parameter has no value, a name is no parameter, or the last axis has another length.
         """
-        missing = [name for name in self.names if name not in values]
-        extra = [name for name in values if name not in self.names]
-        if missing or extra:
-            what = f"no value for {missing[0]!r}" if missing else f"unknown parameter {extra[0]!r}"
-            raise MadocError(f"{what}; expected values for exactly: {', '.join(self.names)}")
-        return np.array([float(values[name]) for name in self.names])
+        if isinstance(values, Mapping):
+            missing = [name for name in self.names if name not in values]
+            extra = [name for name in values if name not in self.names]
+            if missing or extra:
+                what = f"no value for {missing[0]!r}" if missing else f"unknown parameter {extra[0]!r}"
+                raise MadocError(f"{what}; expected values for exactly: {', '.join(self.names)}")
+            return np.array([float(values[name]) for name in self.names])
+        vector = np.array(values, dtype=np.float64)
+        if vector.shape[-1:] != (len(self),):
+            raise MadocError(
+                f"expected {len(self)} parameter values ({', '.join(self.names)}), got an array of shape {vector.shape}"
+            )
+        return vector

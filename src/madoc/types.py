@@ -1,13 +1,14 @@
 """What every room exchanges: transitions, policies, metrics, and the protocol of methods."""
 
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from dataclasses import dataclass, field, is_dataclass
+from functools import cache
+from typing import Annotated, Any, Generic, Literal, Protocol, TypeVar, get_type_hints
 
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from madoc.errors import MadocError
 
@@ -18,45 +19,14 @@ Made = TypeVar("Made")
 Unit = Literal["control steps", "updates"]
 """What a budget counts: simulated control steps, or gradient updates where a method does not simulate."""
 
-
-@dataclass(frozen=True)
-class Seconds:
-    """A budget in wall-clock time from the start of a run, that before a resume included.
-
-    What a run under it results in depends on how fast the machine is.
-    """
-
-    seconds: float
-
-    def __str__(self) -> str:
-        return f"{self.seconds:g} s"
-
-
-Budget = int | Seconds
-"""How long a method may run: a count of what its entry says (`Unit`), or a time."""
-
-_TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
-
-
-def read_budget(given: Budget | str) -> Budget:
-    """A budget as written: `300000` is a count, `300s`, `15min` and `2h` are times.
-
-    Raises:
-        MadocError: It is neither, or not positive.
-    """
-    if isinstance(given, Seconds) or (isinstance(given, int) and not isinstance(given, bool)):
-        budget: Budget = given
-    else:
-        words = re.fullmatch(r"([\d_.]+) ?(s|min|h)?", str(given).strip())
-        try:
-            number, unit = (words[1], words[2]) if words else ("", None)
-            budget = Seconds(float(number) * _TIME_UNITS[unit]) if unit else int(number)
-        except ValueError:
-            raise MadocError(f"expected a budget such as 300000, 300s, 15min or 2h, got {given!r}") from None
-    if isinstance(budget, Seconds) and not budget.seconds > 0:
-        raise MadocError(f"expected a budget of more than 0 s, got {given}")
-    return budget
-
+Count = Annotated[int, Field(ge=1)]
+"""A hyperparameter that counts something there must be one of."""
+CountOrZero = Annotated[int, Field(ge=0)]
+"""A hyperparameter that counts something there may be none of."""
+Layers = tuple[Count, ...]
+"""Units of a network's hidden layers."""
+NotNegative = Annotated[float, Field(ge=0.0)]
+"""A hyperparameter such as a rate or a weight."""
 
 Metrics = dict[str, float]
 """Scalars worth looking at, by name. Never needed by the next step."""
@@ -159,7 +129,7 @@ class MethodEntry(Generic[Made]):
     summary: str = ""
     paper: str = ""
     year: int = 0
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, object] = field(default_factory=dict)
     recognised_by: tuple[str, ...] | None = None
     shown: tuple[str, ...] = ()
     unit: Unit = "control steps"
@@ -167,12 +137,12 @@ class MethodEntry(Generic[Made]):
     needs_data: bool = True
     needs_parameters: bool = True
 
-    def make(self, **changes: Any) -> Made:
+    def make(self, **changes: object) -> Made:
         """The method, with some hyperparameters changed."""
         return self.kind(**{**self.settings, **changes})
 
     @property
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, object]:
         """The hyperparameters by which a method is recognised as this one."""
         names = self.settings if self.recognised_by is None else self.recognised_by
         return {name: self.settings[name] for name in names}
@@ -194,3 +164,28 @@ def entry_of(method: Made, registry: Mapping[str, MethodEntry[Any]]) -> MethodEn
 
     fitting = [entry for entry in registry.values() if fits(entry)]
     return max(fitting, key=lambda entry: len(entry.identity), default=MethodEntry(type(method).__name__, type(method)))
+
+
+def check_hyperparameters(method: object) -> None:
+    """Refuse fields of a dataclass of hyperparameters that are not what their annotations say.
+
+    Raises:
+        MadocError: Names the first such field, what is expected of it, and what it was.
+    """
+    kind: type = type(method)
+    for name, adapter in _adapters(kind).items():
+        try:
+            adapter.validate_python(getattr(method, name))
+        except ValidationError as error:
+            problem = error.errors()[0]
+            expected = problem["msg"].removeprefix("Input should be ")
+            owner = f"{name} of {kind.__name__}"
+            raise MadocError(f"expected {owner} to be {expected}, got {problem['input']!r}") from None
+
+
+@cache
+def _adapters(kind: type) -> dict[str, TypeAdapter[object]]:
+    """What checks each field of a dataclass."""
+    hints = get_type_hints(kind, include_extras=True)
+    checked = {name: hint for name, hint in hints.items() if not is_dataclass(hint)}
+    return {name: TypeAdapter(hint, config=ConfigDict(strict=True)) for name, hint in checked.items()}

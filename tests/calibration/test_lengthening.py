@@ -8,9 +8,16 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares
-from madoc.calibration.least_squares.calibrator import horizon_of
-from madoc.calibration.least_squares.estimated_states import STATES_FIRST, EstimatedStates
-from madoc.calibration.least_squares.lengthening import begun, hopeless, lengthened, noise_alone, says_more
+from madoc.calibration.least_squares.lengthening import (
+    continued,
+    hopeless,
+    horizon_of,
+    lengthened,
+    noise_alone,
+    tells_more,
+)
+from madoc.calibration.least_squares.search import Search
+from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Disturbance, disturb
 from madoc.runs.checkpoint import difference, layout, load, save
 from madoc.types import Epoch
@@ -35,7 +42,7 @@ def problem_of(task, *, rows=2000, noise=0.05):
 
 def searches_of(problem):
     """A search on windows of five rows, with states that tell which window is which, and one on longer ones."""
-    method = EstimatedStates(5, "cauchy", 40, 1, 4, 2, 1e-7)
+    method = Search(UnknownStarts("cauchy"), 5, 40, 1, 4, 2, 1e-7)
     shorter = method.init(problem, jax.random.key(0))
     longer = lengthened(problem, shorter, 15, 3)
     return shorter, longer
@@ -61,7 +68,7 @@ def test_longer_windows_begin_where_shorter_ones_do_and_share_no_reading(pendulu
 def test_they_go_on_from_the_states_that_were_found(pendulum):
     shorter, longer = searches_of(problem_of(pendulum))
     found = replace(shorter, unit=np.full((1, 3), 0.3), states=shorter.rows[None, :, None] + np.array([0.0, 0.5]))
-    first = begun(longer, found)
+    first = continued(longer, found)
     np.testing.assert_array_equal(first.unit, [[0.3, 0.3, 0.3]])
     np.testing.assert_array_equal(first.states, longer.rows[None, :, None] + np.array([0.0, 0.5]))
     assert difference(layout(first), layout(longer)) is None
@@ -69,7 +76,7 @@ def test_they_go_on_from_the_states_that_were_found(pendulum):
 
 def test_too_few_longer_windows_are_none(pendulum):
     problem = problem_of(pendulum, rows=200)
-    shorter = EstimatedStates(5, "cauchy", 40, 1, 4, 2, 1e-7).init(problem, jax.random.key(0))
+    shorter = Search(UnknownStarts("cauchy"), 5, 40, 1, 4, 2, 1e-7).init(problem, jax.random.key(0))
     assert lengthened(problem, shorter, 15, 3) is None
     assert lengthened(problem, shorter, 10_000, 3) is None
 
@@ -81,25 +88,25 @@ def test_longer_windows_may_leave_as_much_noise_as_the_first_and_no_echo(pendulu
     assert noise_alone(longer, shorter, 16)
     assert not noise_alone(replace(longer, deviation=np.array([1.0, 2.5])), shorter, 16)
     # Of 25 windows of 16 readings white noise seems correlated by 1 / 20, three times that by chance alone.
-    assert noise_alone(replace(longer, echo=0.149), shorter, 16)
-    assert not noise_alone(replace(longer, echo=0.151), shorter, 16)
+    assert noise_alone(replace(longer, autocorrelation=0.149), shorter, 16)
+    assert not noise_alone(replace(longer, autocorrelation=0.151), shorter, 16)
 
 
 def test_a_search_is_hopeless_from_its_second_step_on(pendulum):
     shorter, longer = searches_of(problem_of(pendulum))
     loud = replace(longer, deviation=2.1 * shorter.deviation)
-    assert not hopeless(replace(loud, epochs=STATES_FIRST + 1), shorter)
-    assert hopeless(replace(loud, epochs=STATES_FIRST + 2), shorter)
-    assert not hopeless(replace(longer, deviation=1.9 * shorter.deviation, epochs=STATES_FIRST + 2), shorter)
+    assert not hopeless(replace(loud, epochs=1), shorter)
+    assert hopeless(replace(loud, epochs=2), shorter)
+    assert not hopeless(replace(longer, deviation=1.9 * shorter.deviation, epochs=2), shorter)
 
 
 def test_longer_windows_say_more_if_intervals_are_narrower_and_as_many_are_explained(pendulum):
     shorter, longer = searches_of(problem_of(pendulum))
     shorter = replace(shorter, bread=np.eye(3), meat=np.eye(3), explained=len(shorter.rows))
     longer = replace(longer, bread=4.0 * np.eye(3), meat=4.0 * np.eye(3), explained=len(longer.rows))
-    assert says_more(longer, shorter)
-    assert not says_more(replace(longer, bread=np.eye(3), meat=4.0 * np.eye(3)), shorter)
-    assert not says_more(replace(longer, explained=12), replace(shorter, explained=0))
+    assert tells_more(longer, shorter)
+    assert not tells_more(replace(longer, bread=np.eye(3), meat=4.0 * np.eye(3)), shorter)
+    assert not tells_more(replace(longer, explained=12), replace(shorter, explained=0))
 
 
 def test_where_motion_is_smooth_they_make_noise_matter_less(pendulum):
@@ -112,14 +119,14 @@ def test_where_motion_is_smooth_they_make_noise_matter_less(pendulum):
         interval = method.estimate(problem, state).interval
         assert ((interval[:, 0] <= truth) & (truth <= interval[:, 1])).all()
         widths.append(interval[:, 1] - interval[:, 0])
-    assert state.found == len(state.estimated) - 1 > 0
+    assert state.best == len(state.unknown) - 1 > 0
     assert (widths[1] < 0.5 * widths[0]).all()
 
 
 def test_a_run_killed_on_longer_windows_goes_on_with_the_same_bits(pendulum, tmp_path):
     problem, method = problem_of(pendulum), LeastSquares()
     state = method.init(problem, jax.random.key(0))
-    while state.length == 0 or not state.estimated[1].control_steps:
+    while state.length == 0 or not state.unknown[1].epochs:
         state, _ = method.step(problem, state)
     save(tmp_path / "checkpoint.npz", state, {})
     again, _ = load(tmp_path / "checkpoint.npz", method.init(problem, jax.random.key(0)))
@@ -142,7 +149,7 @@ def test_what_the_model_does_wrong_ends_them(pendulum, tmp_path):
     of_machine = problem_of(robots.load(write_robot(machine, PENDULUM_SPEC, pendulum=rough)).task, noise=0.1)
     problem = CalibrationProblem(of_machine.dataset, simulation.make(pendulum, threads=1))
     state, _ = ended(LeastSquares(), problem)
-    assert state.found == 0
-    assert state.estimated[1].control_steps > 0
+    assert state.best == 0
+    assert state.unknown[1].epochs > 0
     warnings = LeastSquares().estimate(problem, state).warnings
     assert any("the simulator leaves more than noise" in warning for warning in warnings)

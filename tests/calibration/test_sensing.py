@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from madoc import simulation
-from madoc.calibration import CalibrationProblem, LeastSquares, Madoc
+from madoc.calibration import CalibrationProblem, CmaEs, LeastSquares, Madoc, Oted
 from madoc.calibration.least_squares.calibrator import horizon_of
 from madoc.calibration.madoc.collection import sensed
-from madoc.calibration.madoc.sensing import noise_deviation, said_of_observations, window_length
+from madoc.calibration.madoc.sensing import noise_deviation, observation_warnings, window_length
 from madoc.data import Disturbance, disturb, observed_task
 from madoc.errors import MadocError
 from madoc.simulation.rollout import Rollout
@@ -35,18 +35,28 @@ def test_windows_are_as_long_as_the_observation_wants(log):
     assert window_length(hidden, 5, "logged") == 5
     assert window_length(hidden, None, "replay") == 1
     with pytest.raises(MadocError, match=r"no episode .* has the 301 rows of a window; take a shorter one"):
-        seen.windows("standardised", 301)
+        seen.features.windows("standardised", 301)
+
+
+def test_rollouts_start_at_logged_states_where_those_are_known(log):
+    seen, hidden = problem_of(log), problem_of(log, hidden_velocities=True)
+    blind = CalibrationProblem(
+        log, simulation.make(replace(WHOLE, state_from_observation=None, posture=None), threads=1)
+    )
+    assert [Madoc()._start_mode(problem) for problem in (seen, hidden, blind)] == ["logged", "logged", "policy"]
+    assert [Oted()._anew(problem) for problem in (seen, hidden, blind)] == [True, False, False]
+    assert [CmaEs("distribution")._acts(problem) for problem in (seen, hidden, blind)] == [False, True, True]
 
 
 def test_simulated_readings_carry_the_noise_that_the_data_says_it_has(log):
     clean, noisy = problem_of(log), problem_of(log, noise=0.1)
     assert not noise_deviation(clean, None).any()
-    change = clean.scalings["standardised"].next_scale
+    change = clean.typical_change
     np.testing.assert_allclose(noise_deviation(noisy, None), 0.1 * change, rtol=0.05)
     np.testing.assert_allclose(noise_deviation(noisy, "estimated"), 0.1 * change, rtol=0.3)
-    (told,) = said_of_observations(noisy, 1, noise_deviation(noisy, None), "logged")
+    (told,) = observation_warnings(noisy, 1, noise_deviation(noisy, None), "logged")
     assert told == "simulated observations were given sensor noise of 9.9 % of a step's change"
-    assert said_of_observations(clean, 1, noise_deviation(clean, None), "logged") == ()
+    assert observation_warnings(clean, 1, noise_deviation(clean, None), "logged") == ()
 
 
 def test_a_reading_that_ends_a_row_begins_the_next():
@@ -93,7 +103,7 @@ def test_too_few_readings_for_the_states_are_refused(log):
     [
         ({"window": 0}, "window"),
         ({"window": 2, "starts": "replay"}, "expected window 1 or none, got 2"),
-        ({"sensor_noise": -0.1}, "expected sensor_noise of 0 or more"),
+        ({"sensor_noise": -0.1}, "expected sensor_noise of Madoc to be greater than or equal to 0, got -0.1"),
     ],
 )
 def test_impossible_windows_and_noise_are_refused(wrong, sentence):

@@ -35,7 +35,7 @@ def test_json_and_a_forecast(arm, capsys):
     told = json.loads(capsys.readouterr().out)
     assert (told["rows"], told["runs"], told["fatal"], told["findings"]) == (298, 2, False, [])
     assert set(told["parameters"]) == {"body_mass.upper", "body_mass.fore", "dof_damping.shoulder", "dof_damping.elbow"}
-    assert told["explanation"]["horizons"] == [1, 5, 25]
+    assert told["explanation"]["horizons"] == [1, 5, 20]
     quick, madoc = told["forecast"]
     assert quick["method"] == "least-squares"
     assert 0.0 < quick["seconds"] < madoc["seconds"]

@@ -3,12 +3,14 @@ import json
 import mujoco
 import numpy as np
 import pytest
-import yaml
 from command_line import asked_for_json
+from ruamel.yaml import YAML
 
 from madoc.commands.main import main
 from madoc.pipeline import read_calibration
 from madoc.simulation import make
+
+read_yaml = YAML(typ="safe").load
 
 
 def test_a_run_is_exported_beside_itself(whole, tmp_path, capsys):
@@ -20,7 +22,7 @@ def test_a_run_is_exported_beside_itself(whole, tmp_path, capsys):
     calibrated = read_calibration(whole)
     written = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml"))
     np.testing.assert_array_equal(written.body_mass, make(calibrated.task).model(calibrated.result.mean).body_mass)
-    patch = yaml.safe_load((tmp_path / "out" / "patch.yaml").read_text())
+    patch = read_yaml((tmp_path / "out" / "patch.yaml").read_text())
     spec = json.loads((whole / "calibration" / "spec.json").read_text())
     assert patch["provenance"]["data"]["fingerprint"] == spec["data"]["fingerprint"]
     assert patch["stepping"]["physics_steps_per_control_step"] == 4

@@ -2,13 +2,16 @@
 
 import json
 import shutil
+from collections import Counter
 
 import jax
+import mujoco
 import pytest
 from command_line import asked_for_json, without_seconds
 
 from madoc import data, robots
 from madoc.commands.main import main
+from madoc.robots import spec
 from own_robots import ARM_SPEC, PENDULUM_SPEC, SPRING_SPEC, write_robot
 from robots import ARM, ARM_TRUTH, recorded
 
@@ -24,6 +27,26 @@ def arm(tmp_path):
     log = tmp_path / "log.npz"
     data.save(recorded(robots.load(path).task, ARM_TRUTH, 600, jax.random.key(1)), log)
     return path, log
+
+
+def test_a_calibration_reads_the_robot_once_and_compiles_its_model_once(arm, tmp_path, monkeypatch):
+    """`robots.load` parses the spec; simulators, checks and the export of evidence share the compiled model."""
+    counts = Counter()
+
+    def counted(name, function):
+        def count(*arguments, **options):
+            counts[name] += 1
+            return function(*arguments, **options)
+
+        return count
+
+    monkeypatch.setattr(spec, "read_document", counted("parsed", spec.read_document))
+    monkeypatch.setattr(mujoco.MjSpec, "compile", counted("compiled", mujoco.MjSpec.compile))
+    path, log = arm
+    path.write_text(path.read_text() + "# unlike every robot that this process has read\n")
+    words = ["calibrate", str(path), "--data", str(log), "--out", str(tmp_path / "run"), "--holdout", "0.2", *FIT]
+    assert main(words) in (0, 10, 11, 12)
+    assert counts == {"parsed": 1, "compiled": 1}
 
 
 def test_init_then_spec(tmp_path, capsys):

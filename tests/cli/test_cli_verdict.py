@@ -104,7 +104,7 @@ def test_a_refusal_is_a_row_and_the_next_method_runs(log, tmp_path, capsys):
     answer, code = asked_for_json(capsys, [*ask, "--set", *comparing.TINY])
     refused, ran = answer["holdout"]["candidates"]
     assert refused["method"] == "least-squares"
-    assert refused["not_run"].startswith("refused: least-squares compares")
+    assert refused["not_run"].startswith("refused: this method compares each row's next")
     assert (ran["method"], ran["verdict"], code) == ("madoc", "DATA_REJECTED", 13)
     assert not (tmp_path / "run" / "least-squares").exists()
 

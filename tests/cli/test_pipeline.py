@@ -5,12 +5,16 @@ import pytest
 
 from madoc import tasks
 from madoc.calibration import CALIBRATORS
+from madoc.commands.main import _parse
+from madoc.data import Disturbance
 from madoc.errors import MadocError
-from madoc.pipeline import fingerprint, split_name
-from madoc.pipeline.data_stage import check_truth, make_target
+from madoc.pipeline import CalibrationOrder, Reading, Search, Source, fingerprint, split_name
+from madoc.pipeline.data_stage import Machine
 from madoc.pipeline.folders import ended, restored_path, stored_path, working_folder
 from madoc.pipeline.keys import seed_key, stage_key
-from madoc.pipeline.methods import hyperparameters, make_method, parse_settings
+from madoc.pipeline.methods import hyperparameters, make_method
+from madoc.pipeline.orders import parse_settings
+from madoc.pipeline.preparation import prepare
 from madoc.simulation import make
 
 
@@ -20,11 +24,26 @@ def test_a_name_is_a_task_and_a_quality():
 
 
 def test_hyperparameters_are_read_as_what_they_are():
-    changes = parse_settings(["updates=3e2", "hidden=[64, 32]", "mixing=sum", "group-count=null", "agents.bound=3"])
+    changes = parse_settings(
+        (("updates=3e2", "hidden=[64, 32]", "mixing=sum"), ("group-count=null", "agents.bound=3")), starts="replay"
+    )
     method = make_method(CALIBRATORS, "madoc", changes)
     assert (method.updates, method.hidden, method.mixing, method.group_count) == (300, (64, 32), "sum", None)
+    assert method.starts == "replay"
     assert method.agents.bound == 3.0
     assert hyperparameters(method)["agents"]["bound"] == 3.0
+
+
+def test_what_the_command_line_reads_is_the_order_that_the_pipeline_carries_out():
+    words = "calibrate hopper --data a.npz b.npz --noise 0.1 --hide-velocities --level easy --budget 5 --set updates=2"
+    reading = Reading(disturbance=Disturbance(noise=0.1, hidden_velocities=True))
+    search = Search(level="easy", budget=5, set=(("updates=2",),))
+    expected = CalibrationOrder("hopper", Source(("a.npz", "b.npz"), reading=reading), search)
+    assert _parse(words.split()).order == expected
+    asked = _parse(["selftest", "hopper", "--data", "a.npz"]).order
+    assert (asked.search.method, asked.search.budget, asked.truths) == ("auto", 400_000, 3)
+    with pytest.raises(MadocError, match="--friction"):
+        _parse(["calibrate", "hopper", "--data", "a.npz", "--friction", "1.2"])
 
 
 def test_a_preset_keeps_its_own_values():
@@ -41,10 +60,10 @@ def test_stages_have_streams_of_their_own():
 
 def test_a_target_binds_what_was_not_calibrated():
     truth = {"gravity": -5.0, "body_mass.torso": 3.3}
-    task = tasks.hopper().with_parameters(["gravity"])
-    check_truth(truth, task, physics="legacy")
-    target = make_target(task, truth)
-    model = target.simulator.model(target.parameters)
+    machine = Machine.named("hopper")
+    machine.check_truth(truth, machine.task.with_parameters(["gravity"]))
+    simulator, parameters = machine.at(truth)
+    model = simulator.model(parameters)
     assert model.body("torso").mass[0] == 3.3
     assert model.opt.gravity[2] == -5.0
 
@@ -77,16 +96,13 @@ def test_a_stage_has_ended_when_its_last_file_is_there(tmp_path):
 
 
 def test_physics_is_the_datas_unless_asked_otherwise(recorded):
-    from madoc.pipeline.calibration_stage import CalibrationOrder, prepare
-    from madoc.pipeline.data_stage import Source
-
     source = Source((str(recorded),))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = prepare(CalibrationOrder("hopper", source))
     assert found.simulator.task.physics == found.dataset.physics == "legacy"
     with pytest.warns(UserWarning, match="recorded in legacy physics"):
-        asked = prepare(CalibrationOrder("hopper", source, physics="modern"))
+        asked = prepare(CalibrationOrder("hopper", source, Search(physics="modern")))
     assert asked.simulator.task.physics == "modern"
     assert fingerprint(found.dataset) == fingerprint(asked.dataset)
 

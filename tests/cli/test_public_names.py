@@ -1,12 +1,16 @@
 import os
+import re
 import subprocess
 import sys
 
-import jax
 import pytest
 from command_line import SOURCE
 
 import madoc
+from madoc.calibration import CALIBRATORS
+from madoc.policies import LEARNERS
+
+README = SOURCE.parent / "README.md"
 
 
 def loaded_by(code):
@@ -38,18 +42,31 @@ def test_public_names_are_there():
         _ = madoc.calibrated
 
 
-def test_the_python_of_the_readme_runs():
-    task = madoc.tasks.hopper()
-    simulator = madoc.simulation.make(task)
-    dataset = madoc.record(simulator, "medium", transitions=1_000, key=jax.random.key(0))
-    problem = madoc.CalibrationProblem(dataset, simulator)
-    method = madoc.Madoc(groups="one", starts="replay", updates=2, epoch_steps=500)
-    result = madoc.calibrate(method, problem, key=jax.random.key(1), budget=1_000, truth=dataset.true_parameters)
-    assert "gravity" in str(result)
-    learner = madoc.SAC(warmup_steps=500, updates_per_step=0.01, epoch_steps=500, hidden=(16, 16))
-    policy = madoc.learn_policy(
-        learner, madoc.PolicyProblem(simulator, result.mean), key=jax.random.key(2), budget=1_000
-    )
-    target = simulator.parameters.vector(dataset.true_parameters)
-    summary = madoc.evaluate(policy.policy, simulator, target, key=jax.random.key(3), episodes=2).summary()
-    assert summary["episodes"] == 2
+SMALL = {
+    "transitions=20_000": "transitions=1_000",
+    "budget=100_000": "budget=1_000",
+    "budget=50_000": "budget=1_000",
+    "madoc.Madoc()": 'madoc.Madoc(groups="one", starts="replay", updates=2, epoch_steps=500)',
+    "madoc.SAC()": "madoc.SAC(warmup_steps=500, updates_per_step=0.01, epoch_steps=500, hidden=(16, 16))",
+    "key=jax.random.key(3))": "key=jax.random.key(3), episodes=2)",
+}
+"""What makes the README's example small enough for a test."""
+
+
+def test_the_python_of_the_readme_runs(capsys):
+    (block,) = re.findall(r"^## Fifteen lines\n\n```python\n(.*?)^```$", README.read_text(), re.MULTILINE | re.DOTALL)
+    assert sum(bool(line.strip()) for line in block.splitlines()) <= 12
+    for before, after in SMALL.items():
+        assert block.count(before) == 1, before
+        block = block.replace(before, after)
+    exec(compile(block, "README.md", "exec"), {})
+    told = capsys.readouterr()
+    assert "body_mass.torso" in told.out
+    assert "'episodes': 2" in told.out
+    assert "recording hopper-medium" in told.err  # progress is shown unless it is silenced
+
+
+def test_every_method_has_its_name_at_the_top():
+    for entry in (*CALIBRATORS.values(), *LEARNERS.values()):
+        kind = type(entry.make())
+        assert getattr(madoc, kind.__name__) is kind

@@ -57,7 +57,7 @@ def test_refusals(hopper, tmp_path):
     for sentence, change in cases.items():
         with pytest.raises(MadocError, match=sentence):
             load(write_npz(tmp_path / "made.npz", arrays | change), hopper)
-    with pytest.raises(MadocError, match=r"cannot be told from its time limits"):
+    with pytest.raises(MadocError, match=r"falls and time limits of a NeoRL file cannot be distinguished"):
         load(write_npz(tmp_path / "made.npz", arrays), replace(hopper, state_from_observation=None))
     with pytest.raises(MadocError, match="at least one transition"):
         empty = {name: values[:0] for name, values in arrays.items()}

@@ -111,3 +111,15 @@ def test_what_cannot_be_held_out_is_refused():
 def test_episodes_in_the_order_given():
     part = episodes_of(log(2, 3, 1), np.array([2, 0]))
     assert (numbers(part), part.episode_starts.tolist()) == ([5, 0, 1], [0, 1])
+
+
+def test_a_dataset_splits_itself():
+    whole = log(*(10,) * 10)
+    train, held_out = whole.split(0.2)
+    assert (len(train), len(held_out)) == (80, 20)
+    assert numbers(held_out) == numbers(whole.split(0.2)[1])
+    parts = hold_out(whole, 0.3, jax.random.key(4))
+    assert [numbers(part) for part in whole.split(0.3, key=jax.random.key(4))] == [
+        numbers(parts.kept),
+        numbers(parts.held),
+    ]

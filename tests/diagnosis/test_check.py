@@ -14,7 +14,7 @@ from madoc.data.findings import Finding
 from madoc.diagnosis import check, refuse_fatal
 from madoc.diagnosis.excitation import excite
 from madoc.errors import MadocError
-from madoc.identification.states import logged_states
+from madoc.identification.states import states_of
 from madoc.simulation.sensitivity import refuse_insensitive
 from robots import ARM
 
@@ -207,7 +207,7 @@ def test_half_widths_shrink_with_the_log(robot, tmp_path):
             write_csv(tmp_path / str(runs) / f"{run}.csv", columns)
         dataset = logs.read(tmp_path / str(runs), robot)
         start, key = simulator.parameters.to_unit(TRUTH), jax.random.key(0)
-        found = excite(dataset, simulator, *logged_states(dataset, robot.task), start=start, key=key)
+        found = excite(dataset, simulator, states_of(dataset, simulator), start=start, key=key)
         widths.append(found.half_width)
     ratio = widths[1] / widths[0]
     assert ((ratio > 0.3) & (ratio < 0.8)).all()

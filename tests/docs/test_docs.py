@@ -10,11 +10,13 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
+from ruamel.yaml import YAML
 
 from madoc import robots
 from madoc.commands.main import main
+from madoc.robots.document import yaml_text
 
+read_yaml = YAML(typ="safe").load
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PENDULUM = Path(os.environ.get("MADOC_PENDULUM", ROOT.parent / "shared" / "data" / "dfki_simple_pendulum"))
@@ -71,7 +73,7 @@ def run_python(block, names):
 
 def load_spec(block, _):
     """A part of a spec takes that part's place in the arm's, whose motors make way for actuators of its own."""
-    whole = yaml.safe_load(Path("examples/arm/arm.yaml").read_text()) | yaml.safe_load(block)
+    whole = read_yaml(Path("examples/arm/arm.yaml").read_text()) | read_yaml(block)
     for channel, default in zip(whole["signals"], ("shoulder", "elbow"), strict=False):
         whole.setdefault("log", {}).setdefault("columns", {}).setdefault(channel["name"], default)
     model = Path("examples/arm/arm.xml").read_text().splitlines()
@@ -82,7 +84,7 @@ def load_spec(block, _):
         )
     )
     whole["model"] = "part.xml"
-    Path("part.yaml").write_text(yaml.safe_dump(whole))
+    Path("part.yaml").write_text(yaml_text(whole))
     robots.load("part.yaml")
 
 

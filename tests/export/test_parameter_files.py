@@ -1,13 +1,14 @@
 """The patch, the ranges and the parameters of `mujoco.sysid`, read back."""
 
 import pytest
-import yaml
+from ruamel.yaml import YAML
 
 from madoc.calibration import ParameterEstimate
-from madoc.export import Found, Provenance, save_patch, save_randomization, save_sysid_parameters
+from madoc.export import Exported, Provenance, save_patch, save_randomization, save_sysid_parameters
 from madoc.parameters import Parameter
 from madoc.simulation.mjcf import Change
 
+read_yaml = YAML(typ="safe").load
 PROVENANCE = Provenance(
     run="h0",
     method="least-squares",
@@ -22,20 +23,20 @@ PROVENANCE = Provenance(
 def found():
     """A mass with an interval, a damping that two joints share, a delay."""
     return [
-        Found(Parameter("body_mass", "cart", 1, 3), ParameterEstimate(2.5, 0.1, 1, 3, "kg", [2.4, 3.2]), (2.0,)),
-        Found(
+        Exported(Parameter("body_mass", "cart", 1, 3), ParameterEstimate(2.5, 0.1, 1, 3, "kg", [2.4, 3.2]), (2.0,)),
+        Exported(
             Parameter("dof_damping", ("left", "right"), 0, 2, label="knees"),
             ParameterEstimate(0.5, 0.5, 0, 2, "N·m·s/rad"),
             (0.4, 0.6),
         ),
-        Found(Parameter("action_delay", "", 0, 0.04), ParameterEstimate(0.01, 0.0, 0, 0.04, "s"), (0.0,)),
+        Exported(Parameter("action_delay", "", 0, 0.04), ParameterEstimate(0.01, 0.0, 0, 0.04, "s"), (0.0,)),
     ]
 
 
 def test_a_patch_says_what_changed_and_where_it_comes_from(tmp_path):
     changes = [Change("inertial of body cart", "mass", [2.0], [2.5])]
     save_patch(tmp_path / "p.yaml", found(), PROVENANCE, changes=changes, stepping={"control_step_s": 0.02})
-    patch = yaml.safe_load((tmp_path / "p.yaml").read_text())
+    patch = read_yaml((tmp_path / "p.yaml").read_text())
     assert patch["provenance"]["data"] == {"rows": 10, "fingerprint": "0a"}
     assert patch["provenance"]["verdict"]["word"] == "CALIBRATED" and "warnings" not in patch["provenance"]
     assert patch["model_changes"] == [{"element": "inertial of body cart", "attribute": "mass", "old": 2.0, "new": 2.5}]
@@ -61,20 +62,20 @@ def test_a_patch_says_what_changed_and_where_it_comes_from(tmp_path):
 )
 def test_ranges_are_the_intervals_within_what_was_searched(tmp_path, name, low, high):
     save_randomization(tmp_path / "r.yaml", found(), PROVENANCE, None)
-    row = yaml.safe_load((tmp_path / "r.yaml").read_text())["parameters"][name]
+    row = read_yaml((tmp_path / "r.yaml").read_text())["parameters"][name]
     assert (row["low"], row["high"]) == (low, high) and row["low"] <= row["mean"] <= row["high"]
 
 
 def test_a_covariance_goes_along_with_its_order(tmp_path):
     rows = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     save_randomization(tmp_path / "r.yaml", found(), PROVENANCE, rows)
-    covariance = yaml.safe_load((tmp_path / "r.yaml").read_text())["covariance"]
+    covariance = read_yaml((tmp_path / "r.yaml").read_text())["covariance"]
     assert covariance == {"order": ["body_mass.cart", "knees", "action_delay"], "rows": rows}
 
 
 def test_parameters_for_sysid_have_its_six_fields(tmp_path):
     save_sysid_parameters(tmp_path / "s.yaml", found())
-    rows = yaml.safe_load((tmp_path / "s.yaml").read_text())
+    rows = read_yaml((tmp_path / "s.yaml").read_text())
     assert rows["knees"] == {
         "name": "knees",
         "nominal": [0.5],

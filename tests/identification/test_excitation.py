@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from madoc import robots, simulation
-from madoc.identification.excitation import expected_half_widths
+from madoc.identification.excitation import expected_half_widths, widened
 from madoc.identification.states import states_of
 from madoc.parameters import Parameter
 from own_robots import CART_SPEC, write_robot
@@ -35,3 +35,17 @@ def test_without_speeds_it_is_noise_over_windows_that_widens_them(tmp_path):
     )
     assert 0.0 < first < 0.1
     assert second == pytest.approx(2.0 * first, rel=1e-2)
+
+
+def test_an_open_direction_is_as_long_as_the_box():
+    direction = np.array([0.6, 0.8])
+    across = np.array([0.8, -0.6])
+    covariance = np.outer(direction, direction) / 3 + 1e-6 * np.outer(across, across)
+    # along (0.6, 0.8) the second reaches its end first: there the first stands at 0.75
+    expected = np.array([0.75, 1.0]) * np.sqrt(1 / 3)
+    assert np.sqrt(np.diag(widened(covariance))) == pytest.approx(expected, rel=1e-5)
+
+
+def test_what_is_told_stays_as_it_is():
+    covariance = np.array([[0.02, 0.01], [0.01, 0.03]])
+    assert widened(covariance) == pytest.approx(covariance, rel=1e-12)

@@ -4,7 +4,14 @@ import pytest
 
 from madoc import simulation
 from madoc.data import Dataset
-from madoc.identification.noise import clipped, consecutive_noise, difference_noise, own_slopes
+from madoc.identification.noise import (
+    channel_noise,
+    clipped,
+    consecutive_noise,
+    difference_noise,
+    own_slopes,
+    residual_noise,
+)
 from madoc.types import Transitions
 from robots import SPRING_TRUTH, recorded, spring
 
@@ -72,3 +79,28 @@ def test_the_slopes_of_the_spring_by_itself():
     assert slopes[:, 0] == pytest.approx(1 - stiffness / mass * h**2 * 0.75, abs=1e-3)
     assert slopes[:, 1] == pytest.approx(1 - damping / mass * h, abs=2e-3)
     assert slopes[0] == pytest.approx(slopes[1], abs=1e-9)  # a spring is linear
+
+
+def test_deviation_is_the_median_over_what_the_states_left():
+    # One window, three readings, two channels; of the second, each state took three quarters of the variance.
+    residuals = np.array([[[1.0, 1.0], [-2.0, 2.0], [3.0, -3.0]]])
+    spare = np.array([[[1.0, 0.25], [1.0, 0.25], [1.0, 0.25]]])
+    np.testing.assert_allclose(channel_noise(residuals, spare), [1.4826 * 2.0, 1.4826 * 4.0])
+
+
+def test_readings_that_their_state_explains_say_nothing():
+    residuals = np.array([[[1.0], [100.0], [3.0]]])
+    spare = np.array([[[1.0], [0.01], [1.0]]])
+    np.testing.assert_allclose(channel_noise(residuals, spare), [1.4826 * 2.0])
+
+
+def test_no_channel_is_a_thousand_times_surer_than_another():
+    found = channel_noise(np.array([[[1.0, 0.0]]]), np.ones((1, 1, 2)))
+    np.testing.assert_allclose(found, 1.4826 * np.array([1.0, 1e-3]))
+
+
+def test_the_noise_of_a_fit_counts_its_unknowns():
+    # Six values of two channels, two of them spent: mean squares 1 and 4 over 4 / 6.
+    residuals = np.array([[[1.0, 2.0], [-1.0, -2.0], [1.0, 2.0]]])
+    np.testing.assert_allclose(residual_noise(residuals, 2), np.sqrt([1.5, 6.0]))
+    assert (residual_noise(np.full((1, 3, 2), np.nan), 2) == 0.0).all()

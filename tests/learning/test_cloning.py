@@ -2,17 +2,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from affine import affine
-from madoc.learning.cloning import clone, cloning_loss
+from madoc.learning.cloning import cloning_loss, continue_cloning, fresh_clone
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.types import Transitions
+
+FEW = {"learning_rate": 1e-3, "batch": 16, "updates": 3}
 
 
-def start(optimiser, hidden=(32, 32)):
-    policy = TanhGaussianPolicy(1, 2, hidden, key=jax.random.key(0))
-    return policy, optimiser.init(eqx.filter(policy, eqx.is_array))
+def fresh(logged, hidden, learning_rate):
+    observation, action = (np.asarray(part) for part in logged)
+    none = np.zeros(len(observation))
+    rows = Transitions(observation, action, none, observation, none > 0, none > 0)
+    return fresh_clone(rows, hidden, learning_rate=learning_rate, key=jax.random.key(0))
 
 
 def behaviour(observation):
@@ -41,11 +45,10 @@ def test_cloning_loss_by_hand(compiled):
 
 
 def test_clone_recovers_mean_and_noise(logged):
-    optimiser = optax.adam(3e-3)
-    policy, optimiser_state = start(optimiser)
-    policy, _, metrics = clone(
-        policy, optimiser_state, logged, jax.random.key(1), optimiser=optimiser, batch=256, count=1500
+    clone, metrics = continue_cloning(
+        fresh(logged, (32, 32), 3e-3), logged, jax.random.key(1), learning_rate=3e-3, batch=256, updates=1500
     )
+    policy = clone.policy
     observation = np.linspace(-0.9, 0.9, 10)[:, None]
     mean, log_std = policy.distribution(jnp.asarray(observation, jnp.float32))
     true_mean, true_std = behaviour(observation)
@@ -55,24 +58,18 @@ def test_clone_recovers_mean_and_noise(logged):
 
 
 def test_clone_traces_once_and_counts_its_updates(logged, traced):
-    optimiser = optax.adam(1e-3)
-    policy, optimiser_state = start(optimiser, hidden=(4,))
-    settings = {"optimiser": optimiser, "batch": 16, "count": 3}
     keys = list(jax.random.split(jax.random.key(1), 11))
-    policy, optimiser_state, _ = clone(policy, optimiser_state, logged, keys[0], **settings)
+    clone, _ = continue_cloning(fresh(logged, (4,), 1e-3), logged, keys[0], **FEW)
     before = traced()
     for key in keys[1:]:
-        policy, optimiser_state, _ = clone(policy, optimiser_state, logged, key, **settings)
+        clone, _ = continue_cloning(clone, logged, key, **FEW)
     assert traced() == before
-    assert optimiser_state[0].count == 33
+    assert clone.epochs == 11
+    assert clone.optimiser[0].count == 33
 
 
 def test_the_same_key_clones_the_same(logged):
-    optimiser = optax.adam(1e-3)
-    policy, optimiser_state = start(optimiser, hidden=(4,))
-    settings = {"optimiser": optimiser, "batch": 16, "count": 3}
-    first, _, _ = clone(policy, optimiser_state, logged, jax.random.key(5), **settings)
-    again, _, _ = clone(policy, optimiser_state, logged, jax.random.key(5), **settings)
-    other, _, _ = clone(policy, optimiser_state, logged, jax.random.key(6), **settings)
+    begun = fresh(logged, (4,), 1e-3)
+    first, again, other = (continue_cloning(begun, logged, jax.random.key(seed), **FEW)[0].policy for seed in (5, 5, 6))
     jax.tree.map(np.testing.assert_array_equal, first, again)
     assert not np.array_equal(first.network.layers[0].weight, other.network.layers[0].weight)

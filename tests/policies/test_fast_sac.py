@@ -111,9 +111,9 @@ def test_the_best_judged_policy_is_handed_back(problem):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"logged_share": 1.5}, "expected logged_share of at most 1 for FastSAC, got 1.5"),
-        ({"policy_delay": 20}, "expected epoch_steps of at least steps_per_update x policy_delay = 100"),
-        ({"environments": 41}, "expected epoch_steps of at least 41"),
+        ({"logged_share": 1.5}, "expected logged_share of FastSAC to be less than or equal to 1, got 1.5"),
+        ({"policy_delay": 20}, "expected epoch_steps of at least 100, for .* an update of the policy, got 40"),
+        ({"environments": 41}, "expected epoch_steps of at least 41, for a control step of each environment"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(changes, sentence):

@@ -7,7 +7,7 @@ from affine import affine
 from madoc.learning.dynamics_ensemble import Ensemble
 from madoc.learning.features import Features
 from madoc.learning.networks import stack
-from madoc.policies.imagination import Dreaming, Filter, best_candidate, dream, fall_asleep
+from madoc.policies.imagination import Filter, Imagination, best_candidate, imagine, start_imagining
 
 FEATURES = Features(jnp.zeros(2), jnp.ones(2), jnp.array([0.5]), jnp.asarray(1.0), jnp.asarray(2.0))
 LOGGED = jnp.array([[0.0], [10.0]])
@@ -26,15 +26,15 @@ def certain(changes):
 def imagined(*, slope, steps=3, penalty=0.0, terminated=lambda o: o[:, 0] > 100, horizon=100, threshold=0.1):
     """Two models, changes 1 and 3 (0.5 and 1.5 physical); past discriminators whose logit rises by `slope` with it."""
     past = stack(2, lambda key: affine([[0.0, 0.0, slope]], [0.0]), jax.random.key(0))
-    return dream(
+    return imagine(
         certain([1.0, 3.0]),
         Filter(jnp.arange(2), past),
         FEATURES,
         lambda observation, key: jnp.zeros_like(observation),
-        fall_asleep(LOGGED[:1], 4, jax.random.key(1)),
+        start_imagining(LOGGED[:1], 4, jax.random.key(1)),
         logged=LOGGED,
         terminated=terminated,
-        settings=Dreaming(2, threshold, horizon, penalty),
+        settings=Imagination(2, threshold, horizon, penalty),
         steps=steps,
         key=jax.random.key(2),
     )
@@ -49,35 +49,35 @@ def test_the_best_candidate_by_hand():
 
 def test_what_looks_most_real_is_what_happens():
     for slope, change in ((1.0, 1.5), (-0.1, 0.5)):
-        dreamers, rows, _ = imagined(slope=slope)
+        under_way, rows, _ = imagined(slope=slope)
         np.testing.assert_allclose(rows["next_observation"] - rows["observation"], change, rtol=1e-4)
         np.testing.assert_allclose(rows["reward"], 1.0, rtol=1e-5)  # the offset: a standardised reward of 0
-        np.testing.assert_allclose(dreamers.observation, 3 * change, rtol=1e-4)
-        assert (np.asarray(dreamers.age) == 3).all()
+        np.testing.assert_allclose(under_way.observation, 3 * change, rtol=1e-4)
+        assert (np.asarray(under_way.age) == 3).all()
         assert not rows["terminated"].any()
 
 
 def test_what_looks_unreal_ends():
     # even the better candidate, change 1, has D = sigmoid(-3), r = 0.0486 < 0.1
-    dreamers, rows, told = imagined(slope=-3.0, steps=1)
+    under_way, rows, metrics = imagined(slope=-3.0, steps=1)
     assert rows["terminated"].all()
-    assert told["stopped"] == 1.0
-    assert set(np.asarray(dreamers.observation)[:, 0].tolist()) <= {0.0, 10.0}
-    assert (np.asarray(dreamers.age) == 0).all()
+    assert metrics["stopped"] == 1.0
+    assert set(np.asarray(under_way.observation)[:, 0].tolist()) <= {0.0, 10.0}
+    assert (np.asarray(under_way.age) == 0).all()
 
 
 def test_a_fall_ends_and_the_horizon_only_starts_again():
     _, rows, _ = imagined(slope=1.0, steps=1, terminated=lambda o: o[:, 0] > 1.0)
     assert rows["terminated"].all()
-    dreamers, rows, _ = imagined(slope=1.0, steps=2, horizon=2)
+    under_way, rows, _ = imagined(slope=1.0, steps=2, horizon=2)
     assert not rows["terminated"].any()
-    assert (np.asarray(dreamers.age) == 0).all()
+    assert (np.asarray(under_way.age) == 0).all()
 
 
 def test_uncertainty_costs():
-    _, rows, told = imagined(slope=1.0, steps=1, penalty=1e6)
-    np.testing.assert_allclose(rows["reward"], 1.0 - 1e6 * told["penalty"], rtol=1e-4)
-    assert told["penalty"] > 0
+    _, rows, metrics = imagined(slope=1.0, steps=1, penalty=1e6)
+    np.testing.assert_allclose(rows["reward"], 1.0 - 1e6 * metrics["penalty"], rtol=1e-4)
+    assert metrics["penalty"] > 0
 
 
 def test_imagined_observations_stay_near_the_logged_ones():

@@ -4,6 +4,17 @@ import json
 
 import numpy as np
 
+from madoc.calibration.holdout import (
+    AgainstChance,
+    Area,
+    NotRun,
+    Predicted,
+    PredictionError,
+    PredictionErrors,
+    Tried,
+    holdout_to_json,
+)
+
 PARAMETERS = {
     "gravity": (-9.9, 0.2, -30.0, 0.0, "m/s²", -9.81),
     "body_mass.torso": (3.4, 0.1, 3.0, 5.0, "kg", 3.53),
@@ -43,9 +54,27 @@ def result(**changes):
     deviation = np.array([row[1] for row in PARAMETERS.values()])
     correlation = np.eye(4)
     correlation[1, 2] = correlation[2, 1] = -0.9
-    errors = [
-        {"horizon": steps, "error": error, "interval": [error / 2, error * 2]} for steps, error in ((1, 0.01), (5, 0.1))
-    ]
+    errors = tuple(PredictionError(steps, at, (at / 2, at * 2), {}) for steps, at in ((1, 0.01), (5, 0.1)))
+    compared = (
+        Tried("madoc", 0.04, (0.03, 0.05), "CALIBRATED", 3128, 83.4),
+        NotRun("oted", "the budget is spent"),
+    )
+    holdout = Predicted(
+        split="1 of 5 episodes is held out",
+        rows=1000,
+        episodes=1,
+        estimate=dict.fromkeys(PARAMETERS, 0.0),
+        interval_shares=dict.fromkeys(PARAMETERS, 0.1),
+        against_chance=(AgainstChance("staying in place", 0.5, 0.002),),
+        noise={},
+        control_steps=0,
+        candidates=compared,
+        errors=PredictionErrors(errors, errors, errors, errors, 0.04, (0.03, 0.05), 0.04, 100, 0),
+        explained=0.0,
+        autocorrelation=0.0,
+        area_at_mid_range=Area(0.9, (0.8, 0.95), 100),
+        area_at_estimate=Area(0.52, (0.45, 0.6), 100),
+    )
     return {
         "method": "madoc",
         "task": "hopper",
@@ -60,32 +89,7 @@ def result(**changes):
         "error": {"mean_absolute": 0.1, "mean_percent_of_range": 4.5, "per_parameter": {}},
         "covariance": (correlation * np.outer(deviation, deviation)).tolist(),
         "verdict": {"word": "CALIBRATED", "sentence": "the hold-out is predicted", "parameters": []},
-        "holdout": {
-            "split": "1 of 5 episodes is held out",
-            "rows": 1000,
-            "episodes": 1,
-            "measure": "prediction",
-            "relative": 0.04,
-            "relative_interval": [0.03, 0.05],
-            "horizons": [1, 5],
-            "prediction": dict.fromkeys(("mid-range", "estimate", "nearby best", "noise"), errors),
-            "interval_share_of_range": dict.fromkeys(PARAMETERS, 0.1),
-            "two_sample": {
-                "mid-range": {"area": 0.9, "interval": [0.8, 0.95]},
-                "estimate": {"area": 0.52, "interval": [0.45, 0.6]},
-            },
-            "candidates": [
-                {
-                    "method": "madoc",
-                    "score": 0.04,
-                    "interval": [0.03, 0.05],
-                    "verdict": "CALIBRATED",
-                    "control_steps": 3128,
-                    "seconds": 83.4,
-                },
-                {"method": "oted", "not_run": "the budget is spent"},
-            ],
-        },
+        "holdout": holdout_to_json(holdout),
     } | changes
 
 

@@ -1,5 +1,6 @@
 """Pages of runs: what they say, and that a browser shows them without a word to the network or of complaint."""
 
+import json
 import re
 
 import pytest
@@ -8,7 +9,7 @@ from run_folders import PARAMETERS, bare_folder, spec, write_json
 
 from madoc.errors import MadocError
 from madoc.report import write_comparison, write_report
-from madoc.report.page import run_context, verdict_of
+from madoc.report.page import headline, run_context
 from madoc.report.reading import read_run
 from madoc.report.sections import ALL
 from madoc.report.sections.estimates import estimates
@@ -58,6 +59,21 @@ def test_the_strongest_correlation_is_told(whole):
     assert section(whole, "correlations").data["told"] == ["leg mass and torso mass: −0.9"]
 
 
+def test_a_hold_out_is_told_by_its_own_measure(whole):
+    held = section(whole, "holdout").data
+    assert ("area under a classifier's curve, 0.5 is chance", "0.9 → 0.52") in held["facts"]
+    assert [name for _, name in held["legend"]][-1] == "estimate"
+    file = whole / "calibration" / "result.json"
+    stored = json.loads(file.read_text())
+    hidden = stored["holdout"] | {"measure": "fitted", "fitted_steps": 10}
+    write_json(file, stored | {"holdout": hidden})
+    held = section(whole, "holdout").data
+    assert len(held["facts"]) == 2 and "control steps ahead of a fitted start" in held["chart"]
+    write_json(file, stored | {"holdout": hidden | {"measure": "told apart"}})
+    assert section(whole, "holdout").data["chart"] is None
+    assert run_context(read_run(whole))["facts"][0].title == "told from the log"
+
+
 def test_time_is_told_by_stage(whole):
     stages = section(whole, "cost").data["stages"]
     assert [(stage["name"], stage["words"]) for stage in stages] == [
@@ -77,8 +93,8 @@ def test_time_is_told_by_stage(whole):
     ],
 )
 def test_the_word_on_top_is_the_verdicts_or_how_it_ended(tmp_path, change, word, tone):
-    verdict = verdict_of(read_run(bare_folder(tmp_path / "run", **change)))
-    assert (verdict["word"], verdict["tone"]) == (word, tone)
+    top = headline(read_run(bare_folder(tmp_path / "run", **change)))
+    assert (top.word, top.tone) == (word, tone)
 
 
 def test_a_run_that_has_not_ended_says_so(whole):

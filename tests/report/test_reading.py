@@ -35,7 +35,7 @@ def test_a_run_under_way_is_read_up_to_its_last_whole_line(bare):
     line = '{"control_steps": 10, "seconds": 1.0, "stage": "searching", "metrics": {"cost": null}}\n'
     (bare / "metrics.jsonl").write_text(line + '{"control_st')
     run = read_run(bare)
-    assert run.result == {} and len(run.log) == 1 and np.isnan(run.log.metrics["cost"][0])
+    assert run.result is None and len(run.log) == 1 and np.isnan(run.log.metrics["cost"][0])
 
 
 def test_units_of_signals_come_from_the_spec_of_a_robot_of_ones_own(bare):
@@ -49,6 +49,7 @@ def test_units_of_signals_come_from_the_spec_of_a_robot_of_ones_own(bare):
     [
         ("spec.json", b"[1]", "expected a JSON object in .*spec.json, got list"),
         ("result.json", b"{", "result.json is not valid JSON"),
+        ("spec.json", b'{"seed": "one"}', "spec.json is damaged .seed: Input should be a valid integer"),
         ("metrics.jsonl", b"{\n{}\n", "metrics.jsonl, line 1, is not JSON"),
         ("evidence.npz", b"PK\x03\x04 no", "evidence.npz is damaged"),
         ("embeddings.npz", b"", "embeddings.npz is damaged"),

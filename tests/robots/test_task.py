@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import madoc.simulation
 import madoc.tasks
 from madoc import robots
 from madoc.data import Dataset
@@ -388,7 +389,7 @@ def test_names_and_paths_resolve(tmp_path, monkeypatch):
     assert robots.resolve("hopper").physics == "legacy"
     assert robots.resolve("hopper", "modern").physics == "modern"
     assert robots.resolve(str(path)).name == robots.resolve(path, "modern").name == "two_link_arm"
-    with pytest.raises(MadocError, match="legacy physics is that of Madoc's own robots"):
+    with pytest.raises(MadocError, match="legacy physics exists only for Madoc's own robots"):
         robots.resolve(path, "legacy")
     with pytest.raises(MadocError, match=r"did you mean hopper\?.*or give the path of a robot's spec file"):
         robots.resolve("hoper")
@@ -411,3 +412,25 @@ def test_what_signals_tell_of_a_state(tmp_path):
     expected[:, 2] = np.nan
     np.testing.assert_allclose(task.posture(task.observe(state)), expected, atol=1e-12)
     assert task_of(tmp_path, ARM_SPEC.replace("position(", "velocity(")).posture is None
+
+
+def test_a_spec_is_parsed_and_its_model_compiled_once(tmp_path, monkeypatch):
+    compiled, compile_spec = [], mujoco.MjSpec.compile
+    monkeypatch.setattr(mujoco.MjSpec, "compile", lambda spec: compiled.append(spec) or compile_spec(spec))
+    path = write_robot(tmp_path, ARM_SPEC.replace("two_link_arm", "counted_arm"))
+    robot = robots.load(path)
+    madoc.simulation.make(robot.task, threads=1)
+    assert robot.task.with_parameters(["gravity"]).action_size == 2
+    assert len(compiled) == 1
+    assert robots.restore_robot(json.loads(json.dumps(robot.task.source))).task is robot.task
+    assert robots.load(path).task is robots.resolve(path) is robot.task
+    assert len(compiled) == 1
+    path.write_text(path.read_text().replace("groups: 2", "groups: 3"))
+    assert robots.load(path).task.groups == 3
+
+
+def test_a_compiled_model_is_the_callers_own():
+    task = madoc.tasks.make("hopper")
+    task.compile().opt.gravity[2] = 0.0
+    assert task.model is task.with_parameters(["gravity"]).model
+    assert task.model.opt.gravity[2] == task.compile().opt.gravity[2] == -9.81

@@ -14,9 +14,9 @@ import pytest
 
 from madoc.errors import MadocError
 from madoc.runs import checkpoint
-from madoc.runs.loop import run
+from madoc.runs.loop import Tally, run
 from madoc.runs.run_folder import RunFolder
-from madoc.types import Seconds
+from madoc.types import Epoch
 from wandering import BUDGET, SPEC, Wander, bits
 
 KEY = jax.random.key(0)
@@ -134,6 +134,16 @@ def test_a_result_lost_to_a_kill_is_written_on_resume(tmp_path):
     (tmp_path / "run/result.json").unlink()
     in_folder(tmp_path / "run", resume=True)
     assert json.loads((tmp_path / "run/result.json").read_text()) == wanted
+
+
+def test_progress_counts_the_preparation_as_a_tenth():
+    tally = Tally()
+    assert tally.fraction(0.5) == 0.5
+    half, ready = (tally.plus(Epoch(fraction=done)) for done in (0.5, 1.0))
+    assert [half.fraction(0.0), ready.fraction(0.0), ready.fraction(0.5), ready.fraction(2.0)] == pytest.approx(
+        [0.05, 0.1, 0.55, 1.0]
+    )
+    assert ready.plus(Epoch(control_steps=5, unbudgeted=2)).spent("control steps") == 3
 
 
 def test_convergence_ends_a_run_before_its_budget(tmp_path):

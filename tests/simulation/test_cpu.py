@@ -9,7 +9,9 @@ import pytest
 import madoc.tasks
 from madoc.errors import MadocError
 from madoc.parameters import Parameter
+from madoc.robots import load
 from madoc.simulation.cpu import CpuSimulator
+from own_robots import CART_SPEC, write_robot
 
 
 @pytest.mark.parametrize("name", madoc.tasks.TASKS)
@@ -154,9 +156,21 @@ def test_initial_state_and_sizes(hopper):
     assert hopper.bind(np.stack([hopper.parameters.middle] * 4)).count == 4
 
 
-@pytest.mark.parametrize("shape", [(8,), (2, 7), (1, 2, 8)])
-def test_parameters_of_a_wrong_shape_are_refused(hopper, shape):
-    with pytest.raises(MadocError, match=r"expected parameters of shape \(systems, 8\), got \("):
+def test_one_system_by_name_or_as_a_vector(hopper):
+    values = dict(zip(hopper.parameters.names, hopper.parameters.middle.tolist(), strict=True))
+    assert hopper.bind(values).count == hopper.bind(hopper.parameters.middle).count == 1
+
+
+@pytest.mark.parametrize(
+    ("shape", "sentence"),
+    [
+        ((7,), "expected 8 parameter values"),
+        ((2, 7), "expected 8 parameter values"),
+        ((1, 2, 8), r"\(systems, 8\), got"),
+    ],
+)
+def test_parameters_of_a_wrong_shape_are_refused(hopper, shape, sentence):
+    with pytest.raises(MadocError, match=sentence):
         hopper.bind(np.ones(shape))
 
 
@@ -211,3 +225,16 @@ def test_models_with_activations_are_refused(spring_task):
 def test_a_parameter_of_an_element_that_is_not_there_is_refused_at_once(spring_task):
     with pytest.raises(MadocError, match=r"dof_damping.slid: the model has no joint 'slid'; nearest: slide"):
         CpuSimulator(spring_task(Parameter("dof_damping", "slid", 0.0, 1.0)))
+
+
+def test_replaced_systems_are_as_if_bound_together(tmp_path):
+    bias = "  - {field: action_delay, low: 0, high: 0.04}\n  - {field: signal_bias, element: place, low: -1, high: 1}\n"
+    simulator = CpuSimulator(load(write_robot(tmp_path, CART_SPEC + bias)).task, threads=1)
+    first, second = np.array([[1.0, 0.0, 0.1], [2.0, 0.01, 0.2], [1.5, 0.03, 0.3]]), np.array([[0.7, 0.035, -0.5]])
+    exchanged = simulator.bind(first).replaced(np.array([1]), second)
+    together = simulator.bind(np.concatenate([first[:1], second, first[2:]]))
+    state, action = np.zeros((3, 2, len(simulator.initial_state))), np.full((3, 2, 1), 0.4)
+    for _ in range(3):
+        state = exchanged.step(state, action)
+        np.testing.assert_array_equal(exchanged.observe(state), together.observe(state))
+        np.testing.assert_array_equal(exchanged.step(state, -action), together.step(state, -action))

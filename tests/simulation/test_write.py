@@ -136,7 +136,7 @@ def test_the_paper_counts_bodies_and_joints_as_we_name_them():
     [
         (("body_mass", "tigh"), r"body_mass.tigh: the model has no body 'tigh'; nearest: thigh"),
         (("dof_damping", "foot"), r"dof_damping.foot: the model has no joint 'foot'; nearest: foot_joint"),
-        (("geom_friction", "xyz"), r"geom_friction.xyz: the model has no geom 'xyz'; nearest: floor, torso_geom"),
+        (("geom_friction", "xyz"), r"geom_friction.xyz: the model has no geom 'xyz'; there are: floor, torso_geom"),
     ],
 )
 def test_an_unknown_element_names_the_nearest(parameter, sentence):

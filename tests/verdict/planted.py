@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from madoc import simulation
-from madoc.calibration import LeastSquares, calibrate
+from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
 from madoc.data import Disturbance, disturb
 from madoc.data.dataset import close_episodes
 from madoc.data.record import record
 from madoc.data.split import hold_out
 from madoc.types import Transitions
-from madoc.verdict import Bench, assess, judge
+from madoc.verdict import Bench, assess
 from robots import ARM_TRUTH, SPRING_TRUTH, recorded, spring, two_link_arm
 
 ROBOTS = {"spring": (spring(max_episode_steps=100), SPRING_TRUTH), "arm": (two_link_arm(), ARM_TRUTH)}
@@ -68,12 +68,13 @@ def shuffled(log, how, seed=0):
 
 def bench(log, task, seed=0):
     split = hold_out(log, 0.2, jax.random.key(seed))
-    return Bench(split, simulation.make(task, threads=1), jax.random.key(seed))
+    problem = CalibrationProblem(split.kept, simulation.make(task, threads=1))
+    return Bench(problem, split.held, jax.random.key(seed), split.sentence)
 
 
 def verdict(log, task, method=None, *, budget=60_000, seed=0):
     """Calibrate to what is kept, and judge: the verdict and what it is made of."""
     judged = bench(log, task, seed)
     result = calibrate(method or LeastSquares(), judged.problem, key=jax.random.key(seed), budget=budget)
-    found = assess(judged, result.mean, result.interval)
-    return judge(found), found
+    found = assess(result, judged)
+    return found.verdict, found.holdout

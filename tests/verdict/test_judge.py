@@ -2,84 +2,122 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
+from madoc.calibration.holdout import (
+    AgainstChance,
+    Area,
+    Fitted,
+    Predicted,
+    PredictionError,
+    PredictionErrors,
+    ToldApart,
+)
 from madoc.commands.answer import EXIT_CODES
 from madoc.verdict import WORDS, judge
-from madoc.verdict.assessment import Assessment
 from madoc.verdict.judge import explains_all
-from madoc.verdict.two_sample import Told
 
-GOOD = Assessment(
-    measure="prediction",
-    names=("mass", "damping"),
-    unit=np.array([0.2, -0.4]),
+
+def errors(one, twenty):
+    return tuple(PredictionError(steps, mean, (mean, mean), {"q": mean}) for steps, mean in ((1, one), (20, twenty)))
+
+
+COMMON = {
+    "split": "1 of 5 episodes is held out",
+    "rows": 400,
+    "episodes": 1,
+    "estimate": {"mass": 0.2, "damping": -0.4},
+    "interval_shares": {"mass": 0.01, "damping": 0.2},
+    "against_chance": (AgainstChance("the simulator", 0.9, 0.002), AgainstChance("staying in place", 0.2, 0.01)),
+    "noise": {"q": 0.1},
+    "control_steps": 0,
+}
+ERRORS = PredictionErrors(
+    mid_range=errors(1.0, 4.0),
+    estimate=errors(0.1, 0.4),
+    nearby_best=errors(0.1, 0.36),
+    noise=errors(0.09, 0.35),
     relative=0.1,
     relative_interval=(0.08, 0.12),
-    best=0.09,
-    errors={
-        "mid-range": {1: 1.0, 20: 4.0},
-        "estimate": {1: 0.1, 20: 0.4},
-        "nearby best": {1: 0.1, 20: 0.36},
-        "noise": {1: 0.09, 20: 0.35},
-    },
-    explained=0.02,
-    autocorrelation=-0.5,
-    shares=np.array([0.01, 0.2]),
-    skill=0.9,
-    chance=0.008,
-    areas={"mid-range": Told(0.9, 0.87, 0.93, 400), "estimate": Told(0.5, 0.46, 0.54, 400)},
-    report={},
-    control_steps=0,
+    nearby_relative=0.09,
+    windows=400,
+    failed_windows=0,
 )
-HIDDEN = replace(GOOD, measure="two-sample", errors={}, relative=0.0, best=0.0)
-LEFT_OVER = {**GOOD.errors, "nearby best": {1: 0.1, 20: 0.8}}
+BEFORE, AFTER = Area(0.9, (0.87, 0.93), 400), Area(0.5, (0.46, 0.54), 400)
+PREDICTED = Predicted(
+    **COMMON, errors=ERRORS, explained=0.02, autocorrelation=-0.5, area_at_mid_range=BEFORE, area_at_estimate=AFTER
+)
+FITTED = Fitted(**COMMON, errors=ERRORS, explained=0.02, fitted_steps=10)
+TOLD_APART = ToldApart(**COMMON, area_at_mid_range=BEFORE, area_at_estimate=AFTER)
+EITHER = pytest.mark.parametrize("good", [PREDICTED, FITTED])
+LEFT_OVER = {"nearby_best": errors(0.1, 0.8)}
 
 
-def test_a_good_estimate_is_calibrated_and_the_sentence_has_its_numbers():
-    verdict = judge(GOOD)
+def changed(good, error_changes=None, **changes):
+    """A hold-out with other numbers: those of its errors, then its own."""
+    return replace(good, errors=replace(good.errors, **(error_changes or {})), **changes)
+
+
+@EITHER
+def test_a_good_estimate_is_calibrated_and_the_sentence_has_its_numbers(good):
+    verdict = judge(good)
     assert verdict.word == "CALIBRATED"
     assert "10 % of mid-range's (95 % interval 8 % to 12 %; 4 → 0.4 after 20 steps" in verdict.sentence
-    assert explains_all(GOOD)
+    assert explains_all(good)
 
 
+@EITHER
 @pytest.mark.parametrize(
-    ("word", "change", "told"),
+    ("word", "of_errors", "change", "told"),
     [
-        ("DATA_REJECTED", {"skill": 0.05}, "5 % nearer than rows paired at random"),
-        ("DATA_REJECTED", {"chance": 0.2}, "p = 0.2"),
-        ("MODEL_MISMATCH", {"errors": LEFT_OVER, "explained": 0.6}, "0.8 of a step's change after 20 steps"),
-        ("MODEL_MISMATCH", {"errors": LEFT_OVER, "explained": 0.6}, "state and action explain 60 % of it"),
-        ("MODEL_MISMATCH", {"errors": LEFT_OVER, "autocorrelation": 0.5}, "correlated from step to step (0.50)"),
-        ("MODEL_MISMATCH", {"errors": LEFT_OVER, "unit": np.array([1.0, 0.0])}, "mass at the end of the range"),
-        ("NOT_IDENTIFIABLE", {"shares": np.array([0.1, 0.7])}, "leaves damping open"),
-        ("NO_IMPROVEMENT", {"relative": 1.1, "relative_interval": (0.9, 1.3)}, "not at its end"),
-        ("NO_IMPROVEMENT", {"relative": 0.5, "relative_interval": (0.4, 0.6)}, "parameters nearby leave 9 %"),
-        ("NO_IMPROVEMENT", {"best": 0.99, "relative": 1.0}, "mid-range is as good"),
+        ("DATA_REJECTED", {}, {"against_chance": (AgainstChance("s", 0.05, 0.002),)}, "5 % nearer than rows paired"),
+        ("DATA_REJECTED", {}, {"against_chance": (AgainstChance("s", 0.9, 0.2),)}, "p = 0.2"),
+        ("MODEL_MISMATCH", LEFT_OVER, {"explained": 0.6}, "the best parameters nearby leave 0.8 of a step's change"),
+        ("MODEL_MISMATCH", LEFT_OVER, {"explained": 0.6}, "actions? explain 60 % of it"),
+        ("MODEL_MISMATCH", LEFT_OVER, {"estimate": {"mass": 1.0}}, "mass at the end of the range"),
+        ("NOT_IDENTIFIABLE", {}, {"interval_shares": {"mass": 0.1, "damping": 0.7}}, "leaves damping open"),
+        ("NO_IMPROVEMENT", {"relative": 1.1, "relative_interval": (0.9, 1.3)}, {}, "not at its end"),
+        ("NO_IMPROVEMENT", {"relative": 0.5, "relative_interval": (0.4, 0.6)}, {}, "parameters nearby leave 9 %"),
+        ("NO_IMPROVEMENT", {"nearby_relative": 0.99, "relative": 1.0}, {}, "mid-range is as good"),
     ],
 )
-def test_one_thing_wrong_changes_the_word(word, change, told):
-    verdict = judge(replace(GOOD, **change))
+def test_one_thing_wrong_changes_the_word(good, word, of_errors, change, told):
+    verdict = judge(changed(good, of_errors, **change))
     assert verdict.word == word
-    assert told in verdict.sentence
+    assert told.replace("actions?", "action" if good is PREDICTED else "actions") in verdict.sentence
 
 
-def test_what_is_left_is_no_mismatch_while_it_looks_like_noise():
-    assert judge(replace(GOOD, errors=LEFT_OVER)).word == "CALIBRATED"
-    assert not explains_all(replace(GOOD, errors={**GOOD.errors, "estimate": {1: 0.1, 20: 0.8}}))
+def test_correlated_residuals_of_single_steps_are_a_mismatch():
+    verdict = judge(changed(PREDICTED, LEFT_OVER, autocorrelation=0.5))
+    assert verdict.word == "MODEL_MISMATCH"
+    assert "correlated from step to step (0.50)" in verdict.sentence
 
 
-def test_a_negligible_residual_is_no_mismatch():
-    exact = {**GOOD.errors, "nearby best": {1: 1e-5, 20: 9e-4}, "noise": {1: 0.0, 20: 0.0}}
-    assert judge(replace(GOOD, errors=exact, explained=1.0)).word == "CALIBRATED"
+def test_errors_behind_a_fitted_start_are_said_to_be():
+    assert "after 20 steps behind a fitted start on" in judge(changed(FITTED, LEFT_OVER, explained=0.6)).sentence
+    assert "after 20 steps on" in judge(changed(PREDICTED, LEFT_OVER, explained=0.6)).sentence
 
 
-def test_rejected_data_comes_before_all_else_and_open_parameters_before_no_improvement():
-    everything = {"skill": 0.0, "errors": LEFT_OVER, "explained": 0.9, "shares": np.array([1.0, 1.0]), "relative": 2.0}
-    assert judge(replace(GOOD, **everything)).word == "DATA_REJECTED"
-    assert judge(replace(GOOD, **everything | {"skill": 0.9})).word == "MODEL_MISMATCH"
-    verdict = judge(replace(GOOD, shares=np.array([1.0, 1.0]), relative=2.0, relative_interval=(1.9, 2.1)))
+@EITHER
+def test_what_is_left_is_no_mismatch_while_it_looks_like_noise(good):
+    assert judge(changed(good, LEFT_OVER)).word == "CALIBRATED"
+    assert not explains_all(changed(good, {"estimate": errors(0.1, 0.8)}))
+
+
+@EITHER
+def test_a_negligible_residual_is_no_mismatch(good):
+    exact = {"nearby_best": errors(1e-5, 9e-4), "noise": errors(0.0, 0.0)}
+    assert judge(changed(good, exact, explained=1.0)).word == "CALIBRATED"
+
+
+@EITHER
+def test_rejected_data_comes_before_all_else_and_open_parameters_before_no_improvement(good):
+    wrong = {"explained": 0.9, "interval_shares": {"mass": 1.0, "damping": 1.0}}
+    poor = {"relative": 2.0, "relative_interval": (1.9, 2.1)}
+    chance = (AgainstChance("s", 0.0, 0.5),)
+    assert judge(changed(good, poor | LEFT_OVER, **wrong, against_chance=chance)).word == "DATA_REJECTED"
+    assert judge(changed(good, poor | LEFT_OVER, **wrong)).word == "MODEL_MISMATCH"
+    verdict = judge(changed(good, poor, **wrong | {"explained": 0.0}))
     assert (verdict.word, verdict.parameters) == ("NOT_IDENTIFIABLE", ("mass", "damping"))
 
 
@@ -93,8 +131,8 @@ def test_rejected_data_comes_before_all_else_and_open_parameters_before_no_impro
     ],
 )
 def test_rows_alone_are_judged_by_the_classifier(word, before, after):
-    areas = {"mid-range": Told(*before, 400), "estimate": Told(*after, 400)}
-    assert judge(replace(HIDDEN, areas=areas)).word == word
+    at_mid_range, at_estimate = (Area(area, ends, 400) for area, *ends in (before, after))
+    assert judge(replace(TOLD_APART, area_at_mid_range=at_mid_range, area_at_estimate=at_estimate)).word == word
 
 
 def test_every_word_has_an_exit_code_of_its_own():

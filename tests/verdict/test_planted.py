@@ -1,5 +1,7 @@
 """Planted situations end in the verdict that is true of them."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -7,9 +9,10 @@ from planted import FEWER, ROBOTS, at_rest, bench, log_of, shuffled, verdict
 
 from calibrating import madoc
 from madoc.calibration import CmaEs, Droid, LeastSquares
-from madoc.data import Disturbance, disturb
+from madoc.data import Disturbance, disturb, hide_velocities
 from madoc.errors import MadocError
-from madoc.verdict import assess, judge
+from madoc.verdict import judge
+from madoc.verdict.assessment import measured
 
 EVERY = pytest.mark.parametrize("robot", ["spring", pytest.param("arm", marks=pytest.mark.slow)])
 NOISES = pytest.mark.parametrize("noise", [0.0, 0.1, pytest.param(0.3, marks=pytest.mark.slow)])
@@ -23,9 +26,9 @@ def test_a_model_that_can_is_calibrated_and_its_noise_is_told(robot, noise):
     said, found = verdict(log, task)
     assert said.word == "CALIBRATED", said.sentence
     change = (log.transitions.next_observation - log.transitions.observation).std(0)
-    assert np.array(list(found.report["noise"].values())) / change == pytest.approx(noise, rel=0.2, abs=1e-6)
-    for at, error in found.errors["estimate"].items():
-        assert error == pytest.approx(found.errors["noise"][at], rel=0.25, abs=1e-6)
+    assert np.array(list(found.noise.values())) / change == pytest.approx(noise, rel=0.2, abs=1e-6)
+    for left, alone in zip(found.errors.estimate, found.errors.noise, strict=True):
+        assert left.mean == pytest.approx(alone.mean, rel=0.25, abs=1e-6)
 
 
 @EVERY
@@ -51,9 +54,24 @@ def test_mid_range_and_an_estimate_that_is_no_better_are_no_improvement():
     task, truth = ROBOTS["spring"]
     judged = bench(log_of("spring"), task)
     for mean in (task.parameters.middle, task.parameters.to_physical([-0.9, 0.9, 0.9])):
-        said = judge(assess(judged, mean))
+        said = judge(measured(judged, mean))
         assert said.word == "NO_IMPROVEMENT", said.sentence
-    assert judge(assess(judged, task.parameters.vector(truth))).word == "CALIBRATED"
+    assert judge(measured(judged, task.parameters.vector(truth))).word == "CALIBRATED"
+
+
+@EVERY
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_a_search_that_stopped_early_is_no_mismatch_where_velocities_are_hidden(robot, noise):
+    task, truth = ROBOTS[robot]
+    task = replace(task, velocities={"spring": 1, "arm": 2}[robot])
+    log = disturb(log_of(robot, noise=noise), Disturbance(hidden_velocities=True), task, jax.random.key(0))
+    judged, true = bench(log, hide_velocities(task)), task.parameters.vector(truth)
+    half = measured(judged, 0.5 * (true + task.parameters.middle))
+    said = judge(half)
+    assert said.word == "NO_IMPROVEMENT", said.sentence
+    assert "the search is not at its end" in said.sentence
+    assert half.errors.nearby_relative < 0.6 * half.errors.relative
+    assert judge(measured(judged, true)).word == "CALIBRATED"
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -61,7 +79,7 @@ def test_mid_range_and_an_estimate_that_is_no_better_are_no_improvement():
 def test_shuffled_next_observations_are_rejected_whatever_the_estimate(robot, how):
     task, truth = ROBOTS[robot]
     judged = bench(shuffled(log_of(robot), how), task)
-    assert judge(assess(judged, task.parameters.vector(truth))).word == "DATA_REJECTED"
+    assert judge(measured(judged, task.parameters.vector(truth))).word == "DATA_REJECTED"
 
 
 METHODS = {
@@ -100,11 +118,11 @@ def test_whole_rows_in_a_random_order_are_as_good():
     log = disturb(log_of("spring"), Disturbance(shuffled="rows"), task, jax.random.key(0))
     said, found = verdict(log, task)
     assert said.word == "CALIBRATED", said.sentence
-    assert list(found.errors["estimate"]) == [1]
+    assert [error.steps for error in found.errors.estimate] == [1]
 
 
 def test_the_same_estimate_gives_the_same_bits():
     task, _ = ROBOTS["spring"]
     log = log_of("spring", rows=300, noise=0.1)
-    first, again = (assess(bench(log, task), task.parameters.middle).report for _ in range(2))
+    first, again = (measured(bench(log, task), task.parameters.middle) for _ in range(2))
     assert first == again

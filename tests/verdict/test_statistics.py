@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from madoc.verdict.statistics import area_under_curve, better_than_chance, interval_of, resampled
+from madoc.verdict.statistics import area_under_curve, better_than_chance, interval_of, resampled, shares_of_ranges
 
 
 def test_the_area_by_hand():
@@ -47,21 +47,28 @@ def test_right_predictions_are_better_than_chance_and_shuffled_ones_are_not():
     rng = np.random.default_rng(3)
     followed = rng.standard_normal((200, 2))
     groups = np.repeat(np.arange(4), 50)
-    right = better_than_chance(followed + 0.1 * rng.standard_normal((200, 2)), followed, groups)
-    assert right["p"] == pytest.approx(1 / 500)
-    assert right["skill"] > 0.8
-    wrong = better_than_chance(rng.permutation(followed), followed, groups)
-    assert wrong["p"] > 0.01
-    assert abs(wrong["skill"]) < 0.1
+    skill, p_value = better_than_chance(followed + 0.1 * rng.standard_normal((200, 2)), followed, groups)
+    assert p_value == pytest.approx(1 / 500)
+    assert skill > 0.8
+    skill, p_value = better_than_chance(rng.permutation(followed), followed, groups)
+    assert p_value > 0.01
+    assert abs(skill) < 0.1
 
 
 def test_telling_one_run_from_another_is_no_skill():
     level = np.repeat(np.arange(4.0), 50)[:, None]
     noise = 0.01 * np.random.default_rng(4).standard_normal((2, 200, 1))
-    found = better_than_chance(level + noise[0], level + noise[1], np.repeat(np.arange(4), 50))
-    assert found["p"] > 0.01
+    _, p_value = better_than_chance(level + noise[0], level + noise[1], np.repeat(np.arange(4), 50))
+    assert p_value > 0.01
 
 
 def test_rows_of_their_own_are_exchanged_with_any():
     followed = np.random.default_rng(5).standard_normal((60, 1))
-    assert better_than_chance(followed, followed, np.arange(60))["skill"] == 1.0
+    assert better_than_chance(followed, followed, np.arange(60))[0] == 1.0
+
+
+def test_shares_are_the_wider_interval_and_at_most_everything():
+    interval = np.array([[1.0, 2.0], [0.0, 1.0], [-5.0, 5.0]])
+    shares = shares_of_ranges(np.array([0.1, 0.6, 0.2]), interval, np.array([4.0, 4.0, 4.0]))
+    assert shares.tolist() == [0.25, 0.6, 1.0]
+    assert shares_of_ranges(np.array([0.1, 3.0]), None, np.ones(2)).tolist() == [0.1, 1.0]

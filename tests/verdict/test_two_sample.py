@@ -12,13 +12,13 @@ def sample(seed, rows, *, moved=0.0, shift=0.0):
 
 def test_rows_of_one_kind_cannot_be_told_apart():
     told = tell_apart(sample(0, 400), sample(1, 400), overlap=False)
-    assert told.low < 0.5 < told.high
+    assert told.interval[0] < 0.5 < told.interval[1]
     assert told.rows == 800
 
 
 def test_other_dynamics_are_told():
     told = tell_apart(sample(0, 400), sample(1, 400, moved=2.0), overlap=False)
-    assert told.low > 0.8
+    assert told.interval[0] > 0.8
 
 
 def test_where_rows_were_is_weighed_out_and_what_followed_is_not():
@@ -26,7 +26,7 @@ def test_where_rows_were_is_weighed_out_and_what_followed_is_not():
     plain, weighed = (tell_apart(there, elsewhere, overlap=overlap).area for overlap in (False, True))
     assert plain > 0.6
     assert abs(weighed - 0.5) < 0.5 * abs(plain - 0.5)
-    assert tell_apart(there, sample(1, 1000, shift=0.7, moved=2.0), overlap=True).low > 0.7
+    assert tell_apart(there, sample(1, 1000, shift=0.7, moved=2.0), overlap=True).interval[0] > 0.7
 
 
 def test_the_same_rows_give_the_same_bits():

@@ -1,26 +1,24 @@
-"""What a calibrator is given, what it must offer, and what it returns."""
+"""The problem that a calibrator is given, its protocol, and the estimate it returns."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float
 
 from madoc.data import Dataset, typical_change
 from madoc.errors import MadocError
 from madoc.identification.noise import regression_noise
 from madoc.identification.states import LoggedStates, probing_rows, states_of
-from madoc.learning.dynamics_ratio import Scaling
-from madoc.learning.window_features import WindowScaling, last_rows, logged_stretch
+from madoc.learning.window_features import LoggedFeatures
 from madoc.simulation.base import Simulator
 from madoc.types import Method, State
 
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """Find the parameters under which the simulator moves as the data does.
+    """A log and the simulator whose parameters are to be estimated from it.
 
     The data's true parameters, where it carries any, are dropped here: no method can read them.
 
@@ -49,25 +47,6 @@ class CalibrationProblem:
         """What the data tells of the simulator's states."""
         return states_of(self.dataset, self.simulator)
 
-    @property
-    def logged_states(self) -> Float[np.ndarray, "states state"]:
-        """States rebuilt exactly from logged observations.
-
-        Raises:
-            MadocError: Observations do not determine them.
-        """
-        return self.states.exact()[0]
-
-    @property
-    def logged_rows(self) -> Int[np.ndarray, " states"]:
-        """The rows of the data that `logged_states` were rebuilt from, ascending."""
-        return self.states.exact()[1]
-
-    @cached_property
-    def logged_actions(self) -> Float[np.ndarray, "states action"]:
-        """The actions taken at `logged_states`."""
-        return np.asarray(self.dataset.transitions.action)[self.logged_rows]
-
     @cached_property
     def typical_change(self) -> Float[np.ndarray, " observation"]:
         """Standard deviation of each channel's change in one control step."""
@@ -80,15 +59,15 @@ class CalibrationProblem:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What is known to keep the simulator from moving as the data does, one sentence each."""
+        """Known reasons why the simulator cannot move exactly as the data does, one sentence each."""
         recorded, simulated = self.dataset.physics, self.simulator.task.physics
         gap = (
             f"the data was recorded in {recorded} physics and the simulator's is {simulated}: "
             "the estimate will make up for the difference"
         )
         gaps = () if recorded in ("unknown", simulated) else (gap,)
-        told = (finding.sentence for finding in self.dataset.findings if finding.level == "warning")
-        return (*gaps, *self.dataset.disturbance.sentences(), *told)
+        findings = (finding.sentence for finding in self.dataset.findings if finding.level == "warning")
+        return (*gaps, *self.dataset.disturbance.sentences(), *findings)
 
     def require_pairs(self) -> None:
         """Refuse data in which it is not known which next observation followed which row.
@@ -98,7 +77,7 @@ class CalibrationProblem:
         """
         if self.dataset.disturbance.shuffled == "next_observations":
             raise MadocError(
-                f"this method compares each row's next observation with a simulated one, and those of "
+                "this method compares each row's next observation with a simulated one, and those of "
                 f"{self.dataset.origin} are shuffled; take a method that compares distributions"
             )
 
@@ -108,72 +87,28 @@ class CalibrationProblem:
         return probing_rows(self.states, self.dataset, self.simulator)
 
     @cached_property
-    def pairs(self) -> tuple[Float[Array, "rows observation"], Float[Array, "rows action"]]:
-        """Logged observations and actions on the device, float32."""
-        logged = self.dataset.transitions
-        return jnp.asarray(logged.observation, jnp.float32), jnp.asarray(logged.action, jnp.float32)
-
-    @cached_property
-    def scalings(self) -> dict[str, Scaling]:
-        """The two ways to describe (s, a, s') to a network, by name."""
-        logged = self.dataset.transitions
-        return {"standardised": Scaling.standardised(logged), "raw": Scaling.raw(logged)}
-
-    @cached_property
-    def standardised_features(self) -> tuple[Array, Array]:
-        """Standardised features of the logged rows, on the device."""
-        return self._features("standardised")
-
-    @cached_property
-    def raw_features(self) -> tuple[Array, Array]:
-        """Raw features of the logged rows, on the device."""
-        return self._features("raw")
-
-    @cached_property
-    def _windows(self) -> dict[tuple[str, int], tuple[WindowScaling, tuple[Array, Array]]]:
-        return {}
-
-    def windows(self, name: str, length: int) -> tuple[WindowScaling, tuple[Array, Array]]:
-        """How windows of so many logged rows are described, and the features of all there are, on the device.
-
-        Raises:
-            MadocError: No episode is long enough.
-        """
-        if (name, length) not in self._windows:
-            rows, starts = self.dataset.transitions, self.dataset.episode_starts
-            last = last_rows(len(self.dataset), starts, length)
-            if not len(last):
-                raise MadocError(
-                    f"no episode of {self.dataset.origin} has the {length} rows of a window; take a shorter one"
-                )
-            stretch = logged_stretch(rows, last, length)
-            scaling = WindowScaling.of(self.scalings[name], stretch)
-            window, following = scaling.features(stretch)
-            self._windows[name, length] = scaling, (jnp.asarray(window), jnp.asarray(following))
-        return self._windows[name, length]
-
-    def _features(self, name: str) -> tuple[Array, Array]:
-        pair, following = self.scalings[name].features(self.dataset.transitions)
-        return jnp.asarray(pair), jnp.asarray(following)
+    def features(self) -> LoggedFeatures:
+        """The data as networks see it."""
+        return LoggedFeatures(self.dataset)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a calibrator believes, in physical units.
+    """An estimate of all parameters, in physical units.
 
     Attributes:
-        mean: Value of each parameter, shape (d,).
-        std: Its spread under the calibration distribution, shape (d,).
-        groups: Parameters calibrated together, as indices; one group of all where a method has none.
+        mean: Estimated value of each parameter.
+        std: Standard deviation of each parameter under the method's distribution.
+        groups: Indices of parameters that were calibrated together; empty is one group of all.
         failures: Simulated rows that exploded and were left out.
         warnings: What a user should know about it, one sentence each.
-        covariance: Its joint spread, shape (d, d), where the method knows it; the diagonal is `std` squared.
-        interval: 95 % confidence interval of each, columns low and high, where the method knows it.
+        covariance: Joint covariance of the parameters, None where the method has none; its diagonal is `std` squared.
+        interval: 95 % confidence interval of each parameter, columns low and high; None where the method has none.
     """
 
     mean: Float[np.ndarray, " d"]
     std: Float[np.ndarray, " d"]
-    groups: tuple[tuple[int, ...], ...]
+    groups: tuple[tuple[int, ...], ...] = ()
     failures: int = 0
     warnings: tuple[str, ...] = field(default=())
     covariance: Float[np.ndarray, "d d"] | None = None
@@ -182,10 +117,10 @@ class Estimate:
 
 @runtime_checkable
 class EmbedsParameters(Protocol):
-    """What a method may have besides: it learns which parameters act alike, and can show it."""
+    """An addition to the protocol for methods that learn which parameters act alike."""
 
-    def embeddings(self, problem: CalibrationProblem, state: Any) -> Float[np.ndarray, "d latent"] | None:
-        """One vector a parameter, near for those that act alike; None while nothing is learnt of it."""
+    def embeddings(self, problem: CalibrationProblem, state: object) -> Float[np.ndarray, "d latent"] | None:
+        """One vector for each parameter, close together for those that act alike; None before anything is learnt."""
         ...
 
 

@@ -1,14 +1,13 @@
-"""Run a calibrator on a problem: refuse what cannot work, spend the budget, say what came out."""
+"""Run a calibrator on a problem: refuse what cannot work, spend the budget, report the estimate."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
-from madoc.calibration.cautions import exploded, told_once
+from madoc.calibration.cautions import exploded, without_repeats
 from madoc.calibration.registry import CALIBRATORS
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
@@ -26,10 +25,10 @@ def calibrate(
     *,
     key: PRNGKeyArray,
     budget: int,
-    truth: Mapping[str, float] | None = None,
+    truth: Mapping[str, float] | Float[np.ndarray, " d"] | None = None,
     folder: RunFolder | None = None,
     resume: bool = False,
-    quiet: bool = True,
+    quiet: bool = False,
     checkpoint_every: float = 30.0,
 ) -> CalibrationResult:
     """Calibrate, and judge the estimate against the truth where that is given.
@@ -39,7 +38,7 @@ def calibrate(
         problem: Data and simulator.
         key: The only source of randomness.
         budget: Simulated control steps, of any kind.
-        truth: The target's physical values by name; only the finished estimate is compared with them.
+        truth: The target's physical values, by name or as a vector; only the finished estimate is compared with them.
         folder: Where to keep logs, checkpoints and `result.json`.
         resume: Go on from the folder's checkpoint.
         quiet: Show no progress.
@@ -49,7 +48,7 @@ def calibrate(
         MadocError: The method refuses the problem, a parameter changes no next state, or `loop.run` refuses.
     """
     space = problem.simulator.parameters
-    known = None if truth is None else space.vector(dict(truth))
+    true_values = None if truth is None else space.vector(truth)
     entry = entry_of(method, CALIBRATORS)
     method.init(problem, key)  # a refusal of the method comes before one of the parameters
     probing = refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0)) if entry.simulates else 0
@@ -75,11 +74,14 @@ def calibrate(
         control_steps=finished.control_steps + probing,
         seconds=round(finished.seconds, 3),
         seed=seed_of(key),
-        groups=[[space.names[index] for index in group] for group in estimate.groups],
+        groups=[[space.names[index] for index in group] for group in estimate.groups or [range(len(space))]],
         parameters=_parameters(space, estimate),
-        warnings=told_once((*estimate.warnings, *exploded(estimate.failures, finished.control_steps)), problem.doubts),
-        error=None if known is None else calibration_error(estimate.mean, known, space),
+        warnings=without_repeats(
+            (*estimate.warnings, *exploded(estimate.failures, finished.control_steps)), problem.doubts
+        ),
+        error=None if true_values is None else calibration_error(estimate.mean, true_values, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
+        problem=problem,
     )
     if folder is not None:
         if isinstance(method, EmbedsParameters):
@@ -89,7 +91,7 @@ def calibrate(
 
 
 def _trace(space: ParameterSpace, estimate: Estimate) -> dict[str, float]:
-    """What the log keeps of an estimate on its way."""
+    """The mean and deviation of every parameter, as metrics for the log of the run."""
     columns = zip(space.names, estimate.mean.tolist(), estimate.std.tolist(), strict=True)
     both = {
         f"{kind}/{name}": value
@@ -100,7 +102,7 @@ def _trace(space: ParameterSpace, estimate: Estimate) -> dict[str, float]:
 
 
 def _keep_embeddings(folder: RunFolder, space: ParameterSpace, vectors: np.ndarray | None) -> None:
-    """Leave `embeddings.npz`: names of parameters, and what was learnt of which act alike."""
+    """Write `embeddings.npz`: the names of the parameters, and one learnt vector for each."""
     if vectors is not None:
         with replacing(folder.path / "embeddings.npz") as stream:
             np.savez(stream, allow_pickle=False, names=np.array(space.names), vectors=vectors)
@@ -118,5 +120,4 @@ def _parameters(space: ParameterSpace, estimate: Estimate) -> dict[str, Paramete
 
 def seed_of(key: PRNGKeyArray) -> int:
     """The seed that `jax.random.key` was given (its low word)."""
-    data: Any = jax.random.key_data(key)
-    return int(data[-1])
+    return int(np.asarray(jax.random.key_data(key))[-1])

@@ -1,22 +1,21 @@
-"""Sentences that any method may have to say of its estimate."""
+"""Warnings that the estimate of any method may need."""
 
 from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float
 
-_AT_END = 0.98
-"""Of [-1, 1]: from here on an estimate stands at the end of its range."""
 
-
-def at_end_of_range(unit: Float[np.ndarray, " d"], names: tuple[str, ...]) -> tuple[str, ...]:
-    """Which estimates in [-1, 1] stand at an end."""
-    found = [name for name, value in zip(names, unit, strict=True) if abs(value) > _AT_END]
-    return (f"at the end of its range: {', '.join(found)}; widen the range or doubt the model",) if found else ()
+def at_end_of_range(
+    scaled: Float[np.ndarray, " d"], names: tuple[str, ...], *, beyond: float = 0.98
+) -> tuple[str, ...]:
+    """Name the estimates in [-1, 1] whose absolute value is larger than `beyond`."""
+    ends = [name for name, value in zip(names, scaled, strict=True) if abs(value) > beyond]
+    return (f"at the end of its range: {', '.join(ends)}; widen the range or doubt the model",) if ends else ()
 
 
 def exploded(failures: int, control_steps: int) -> tuple[str, ...]:
-    """How many simulated rows failed."""
+    """Warn of simulated rows that failed, if any did."""
     if not failures:
         return ()
     return (
@@ -25,7 +24,7 @@ def exploded(failures: int, control_steps: int) -> tuple[str, ...]:
     )
 
 
-def told_once(warnings: Iterable[str], doubts: Iterable[str]) -> list[str]:
-    """What a method and what the data's check warn of; what both do only in the method's words."""
+def without_repeats(warnings: Iterable[str], doubts: Iterable[str]) -> list[str]:
+    """The warnings of a method, then those of the check of the data that the method does not give already."""
     own = list(dict.fromkeys(warnings))
     return [*own, *(doubt for doubt in doubts if not any(doubt.endswith(sentence) for sentence in own))]

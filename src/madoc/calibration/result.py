@@ -2,7 +2,7 @@
 
 import io
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.holdout import HoldOut, Verdict, holdout_from_json, holdout_to_json
 from madoc.errors import MadocError
 
 
@@ -27,7 +29,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """A finished calibration; `result.json` holds exactly its fields. Printing it shows a table.
+    """A finished calibration; `result.json` holds its fields but for `problem`. Printing it shows a table.
 
     Attributes:
         method: Name of the method, as `madoc methods` lists it.
@@ -42,8 +44,9 @@ class CalibrationResult:
         warnings: What to know before trusting it, one sentence each.
         error: Only where the truth was given: `mean_absolute`, `mean_percent_of_range`, `per_parameter`.
         covariance: Rows of the estimates' covariance in physical units, in the task's order, where known.
-        verdict: `word`, `sentence` and `parameters`, where rows were held out to judge it by.
-        holdout: All that those rows said.
+        verdict: What to make of it, where rows were held out to judge it by.
+        holdout: The numbers behind the verdict.
+        problem: What was calibrated to, while the program runs that calibrated; files do not keep it.
     """
 
     method: str
@@ -58,8 +61,9 @@ class CalibrationResult:
     warnings: list[str] = field(default_factory=list)
     error: dict[str, Any] | None = None
     covariance: list[list[float]] | None = None
-    verdict: dict[str, Any] | None = None
-    holdout: dict[str, Any] | None = None
+    verdict: Verdict | None = None
+    holdout: HoldOut | None = None
+    problem: CalibrationProblem | None = field(default=None, repr=False, compare=False)
 
     @property
     def mean(self) -> np.ndarray:
@@ -79,23 +83,27 @@ class CalibrationResult:
 
     def to_json(self) -> dict[str, Any]:
         """As JSON; what is not known (`error`, `covariance`, an `interval`, the `verdict`) is left out."""
-        fields = asdict(self)
-        optional = ("error", "covariance", "interval", "verdict", "holdout")
+        fields = asdict(replace(self, verdict=None, holdout=None, problem=None))
         for row in (fields, *fields["parameters"].values()):
-            for name in [name for name in optional if row.get(name, "") is None]:
+            for name in [name for name, value in row.items() if value is None]:
                 del row[name]
-        return fields
+        judged = {} if self.verdict is None else {"verdict": self.verdict.to_json()}
+        return fields | judged | ({} if self.holdout is None else {"holdout": holdout_to_json(self.holdout)})
 
     @classmethod
     def from_json(cls, fields: dict[str, Any]) -> "CalibrationResult":
         """What `to_json` wrote.
 
         Raises:
-            MadocError: A field is missing or unknown.
+            MadocError: A field is missing or unknown, or another version wrote its report on the hold-out.
         """
         try:
             parameters = {name: ParameterEstimate(**row) for name, row in fields["parameters"].items()}
-            return cls(**{**fields, "parameters": parameters})
+            verdict = Verdict(**fields["verdict"]) if "verdict" in fields else None
+            if verdict is not None:
+                verdict = replace(verdict, parameters=tuple(verdict.parameters))
+            holdout = holdout_from_json(fields["holdout"]) if "holdout" in fields else None
+            return cls(**{**fields, "parameters": parameters, "verdict": verdict, "holdout": holdout})
         except (KeyError, TypeError, AttributeError) as error:
             raise MadocError(f"this is not the result of a calibration: {error}") from error
 
@@ -131,7 +139,7 @@ class CalibrationResult:
 
     def verdict_line(self) -> str:
         """The verdict, to be read before the table; empty where there is none."""
-        return f"{self.verdict['word']}: {self.verdict['sentence']}" if self.verdict else ""
+        return "" if self.verdict is None else str(self.verdict)
 
     def summary(self) -> str:
         """Status, cost, error and warnings, a line each."""

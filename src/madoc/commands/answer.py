@@ -1,15 +1,17 @@
 """What a command returns, and the options all commands share."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from rich.console import RenderableType
 from rich.table import Table
 
 if TYPE_CHECKING:
     from madoc.calibration import CalibrationResult
+    from madoc.calibration.holdout import HoldOut
+    from madoc.pipeline.records import EvaluationRecord
 
 EXIT_CODES: Mapping[str, int] = {
     "finished": 0,
@@ -24,7 +26,7 @@ EXIT_CODES: Mapping[str, int] = {
     "DATA_REJECTED": 13,
     "NOT_RECOVERABLE": 14,
 }
-"""Exit codes by how a run ended, or by its verdict where it has one; 2 is a refusal."""
+"""Exit codes by the status of a run, or by its verdict where it has one; 2 is a refusal."""
 
 PLACE_NAMES: Mapping[str, str] = {
     "calibrated": "at the calibrated parameters",
@@ -42,11 +44,11 @@ class Answer:
 
     Attributes:
         json: What `--json` prints.
-        text: What is printed without it, one after another.
+        text: What is printed without `--json`, one part after another.
         status: A key of `EXIT_CODES`.
     """
 
-    json: Mapping[str, Any]
+    json: Mapping[str, object]
     text: tuple[RenderableType, ...]
     status: str = "finished"
 
@@ -70,77 +72,72 @@ class Command(Protocol):
         ...
 
     def run(self) -> Answer:
-        """Do it."""
+        """Carry the command out."""
         ...
 
 
-def evaluation_table(evaluation: Mapping[str, Any]) -> Table:
-    """Returns in the target, a row a policy."""
-    episodes = evaluation["episodes"]
-    table = Table(title=f"{evaluation['task']}: returns in the target, {episodes} episodes", title_justify="left")
+def evaluation_text(evaluation: "EvaluationRecord") -> tuple[RenderableType, ...]:
+    """Returns in the target, a row for each policy, and how near the calibrated one comes to that of the truth."""
+    title = f"{evaluation.task}: returns in the target, {evaluation.episodes} episodes"
+    table = Table(title=title, title_justify="left")
     table.add_column("policy learnt")
     for heading in ("return ± std", "normalized", "length"):
         table.add_column(heading, justify="right")
-    for name, row in evaluation["policies"].items():
+    for name, row in evaluation.policies.items():
         table.add_row(
             PLACE_NAMES.get(name, name),
             f"{row['return']:,.1f} ± {row['return_std']:,.1f}",
             f"{row['normalized']:.1f}",
             f"{row['length']:.0f}",
         )
-    return table
-
-
-def evaluation_text(evaluation: Mapping[str, Any]) -> tuple[RenderableType, ...]:
-    """The table, and how near the calibrated policy comes to that of the truth."""
-    share = evaluation.get("calibrated_percent_of_truth")
-    line = () if share is None else (f"calibrated: {share:.1f} % of the return of the policy learnt at the truth",)
-    return (evaluation_table(evaluation), *line)
+    share = evaluation.calibrated_percent_of_truth
+    if share is None:
+        return (table,)
+    return table, f"calibrated: {share:.1f} % of the return of the policy learnt at the truth"
 
 
 def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
     """The verdict, the table, the comparison of methods, and the rest in lines."""
     verdict = (result.verdict_line(),) if result.verdict else ()
-    rows = (result.holdout or {}).get("candidates")
-    compared = (candidates_table(rows, result),) if rows else ()
+    compared = (candidates_table(result.holdout),) if result.holdout and result.holdout.candidates else ()
     return (*verdict, result.table(), *compared, result.summary())
 
 
-def candidates_table(rows: Sequence[Mapping[str, Any]], result: "CalibrationResult") -> Table:
-    """What `auto` has tried, a row a method, those it did not run with the reason."""
-    predicted = (result.holdout or {}).get("measure") == "prediction"
-    measure = "error / mid-range's" if predicted else "told apart, area - ½"
+def candidates_table(holdout: "HoldOut") -> Table:
+    """The methods that `auto` has compared, a row each; those it did not run with the reason."""
+    from madoc.calibration.holdout import NotRun
+
+    measure = "area - ½" if holdout.measure == "told apart" else "error / mid-range's"
     table = Table(title="methods compared on the hold-out", title_justify="left")
     table.add_column("method", no_wrap=True)
     for heading in (measure, "95 %", "control steps", "s"):
         table.add_column(heading, justify="right")
     table.add_column("verdict")
-    for row in rows:
-        if "not_run" in row:
-            table.add_row(row["method"], "", "", "", "", row["not_run"])
+    for row in holdout.candidates:
+        if isinstance(row, NotRun):
+            table.add_row(row.method, "", "", "", "", row.not_run)
             continue
-        kept = " (kept)" if row["method"] == result.method else ""
         table.add_row(
-            row["method"],
-            f"{row['score']:.3g}",
-            "[{:.3g}, {:.3g}]".format(*row["interval"]),
-            f"{row['control_steps']:,}",
-            f"{row['seconds']:.0f}",
-            row["verdict"] + kept,
+            row.method,
+            f"{row.score:.3g}",
+            "[{:.3g}, {:.3g}]".format(*row.interval),
+            f"{row.control_steps:,}",
+            f"{row.seconds:.0f}",
+            row.verdict + (" (kept)" if row.method == holdout.chosen else ""),
         )
     return table
 
 
 def calibration_status(result: "CalibrationResult") -> str:
     """The key of `EXIT_CODES` that a calibration ends with: its verdict, where it has one."""
-    return result.verdict["word"] if result.verdict else result.status
+    return result.verdict.word if result.verdict else result.status
 
 
 def left_behind(path: Path, what: str) -> str:
-    """A line on what was left where."""
+    """A line that says which file or folder was left where."""
     return f"{what}: {path}"
 
 
 def page_line(page: Path | None) -> tuple[str, ...]:
-    """Where a run's page is, if it could be written."""
+    """A line that says where the run's page is, if it could be written."""
     return () if page is None else (left_behind(page, "report"),)

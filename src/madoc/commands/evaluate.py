@@ -7,6 +7,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output, evaluation_text, left_behind
+from madoc.pipeline.orders import EvaluationOrder
 
 
 @dataclass(frozen=True)
@@ -15,25 +16,13 @@ class Evaluate:
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """A run folder with policies in it, or the folder of one policy."""
-    episodes: int = 20
-    """Episodes for each policy, from the same starts."""
-    seed: int = 0
-    """Of the starts."""
-    truth: Path | None = None
-    """JSON file {parameter: value} that makes the target. Default: what the run remembers."""
+    order: Annotated[EvaluationOrder, arg(name="")] = field(default_factory=EvaluationOrder)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
         """Evaluate, and leave evaluation.json."""
         from madoc.pipeline import evaluate_folder
-        from madoc.pipeline.data_stage import read_truth
 
-        evaluation = evaluate_folder(
-            self.folder,
-            truth=None if self.truth is None else read_truth(self.truth),
-            episodes=self.episodes,
-            seed=self.seed,
-            quiet=self.output.quiet,
-        )
+        evaluation = evaluate_folder(self.folder, self.order, quiet=self.output.quiet)
         lines = (*evaluation_text(evaluation), left_behind(self.folder / "evaluation.json", "evaluation"))
-        return Answer(evaluation, lines)
+        return Answer(evaluation.to_json(), lines)

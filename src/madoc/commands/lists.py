@@ -1,13 +1,17 @@
 """`madoc tasks` and `madoc methods`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING
 
-from rich.console import RenderableType
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes
 
 from madoc.commands.answer import Answer, Output
+
+if TYPE_CHECKING:
+    from madoc.tasks import Task
+    from madoc.types import MethodEntry
 
 PHYSICS = ("legacy", "modern")
 
@@ -24,17 +28,16 @@ class Tasks:
         """The robots, as a table."""
         from madoc.tasks import TASKS, make
 
-        rows = [_task_row(make(name)) for name in TASKS]
-        table = Table(title="robots", title_justify="left")
-        table.add_column("name")
+        tasks = [make(name) for name in TASKS]
+        table = Table("name", title="robots", title_justify="left")
         for heading in ("observations", "motors", "parameters", "groups"):
             table.add_column(heading, justify="right")
         table.add_column("physics")
-        for row in rows:
-            cells = (row["observations"], row["motors"], len(row["parameters"]), row["groups"])
-            table.add_row(row["name"], *map(str, cells), ", ".join(PHYSICS))
-        details: tuple[RenderableType, ...] = tuple(map(_parameter_table, rows)) if self.verbose else ()
-        return Answer({"tasks": rows}, (table, *details))
+        for task in tasks:
+            counts = (task.observation_size, task.action_size, len(task.parameters), task.groups)
+            table.add_row(task.name, *map(str, counts), ", ".join(PHYSICS))
+        details = tuple(map(_parameter_table, tasks)) if self.verbose else ()
+        return Answer({"tasks": [_described(task) for task in tasks]}, (table, *details))
 
 
 @dataclass(frozen=True)
@@ -48,31 +51,31 @@ class Methods:
         from madoc.calibration import CALIBRATORS
         from madoc.policies import LEARNERS
 
-        kinds = (("calibrator", CALIBRATORS), ("policy learner", LEARNERS))
+        kinds: dict[str, Mapping[str, MethodEntry]] = {"calibrator": CALIBRATORS, "policy learner": LEARNERS}
         rows = [
             {"name": name, "kind": kind, "summary": entry.summary, "paper": entry.paper, "year": entry.year}
             | {"budget": entry.unit}
-            for kind, entries in kinds
+            for kind, entries in kinds.items()
             for name, entry in entries.items()
         ]
-        return Answer({"methods": rows}, tuple(_methods_table(kind, rows) for kind, _ in kinds))
+        return Answer({"methods": rows}, tuple(_methods_table(kind, entries) for kind, entries in kinds.items()))
 
 
-def _methods_table(kind: str, rows: list[dict[str, Any]]) -> Table:
-    """The methods of one kind; what their budgets count is in the title where all count the same."""
-    own = [row for row in rows if row["kind"] == kind]
-    units = {row["budget"] for row in own}
-    columns = ["name", "summary", "paper", "year", *(["budget"] if len(units) > 1 else [])]
-    told = "" if len(units) > 1 else f", budgets in {units.pop()}"
-    table = Table(title=f"{kind}s{told}", title_justify="left")
-    for heading in columns:
-        table.add_column(heading, no_wrap=heading in ("name", "year", "budget"))
-    for row in own:
-        table.add_row(*(str(row[column]) for column in columns))
+def _methods_table(kind: str, entries: "Mapping[str, MethodEntry]") -> Table:
+    """The methods of one kind; the unit of their budgets is in the title where all have the same."""
+    units = {entry.unit for entry in entries.values()}
+    columns = ["summary", "paper", "year", *(["unit"] if len(units) > 1 else [])]
+    ending = "" if len(units) > 1 else f", budgets in {units.pop()}"
+    table = Table(title=f"{kind}s{ending}", title_justify="left")
+    for column in ["name", *columns]:
+        heading = "budget" if column == "unit" else column
+        table.add_column(heading, no_wrap=column in ("name", "year", "unit"))
+    for name, entry in entries.items():
+        table.add_row(name, *(str(getattr(entry, column)) for column in columns))
     return table
 
 
-def _task_row(task: Any) -> dict[str, Any]:
+def _described(task: "Task") -> dict[str, object]:
     """A robot as JSON."""
     levels = {level: space.parameters for level, space in task.ranges.items()}
     return {
@@ -92,15 +95,12 @@ def _task_row(task: Any) -> dict[str, Any]:
     }
 
 
-def _parameter_table(row: dict[str, Any]) -> Table:
-    """The parameters of one robot."""
-    levels = list(row["parameters"][0]["ranges"])
-    table = Table(title=row["name"], title_justify="left")
-    table.add_column("parameter")
-    table.add_column("unit")
-    for level in levels:
+def _parameter_table(task: "Task") -> Table:
+    """The parameters of one robot, with their ranges at every level."""
+    table = Table("parameter", "unit", title=task.name, title_justify="left")
+    for level in task.ranges:
         table.add_column(level, justify="right")
-    for parameter in row["parameters"]:
-        ranges = [f"[{low:g}, {high:g}]" for low, high in parameter["ranges"].values()]
-        table.add_row(parameter["name"], parameter["unit"], *ranges)
+    for index, parameter in enumerate(task.parameters.parameters):
+        rows = [space.parameters[index] for space in task.ranges.values()]
+        table.add_row(parameter.name, parameter.unit, *(f"[{row.low:g}, {row.high:g}]" for row in rows))
     return table

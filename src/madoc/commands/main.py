@@ -5,8 +5,8 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Sequence
-from typing import Annotated, Any, TextIO
+from collections.abc import Iterator, Sequence
+from typing import Annotated
 
 import tyro
 from tyro.conf import subcommand
@@ -95,9 +95,9 @@ def _parse(arguments: Sequence[str]) -> Command:
     Raises:
         MadocError: They cannot be understood.
     """
-    heard = io.StringIO()
+    printed = io.StringIO()
     try:
-        with contextlib.redirect_stderr(heard):
+        with contextlib.redirect_stderr(printed):
             return tyro.cli(
                 Commands,  # type: ignore[arg-type]
                 prog="madoc",
@@ -109,35 +109,28 @@ def _parse(arguments: Sequence[str]) -> Command:
     except SystemExit as end:
         if not end.code:
             raise
-        raise MadocError(_one_sentence(heard.getvalue())) from None
+        raise MadocError(_one_sentence(printed.getvalue())) from None
 
 
 def _one_sentence(box: str) -> str:
-    """What tyro draws as a box: its first paragraph, a suggestion if there is one, and where to read on."""
+    """A box drawn by tyro as one sentence: its first paragraph, a suggestion if any, and where to read on."""
     lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:-1]]
     paragraphs = [" ".join(text.split()) for text in "\n".join(lines).split("─" * 10) if text.strip("─\n ")]
     paragraphs = [text.strip("─ ") for text in paragraphs]
     if not paragraphs:
         return " ".join(box.split())
-    told = [paragraphs[0].rstrip(".")]
-    told += [text for text in paragraphs[1:-1] if text.startswith(("Perhaps", "Available"))][:1]
+    parts = [paragraphs[0].rstrip(".")]
+    parts += [text for text in paragraphs[1:-1] if text.startswith(("Perhaps", "Available"))][:1]
     read_on = paragraphs[-1] if paragraphs[-1].startswith("For full") else ""
     read_on = read_on[read_on.find("madoc") :]
-    return "; ".join([*told, f"see {read_on}"] if read_on else told)
+    return "; ".join([*parts, f"see {read_on}"] if read_on else parts)
 
 
 @contextlib.contextmanager
-def _calm() -> Any:
-    """Warnings as one line each."""
+def _calm() -> Iterator[None]:
+    """A block whose warnings are printed as one line each."""
 
-    def show(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
+    def show(message: Warning | str, *where: object, **options: object) -> None:
         print(f"madoc: warning: {message}", file=sys.stderr)
 
     with warnings.catch_warnings():

@@ -3,13 +3,13 @@
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import OmitArgPrefixes, arg
 
 from madoc.commands.answer import Answer, Output, left_behind
-from madoc.commands.disturbed import Disturbed, disturbance_of
 from madoc.errors import MadocError
+from madoc.pipeline.orders import RecordOrder
 
 
 @dataclass(frozen=True)
@@ -19,21 +19,11 @@ class Record:
     Behaviour policies that come with madoc act in the target; its true parameters travel with the data.
     """
 
-    name: Annotated[Positional[str], arg(metavar="TASK-QUALITY")]
-    """TASK-QUALITY: hopper-medium, halfcheetah-medium-replay, walker2d-neorl-high, ..."""
-    transitions: int = 200_000
-    """Rows to record."""
-    seed: int = 0
-    """Of all randomness."""
+    order: Annotated[RecordOrder, arg(name="")]
     out: Path | None = None
     """File to write. Default: NAME.npz."""
-    physics: Literal["legacy", "modern"] = "legacy"
-    """legacy is that of D4RL, NeoRL and the paper."""
-    friction: float = 1.0
-    """Friction of the target's contacts as a multiple of the model's: 1.2 is a gap that no parameter closes."""
     force: bool = False
     """Write over an existing file."""
-    disturbed: OmitArgPrefixes[Disturbed] = field(default_factory=Disturbed)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
@@ -41,35 +31,27 @@ class Record:
         from madoc import data
         from madoc.pipeline import record_named, split_name
 
-        split_name(self.name)
-        out = (self.out or Path(f"{self.name}.npz")).expanduser()
+        split_name(self.order.name)
+        out = (self.out or Path(f"{self.order.name}.npz")).expanduser()
         if out.exists() and not self.force:
             raise MadocError(f"{out} exists already; choose another --out or pass --force to write over it")
         if not out.parent.is_dir():
             raise MadocError(f"no folder {out.parent} to write {out.name} into; make it first")
-        disturbance = disturbance_of(self.disturbed, friction=self.friction)
         started = time.monotonic()
-        dataset = record_named(
-            self.name,
-            transitions=self.transitions,
-            physics=self.physics,
-            seed=self.seed,
-            disturbance=disturbance,
-            quiet=self.output.quiet,
-        )
+        dataset = record_named(self.order, quiet=self.output.quiet)
         data.save(dataset, out)
         seconds = time.monotonic() - started
         episodes = len(dataset.episode_starts)
         mean_return = float(dataset.transitions.reward.sum()) / episodes
         answer = {
             "path": str(out),
-            "name": self.name,
+            "name": self.order.name,
             "task": dataset.task_name,
             "physics": dataset.physics,
             "transitions": len(dataset),
             "episodes": episodes,
             "mean_return": mean_return,
-            "seed": self.seed,
+            "seed": self.order.seed,
             "seconds": round(seconds, 3),
             "disturbance": asdict(dataset.disturbance),
             "true_parameters": dataset.true_parameters,

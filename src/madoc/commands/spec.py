@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from rich import box
 from rich.table import Table
@@ -38,8 +38,8 @@ class Init:
             "actions": len(robot.actions),
             "parameters": len(robot.spec.parameters),
         }
-        told = ", ".join(f"{count} {what.removesuffix('s') if count == 1 else what}" for what, count in counts.items())
-        lines = (f"{told}; edit it, then: madoc spec {out}", left_behind(out, "spec"))
+        parts = [f"{count} {what.removesuffix('s') if count == 1 else what}" for what, count in counts.items()]
+        lines = (f"{', '.join(parts)}; edit it, then: madoc spec {out}", left_behind(out, "spec"))
         return Answer({"spec": str(out), "name": robot.spec.name, **counts}, lines)
 
 
@@ -63,15 +63,15 @@ class Spec:
             return Answer(schema, (json_text(schema, what="the schema", indent=2),))
         if not self.spec:
             raise MadocError("expected the spec file of a robot, as madoc spec robot.yaml; madoc init MODEL writes one")
-        described = describe(robots.load(self.spec))
-        return Answer(described, (*_tables(described), *described["sentences"]))
+        robot = robots.load(self.spec)
+        return Answer(describe(robot), (*_tables(robot), *_sentences(robot)))
 
 
-def describe(robot: "Robot") -> dict[str, Any]:
-    """What a spec means, as JSON."""
+def describe(robot: "Robot") -> dict[str, object]:
+    """The robot of a spec, as JSON."""
     from madoc.simulation.write import nominal_values
 
-    task, model = robot.task, robot.task.compile()
+    task, model = robot.task, robot.task.model
     return {
         "name": task.name,
         "spec": str(robot.path),
@@ -100,41 +100,45 @@ def describe(robot: "Robot") -> dict[str, Any]:
 
 
 def _sentences(robot: "Robot") -> list[str]:
+    """What a user should know of the robot, one sentence each."""
     task = robot.task
-    said = [
+    sentences = [
         f"one action every {robot.spec.control_step:g} s, {task.frame_skip} physics steps each; "
         f"{len(task.parameters)} parameters in {task.groups} group{'s' * (task.groups > 1)}"
     ]
     if task.state_from_observation is not None:
-        said.append("states can be rebuilt from the log: every method can calibrate this robot")
+        sentences.append("states can be rebuilt from the log: every method can calibrate this robot")
     else:
         missing = ", ".join(robot.undetermined) or "the signals do not tell joints apart"
         willing = "least-squares estimates them, madoc looks at windows of rows, " if task.posture else ""
-        said.append(
+        sentences.append(
             f"states cannot be rebuilt from the log, as {missing}: {willing}methods that take logged states for true "
             "refuse"
         )
     if task.pending:
-        said.append(f"a state carries the last {task.pending} action{'s' * (task.pending > 1)}")
+        sentences.append(f"a state carries the last {task.pending} action{'s' * (task.pending > 1)}")
     if not task.rewarded:
-        said.append("no reward: madoc learn refuses this robot until the spec has one")
-    return [*said, *robot.notes]
+        sentences.append("no reward: madoc learn refuses this robot until the spec has one")
+    return [*sentences, *robot.notes]
 
 
-def _tables(described: dict[str, Any]) -> tuple[Table, ...]:
-    signals = _table(f"{described['name']}: signals", ("name", "unit", "reads"))
-    for row in described["signals"]:
-        signals.add_row(row["name"], row["unit"], row["reads"])
+def _tables(robot: "Robot") -> tuple[Table, ...]:
+    """The signals, actions and parameters of a robot."""
+    from madoc.simulation.write import nominal_values
+
+    signals = _table(f"{robot.task.name}: signals", ("name", "unit", "reads"))
+    for signal in robot.signals:
+        signals.add_row(signal.name, signal.unit, signal.reads)
     actions = _table("actions", ("name", "unit", "low", "high", "actuator", "control"))
-    for row in described["actions"]:
-        low, high = row["control"]
-        ends = (f"{row['low']:g}", f"{row['high']:g}")
-        actions.add_row(row["name"], row["unit"], *ends, row["actuator"], f"[{low:g}, {high:g}]")
+    for row in robot.actions:
+        control = f"[{row.low * row.scale:g}, {row.high * row.scale:g}]"
+        actions.add_row(row.name, row.unit, f"{row.low:g}", f"{row.high:g}", row.actuator, control)
     parameters = _table("parameters", ("name", "unit", "low", "high", "model", "shared by"))
-    for row in described["parameters"]:
-        values = ", ".join(dict.fromkeys(f"{value:.4g}" for value in row["model"]))
-        shared = ", ".join(row["elements"]) if len(row["elements"]) > 1 else ""
-        parameters.add_row(row["name"], row["unit"], f"{row['low']:g}", f"{row['high']:g}", values, shared)
+    for parameter in robot.task.parameters.parameters:
+        values = dict.fromkeys(f"{value:.4g}" for value in nominal_values(robot.task.model, parameter))
+        shared = ", ".join(parameter.elements) if len(parameter.elements) > 1 else ""
+        ends = (f"{parameter.low:g}", f"{parameter.high:g}")
+        parameters.add_row(parameter.name, parameter.unit, *ends, ", ".join(values), shared)
     return signals, actions, parameters
 
 

@@ -1,4 +1,4 @@
-"""D4RL's HDF5 layout, v0 to v2 (Fu et al. 2020): one file, rows of all episodes in a row."""
+"""D4RL's HDF5 layout, v0 to v2 (Fu et al. 2020): one file with the rows of all episodes, one after another."""
 
 import re
 from dataclasses import replace
@@ -9,16 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from madoc.data.dataset import Dataset, close_episodes, starts_after
-from madoc.data.validation import (
-    NAMES,
-    as_flags,
-    as_matrix,
-    as_vector,
-    check_lengths,
-    require_arrays,
-    require_file,
-    validate,
-)
+from madoc.data.validation import as_matrix, as_transitions, check_lengths, require_arrays, require_file, validate
 from madoc.errors import MadocError
 from madoc.tasks import Task
 from madoc.types import Transitions
@@ -26,6 +17,14 @@ from madoc.types import Transitions
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 REQUIRED = ("observations", "actions", "rewards", "terminals")
 OPTIONAL = ("next_observations", "timeouts")
+NAMES_HERE = {
+    "observation": "observations",
+    "action": "actions",
+    "reward": "rewards",
+    "next_observation": "next_observations",
+    "terminated": "terminals",
+    "truncated": "timeouts",
+}
 # D4RL's Ant: 27 values of state, then contact forces of 14 bodies that mujoco-py 2.x left at zero.
 ANT_WIDTH, ANT_STATE_WIDTH = 111, 27
 
@@ -41,43 +40,29 @@ def recognises(path: Path) -> bool:
 def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
     """Read a D4RL file. `terminals` terminate, `timeouts` truncate.
 
-    Without `next_observations` (v0) the next row's observation takes their place, and the last row of every
-    episode is dropped: its successor was not recorded. (D4RL's own `qlearning_dataset` keeps terminal rows,
-    with the next episode's first observation as successor; that pair never happened.) The row before then
-    ends its episode as truncated. Without any timeout, every `task.max_episode_steps` rows since the last end
-    are one, as in `qlearning_dataset`. An Ant of 111 values keeps the first 27; the other 84 must be 0.
-    Physics is legacy for names that end in -v0, -v1 or -v2, as D4RL's do, else unknown.
+    Without `next_observations` (v0) the next row's observation takes their place, and the last row of every episode is
+    dropped, as its successor was not recorded (D4RL's own `qlearning_dataset` pairs it with the next episode's first
+    observation). The row before then ends its episode as truncated. Without any timeout, an episode is cut after every
+    `task.max_episode_steps` rows, as in `qlearning_dataset`. An Ant of 111 values keeps the first 27; the other 84
+    must be 0. Physics is legacy for names that end in -v0, -v1 or -v2, as D4RL's do, else unknown.
 
     Raises:
         MadocError: Missing, damaged, not this layout, or refused by `validate`.
     """
     arrays = _read_arrays(path)
     check_lengths(arrays)
-    observation = _observation(arrays["observations"], "observations", task)
-    terminated = as_flags(arrays["terminals"], "terminals")
-    timeouts = np.zeros_like(terminated)
-    if "timeouts" in arrays:
-        timeouts = as_flags(arrays["timeouts"], "timeouts")
-    if not timeouts.any():
-        timeouts = count_time_limits(terminated, task.max_episode_steps)
     has_next = "next_observations" in arrays
-    next_observation = np.roll(observation, -1, axis=0)
-    if has_next:
-        next_observation = _observation(arrays["next_observations"], "next_observations", task)
-    transitions = Transitions(
-        observation=observation,
-        action=as_matrix(arrays["actions"], "actions"),
-        reward=as_vector(arrays["rewards"], "rewards"),
-        next_observation=next_observation,
-        terminated=terminated,
-        truncated=timeouts,
-    )
-    dataset = _dataset(transitions, terminated | timeouts, path, task)
-    names = {**NAMES, "observation": "observations", "action": "actions", "reward": "rewards"}
-    names |= {
-        "next_observation": "next_observations" if has_next else "observations",
-        "terminated": "terminals",
-    }
+    names = NAMES_HERE if has_next else {**NAMES_HERE, "next_observation": "observations"}
+    for name in {names["observation"], names["next_observation"]}:
+        arrays[name] = _observation(arrays[name], name, task)
+    transitions = as_transitions({"timeouts": np.zeros(len(arrays["terminals"])), **arrays}, names)
+    terminated, truncated = np.asarray(transitions.terminated), np.asarray(transitions.truncated)
+    if not truncated.any():
+        truncated = count_time_limits(terminated, task.max_episode_steps)
+        transitions = replace(transitions, truncated=truncated)
+    if not has_next:
+        transitions = replace(transitions, next_observation=np.roll(transitions.observation, -1, axis=0))
+    dataset = _dataset(transitions, terminated | truncated, path, task)
     dataset = validate(dataset, task, names, clip_actions=clip_actions)
     return dataset if has_next else _without_last_rows(dataset)
 

@@ -1,79 +1,15 @@
 """A dataset: logged transitions, where their episodes begin, and where they come from."""
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
+from madoc.data.disturbance import Disturbance
 from madoc.data.findings import Finding
 from madoc.errors import MadocError
 from madoc.types import Transitions
-
-Shuffled = Literal["none", "rows", "next_observations"]
-Velocities = Literal["logged", "differences"]
-
-
-@dataclass(frozen=True)
-class Disturbance:
-    """What keeps logged data from being clean: the truth of sensors, put there on purpose or not.
-
-    Attributes:
-        noise: Deviation of the noise on every observation, as a share of its channel's typical change in a step.
-        hidden_velocities: Observations show positions alone.
-        shuffled: `rows`: rows (s, a, s') stay whole but their order is lost; `next_observations`: which s' belongs
-            to which (s, a) is lost as well.
-        friction: Of all contacts in the target, as a multiple of the model's: a gap no parameter can close.
-        velocities: `logged`, or `differences` of positions in place of those that are hidden.
-    """
-
-    noise: float = 0.0
-    hidden_velocities: bool = False
-    shuffled: Shuffled = "none"
-    friction: float = 1.0
-    velocities: Velocities = "logged"
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.noise) and self.noise >= 0):
-            raise MadocError(f"expected noise as a share of a step's change, 0 or more, got {self.noise}")
-        if not (np.isfinite(self.friction) and self.friction > 0):
-            raise MadocError(f"expected friction as a positive multiple of the model's, got {self.friction}")
-
-    def joined(self, other: "Disturbance") -> "Disturbance":
-        """Both, one after the other."""
-        return Disturbance(
-            noise=float(np.hypot(self.noise, other.noise)),
-            hidden_velocities=self.hidden_velocities or other.hidden_velocities,
-            shuffled=other.shuffled if self.shuffled == "none" else self.shuffled,
-            friction=self.friction * other.friction,
-            velocities=other.velocities if self.velocities == "logged" else self.velocities,
-        )
-
-    def sentences(self) -> tuple[str, ...]:
-        """What a reader of an estimate should know, one sentence each; none where the data is clean."""
-        found = []
-        if self.noise:
-            found.append(
-                f"the data carries observation noise of {100 * self.noise:g} % of a step's change: states rebuilt from "
-                "it are not exact, and methods that take them for true are biased"
-            )
-        if self.velocities == "differences":
-            found.append(
-                "the data's velocities are differences of positions: states rebuilt from them are not exact, and "
-                "methods that take them for true are biased"
-            )
-        elif self.hidden_velocities:
-            found.append("the data hides velocities: its states cannot be rebuilt, and a clone acts on positions alone")
-        if self.shuffled == "rows":
-            found.append("the data's rows are in random order: nothing longer than one row can be replayed")
-        if self.shuffled == "next_observations":
-            found.append("the data's next observations are not those of their rows: only their distribution is known")
-        if self.friction != 1.0:
-            found.append(
-                f"the target's friction is {self.friction:g} times the simulator's: the estimate will make up for it"
-            )
-        return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -115,6 +51,23 @@ class Dataset:
     def episode_of(self, rows: Int[np.ndarray, "*rows"]) -> Int[np.ndarray, "*rows"]:
         """The index of the episode that each of the given rows belongs to."""
         return np.searchsorted(self.episode_starts, rows, side="right") - 1
+
+    def split(self, share: float = 0.2, *, key: PRNGKeyArray | None = None) -> tuple["Dataset", "Dataset"]:
+        """Hold out about `share` of the rows to judge an estimate by: `train, held_out = dataset.split(0.2)`.
+
+        Whole episodes are held out, or stretches where there are few; `data.split.hold_out` says how.
+
+        Args:
+            share: Share of the rows that are held out, between 0 and 1.
+            key: Draws the episodes; without one, the draw is always the same.
+
+        Raises:
+            MadocError: The share is not between 0 and 1, or there are fewer than 2 rows.
+        """
+        from madoc.data.split import hold_out  # which is built on this module
+
+        parts = hold_out(self, share, jax.random.key(0) if key is None else key)
+        return parts.kept, parts.held
 
 
 def starts_after(ends: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, " episodes"]:
@@ -158,5 +111,10 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
 def typical_change(dataset: Dataset) -> Float[np.ndarray, " observation"]:
     """Standard deviation of each channel's change in a control step, in its unit; 1 for one that never moves."""
     logged = dataset.transitions
-    spread = (np.asarray(logged.next_observation) - logged.observation).std(0)
+    return spread_of(np.asarray(logged.next_observation) - logged.observation)
+
+
+def spread_of(rows: Float[np.ndarray, "*rows values"]) -> Float[np.ndarray, " values"]:
+    """Standard deviation of every channel over all rows; 1 for one that never moves."""
+    spread = rows.reshape(-1, rows.shape[-1]).std(0)
     return np.where(spread > 1e-8, spread, 1.0)

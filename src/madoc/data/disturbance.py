@@ -1,169 +1,73 @@
-"""Disturbances: what real logs suffer from, put into clean ones on purpose, and told by the data ever after."""
+"""What keeps logged data from being clean, as the command line asks for it and as the data remembers it."""
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
-import jax
-import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from tyro.conf import Suppress, arg
 
-from madoc.data.dataset import Dataset, Disturbance, close_episodes
-from madoc.data.velocities import moving_states, show_velocities
 from madoc.errors import MadocError
-from madoc.simulation.velocities import missing_velocities, refuse_unseen_positions
-from madoc.tasks import Task
+
+Shuffled = Literal["none", "rows", "next_observations"]
+Velocities = Literal["logged", "differences"]
 
 
-def disturb(dataset: Dataset, disturbance: Disturbance, task: Task, key: PRNGKeyArray) -> Dataset:
-    """The dataset as it would have been logged under noise, without velocities, or out of order.
+@dataclass(frozen=True)
+class Disturbance:
+    """What is put into the data; an estimate made from it says so."""
 
-    Velocities by differences of positions are put in last, as a reader of such a log would.
+    noise: float = 0.0
+    """Observation noise as a share of a step's typical change: 0.1 is 10 %."""
+    hidden_velocities: Annotated[bool, arg(name="hide-velocities")] = False
+    """Observations without velocities: states cannot be rebuilt, and methods that need them refuse."""
+    shuffled: Annotated[Shuffled, arg(name="shuffle")] = "none"
+    """rows loses the order of the rows (s, a, s'); next_observations also which s' belongs to which row."""
+    friction: Suppress[float] = 1.0
+    """Friction of the target's contacts as a multiple of the model's: a gap that no parameter closes."""
+    velocities: Velocities = "logged"
+    """differences puts velocities from positions where the data has none; methods that take states for true warn."""
 
-    Rewards and ends stay as they were recorded. The friction of a target is a matter of recording and is only
-    noted down.
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.noise) and self.noise >= 0):
+            raise MadocError(f"expected noise as a share of a step's change, 0 or more, got {self.noise}")
+        if not (math.isfinite(self.friction) and self.friction > 0):
+            raise MadocError(f"expected friction as a positive multiple of the model's, got {self.friction}")
 
-    Args:
-        dataset: What to disturb.
-        disturbance: How.
-        task: Its robot, with all that a clean observation shows.
-        key: Randomness of the noise and of the order.
-
-    Raises:
-        MadocError: The data is disturbed in the same way already, the task's velocities cannot be told apart, or they
-            are not to be had from positions.
-    """
-    _refuse_twice(dataset, disturbance)
-    of_noise, of_order = jax.random.split(key)
-    if disturbance.noise:
-        dataset = _with_noise(dataset, disturbance.noise, of_noise)
-    if disturbance.hidden_velocities:
-        dataset = _with_observations(dataset, slice(hide_velocities(task).observation_size))
-    if disturbance.shuffled != "none":
-        order = np.asarray(jax.random.permutation(of_order, len(dataset)))
-        shuffle = _shuffle_rows if disturbance.shuffled == "rows" else _shuffle_next_observations
-        dataset = shuffle(dataset, order)
-    dataset = replace(dataset, disturbance=dataset.disturbance.joined(disturbance))
-    return _with_differences(dataset, task) if disturbance.velocities == "differences" else dataset
-
-
-def observed_task(task: Task, dataset: Dataset) -> Task:
-    """The robot as the data shows it: without hidden velocities, with those that were put in from positions."""
-    known = dataset.disturbance
-    if known.velocities == "differences":
-        return task if task.velocities else show_velocities(task)
-    return hide_velocities(task) if known.hidden_velocities and task.velocities else task
-
-
-def hide_velocities(task: Task) -> Task:
-    """The same robot seen without velocities: no state can then be rebuilt from one observation.
-
-    Raises:
-        MadocError: Its velocities are not the last values of an observation.
-    """
-    if not task.velocities:
-        raise MadocError(f"an observation of {task.name} does not end in velocities, so they cannot be hidden")
-    size, observe, whole = task.observation_size - task.velocities, task.observe, task.state_from_observation
-    unknown = np.full(task.velocities, np.nan)
-    return replace(
-        task,
-        observation_size=size,
-        observe=lambda state: observe(state)[..., :size],
-        velocities=0,
-        state_from_observation=None,
-        rebuildable=None,
-        posture=None if whole is None else lambda observation: whole(_joined(observation, unknown)),
-    )
-
-
-def _joined(positions: Float[np.ndarray, "*rows positions"], velocities: np.ndarray) -> np.ndarray:
-    return np.concatenate([positions, np.broadcast_to(velocities, (*positions.shape[:-1], len(velocities)))], axis=-1)
-
-
-def noise_of(
-    dataset: Dataset, share: float, key: PRNGKeyArray
-) -> tuple[Float[np.ndarray, "rows observation"], Float[np.ndarray, "rows observation"]]:
-    """Normal noise for observations and next observations, its deviation a share of each channel's change in a step.
-
-    A sensor is read once a step: where a row's next observation is the next row's observation, both carry the same
-    noise.
-    """
-    logged = dataset.transitions
-    observation, following = np.asarray(logged.observation), np.asarray(logged.next_observation)
-    deviation = share * (following - observation).std(0)
-    first, second = (
-        np.asarray(jax.random.normal(part, observation.shape), np.float64) for part in jax.random.split(key)
-    )
-    same = (following[:-1] == observation[1:]).all(-1)
-    same[dataset.episode_starts[1:] - 1] = False
-    second = np.array(second)
-    second[:-1][same] = first[1:][same]
-    return deviation * first, deviation * second
-
-
-def _with_noise(dataset: Dataset, share: float, key: PRNGKeyArray) -> Dataset:
-    logged = dataset.transitions
-    before, after = noise_of(dataset, share, key)
-    transitions = replace(
-        logged, observation=logged.observation + before, next_observation=logged.next_observation + after
-    )
-    return replace(dataset, transitions=transitions)
-
-
-def _with_differences(dataset: Dataset, task: Task) -> Dataset:
-    hidden = dataset.disturbance.hidden_velocities
-    if task.state_from_observation is not None and not hidden:
-        raise MadocError(f"the data of {dataset.origin} has velocities; velocities=differences is for data without")
-    if dataset.disturbance.shuffled == "next_observations":
-        raise MadocError(f"the next observations of {dataset.origin} are shuffled: their differences are no velocities")
-    positions = hide_velocities(task) if hidden else task
-    refuse_unseen_positions(positions)
-    logged = dataset.transitions
-    missing = None if hidden else missing_velocities(task)
-    here, there = (
-        np.concatenate(
-            [shown, np.asarray(task.observe(states))[:, shown.shape[1] :] if missing is None else states[:, missing]],
-            axis=-1,
+    def joined(self, other: "Disturbance") -> "Disturbance":
+        """This disturbance followed by another one."""
+        return Disturbance(
+            noise=math.hypot(self.noise, other.noise),
+            hidden_velocities=self.hidden_velocities or other.hidden_velocities,
+            shuffled=other.shuffled if self.shuffled == "none" else self.shuffled,
+            friction=self.friction * other.friction,
+            velocities=other.velocities if self.velocities == "logged" else self.velocities,
         )
-        for shown, states in zip(
-            (logged.observation, logged.next_observation), moving_states(dataset, positions), strict=True
-        )
-    )
-    return replace(dataset, transitions=replace(logged, observation=here, next_observation=there))
 
-
-def _with_observations(dataset: Dataset, shown: slice) -> Dataset:
-    logged = dataset.transitions
-    transitions = replace(
-        logged, observation=logged.observation[:, shown], next_observation=logged.next_observation[:, shown]
-    )
-    return replace(dataset, transitions=transitions)
-
-
-def _shuffle_rows(dataset: Dataset, order: Int[np.ndarray, " rows"]) -> Dataset:
-    """Every row an episode of its own: nothing is known of what came before or after it."""
-    starts = np.arange(len(dataset))
-    names = dataset.run_names
-    if names is not None:
-        episode = dataset.episode_of(order)
-        names = tuple(names[index] for index in episode)
-    transitions = close_episodes(dataset.transitions.take(order), starts)
-    return replace(dataset, transitions=transitions, episode_starts=starts, run_names=names)
-
-
-def _shuffle_next_observations(dataset: Dataset, order: Int[np.ndarray, " rows"]) -> Dataset:
-    """Which next observation belongs to which row is lost, and with it the order of the rows."""
-    loose = _shuffle_rows(dataset, order)
-    following = np.asarray(dataset.transitions.next_observation)
-    return replace(loose, transitions=replace(loose.transitions, next_observation=following))
-
-
-def _refuse_twice(dataset: Dataset, disturbance: Disturbance) -> None:
-    there = dataset.disturbance
-    now = disturbance
-    for what, before, asked in (
-        ("carries noise", there.noise, now.noise),
-        ("hides velocities", there.hidden_velocities, now.hidden_velocities),
-        ("has velocities by differences", there.velocities == "differences", now.velocities == "differences"),
-        ("is shuffled", there.shuffled != "none", now.shuffled != "none"),
-    ):
-        if before and asked:
-            raise MadocError(f"the data of {dataset.origin} {what} already; disturb the clean data instead")
+    def sentences(self) -> tuple[str, ...]:
+        """What a reader of an estimate should know of the data, one sentence each; none where it is clean."""
+        sentences = []
+        if self.noise:
+            sentences.append(
+                f"the data carries observation noise of {100 * self.noise:g} % of a step's change: states rebuilt from "
+                "it are not exact, and methods that take them for true are biased"
+            )
+        if self.velocities == "differences":
+            sentences.append(
+                "the data's velocities are differences of positions: states rebuilt from them are not exact, and "
+                "methods that take them for true are biased"
+            )
+        elif self.hidden_velocities:
+            sentences.append(
+                "the data hides velocities: its states cannot be rebuilt, and a clone acts on positions alone"
+            )
+        if self.shuffled == "rows":
+            sentences.append("the data's rows are in random order: nothing longer than one row can be replayed")
+        if self.shuffled == "next_observations":
+            sentences.append(
+                "the data's next observations are not those of their rows: only their distribution is known"
+            )
+        if self.friction != 1.0:
+            sentences.append(
+                f"the target's friction is {self.friction:g} times the simulator's: the estimate will make up for it"
+            )
+        return tuple(sentences)

@@ -1,4 +1,4 @@
-"""What was found out about a log: each a value with a level, what, where, and what to do."""
+"""Findings about a log: each with its level, what was found, where, and what to do."""
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -10,13 +10,13 @@ LEVELS: tuple[Level, ...] = ("fatal", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to know about a log before anything is made of it.
+    """One finding about a log.
 
     Attributes:
-        level: `fatal` stops a calibration, `warning` goes with its result, `note` is told once.
-        what: What was found, as a clause.
-        where: A file, a row, a signal, a parameter; empty where it is the whole.
-        do: What to do about it; empty where nothing is.
+        level: `fatal` stops a calibration, `warning` is kept with its result, `note` is printed once.
+        what: The finding, as a clause.
+        where: A file, a row, a signal or a parameter; empty where it concerns the whole log.
+        do: What to do about it; empty where nothing is to be done.
     """
 
     level: Level
@@ -26,15 +26,15 @@ class Finding:
 
     @property
     def sentence(self) -> str:
-        """All of it on one line."""
+        """The whole finding on one line."""
         place = f"{self.where}: " if self.where else ""
         return f"{place}{self.what}" + (f"; {self.do}" if self.do else "")
 
     def to_json(self) -> dict[str, str]:
-        """Its fields."""
+        """The fields for JSON."""
         return asdict(self)
 
 
 def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Fatal ones, then warnings, then notes; each only once, in the order found."""
+    """Fatal findings, then warnings, then notes; each only once, otherwise in the given order."""
     return tuple(sorted(dict.fromkeys(findings), key=lambda finding: LEVELS.index(finding.level)))

@@ -1,4 +1,4 @@
-"""Which reader reads which file. A new format is one module and one line of `FORMATS`."""
+"""The formats of logged data and their readers. A new format is one module and one line of `FORMATS`."""
 
 import os
 from collections.abc import Callable
@@ -20,8 +20,8 @@ class Format:
 
     Attributes:
         read: (path, task, clip_actions=...) -> validated dataset.
-        recognises: path -> whether it is this layout, judged by a glance at its content.
-        description: What it looks like, for lists.
+        recognises: path -> whether it has this layout, from the beginning of its content.
+        description: A short description of the layout, for lists.
     """
 
     read: Callable[..., Dataset]
@@ -47,14 +47,14 @@ def load(
     clip_actions: bool = False,
     download: bool = False,
 ) -> Dataset:
-    """Read logged data of a robot, in whatever format it is.
+    """Read logged data of a robot in any of the known formats.
 
     Args:
         path: A file, a Minari directory, or a Minari id.
         task: The robot.
-        format: A name in `FORMATS`, instead of a glance at the content.
-        max_transitions: Keep at most so many (see `subsample`); needs a key.
-        key: Which episodes to keep.
+        format: A name in `FORMATS`; None recognises the format from the content.
+        max_transitions: Largest number of transitions to keep (see `subsample`); needs a key.
+        key: Randomness of the episodes to keep.
         clip_actions: Clip actions outside [-1, 1] instead of refusing them.
         download: Fetch a Minari id that is not on this machine. Without it nothing touches the network.
 

@@ -1,9 +1,10 @@
-"""Minari datasets (Younis et al. 2024): a directory of episodes, or the id of one on this machine."""
+"""Minari datasets (Younis et al. 2024): a directory of episodes, or the id of a dataset on this machine."""
 
 import re
 import warnings
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from madoc.data.validation import as_flags, as_matrix, as_vector, check_lengths,
 from madoc.errors import MadocError
 from madoc.tasks import Task
 from madoc.types import Transitions
+
+if TYPE_CHECKING:
+    from minari import EpisodeData
 
 ID = re.compile(r"[\w-]+(/[\w-]+)*-v\d+")
 # Ant-v5: 27 values of state, then 78 contact forces, which the state determines.
@@ -27,7 +31,7 @@ NAMES_HERE = {
 
 
 def recognises(path: Path) -> bool:
-    """Whether the path is a Minari directory, or no path but an id such as `mujoco/hopper/expert-v0`."""
+    """Whether the path is a Minari directory, or an id such as `mujoco/hopper/expert-v0`."""
     if path.exists():
         return _data_directory(path) is not None
     return ID.fullmatch(path.as_posix()) is not None
@@ -73,13 +77,13 @@ def download(dataset_id: str) -> None:
     minari = _import_minari()
     try:
         minari.load_dataset(dataset_id, download=True)
-    except Exception as error:  # whatever the host's client raises is one thing to the user: it did not come
+    except Exception as error:  # the client of the host raises errors of many types
         raise MadocError(
             f"cannot download Minari dataset {dataset_id!r} ({error}); check its id and the network"
         ) from error
 
 
-def _import_minari() -> Any:
+def _import_minari() -> ModuleType:
     try:
         import minari
     except ImportError as error:
@@ -89,8 +93,7 @@ def _import_minari() -> Any:
 
 def _data_directory(path: Path) -> Path | None:
     """The folder with the metadata: the path itself or its `data`."""
-    found = [folder for folder in (path / "data", path) if (folder / "metadata.json").is_file()]
-    return found[0] if found else None
+    return next((folder for folder in (path / "data", path) if (folder / "metadata.json").is_file()), None)
 
 
 def local_directory(path: Path) -> Path:
@@ -118,7 +121,7 @@ def local_directory(path: Path) -> Path:
     return directory
 
 
-def read_episodes(directory: Path) -> tuple[list[Any], str]:
+def read_episodes(directory: Path) -> tuple[list["EpisodeData"], str]:
     """All episodes, and the id of their environment (empty if not recorded).
 
     Raises:
@@ -150,7 +153,7 @@ def _join(parts: list[np.ndarray], name: str) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _observation(episode: Any, task: Task) -> np.ndarray:
+def _observation(episode: "EpisodeData", task: Task) -> np.ndarray:
     if isinstance(episode.observations, dict | tuple):
         raise MadocError(
             f"expected observations of {task.name} as one array, got a {type(episode.observations).__name__} "

@@ -1,32 +1,26 @@
-"""Madoc's own file: an npz of the arrays and one JSON string. Written whole or not at all; never a pickle."""
+"""Madoc's own file: an npz of the arrays and one JSON string. It is written atomically and never holds a pickle."""
 
 import json
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from madoc.data.dataset import Dataset, Disturbance
-from madoc.data.disturbance import observed_task
+from madoc.data.dataset import Dataset
+from madoc.data.disturbance import Disturbance
+from madoc.data.disturbing import observed_task
 from madoc.data.findings import Finding
 from madoc.data.npz import array_names, is_npz, read_arrays
-from madoc.data.validation import (
-    NAMES,
-    as_flags,
-    as_matrix,
-    as_vector,
-    require_arrays,
-    validate,
-)
+from madoc.data.validation import NAMES, as_transitions, require_arrays, validate
 from madoc.errors import MadocError
 from madoc.parameters import FIELDS
 from madoc.runs.files import json_text, replacing
 from madoc.tasks import Task
-from madoc.types import Transitions
 
+Part = TypeVar("Part")
 VERSION = 1
 REQUIRED = (*NAMES, "episode_starts", "metadata")
 
@@ -53,7 +47,7 @@ def save(dataset: Dataset, path: str | os.PathLike) -> None:
 
 
 def load(path: str | os.PathLike) -> Dataset:
-    """Read what `save` wrote, bit for bit.
+    """Read a file of `save`, bit for bit.
 
     Raises:
         MadocError: Missing, damaged, not ours, or of another version.
@@ -62,23 +56,15 @@ def load(path: str | os.PathLike) -> Dataset:
     arrays = read_arrays(source)
     require_arrays(arrays, REQUIRED, source, "it is not a file of Madoc, pass the --format it has")
     metadata = _metadata(arrays["metadata"], source)
-    transitions = Transitions(
-        observation=as_matrix(arrays["observation"], "observation"),
-        action=as_matrix(arrays["action"], "action"),
-        reward=as_vector(arrays["reward"], "reward"),
-        next_observation=as_matrix(arrays["next_observation"], "next_observation"),
-        terminated=as_flags(arrays["terminated"], "terminated"),
-        truncated=as_flags(arrays["truncated"], "truncated"),
-    )
     return Dataset(
-        transitions,
+        as_transitions(arrays),
         _row_numbers(arrays["episode_starts"], source),
         task_name=metadata["task_name"],
         physics=metadata["physics"],
         origin=metadata["origin"],
         true_parameters=metadata["true_parameters"],
         disturbance=_part(Disturbance, metadata.get("disturbance", {}), source),
-        run_names=_part(tuple[str, ...] | None, metadata.get("run_names"), source),
+        run_names=_part(tuple[str, ...], metadata["run_names"], source) if metadata.get("run_names") else None,
         findings=_part(tuple[Finding, ...], metadata.get("findings", ()), source),
     )
 
@@ -112,7 +98,7 @@ def _arrays(dataset: Dataset) -> dict[str, np.ndarray]:
 
 
 def _unit(parameter_name: str) -> str:
-    """The unit of `field.element`; empty for a field unknown here. For whoever opens the file by hand."""
+    """The unit of `field.element`, for people who open the file; empty for an unknown field."""
     field = FIELDS.get(parameter_name.split(".")[0])
     return "" if field is None else field.unit
 
@@ -126,8 +112,8 @@ def _row_numbers(values: np.ndarray, path: Path) -> np.ndarray:
     return values.astype(np.int64)
 
 
-def _part(kind: Any, fields: Any, path: Path) -> Any:
-    """A part of the metadata as the type it has."""
+def _part(kind: type[Part], fields: object, path: Path) -> Part:
+    """A part of the metadata as its type."""
     try:
         return TypeAdapter(kind).validate_python(fields)
     except ValidationError as error:

@@ -1,16 +1,17 @@
 """NeoRL's npz layout (Qin et al. 2022): `obs` with root positions, one `done` for falls and time limits."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from madoc.data.dataset import Dataset, close_episodes
 from madoc.data.npz import array_names, is_npz, read_arrays
 from madoc.data.validation import (
     NAMES,
-    as_flags,
     as_matrix,
+    as_transitions,
     as_vector,
     check_lengths,
     require_arrays,
@@ -18,7 +19,6 @@ from madoc.data.validation import (
 )
 from madoc.errors import MadocError
 from madoc.tasks import Task
-from madoc.types import Transitions
 
 COLUMNS = ("obs", "next_obs", "action", "reward", "done")
 REQUIRED = (*COLUMNS, "index")
@@ -45,17 +45,12 @@ def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
     arrays = read_arrays(path)
     require_arrays(arrays, REQUIRED, path, "pass the --format it has")
     check_lengths({name: np.atleast_1d(arrays[name]) for name in COLUMNS})
-    next_observation = _without_root(arrays["next_obs"], "next_obs", task)
-    done = as_flags(arrays["done"], "done")
-    terminated = done & _fallen(next_observation, task)
-    transitions = Transitions(
-        observation=_without_root(arrays["obs"], "obs", task),
-        action=as_matrix(arrays["action"], "action"),
-        reward=as_vector(arrays["reward"], "reward"),
-        next_observation=next_observation,
-        terminated=terminated,
-        truncated=done & ~terminated,
-    )
+    for name in ("obs", "next_obs"):
+        arrays[name] = _without_root(arrays[name], name, task)
+    transitions = as_transitions(arrays, {**NAMES_HERE, "truncated": "done"})
+    done = np.asarray(transitions.terminated)
+    terminated = done & np.asarray(task.terminated(_rebuild(arrays["next_obs"], task)), dtype=bool)
+    transitions = replace(transitions, terminated=terminated, truncated=done & ~terminated)
     starts = _episode_starts(as_vector(arrays["index"], "index"), done)
     if len(done):
         transitions = close_episodes(transitions, starts)
@@ -66,8 +61,8 @@ def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
 def _rebuild(observation: np.ndarray, task: Task) -> np.ndarray:
     if task.state_from_observation is None:
         raise MadocError(
-            f"an observation of {task.name} does not determine its state, so a NeoRL file's falls cannot be "
-            "told from its time limits; give the task a state_from_observation, or convert the file"
+            f"an observation of {task.name} does not determine its state, so falls and time limits of a NeoRL file "
+            "cannot be distinguished; give the task a state_from_observation, or convert the file"
         )
     return np.asarray(task.state_from_observation(observation))
 
@@ -81,10 +76,6 @@ def _without_root(values: np.ndarray, name: str, task: Task) -> Float[np.ndarray
             f"got {observation.shape[1]} in row 0 of {name}; is this file of {task.name}?"
         )
     return np.ascontiguousarray(observation[:, width - task.observation_size :])
-
-
-def _fallen(next_observation: np.ndarray, task: Task) -> Bool[np.ndarray, " rows"]:
-    return np.asarray(task.terminated(_rebuild(next_observation, task)), dtype=bool)
 
 
 def _episode_starts(index: np.ndarray, done: np.ndarray) -> Int[np.ndarray, " episodes"]:

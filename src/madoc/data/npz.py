@@ -1,4 +1,4 @@
-"""Read npz archives without ever unpickling, and say so when one is damaged."""
+"""Reading of npz archives without unpickling; a damaged archive is refused."""
 
 import zipfile
 import zlib

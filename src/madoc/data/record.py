@@ -1,4 +1,4 @@
-"""Recording: a policy acts in a target, and what it sees becomes a dataset."""
+"""Recording: a policy acts in a target, and its transitions become a dataset."""
 
 from collections.abc import Callable
 
@@ -13,8 +13,9 @@ from madoc.simulation.rollout import begin, reset_states, roll
 from madoc.types import Policy, Transitions
 
 WALKERS = 100
-"""Episodes recorded at a time."""
+"""Largest number of episodes recorded at a time."""
 _BLOCK = 100
+"""Control steps between two reports of progress."""
 
 
 def record(
@@ -33,16 +34,16 @@ def record(
     truncated there.
 
     Args:
-        policy: Who acts; its actions are sampled.
-        simulator: The robot. Its model is bound to `true_parameters`.
+        policy: The policy; its actions are sampled.
+        simulator: The robot, bound to `true_parameters`.
         true_parameters: The target's physical values by name; they travel with the data.
-        transitions: Rows wanted.
+        transitions: Number of transitions.
         key: Randomness.
-        origin: What the dataset should say of itself.
-        advance: Told how many rows have come.
+        origin: Description of the dataset.
+        advance: Called with the number of new rows.
 
     Raises:
-        MadocError: The target explodes, or `transitions` is not positive.
+        MadocError: The simulation diverges, or `transitions` is not positive.
     """
     if transitions < 1:
         raise MadocError(f"expected at least 1 transition to record, got {transitions}")
@@ -67,7 +68,7 @@ def record(
         )
         if rollout.failures:
             raise MadocError(
-                f"the target {simulator.task.name} explodes under its true parameters ({rollout.failures} rows); "
+                f"the target {simulator.task.name} diverges under its true parameters ({rollout.failures} rows); "
                 "check the values"
             )
         blocks.append(rollout.transitions)

@@ -10,9 +10,9 @@ from madoc.data.dataset import Dataset, close_episodes
 from madoc.errors import MadocError
 
 STRETCHES = 10
-"""That a log of one episode is cut into."""
+"""Number of stretches that a log of one episode is cut into, to hold some of them out."""
 _SHORTEST = 20
-"""Rows of a stretch."""
+"""Smallest mean number of rows in a stretch; of a shorter log of one episode the last rows are held out instead."""
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class Split:
     """A log in two parts.
 
     Attributes:
-        kept: What methods calibrate to.
-        held: What their estimates are judged by.
-        sentence: How it was split.
+        kept: The rows that methods calibrate to.
+        held: The rows that their estimates are judged by.
+        sentence: How the rows were chosen.
     """
 
     kept: Dataset
@@ -68,7 +68,7 @@ def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
 
 
 def _stretches(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
-    """A log of few or uneven episodes, none longer than a tenth of it: as if each stretch of a longer one were one."""
+    """Split a log of few or uneven episodes: long ones are cut into stretches, each of which counts as an episode."""
     rows, spans = len(dataset), zip(dataset.episode_starts, dataset.episode_ends, strict=True)
     cuts = [np.linspace(start, end, -(-STRETCHES * (end - start) // rows), endpoint=False) for start, end in spans]
     starts = np.concatenate(cuts).astype(np.int64)
@@ -92,7 +92,7 @@ def episodes_of(dataset: Dataset, episodes: Int[np.ndarray, " episodes"]) -> Dat
 
 
 def _drawn(lengths: np.ndarray, share: float, order: np.ndarray) -> np.ndarray:
-    """Which episodes are held out."""
+    """A mask of the episodes that are held out."""
     wanted, taken = share * lengths.sum(), 0
     held = np.zeros(len(lengths), dtype=bool)
     for episode in order:

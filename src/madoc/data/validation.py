@@ -1,4 +1,4 @@
-"""What every reader checks, so that a bad file is refused with one sentence before any budget is spent."""
+"""Checks of every reader, so that a bad file is refused with one sentence before any budget is spent."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -10,15 +10,16 @@ from jaxtyping import Bool, Float
 from madoc.data.dataset import Dataset
 from madoc.errors import MadocError
 from madoc.tasks import Task
+from madoc.types import Transitions
 
-# An action of exactly ±1 may leave that range when a recorder rounds it to float32 or rescales it.
 ACTION_TOLERANCE = 1e-5
+"""Largest distance of an action from [-1, 1] that is clipped silently: a recorder may round ±1 or rescale it."""
 FLOATS = ("observation", "action", "reward", "next_observation")
 NAMES = {name: name for name in (*FLOATS, "terminated", "truncated")}
 
 
 def require_file(path: Path) -> None:
-    """Refuse a path that is no readable, non-empty file.
+    """Refuse a path that is not a readable, non-empty file.
 
     Raises:
         MadocError: Missing, a directory, or empty.
@@ -72,7 +73,7 @@ def as_matrix(values: np.ndarray, name: str) -> Float[np.ndarray, "rows values"]
 
 
 def as_vector(values: np.ndarray, name: str) -> Float[np.ndarray, " rows"]:
-    """Values as float64, one a row; a second axis of one value is dropped.
+    """Values as float64, one per row; a second axis of one value is dropped.
 
     Raises:
         MadocError: Not numbers, or more than one value a row.
@@ -86,7 +87,7 @@ def as_vector(values: np.ndarray, name: str) -> Float[np.ndarray, " rows"]:
 
 
 def as_flags(values: np.ndarray, name: str) -> Bool[np.ndarray, " rows"]:
-    """Values as bool, one a row.
+    """Values as bool, one per row.
 
     Raises:
         MadocError: A value is neither 0 nor 1.
@@ -98,14 +99,24 @@ def as_flags(values: np.ndarray, name: str) -> Bool[np.ndarray, " rows"]:
     return numbers.astype(bool)
 
 
+def as_transitions(arrays: Mapping[str, np.ndarray], names: Mapping[str, str] = NAMES) -> Transitions:
+    """Arrays of a file as transitions; `names` gives the file's name of each field.
+
+    Raises:
+        MadocError: An array has the wrong kind of values or the wrong shape.
+    """
+    kinds = {"reward": as_vector, "terminated": as_flags, "truncated": as_flags}
+    return Transitions(**{field: kinds.get(field, as_matrix)(arrays[name], name) for field, name in names.items()})
+
+
 def validate(dataset: Dataset, task: Task, names: Mapping[str, str] = NAMES, *, clip_actions: bool = False) -> Dataset:
-    """The dataset, if it can be one of the task. Actions within rounding of [-1, 1] are clipped.
+    """The dataset, if it fits the task. Actions within rounding of [-1, 1] are clipped.
 
     Args:
-        dataset: What a reader made of a file, row for row.
-        task: The robot it should be of.
-        names: What the file calls each field of `Transitions`, for the sentences.
-        clip_actions: Clip all actions to [-1, 1], as the motors do with what is asked of them.
+        dataset: The rows of a file, as a reader made them.
+        task: The robot that they should be of.
+        names: The file's name of each field of `Transitions`, for error sentences.
+        clip_actions: Clip all actions to [-1, 1], as the motors do.
 
     Raises:
         MadocError: Another task, no rows, lengths that disagree, a wrong width, a value that is not finite,
@@ -118,9 +129,8 @@ def validate(dataset: Dataset, task: Task, names: Mapping[str, str] = NAMES, *, 
     if not len(dataset):
         raise MadocError(f"expected at least one transition for {task.name}, got none in {dataset.origin}")
     columns = {field: np.asarray(getattr(transitions, field)) for field in FLOATS}
-    for field in ("observation", "next_observation"):
-        _check_observation_width(columns[field], task, names[field])
-    _check_action_width(columns["action"], task, names["action"])
+    for field in ("observation", "next_observation", "action"):
+        _check_width(columns[field], task, field, names[field])
     for field, values in columns.items():
         _check_finite(values, names[field])
     _check_episode_starts(dataset)
@@ -137,23 +147,13 @@ def _as_numbers(values: np.ndarray, name: str) -> np.ndarray:
     return array.astype(np.float64)
 
 
-def _check_observation_width(values: np.ndarray, task: Task, name: str) -> None:
-    expected, got = task.observation_size, values.shape[-1]
+def _check_width(values: np.ndarray, task: Task, field: str, name: str) -> None:
+    what, expected = ("action", task.action_size) if field == "action" else ("observation", task.observation_size)
+    got = values.shape[-1]
     if got != expected:
-        neorl = got == expected + 1
+        neorl = what == "observation" and got == expected + 1
         hint = "a NeoRL file? pass --format neorl" if neorl else f"is this file of {task.name}?"
-        raise MadocError(
-            f"expected {expected} values per observation for {task.name}, got {got} in row 0 of {name}; {hint}"
-        )
-
-
-def _check_action_width(values: np.ndarray, task: Task, name: str) -> None:
-    expected, got = task.action_size, values.shape[-1]
-    if got != expected:
-        raise MadocError(
-            f"expected {expected} values per action for {task.name}, got {got} in row 0 of {name}; "
-            f"is this file of {task.name}?"
-        )
+        raise MadocError(f"expected {expected} values per {what} for {task.name}, got {got} in row 0 of {name}; {hint}")
 
 
 def _check_finite(values: np.ndarray, name: str) -> None:

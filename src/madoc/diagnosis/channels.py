@@ -1,4 +1,4 @@
-"""What the log alone tells of its channels: which move, which stand at a limit, which contradict each other."""
+"""Channels of a log: which of them move, which stand at a limit, which contradict each other."""
 
 from dataclasses import dataclass
 
@@ -6,18 +6,22 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.data import Dataset
-from madoc.data.findings import Finding
+from madoc.data.findings import Finding, Level
 from madoc.errors import MadocError
 from madoc.robots import Robot
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.tasks import Task
 
 AT_LIMIT = 1.0 - 1e-6
-"""Size in [-1, 1] from which an action stands at its limit."""
+"""Size of an action in [0, 1], from which on it stands at its limit."""
 MANY_AT_LIMIT = 0.1
+"""Share in [0, 1] of rows with an action at its limit; above it the action is warned of."""
+HARDLY_USED = 0.05
+"""Largest size of an action in [0, 1]; below it the action is warned of."""
 FEW_ROWS = 100
+"""Number of rows; fewer are warned of."""
 _STILL = 1e-9
-"""Spread, relative to the size of the values, below which a channel never moves."""
+"""Range of the values over the largest of them; up to it, a channel counts as one that never moves."""
 _KNOWN_RATIOS = {
     180.0 / np.pi: "one in degrees, the other in radians",
     np.pi / 180.0: "one in degrees, the other in radians",
@@ -32,7 +36,7 @@ _KNOWN_RATIOS = {
     -1.0: "one of them with its sign reversed",
 }
 _TRUSTED = 0.5
-"""Squared correlation of a position's changes with its speed from which their ratio is believed."""
+"""Squared correlation in [0, 1] of a position's changes with its speed; below it their ratio says nothing."""
 
 
 @dataclass(frozen=True)
@@ -79,40 +83,41 @@ def channels_of(dataset: Dataset, task: Task, robot: Robot | None = None) -> tup
     """Signals, then actions."""
     logged = dataset.transitions
     observation, following = np.asarray(logged.observation), np.asarray(logged.next_observation)
-    both = np.stack([np.minimum(observation, following).min(0), np.maximum(observation, following).max(0)])
-    change = (following - observation).std(0)
+    both = np.concatenate([observation, following])
     units = [signal.unit or "" for signal in robot.signals] if robot else []
-    units += [""] * (task.observation_size - len(units))  # of velocities made from positions too
-    signals = [
-        Channel(name, "signal", unit, float(low), float(high), float(step))
-        for name, unit, low, high, step in zip(signal_names(task), units, *both, change, strict=True)
-    ]
+    units += [""] * (task.observation_size - len(units))  # of velocities that were derived from positions too
+    numbers = np.column_stack([both.min(0), both.max(0), (following - observation).std(0)]).tolist()
+    columns = zip(signal_names(task), units, numbers, strict=True)
+    signals = [Channel(name, "signal", unit, *values) for name, unit, values in columns]
     unit_action = np.asarray(logged.action)
     physical = _physical(unit_action, task)
-    within = _not_last(dataset)
-    step = np.diff(physical, axis=0)[within].std(0) if within.any() else np.zeros(task.action_size)
+    within = np.ones(len(dataset), dtype=bool)
+    within[dataset.episode_ends - 1] = False  # the next row is of another episode
+    change = np.diff(physical, axis=0)[within[:-1]]
+    step = change.std(0) if len(change) else np.zeros(task.action_size)
     units = [channel.unit for channel in task.actions] or [""] * task.action_size
     limits = (np.abs(unit_action) >= AT_LIMIT).mean(0)
-    columns = zip(action_names(task), units, physical.min(0), physical.max(0), step, limits, strict=True)
-    actions = [Channel(name, "action", unit, *map(float, numbers)) for name, unit, *numbers in columns]
-    return (*signals, *actions)
+    numbers = np.column_stack([physical.min(0), physical.max(0), step, limits]).tolist()
+    columns = zip(action_names(task), units, numbers, strict=True)
+    return (*signals, *(Channel(name, "action", unit, *values) for name, unit, values in columns))
 
 
-def channel_findings(dataset: Dataset, simulator: CpuSimulator, channels: tuple[Channel, ...]) -> list[Finding]:
+def channel_findings(dataset: Dataset, simulator: Simulator, channels: tuple[Channel, ...]) -> list[Finding]:
     """Too few rows, channels that never move, actions at their limits, positions that contradict their speeds."""
-    found = _size_findings(dataset, len(simulator.parameters))
-    for kind in ("signal", "action"):
-        still = [channel for channel in channels if channel.kind == kind and not channel.moves]
-        everything = len(still) == sum(channel.kind == kind for channel in channels)
-        level = "fatal" if everything and kind == "signal" else "warning"
-        for channel in still:
+    findings = _size_findings(dataset, len(simulator.parameters))
+    signals, actions = ([channel for channel in channels if channel.kind == kind] for kind in ("signal", "action"))
+    nothing_moves = not any(channel.moves for channel in signals)
+    for channel in (*signals, *actions):
+        if not channel.moves:
+            level: Level = "fatal" if nothing_moves and channel.kind == "signal" else "warning"
             what = f"it never moves: {channel.low + 0.0:g} in all {len(dataset):,} rows"
-            remedy = "a dead sensor, or the wrong column?" if kind == "signal" else "is it the column of the command?"
-            found.append(Finding(level, what, channel.name, remedy))  # type: ignore[arg-type]
-    for index, channel in enumerate(channel for channel in channels if channel.kind == "action"):
+            dead = "a dead sensor, or the wrong column?"
+            remedy = dead if channel.kind == "signal" else "is it the column of the command?"
+            findings.append(Finding(level, what, channel.name, remedy))
+    for channel, column in zip(actions, np.asarray(dataset.transitions.action).T, strict=True):
         if channel.moves:
-            found += _limit_findings(channel, np.asarray(dataset.transitions.action)[:, index])
-    return found + _speed_findings(dataset, simulator)
+            findings += _limit_findings(channel, column)
+    return findings + _speed_findings(dataset, simulator)
 
 
 def _size_findings(dataset: Dataset, parameters: int) -> list[Finding]:
@@ -126,25 +131,19 @@ def _size_findings(dataset: Dataset, parameters: int) -> list[Finding]:
 
 
 def _limit_findings(channel: Channel, unit_action: Float[np.ndarray, " rows"]) -> list[Finding]:
-    if channel.at_limits > MANY_AT_LIMIT:
-        return [
-            Finding(
-                "warning",
-                f"it stands at an end of its range in {100 * channel.at_limits:.0f} % of the rows",
-                channel.name,
-                "if the driver clips there, log what it applied and not what was asked for",
-            )
-        ]
     largest = float(np.abs(unit_action).max())
-    if largest < 0.05:
+    if channel.at_limits > MANY_AT_LIMIT:
+        what = f"it stands at an end of its range in {100 * channel.at_limits:.0f} % of the rows"
+        remedy = "if the driver clips there, log what it applied and not what was asked for"
+    elif largest < HARDLY_USED:
         what = f"it stays within {100 * largest:.2g} % of its range"
-        return [
-            Finding("warning", what, channel.name, "is the log's unit that of the spec? Else excite the robot more")
-        ]
-    return []
+        remedy = "is the log's unit that of the spec? Else excite the robot more"
+    else:
+        return []
+    return [Finding("warning", what, channel.name, remedy)]
 
 
-def _speed_findings(dataset: Dataset, simulator: CpuSimulator) -> list[Finding]:
+def _speed_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
     """Positions that do not change by their speeds times the control step: another unit or sign, wrapped angles."""
     task = simulator.task
     if task.state_from_observation is None:
@@ -158,7 +157,7 @@ def _speed_findings(dataset: Dataset, simulator: CpuSimulator) -> list[Finding]:
         for part in (logged.observation, logged.next_observation)
     )
     names = _names_of_states(task, 2 * model.nv)
-    found = []
+    findings = []
     for dof in range(model.nv):
         position, speed = names[dof], names[model.nv + dof]
         if position is None or speed is None:
@@ -169,9 +168,9 @@ def _speed_findings(dataset: Dataset, simulator: CpuSimulator) -> list[Finding]:
         turned &= np.abs(change - expected) > np.pi
         if turned.any():
             what = f"it jumps by a whole turn in {int(turned.sum())} rows"
-            found.append(Finding("warning", what, position, "unwrap the angle where it is logged"))
-        found += _ratio_findings(change[~turned], expected[~turned], position, speed)
-    return found
+            findings.append(Finding("warning", what, position, "unwrap the angle where it is logged"))
+        findings += _ratio_findings(change[~turned], expected[~turned], position, speed)
+    return findings
 
 
 def _ratio_findings(change: np.ndarray, expected: np.ndarray, position: str, speed: str) -> list[Finding]:
@@ -206,18 +205,11 @@ def _physical(unit_action: Float[np.ndarray, "rows action"], task: Task) -> Floa
     return low + (unit_action + 1.0) / 2.0 * (high - low)
 
 
-def _not_last(dataset: Dataset) -> np.ndarray:
-    """Whether a row's successor is of the same episode."""
-    within = np.ones(len(dataset), dtype=bool)
-    within[dataset.episode_ends - 1] = False
-    return within[:-1]
-
-
 def refuse_fatal(findings: tuple[Finding, ...]) -> None:
-    """Stop what a fatal finding makes pointless.
+    """Refuse a log that has a fatal finding.
 
     Raises:
-        MadocError: There is one; it is the sentence.
+        MadocError: It has one; its sentence is the message.
     """
     fatal = [finding for finding in findings if finding.level == "fatal"]
     if fatal:

@@ -1,4 +1,4 @@
-"""What a log can and cannot say of a robot, told before anything is solved: `check` returns a `Diagnosis`."""
+"""What a log can and cannot say of a robot, before anything is calibrated: `check` returns a `Diagnosis`."""
 
 import time
 from dataclasses import dataclass
@@ -12,25 +12,25 @@ from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, 
 from madoc.diagnosis.explanation import Explanation, action_findings, explain, explanation_findings
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.robots import Robot
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.simulation.sensitivity import insensitive
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found out about a log and a model.
+    """A log and a model compared, before any calibration.
 
     Attributes:
-        rows: Transitions.
-        episodes: Stretches without a break.
-        runs: Recordings they come from.
-        control_step: s between two rows.
+        rows: Number of transitions.
+        episodes: Number of stretches without a break.
+        runs: Number of recordings that they come from.
+        control_step: Time between two rows, s.
         channels: Signals, then actions.
-        explanation: How well the model tells what happens next; None where no state can be rebuilt.
-        excitation: How well the log could tell each parameter; None where a fatal finding came before.
-        findings: The worst first.
-        control_steps: Simulated for all of this.
-        seconds: It took.
+        explanation: How well the model predicts the log; None where no state can be rebuilt.
+        excitation: How well the log could determine each parameter; None where a fatal finding came before.
+        findings: What to know, the worst first.
+        control_steps: Control steps simulated.
+        seconds: Wall-clock time.
     """
 
     rows: int
@@ -50,34 +50,31 @@ class Diagnosis:
         return any(finding.level == "fatal" for finding in self.findings)
 
 
-def check(dataset: Dataset, simulator: CpuSimulator, *, robot: Robot | None = None, seed: int = 0) -> Diagnosis:
-    """Look at a log and a model before any solving.
+def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None, seed: int = 0) -> Diagnosis:
+    """Compare a log with a model before any calibration.
 
     Args:
-        dataset: The log; what reading it told is among the findings.
-        simulator: The model and its box of parameters.
+        dataset: The log; findings of its reader are among those returned.
+        simulator: The model and the ranges of its parameters.
         robot: For units and reasons, where the robot is one's own.
-        seed: Of the stretches looked at and of the draws from the box.
+        seed: Of the windows that are looked at and of the parameters that are tried.
     """
     started = time.monotonic()
-    task = simulator.task
     of_rows, of_box, of_actions, of_windows = jax.random.split(jax.random.key(seed), 4)
-    channels = channels_of(dataset, task, robot)
+    channels = channels_of(dataset, simulator.task, robot)
     findings = [*dataset.findings, *channel_findings(dataset, simulator, channels)]
     explanation, excitation, spent = None, None, 0
     if not any(finding.level == "fatal" for finding in findings):
         logged = states_of(dataset, simulator)
-        probing = insensitive(simulator, *probing_rows(logged, dataset, simulator), key=of_rows)
-        spent += probing[1]
-        findings += _insensitive_findings(probing[0])
+        idle, spent = insensitive(simulator, *probing_rows(logged, dataset, simulator), key=of_rows)
+        findings += _insensitive_findings(idle)
         if logged.kind == "exact":
-            states, rows = logged.exact()
-            explanation = explain(dataset, simulator, states, rows, key=of_box)
+            explanation = explain(dataset, simulator, logged, key=of_box)
             findings += explanation_findings(explanation, channels)
-            about_actions, steps = action_findings(dataset, simulator, states, rows, explanation, key=of_actions)
+            about_actions, steps = action_findings(dataset, simulator, logged, explanation, key=of_actions)
             findings += about_actions
             start = explanation.draws[explanation.best]
-            excitation = excite(dataset, simulator, states, rows, start=start, key=of_windows)
+            excitation = excite(dataset, simulator, logged, start=start, key=of_windows)
             spent += explanation.control_steps + steps
         else:
             findings.append(_inexact_states_finding(logged, robot))

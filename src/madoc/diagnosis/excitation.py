@@ -1,9 +1,9 @@
-"""How well a log could tell each parameter, from slopes of residuals: expected intervals, and what goes together."""
+"""How well a log could determine each parameter: expected intervals and correlations of estimates."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from madoc.data import Dataset, typical_change
 from madoc.data.findings import Finding
@@ -21,26 +21,26 @@ WINDOWS = {5: 200, 20: 60}
 Long ones tell more where sensors are noisy, short ones where the robot is chaotic.
 """
 ROUNDS = 3
-"""Times the slopes are taken: from the best draw, the residual falls to what no parameter explains within two steps."""
+"""Number of linearisations. From the best draw two steps reach the residual that no parameter explains."""
 INSIDE = 0.98
 """Largest |parameter| in [-1, 1] at which derivatives are taken: a mass of 0 or the like has none."""
 _DAMPING = 1e-8
 """Relative damping of the steps: enough to keep directions that the log says nothing of where they are."""
 WIDE = 0.25
-"""Of its range: an expected interval with a larger half width says little."""
+"""Share in [0, 1] of its range; a parameter whose expected interval has a larger half width is warned of."""
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """What the log could say of each parameter, at best.
+    """How well the log could determine each parameter, at best.
 
     Attributes:
-        effect: How far half of its range moves what is seen, in units of what no parameter explains; NaN where no
-            state can be rebuilt and nothing is known of that.
-        half_width: Of the expected 95 % interval, in physical units; NaN likewise.
-        pairs: Parameters whose estimates would go together: names and correlation.
-        sentences: What cannot be told apart, or at all.
-        control_steps: Simulated.
+        effect: Change of an observation by half of the parameter's range, over the residual that no parameter
+            explains; NaN where states are not exact, so that this residual is not known.
+        half_width: Half of the expected 95 % interval, in physical units; NaN likewise.
+        pairs: Parameters whose estimates would be correlated: two names and the correlation.
+        sentences: Which parameters cannot be determined, or not apart from each other.
+        control_steps: Control steps simulated.
     """
 
     effect: Float[np.ndarray, " d"]
@@ -51,48 +51,37 @@ class Excitation:
 
 
 def excite(
-    dataset: Dataset,
-    simulator: Simulator,
-    states: Float[np.ndarray, "states state"],
-    rows: Int[np.ndarray, " states"],
-    *,
-    start: Float[np.ndarray, " d"],
-    key: PRNGKeyArray,
+    dataset: Dataset, simulator: Simulator, logged: LoggedStates, *, start: Float[np.ndarray, " d"], key: PRNGKeyArray
 ) -> Excitation:
-    """Slopes of residuals over stretches of the log that do not overlap, near the best fit that is quickly had.
+    """Expected intervals from derivatives of residuals over windows of the log that do not overlap.
 
-    A few Gauss-Newton steps within the box go to where the residual is what no parameter explains; it is the noise
-    that the expected intervals assume. Of short and long stretches, those that tell more count.
+    A few Gauss-Newton steps go to where the residual is what no parameter explains. It is the noise that the expected
+    intervals assume. Of short and long windows, those that determine the parameters better count.
 
     Args:
         dataset: The log.
         simulator: The model.
-        states: Rebuilt from the log.
-        rows: The rows they were rebuilt from.
+        logged: Exact states of the log.
         start: Parameters in [-1, 1] that explain the log well already.
-        key: Draws the stretches.
+        key: Draws the windows.
     """
-    of_length = [
-        _excited(dataset, simulator, states, rows, start=start, horizon=horizon, key=key) for horizon in WINDOWS
-    ]
-    spent = sum(found.control_steps for found in of_length)
+    of_length = [_excited(dataset, simulator, logged, start=start, horizon=horizon, key=key) for horizon in WINDOWS]
     spans = simulator.parameters.high - simulator.parameters.low
-    widths = [np.nan_to_num(found.half_width / spans, nan=1.0).mean() for found in of_length]
-    return replace(of_length[int(np.argmin(widths))], control_steps=spent)
+    widths = [np.nan_to_num(each.half_width / spans, nan=1.0).mean() for each in of_length]
+    return replace(of_length[int(np.argmin(widths))], control_steps=sum(each.control_steps for each in of_length))
 
 
 def _excited(
     dataset: Dataset,
     simulator: Simulator,
-    states: Float[np.ndarray, "states state"],
-    rows: Int[np.ndarray, " states"],
+    logged: LoggedStates,
     *,
     start: Float[np.ndarray, " d"],
     horizon: int,
     key: PRNGKeyArray,
 ) -> Excitation:
-    """As `excite`, over stretches of one length."""
-    space = simulator.parameters
+    """As `excite`, over windows of one length."""
+    space, (states, rows) = simulator.parameters, logged.exact()
     steps = longest_fit(dataset, rows, horizon)
     disjoint = disjoint_windows(dataset, rows, steps, gap=0)
     chosen, available = drawn(disjoint, WINDOWS[horizon], key), len(disjoint)
@@ -112,16 +101,14 @@ def _excited(
         nothing = np.full(len(space), np.nan)
         sentence = f"the simulation fails in all {len(windows)} stretches tried; look at the ranges and the states"
         return Excitation(nothing, nothing, (), (sentence,), spent)
-    half = (space.high - space.low) / 2.0
-    more = max(1.0, available / len(best.residuals))  # of such stretches are in the whole log
-    found = sandwich(more * bread(best, 1.0, "linear"), more * meat(best, 1.0, "linear"))
+    more = max(1.0, available / len(best.residuals))  # windows of the whole log for each of these
+    certainty = sandwich(more * bread(best, 1.0, "linear"), more * meat(best, 1.0, "linear"))
     noise = max(float(np.sqrt((best.residuals**2).mean())), np.finfo(float).tiny)
-    slopes = np.sqrt((best.jacobian**2).mean((0, 1)))
     return Excitation(
-        effect=slopes / noise,
-        half_width=half * half_width(found.covariance, available),
-        pairs=tuple(correlated_pairs(found.correlation, space.names)),
-        sentences=identifiability(found, space.names),
+        effect=np.sqrt((best.jacobian**2).mean((0, 1))) / noise,
+        half_width=(space.high - space.low) / 2.0 * half_width(certainty.covariance, available),
+        pairs=tuple(correlated_pairs(certainty.correlation, space.names)),
+        sentences=identifiability(certainty, space.names),
         control_steps=spent,
     )
 
@@ -144,22 +131,17 @@ def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates)
     )
 
 
-def excitation_findings(found: Excitation, simulator: Simulator) -> list[Finding]:
+def excitation_findings(excitation: Excitation, simulator: Simulator) -> list[Finding]:
     """A warning for each parameter that the log would leave open, and for those it cannot tell apart."""
-    space = simulator.parameters
-    findings = [Finding("warning", sentence, "parameters") for sentence in found.sentences]
-    told = " ".join(found.sentences)
-    for parameter, width in zip(space.parameters, found.half_width, strict=True):
+    findings = [Finding("warning", sentence, "parameters") for sentence in excitation.sentences]
+    named = " ".join(excitation.sentences)
+    for parameter, width in zip(simulator.parameters.parameters, excitation.half_width, strict=True):
         share = width / (parameter.high - parameter.low)
-        if not share > WIDE or parameter.name in told:
-            continue
-        findings.append(
-            Finding(
-                "warning",
+        if share > WIDE and parameter.name not in named:
+            what = (
                 f"the log says little of it: expect ± {width:.2g} {parameter.unit} (95 %), {100 * share:.0f} % of its "
-                f"range",
-                parameter.name,
-                "excite it more, record longer, or leave it out",
+                "range"
             )
-        )
+            remedy = "excite it more, record longer, or leave it out"
+            findings.append(Finding("warning", what, parameter.name, remedy))
     return findings

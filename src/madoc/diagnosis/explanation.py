@@ -11,19 +11,21 @@ from madoc.data import Dataset
 from madoc.data.findings import Finding
 from madoc.diagnosis.channels import Channel, action_names
 from madoc.identification.replay import window_residuals
+from madoc.identification.states import LoggedStates
 from madoc.identification.windows import HORIZONS, Windows, drawn, longest_fit, rows_that_fit, windows_at
-from madoc.simulation import CpuSimulator
+from madoc.simulation.base import Simulator
 from madoc.tasks import Task
 
 WINDOWS = 64
-"""Windows replayed, at most."""
+"""Largest number of windows replayed."""
 CORNERS, DRAWS = 8, 24
+"""Number of corners of the box of parameters that are tried, and of points inside it."""
 HALF = 0.5
-"""Share of the live signals from which what no draw explains is the model, not a signal."""
+"""Share in [0, 1] of the signals that move; if no draw explains so many, the model is at fault, not a signal."""
 CLEARLY = 0.7
-"""A change of the actions that lowers the error below this share is worth a word."""
+"""Ratio in [0, 1] of the errors with and without a change of the actions; below it the change is suggested."""
 WORST = 10.0
-"""An error relative to "nothing changes" counts as no more."""
+"""Largest error that a signal counts with, relative to that of "nothing changes"."""
 
 
 @dataclass(frozen=True)
@@ -53,24 +55,17 @@ class Explanation:
         return int(np.argmin(np.log(np.maximum(self.overall, 1e-12)).mean(-1)))
 
 
-def explain(
-    dataset: Dataset,
-    simulator: CpuSimulator,
-    states: Float[np.ndarray, "states state"],
-    rows: Int[np.ndarray, " states"],
-    *,
-    key: PRNGKeyArray,
-) -> Explanation:
-    """Replay stretches of the log from its states, at mid-range, in corners and in draws of the box.
+def explain(dataset: Dataset, simulator: Simulator, logged: LoggedStates, *, key: PRNGKeyArray) -> Explanation:
+    """Replay windows of the log from its states, at mid-range, in corners and at random points of the box.
 
     Args:
         dataset: The log.
         simulator: The model.
-        states: Rebuilt from the log.
-        rows: The rows of the log they were rebuilt from.
-        key: Draws the stretches and the box.
+        logged: Exact states of the log.
+        key: Draws the windows and the points.
     """
     of_windows, of_box = jax.random.split(key)
+    states, rows = logged.exact()
     steps = longest_fit(dataset, rows, max(HORIZONS))
     chosen = drawn(rows_that_fit(dataset, rows, steps), WINDOWS, of_windows)
     horizons = tuple(horizon for horizon in HORIZONS if horizon <= steps)
@@ -89,87 +84,69 @@ def box_draws(count: int, key: PRNGKeyArray) -> Float[np.ndarray, "draws d"]:
     return np.concatenate([np.zeros((1, count)), np.unique(corners, axis=0), inside])
 
 
-def explanation_findings(found: Explanation, channels: tuple[Channel, ...]) -> list[Finding]:
+def explanation_findings(explanation: Explanation, channels: tuple[Channel, ...]) -> list[Finding]:
     """Signals that no draw explains: half of them or more, and the model is not this log's."""
     names = [channel.name for channel in channels if channel.kind == "signal"]
-    live = ~np.isnan(found.errors).all((0, 1))
+    live = ~np.isnan(explanation.errors).all((0, 1))
     reached = np.full(len(names), np.inf)
-    reached[live] = found.errors[..., live].min((0, 1))
+    reached[live] = explanation.errors[..., live].min((0, 1))
     lost = [name for name, error, moves in zip(names, reached, live, strict=True) if moves and error >= 1.0]
-    ahead = _ahead(found.horizons)
+    better = f"{_ahead(explanation.horizons)} steps ahead better than 'nothing changes' does"
     remedy = "look at its column, sign and unit in the spec, and at the model"
-    if len(lost) >= HALF * live.sum() and lost:
-        what = f"no draw from the box tells {', '.join(lost)} {ahead} steps ahead better than 'nothing changes' does"
+    if lost and len(lost) >= HALF * live.sum():
+        what = f"no draw from the box tells {', '.join(lost)} {better}"
         return [Finding("fatal", what, "the model", remedy.replace("its column, sign", "columns, signs"))]
-    what = f"no draw from the box tells it {ahead} steps ahead better than 'nothing changes' does"
-    findings = [Finding("warning", what, name, remedy) for name in lost]
-    if not lost and (found.overall[0] >= 1.0).all() and (found.overall.min(0) < 1.0).any():
-        findings.append(
-            Finding(
-                "note", "at mid-range it is no better than 'nothing changes', in parts of the box it is", "the model"
-            )
-        )
-    return findings
+    overall = explanation.overall
+    if not lost and (overall[0] >= 1.0).all() and (overall.min(0) < 1.0).any():
+        what = "at mid-range it is no better than 'nothing changes', in parts of the box it is"
+        return [Finding("note", what, "the model")]
+    return [Finding("warning", f"no draw from the box tells it {better}", name, remedy) for name in lost]
 
 
 def action_findings(
-    dataset: Dataset,
-    simulator: CpuSimulator,
-    states: Float[np.ndarray, "states state"],
-    rows: Int[np.ndarray, " states"],
-    found: Explanation,
-    *,
-    key: PRNGKeyArray,
+    dataset: Dataset, simulator: Simulator, logged: LoggedStates, explanation: Explanation, *, key: PRNGKeyArray
 ) -> tuple[list[Finding], int]:
     """Whether the log would be explained clearly better with an action reversed, a row later or a row earlier.
 
     Returns:
-        What was found, and the control steps spent.
+        The findings, and the control steps spent.
     """
-    task = simulator.task
-    horizon = found.horizons[min(1, len(found.horizons) - 1)]
+    task, (states, rows) = simulator.task, logged.exact()
+    at = min(1, len(explanation.horizons) - 1)
+    horizon = explanation.horizons[at]
     chosen = drawn(rows_that_fit(dataset, rows, horizon, margin=1), WINDOWS, key)
     if not len(chosen):
         return [], 0
     windows = windows_at(dataset, states[chosen], rows[chosen], horizon)
-    best = np.argsort(found.overall[:, min(1, len(found.horizons) - 1)])[:3]
-    draws = found.draws[np.unique(np.append(best, 0))]
+    best = np.argsort(explanation.overall[:, at])[:3]
+    draws = explanation.draws[np.unique(np.append(best, 0))]
 
     def error(actions: np.ndarray) -> float:
         changed = Windows(windows.states, actions, windows.following)
         errors = _errors(dataset, simulator, changed, rows[chosen], draws, (horizon,))
         return float(np.sqrt(np.nanmean(np.minimum(errors, WORST) ** 2, axis=-1)).min())
 
-    plain = error(windows.actions)
-    findings, tried = [], 1
+    changes = []
     for index, name in enumerate(action_names(task)):
         reversed_actions = _reversed(windows.actions, task, index)
-        if reversed_actions is None:
-            continue
-        tried += 1
-        if error(reversed_actions) < CLEARLY * plain:
+        if reversed_actions is not None:
             what = "with its sign reversed the model explains the log clearly better"
-            findings.append(Finding("warning", what, name, "reverse it in the spec or in the log"))
-    stretch = rows[chosen][:, None] + np.arange(horizon)
-    logged = np.asarray(dataset.transitions.action)
-    shifts = {
-        -1: ("actions take effect a row later than they are logged", "add the parameter action_delay"),
-        1: ("actions take effect a row before they are logged", "log each action with what was seen just before it"),
-    }
-    for shift, (what, remedy) in shifts.items():
-        if task.pending and shift < 0:
-            continue
-        tried += 1
-        if error(logged[stretch + shift]) < CLEARLY * plain:
-            findings.append(
-                Finding("warning", f"the model explains the log clearly better if {what}", "actions", remedy)
-            )
-    return findings, tried * len(draws) * len(windows) * horizon
+            changes.append((reversed_actions, Finding("warning", what, name, "reverse it in the spec or in the log")))
+    action, stretch = np.asarray(dataset.transitions.action), rows[chosen][:, None] + np.arange(horizon)
+    later = "a row later than they are logged", "add the parameter action_delay"
+    earlier = "a row before they are logged", "log each action with what was seen just before it"
+    for shift, (when, remedy) in ((-1, later), (1, earlier)):
+        if shift > 0 or not task.pending:
+            what = f"the model explains the log clearly better if actions take effect {when}"
+            changes.append((action[stretch + shift], Finding("warning", what, "actions", remedy)))
+    plain = error(windows.actions)
+    findings = [finding for actions, finding in changes if error(actions) < CLEARLY * plain]
+    return findings, (1 + len(changes)) * len(draws) * len(windows) * horizon
 
 
 def _errors(
     dataset: Dataset,
-    simulator: CpuSimulator,
+    simulator: Simulator,
     windows: Windows,
     rows: Int[np.ndarray, " windows"],
     draws: Float[np.ndarray, "draws d"],

@@ -2,133 +2,116 @@
 
 import math
 from collections import Counter
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
 from rich import box
 from rich.console import RenderableType
 from rich.table import Table
 
-from madoc.data.findings import LEVELS
+from madoc.data.findings import LEVELS, Finding
+from madoc.diagnosis.channels import Channel
 from madoc.diagnosis.diagnosis import Diagnosis
+from madoc.diagnosis.excitation import Excitation
+from madoc.diagnosis.explanation import Explanation
 from madoc.parameters import ParameterSpace
 
 MOST_ALIKE = 4
-"""Findings with the same advice that are printed."""
+"""Largest number of findings with the same advice that are printed; `--json` has all."""
 
 
-def to_json(found: Diagnosis, space: ParameterSpace) -> dict[str, Any]:
+def to_json(diagnosis: Diagnosis, space: ParameterSpace) -> dict[str, object]:
     """Everything in it; what is not known is null."""
-    explanation, excitation = found.explanation, found.excitation
-    told: dict[str, Any] = {
-        "rows": found.rows,
-        "episodes": found.episodes,
-        "runs": found.runs,
-        "control_step": found.control_step,
-        "fatal": found.fatal,
-        "findings": [finding.to_json() for finding in found.findings],
-        "channels": [
-            {"name": row.name, "kind": row.kind, "unit": row.unit, "low": row.low, "high": row.high, "step": row.step}
-            | ({"at_limits": row.at_limits} if row.kind == "action" else {})
-            for row in found.channels
-        ],
-        "explanation": None,
-        "parameters": None,
-        "pairs": [],
-        "control_steps": found.control_steps,
-        "seconds": round(found.seconds, 3),
-    }
-    if explanation is not None:
-        signals = [row.name for row in found.channels if row.kind == "signal"]
-        rows = {"midrange": 0, "best_draw": explanation.best}
-        told["explanation"] = {
-            "horizons": list(explanation.horizons),
-            **{
-                name: {signal: _known(explanation.errors[draw, :, at]) for at, signal in enumerate(signals)}
-                | {"overall": _known(explanation.overall[draw])}
-                for name, draw in rows.items()
-            },
-        }
+    excitation, signals = diagnosis.excitation, _signals(diagnosis)
+    counts = ("rows", "episodes", "runs", "control_step", "fatal")
+    channels = [asdict(channel) for channel in diagnosis.channels]
+    for channel in channels:
+        if channel["kind"] == "signal":
+            del channel["at_limits"]
+    parameters = None
     if excitation is not None:
-        told["parameters"] = {
+        columns = zip(space.parameters, _known(excitation.effect), _known(excitation.half_width), strict=True)
+        parameters = {
             row.name: {"unit": row.unit, "low": row.low, "high": row.high, "effect": effect, "half_width": width}
-            for row, effect, width in zip(
-                space.parameters, _known(excitation.effect), _known(excitation.half_width), strict=True
-            )
+            for row, effect, width in columns
         }
-        told["pairs"] = [[first, second, value] for first, second, value in excitation.pairs]
-    return told
+    return {
+        **{name: getattr(diagnosis, name) for name in counts},
+        "findings": [finding.to_json() for finding in diagnosis.findings],
+        "channels": channels,
+        "explanation": None if diagnosis.explanation is None else _explanation_json(diagnosis.explanation, signals),
+        "parameters": parameters,
+        "pairs": [] if excitation is None else [list(pair) for pair in excitation.pairs],
+        "control_steps": diagnosis.control_steps,
+        "seconds": round(diagnosis.seconds, 3),
+    }
 
 
-def tables(found: Diagnosis, space: ParameterSpace) -> tuple[RenderableType, ...]:
-    """The log, its channels, what the model explains, what it could tell of each parameter, and the findings."""
-    seconds = found.rows * found.control_step
+def _explanation_json(explanation: Explanation, signals: list[str]) -> dict[str, object]:
+    def of(draw: int) -> dict[str, list[float | None]]:
+        by_signal = {signal: _known(explanation.errors[draw, :, at]) for at, signal in enumerate(signals)}
+        return by_signal | {"overall": _known(explanation.overall[draw])}
+
+    return {"horizons": list(explanation.horizons), "midrange": of(0), "best_draw": of(explanation.best)}
+
+
+def tables(diagnosis: Diagnosis, space: ParameterSpace) -> tuple[RenderableType, ...]:
+    """The log, its channels, what the model explains, what the log could say of each parameter, and the findings."""
+    seconds, runs, episodes = diagnosis.rows * diagnosis.control_step, diagnosis.runs, diagnosis.episodes
     line = (
-        f"{found.rows:,} rows in {found.runs} run{'s' * (found.runs != 1)} ({found.episodes} "
-        f"stretch{'es' * (found.episodes != 1)} without a break), {found.control_step:g} s apart: {seconds:,.1f} s"
+        f"{diagnosis.rows:,} rows in {runs} run{'s' * (runs != 1)} ({episodes} stretch{'es' * (episodes != 1)} without "
+        f"a break), {diagnosis.control_step:g} s apart: {seconds:,.1f} s"
     )
-    parts: list[RenderableType] = [line, _channel_table(found)]
-    if found.explanation is not None:
-        parts.append(_explanation_table(found))
-    if found.excitation is not None:
-        parts.append(_parameter_table(found, space))
-    return (*parts, *_finding_lines(found))
+    parts: list[RenderableType] = [line, _channel_table(diagnosis.channels)]
+    if diagnosis.explanation is not None:
+        parts.append(_explanation_table(diagnosis.explanation, _signals(diagnosis)))
+    if diagnosis.excitation is not None:
+        parts.append(_parameter_table(diagnosis.excitation, space))
+    return (*parts, *_finding_lines(diagnosis.findings))
 
 
-def _channel_table(found: Diagnosis) -> Table:
-    table = _table("channels", "channel", "unit")
-    for heading in ("lowest", "highest", "typical change", "at limits"):
-        table.add_column(heading, justify="right")
-    for row in found.channels:
+def _signals(diagnosis: Diagnosis) -> list[str]:
+    return [channel.name for channel in diagnosis.channels if channel.kind == "signal"]
+
+
+def _channel_table(channels: tuple[Channel, ...]) -> Table:
+    table = _table("channels", ("channel", "unit"), ("lowest", "highest", "typical change", "at limits"))
+    for row in channels:
         limits = f"{100 * row.at_limits:.1f} %" if row.kind == "action" else ""
         table.add_row(row.name, row.unit, f"{row.low:.4g}", f"{row.high:.4g}", f"{row.step:.3g}", limits)
     return table
 
 
-def _explanation_table(found: Diagnosis) -> Table:
-    explanation = found.explanation
-    assert explanation is not None
-    ahead = ", ".join(map(str, explanation.horizons))
-    table = _table(f"prediction errors {ahead} steps ahead, in % of what 'nothing changes' errs", "signal")
-    for where in ("mid-range", "best draw"):
-        for at, horizon in enumerate(explanation.horizons):
-            table.add_column(f"{horizon}" if at else f"{where}: {horizon}", justify="right")
-    signals = [row.name for row in found.channels if row.kind == "signal"]
-    both = (0, explanation.best)
+def _explanation_table(explanation: Explanation, signals: list[str]) -> Table:
+    first, *others = map(str, explanation.horizons)
+    ahead, both = ", ".join((first, *others)), (0, explanation.best)
+    numbers = [heading for where in ("mid-range", "best draw") for heading in (f"{where}: {first}", *others)]
+    table = _table(f"prediction errors {ahead} steps ahead, in % of what 'nothing changes' errs", ("signal",), numbers)
     for at, name in enumerate(signals):
         table.add_row(name, *(_percent(value) for draw in both for value in explanation.errors[draw, :, at]))
     table.add_row("all", *(_percent(value) for draw in both for value in explanation.overall[draw]))
     return table
 
 
-def _parameter_table(found: Diagnosis, space: ParameterSpace) -> Table:
-    excitation = found.excitation
-    assert excitation is not None
-    table = _table("what this log could tell of each parameter, at best", "parameter", "unit")
-    for heading in ("range", "effect of half of it", "expected 95 %", "of its range"):
-        table.add_column(heading, justify="right")
-    columns = zip(space.parameters, excitation.effect, excitation.half_width, strict=True)
-    for row, effect, width in columns:
-        known = math.isfinite(width)
-        table.add_row(
-            row.name,
-            row.unit,
-            f"[{row.low:g}, {row.high:g}]",
-            f"{effect:.3g} × noise" if known else "?",
-            f"± {width:.2g}" if known else "?",
-            f"{100 * width / (row.high - row.low):.2g} %" if known else "?",
-        )
+def _parameter_table(excitation: Excitation, space: ParameterSpace) -> Table:
+    numbers = ("range", "effect of half of it", "expected 95 %", "of its range")
+    table = _table("what this log could tell of each parameter, at best", ("parameter", "unit"), numbers)
+    for row, effect, width in zip(space.parameters, excitation.effect, excitation.half_width, strict=True):
+        cells = (f"{effect:.3g} × noise", f"± {width:.2g}", f"{100 * width / (row.high - row.low):.2g} %")
+        cells = cells if math.isfinite(width) else ("?", "?", "?")
+        table.add_row(row.name, row.unit, f"[{row.low:g}, {row.high:g}]", *cells)
     return table
 
 
-def _finding_lines(found: Diagnosis) -> tuple[str, ...]:
-    if not found.findings:
+def _finding_lines(findings: tuple[Finding, ...]) -> tuple[str, ...]:
+    if not findings:
         return ("nothing to warn of",)
-    counts = [sum(finding.level == level for finding in found.findings) for level in LEVELS]
-    names = ("fatal", "warnings", "notes")
-    head = ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True) if count)
-    lines, alike = [head], Counter[tuple[str, str]]()
-    for finding in found.findings:
+    counts = Counter(finding.level for finding in findings)
+    names = dict(zip(LEVELS, ("fatal", "warnings", "notes"), strict=True))
+    lines = [", ".join(f"{counts[level]} {name}" for level, name in names.items() if counts[level])]
+    alike = Counter[tuple[str, str]]()
+    for finding in findings:
         kind = (finding.level, finding.do)
         alike[kind] += 1
         if alike[kind] <= MOST_ALIKE:
@@ -137,15 +120,17 @@ def _finding_lines(found: Diagnosis) -> tuple[str, ...]:
     return (*lines, f"... and {hidden} more like these: --json has all") if hidden else tuple(lines)
 
 
-def _table(title: str, *texts: str) -> Table:
+def _table(title: str, texts: Sequence[str], numbers: Sequence[str]) -> Table:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
     for heading in texts:
         table.add_column(heading, no_wrap=True)
+    for heading in numbers:
+        table.add_column(heading, justify="right")
     return table
 
 
 def _percent(value: float) -> str:
-    return "" if not math.isfinite(value) else f"{100 * value:.3g} %"
+    return f"{100 * value:.3g} %" if math.isfinite(value) else ""
 
 
 def _known(values: np.ndarray) -> list[float | None]:

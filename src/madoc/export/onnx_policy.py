@@ -1,14 +1,18 @@
 """A learnt policy as ONNX, for runtimes other than NumPy."""
 
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from madoc.errors import MadocError
 from madoc.numpy_policy import NumpyPolicy
 from madoc.runs.files import replacing
 
+if TYPE_CHECKING:
+    from onnx import ModelProto
+
 OPSET = 17
-"""Of the operators used here all are older; ONNX Runtime has read it since 2022."""
+"""Version of the operator set; all operators used here are older, and ONNX Runtime has read it since 2022."""
 
 
 def save_onnx(policy: NumpyPolicy, path: Path) -> None:
@@ -29,8 +33,8 @@ def save_onnx(policy: NumpyPolicy, path: Path) -> None:
         stream.write(model.SerializeToString())
 
 
-def _model(policy: NumpyPolicy, onnx: Any) -> Any:
-    """(observation - offset) / scale, hidden layers with ReLU, the mean's half of the last one, tanh."""
+def _model(policy: NumpyPolicy, onnx: ModuleType) -> "ModelProto":
+    """(observation - offset) / scale, hidden layers with ReLU, the half of the last one that is the mean, tanh."""
     make, constants, nodes = onnx.helper.make_node, {}, []
     constants["offset"], constants["scale"] = policy.offset, policy.scale
     nodes.append(make("Sub", ["observation", "offset"], ["centred"]))

@@ -1,4 +1,4 @@
-"""How sure a least-squares estimate is, and what the data cannot tell. All in [-1, 1] of the ranges."""
+"""Covariance and confidence intervals of a least-squares estimate, and what the data cannot identify; in [-1, 1]."""
 
 from dataclasses import dataclass
 
@@ -11,24 +11,25 @@ from madoc.identification.losses import Loss, loss_curvature, loss_slope
 
 CONFIDENCE = 0.95
 SETTLED = 0.1
-"""Of its standard error: a step smaller than this changes nothing worth a simulation."""
+"""A step over its standard error, from 0 to 1: a smaller one changes nothing worth a simulation."""
 BOX_VARIANCE = 1.0 / 3.0
-"""Of a uniform distribution over [-1, 1]: what is known of a direction that the data says nothing of."""
+"""Variance of a uniform distribution over [-1, 1]: that of a direction that the data says nothing of."""
 _BLIND = 1e-12
-"""Squared slope, relative to the largest, below which a direction is only the error of the differences."""
+"""Curvature along a direction, relative to the largest, below which it is only the error of the differences."""
 _CORRELATED = 0.95
+"""Correlation, from 0 to 1, above which a pair of parameters is named."""
 _SHARE = 0.2
-"""Of a direction's largest component, from which a parameter is named as part of it."""
+"""Component of a direction, relative to its largest, above which a parameter is named as part of it."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What is known around an estimate, in units of [-1, 1].
+    """The uncertainty of an estimate, in units of [-1, 1].
 
     Attributes:
-        covariance: Of the estimate; directions the data cannot identify have the box's variance.
-        correlation: Of the estimates as the slopes alone have it: residuals of clean data are rounding errors.
-        unidentified: Unit vectors along which the data cannot tell, one a row.
+        covariance: Of the estimate; directions that the data cannot identify have the box's variance.
+        correlation: Of the estimates by the curvature alone: residuals of clean data are rounding errors.
+        unidentified: Unit vectors that the data cannot identify, one a row.
     """
 
     covariance: Float[np.ndarray, "d d"]
@@ -37,14 +38,14 @@ class Uncertainty:
 
 
 def bread(around: Linearisation, scale: float, loss: Loss) -> Float[np.ndarray, "d d"]:
-    """Σ ψ' J Jᵀ: how fast the loss curves. Cauchy's tails curve downwards; should they prevail, Σ ρ' J Jᵀ."""
+    """Σ ψ' J Jᵀ, the curvature of the cost. Cauchy's tails curve downwards; should they prevail, Σ ρ' J Jᵀ."""
     z = (around.residuals / scale) ** 2
     curved = _sum_of_products(around, loss_curvature(z, loss))
     return curved if np.linalg.eigvalsh(curved)[0] > 0 else _sum_of_products(around, loss_slope(z, loss))
 
 
 def meat(around: Linearisation, scale: float, loss: Loss) -> Float[np.ndarray, "d d"]:
-    """Σ g gᵀ over windows, g = Σ ψ J: how much the windows' slopes scatter; n / (n - d) for the parameters spent.
+    """Σ g gᵀ over windows, g = Σ ψ J: the scatter of the windows' gradients; n / (n - d) for the parameters spent.
 
     Residuals of one window are taken to depend on each other, those of different windows not.
     """
@@ -57,14 +58,14 @@ def meat(around: Linearisation, scale: float, loss: Loss) -> Float[np.ndarray, "
 def jackknife_meat(around: Linearisation, share: float, bread: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
     """B C B of the covariance C that leaving out one window at a time has: (n - 1) / n Σ δ δᵀ, δ = (B - B_w)⁻¹ g_w.
 
-    g_w is the slope of the window's cost and B_w its part of the bread B. In `meat` a window that weighs much hides how
-    far it has drawn the estimate towards itself; left out, it shows (Bell and McCaffrey 2002, the CR3 of MacKinnon
-    and White 1985). It matters where windows are few and unlike.
+    g_w is the gradient of the window's cost and B_w its part of the bread B. In `meat` a window that weighs much hides
+    how far it has drawn the estimate towards itself; left out, it shows (Bell and McCaffrey 2002, the CR3 of MacKinnon
+    and White 1985). It matters where windows are few and differ.
 
     Args:
         around: Of a linear problem, weights included.
-        share: How much of its squared slopes the bread is.
-        bread: Their sum.
+        share: The bread over the sum of products of derivatives.
+        bread: The curvature.
     """
     windows = len(around.jacobian)
     scores = np.einsum("wv,wvd->wd", around.residuals, around.jacobian)
@@ -77,29 +78,29 @@ def jackknife_meat(around: Linearisation, share: float, bread: Float[np.ndarray,
 
 
 def least_share(part: Linearisation, whole: Linearisation) -> float:
-    """The least share of what all windows tell of a direction that a part of them tells; of those all tell of.
+    """The smallest eigenvalue of B_part v = λ B_whole v: what a part of the windows tells, where it tells least of all.
 
-    The smallest eigenvalue of B_part v = λ B_whole v.
+    Directions that all windows together do not identify are left out.
     """
     values, vectors = np.linalg.eigh(_sum_of_products(whole, np.ones_like(whole.residuals)))
-    told = values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)
-    if not told.any():
+    identified = values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)
+    if not identified.any():
         return 1.0
-    basis = vectors[:, told] / np.sqrt(values[told])
+    basis = vectors[:, identified] / np.sqrt(values[identified])
     return float(np.linalg.eigvalsh(basis.T @ _sum_of_products(part, np.ones_like(part.residuals)) @ basis)[0])
 
 
 def at_least_noise(
     meat: Float[np.ndarray, "d d"], bread: Float[np.ndarray, "d d"], ratio: float
 ) -> Float[np.ndarray, "d d"]:
-    """The meat, widened where noise that is alike in all windows would scatter the estimate more than windows do.
+    """The meat, widened where noise of equal variance in all windows would scatter the estimate more than windows do.
 
-    Few windows may scatter less than they should by chance; that the noise is what the residuals say is then surer.
+    Few windows may scatter too little by chance; the residuals then tell the variance of the noise more surely.
 
     Args:
         meat: B C B of a covariance C.
         bread: B.
-        ratio: Variance of what a reading pulls with over the mean curvature of its cost: noise alone has ratio B⁻¹.
+        ratio: Variance of a reading's gradient over its mean curvature: noise alone makes the covariance ratio B⁻¹.
     """
     inverse = np.linalg.pinv(bread, rcond=_BLIND, hermitian=True)
     covariance = inverse @ meat @ inverse
@@ -111,16 +112,16 @@ def at_least_noise(
 
 
 def sandwich(bread: Float[np.ndarray, "d d"], meat: Float[np.ndarray, "d d"]) -> Uncertainty:
-    """bread⁻¹ meat bread⁻¹ (Huber 1967) where the data can tell, the box where it cannot.
+    """bread⁻¹ meat bread⁻¹ (Huber 1967) in directions that the data identifies, the box's variance in others.
 
     It holds for robust losses, for channels of unequal noise, and for noise that is not normal.
     """
     values, vectors = np.linalg.eigh(bread)
-    told: Bool[np.ndarray, " d"] = values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)
-    inverse = (vectors[:, told] / values[told]) @ vectors[:, told].T
+    identified: Bool[np.ndarray, " d"] = values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)
+    inverse = (vectors[:, identified] / values[identified]) @ vectors[:, identified].T
     covariance = inverse @ meat @ inverse
-    told &= np.einsum("id,ij,jd->d", vectors, covariance, vectors) < BOX_VARIANCE
-    kept, lost = vectors[:, told] @ vectors[:, told].T, vectors[:, ~told]
+    identified &= np.einsum("id,ij,jd->d", vectors, covariance, vectors) < BOX_VARIANCE
+    kept, lost = vectors[:, identified] @ vectors[:, identified].T, vectors[:, ~identified]
     deviation = np.sqrt(np.maximum(np.diag(inverse), np.finfo(float).tiny))
     return Uncertainty(
         covariance=kept @ covariance @ kept + BOX_VARIANCE * lost @ lost.T,
@@ -135,11 +136,11 @@ def half_width(covariance: Float[np.ndarray, "d d"], windows: int) -> Float[np.n
     return t.ppf(0.5 + CONFIDENCE / 2.0, freedom) * np.sqrt(np.diag(covariance))
 
 
-def identifiability(found: Uncertainty, names: tuple[str, ...]) -> tuple[str, ...]:
+def identifiability(uncertainty: Uncertainty, names: tuple[str, ...]) -> tuple[str, ...]:
     """A sentence for each direction the data cannot identify, and one for the pairs it can hardly tell apart."""
     sentences: list[str] = []
     named: set[str] = set()
-    for direction in np.abs(found.unidentified):
+    for direction in np.abs(uncertainty.unidentified):
         involved = [name for name, part in zip(names, direction, strict=True) if part > _SHARE * direction.max()]
         named.update(involved)
         if len(involved) == 1:
@@ -149,10 +150,10 @@ def identifiability(found: Uncertainty, names: tuple[str, ...]) -> tuple[str, ..
                 f"the data does not identify {', '.join(involved)} together: they can change jointly without changing "
                 "what is seen; leave one of them out"
             )
-    pairs = [pair for pair in correlated_pairs(found.correlation, names) if not named.issuperset(pair[:2])]
+    pairs = [pair for pair in correlated_pairs(uncertainty.correlation, names) if not named.issuperset(pair[:2])]
     if pairs:
-        told = ", ".join(f"{first} and {second} ({value:+.2f})" for first, second, value in pairs)
-        sentences.append(f"the data can hardly tell apart (correlation of the estimates): {told}")
+        listed = ", ".join(f"{first} and {second} ({value:+.2f})" for first, second, value in pairs)
+        sentences.append(f"the data can hardly tell apart (correlation of the estimates): {listed}")
     return tuple(sentences)
 
 

@@ -14,9 +14,11 @@ Loss = Literal["linear", "huber", "soft-l1", "cauchy"]
 TUNING: dict[Loss, float] = {"linear": 1.0, "huber": 1.345, "soft-l1": 1.345, "cauchy": 2.385}
 """c in standard deviations: 95 % efficient under normal noise (Holland and Welsch 1977); soft-l1 as Huber's."""
 _NORMAL_90 = 1.644854
+"""90th percentile of the absolute value of normal noise, in standard deviations."""
 _SHARE_OF_TAIL = 0.2
+"""Least robust deviation, from 0 to 1, relative to that of the 90th percentile."""
 NORMAL_MAD = 1.4826
-"""Standard deviations in a median absolute deviation, for normal noise."""
+"""Standard deviation over median absolute deviation of normal noise, to four places: 1.4826."""
 _SMALLEST_SCALE = 1e-12
 """Residuals are in units of a channel's typical change; below this they are rounding."""
 ALL_FAILED = 1e30
@@ -59,7 +61,7 @@ def loss_curvature(z: Residuals, loss: Loss) -> Residuals:
 
 
 def curvature_share(z: Residuals, loss: Loss) -> float:
-    """Mean of ψ' over the mean of ρ': what the curvature of the loss is of the one its weights have.
+    """Mean of ψ' over the mean of ρ': the curvature of the loss over that of the weighted squares.
 
     One number for all residuals, as their slopes do not depend on how large they are (Huber 1981, section 7.6). Not
     below a tenth: past that Cauchy's tails prevail, and residuals are no longer noise.
@@ -70,17 +72,17 @@ def curvature_share(z: Residuals, loss: Loss) -> float:
 
 
 def scale_of(residuals: Residuals, loss: Loss) -> float:
-    """c: the tuning constant times the standard deviation of residuals that are noise; 1 for `linear`."""
+    """c: the tuning constant times the robust standard deviation of the residuals; 1 for `linear`."""
     if loss == "linear" or not residuals.size:
         return 1.0
     return TUNING[loss] * max(robust_deviation(np.abs(residuals)), _SMALLEST_SCALE)
 
 
 def robust_deviation(size: Float[np.ndarray, "*values"]) -> float:
-    """The standard deviation that the median of |residuals|, in typical changes of a step, speaks of.
+    """The standard deviation of normal noise with this median of |residuals|, in typical changes of a step.
 
-    Where a robot rests and its sensors are coarse, most residuals are 0 and speak of nothing: not below a fifth of what
-    the largest tenth says, as far as that is less than a step's change and so may be noise.
+    Where a robot rests and its sensors are coarse, most residuals are 0. So it is not below a fifth of what the 90th
+    percentile makes it, as far as that is less than a step's change and so may be noise.
     """
     tail = min(float(np.percentile(size, 90)), 1.0)
     return max(NORMAL_MAD * float(np.median(size)), _SHARE_OF_TAIL * tail / _NORMAL_90)

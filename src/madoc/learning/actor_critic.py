@@ -26,7 +26,7 @@ STILL = 1e-3
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ActorCritic:
-    """What gradient updates change."""
+    """Everything that gradient updates change."""
 
     policy: TanhGaussianPolicy
     critic: TwinCritic
@@ -39,7 +39,7 @@ class ActorCritic:
 
 @dataclass(frozen=True)
 class Descent:
-    """How it changes them.
+    """The optimisers of an actor-critic.
 
     Attributes:
         policy: Of the policy, and of the temperature.

@@ -34,9 +34,7 @@ class Ensemble(eqx.Module):
     ) -> None:
         outputs = observation + 1
         self.networks = stack(
-            models,
-            lambda key: Network(observation + action, 2 * outputs, hidden, key=key, activation=jax.nn.silu),
-            key,
+            models, lambda key: Network(observation + action, 2 * outputs, hidden, key=key, activation=jax.nn.silu), key
         )
         self.largest, self.smallest = jnp.full(outputs, 0.5), jnp.full(outputs, -10.0)
 

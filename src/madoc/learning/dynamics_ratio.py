@@ -1,4 +1,4 @@
-"""Two discriminators tell logged from simulated rows; their difference is the log dynamics ratio, the reward."""
+"""Two discriminators classify rows as logged or simulated; their difference is the log dynamics ratio, the reward."""
 
 from dataclasses import dataclass
 
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from madoc.data.dataset import spread_of
 from madoc.learning.networks import Network
 from madoc.types import Transitions
 
@@ -57,17 +58,11 @@ class Scaling:
         )
 
 
-def spread_of(column: Float[np.ndarray, "*rows values"]) -> Float[np.ndarray, " values"]:
-    """Standard deviation of every channel over all rows; 1 for one that never moves."""
-    spread = column.reshape(-1, column.shape[-1]).std(0)
-    return np.where(spread > 1e-8, spread, 1.0)
-
-
 class Discriminators(eqx.Module):
     """f_sa and f_sas, each two logits (target, source), bounded by a tanh (appendix C, Jiang et al. 2024: both by 2).
 
-    A wider bound of f_sa keeps the reward clean: where simulated (s, a) are far from logged ones, what f_sa may not
-    say of them f_sas says in its place, and it reads as a difference in dynamics.
+    A wider bound of f_sa keeps the reward clean: where simulated (s, a) are far from logged ones, f_sas makes up for
+    what a narrowly bounded f_sa cannot express, and that looks like a difference in dynamics.
 
     Attributes:
         pair: f_sa's network.

@@ -4,7 +4,7 @@ The authors never published how they train it. What they say of it: inverse rein
 whose "policy" is the transition, in the manner of GAIL (Ho & Ermon 2016, arXiv 1606.03476), with an ensemble of past
 discriminators. Chosen here: as the agent's action, the next state, earns its reward at once, the generator climbs the
 reward's own gradient through its sample, without a reinforcement learner; and discriminators see blurred next states,
-without which they would tell a deterministic simulator from any model at once.
+without which a deterministic simulator is at once distinguished from any model.
 """
 
 from dataclasses import dataclass
@@ -80,7 +80,7 @@ def deceiving_loss(generated: Float[Array, " rows"]) -> Float[Array, ""]:
 
 
 def dynamics_reward(logits: Float[Array, "members *rows"]) -> Float[Array, "*rows"]:
-    """R = -log(1 - mean D) over past discriminators; 0.69 where they cannot tell."""
+    """R = -log(1 - mean D) over past discriminators; 0.69 where they are undecided."""
     return -jnp.log1p(-jnp.minimum(jax.nn.sigmoid(logits).mean(0), SURE))
 
 
@@ -128,7 +128,7 @@ def oppose(
             deceit = jax.lax.stop_gradient(generated(carry.generator))
             return telling_loss(logit(discriminator, pair, change + blur[0]), logit(discriminator, pair, deceit))
 
-        told, gradients = eqx.filter_value_and_grad(telling)(carry.discriminator)
+        loss, gradients = eqx.filter_value_and_grad(telling)(carry.discriminator)
         discriminator, discriminator_optimiser = descend(
             optimiser, gradients, carry.discriminator_optimiser, carry.discriminator
         )
@@ -139,7 +139,7 @@ def oppose(
         deceived, gradients = eqx.filter_value_and_grad(deceiving)(carry.generator)
         generator, generator_optimiser = descend(optimiser, gradients, carry.generator_optimiser, carry.generator)
         following = Opposition(generator, discriminator, carry.past, generator_optimiser, discriminator_optimiser)
-        return following, {"discriminator_loss": told, "generated_reward": -deceived}
+        return following, {"discriminator_loss": loss, "generated_reward": -deceived}
 
     following, metrics = scan_updates(update, opposition, key, count)
     return remember(following), metrics

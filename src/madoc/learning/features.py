@@ -41,6 +41,11 @@ class Features(eqx.Module):
         change = following - observation
         return change / _like(self.change_scale, change)
 
+    def described(self, rows: dict[str, Array]) -> tuple[Float[Array, "rows pair"], Float[Array, "rows observation"]]:
+        """(s, a) and s' - s of rows, as networks see them."""
+        observation = rows["observation"]
+        return self.pair(observation, rows["action"]), self.change(observation, rows["next_observation"])
+
     def following(
         self, observation: Float[Array, "*rows observation"], change: Float[Array, "*rows observation"]
     ) -> Float[Array, "*rows observation"]:

@@ -87,10 +87,7 @@ def map_stack(
 
 
 def scan_updates(
-    update: Callable[[Carry, PRNGKeyArray], tuple[Carry, dict[str, Array]]],
-    carry: Carry,
-    key: PRNGKeyArray,
-    count: int,
+    update: Callable[[Carry, PRNGKeyArray], tuple[Carry, dict[str, Array]]], carry: Carry, key: PRNGKeyArray, count: int
 ) -> tuple[Carry, dict[str, Array]]:
     """Run `count` updates in one `lax.scan`; returns the last carry and the mean of each metric."""
     return scan_inputs(update, carry, jax.random.split(key, count))

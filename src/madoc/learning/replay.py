@@ -1,26 +1,26 @@
 """A ring of rows on the device, filled by jitted writes and sampled inside jitted updates."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Replay:
-    """The last `capacity` rows of any pytree, float32 on the device.
+    """The last `capacity` rows of named columns, float32 on the device.
 
     Attributes:
         rows: Columns of shape (capacity, ...).
         written: How many rows were ever written.
     """
 
-    rows: PyTree
+    rows: dict[str, Array]
     written: Int[Array, ""]
 
     @property
@@ -36,7 +36,7 @@ def empty(capacity: int, **columns: tuple[int, ...]) -> Replay:
 
 
 @partial(jax.jit, donate_argnums=0)
-def add(replay: Replay, rows: PyTree, valid: Bool[Array, " batch"]) -> Replay:
+def add(replay: Replay, rows: Mapping[str, Array | np.ndarray], valid: Bool[Array, " batch"]) -> Replay:
     """Write the valid rows of a batch over the oldest ones. The replay given is consumed."""
     position = replay.written + jnp.cumsum(valid) - 1
     written = replay.written + valid.sum(dtype=jnp.int32)
@@ -52,7 +52,7 @@ def clear(replay: Replay) -> Replay:
     return Replay(replay.rows, jnp.zeros((), jnp.int32))
 
 
-def sample(replay: Replay, key: PRNGKeyArray, *shape: int) -> Any:
+def sample(replay: Replay, key: PRNGKeyArray, *shape: int) -> dict[str, Array]:
     """Rows drawn uniformly with replacement, with leading axes of this shape."""
     size = jnp.minimum(replay.written, replay.capacity)
     index = jax.random.randint(key, shape, 0, size)

@@ -1,15 +1,21 @@
 """Several rows as one: what a discriminator is shown where a single observation does not determine the state.
 
-Not in the paper, whose robots show all of their state. Where velocities are hidden, (s, a) says little of s'; the last
-few observations and actions say as much as a state does.
+Not in the paper, whose robots show all of their state. Where velocities are hidden, (s, a) does not determine s'; the
+last few observations and actions do about as well as a state.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from madoc.learning.dynamics_ratio import Scaling, spread_of
+from madoc.data.dataset import Dataset, spread_of
+from madoc.errors import MadocError
+from madoc.learning.cloning import Pairs
+from madoc.learning.dynamics_ratio import Scaling
 from madoc.types import Transitions
 
 Stretch = tuple[
@@ -63,6 +69,47 @@ class WindowScaling:
         size = following.shape[-1]
         earlier = [part for pair, change in each[-2::-1] for part in (change, pair[..., size:])]
         return np.concatenate([pair, *earlier], axis=-1), (turn(stretch) / self.next_scale).astype(np.float32)
+
+
+class LoggedFeatures:
+    """A log as networks see it. Every description of it is made once, when it is first asked for."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        """Of this log."""
+        self._dataset = dataset
+        self._windows: dict[tuple[str, int], tuple[WindowScaling, tuple[Array, Array]]] = {}
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """Observations and actions as they are, on the device, float32."""
+        logged = self._dataset.transitions
+        return jnp.asarray(logged.observation, jnp.float32), jnp.asarray(logged.action, jnp.float32)
+
+    @cached_property
+    def standardised(self) -> Scaling:
+        """How (s, a, s') become features of order one."""
+        return Scaling.standardised(self._dataset.transitions)
+
+    def windows(
+        self, features: Literal["standardised", "raw"], length: int
+    ) -> tuple[WindowScaling, tuple[Float[Array, "windows window"], Float[Array, "windows observation"]]]:
+        """How windows of so many rows are described, and the features of all there are, on the device.
+
+        Raises:
+            MadocError: No episode is long enough.
+        """
+        if (features, length) not in self._windows:
+            rows, starts = self._dataset.transitions, self._dataset.episode_starts
+            last = last_rows(len(self._dataset), starts, length)
+            if not len(last):
+                raise MadocError(
+                    f"no episode of {self._dataset.origin} has the {length} rows of a window; take a shorter one"
+                )
+            stretch = logged_stretch(rows, last, length)
+            scaling = WindowScaling.of(self.standardised if features == "standardised" else Scaling.raw(rows), stretch)
+            window, following = scaling.features(stretch)
+            self._windows[features, length] = scaling, (jnp.asarray(window), jnp.asarray(following))
+        return self._windows[features, length]
 
 
 def turn(stretch: Stretch) -> Float[np.ndarray, "*rows observation"]:

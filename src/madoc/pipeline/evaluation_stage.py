@@ -2,76 +2,56 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from madoc.errors import MadocError
 from madoc.evaluation import evaluate
-from madoc.pipeline.data_stage import check_truth, make_target, task_of_spec
+from madoc.pipeline.data_stage import Machine, read_truth
 from madoc.pipeline.keys import stage_key
+from madoc.pipeline.orders import EvaluationOrder
+from madoc.pipeline.records import EvaluationRecord, SpecRecord, read_spec
 from madoc.policies import load_policy
-from madoc.runs.files import read_json, write_json
+from madoc.runs.files import write_json
 from madoc.runs.progress import bar
 
 
 def evaluate_folder(
-    folder: Path,
-    *,
-    truth: Mapping[str, float] | None = None,
-    episodes: int = 20,
-    seed: int = 0,
-    names: Sequence[str] = (),
-    quiet: bool = True,
-) -> dict[str, Any]:
+    folder: Path, order: EvaluationOrder | None = None, *, names: Sequence[str] = (), quiet: bool = False
+) -> EvaluationRecord:
     """Evaluate the policies of a run in the target, on the same starts, and leave `evaluation.json`.
 
     Args:
         folder: A run folder with policies in it, or the folder of one policy.
-        truth: The target's physical values by name; None takes those the run remembers.
-        episodes: How many.
-        seed: Of the starts.
+        order: Episodes, seed and truth; without a truth, the one that the run remembers is taken.
         names: Only the policies of these names; empty takes all.
         quiet: Show no progress.
-
-    Returns:
-        What `evaluation.json` holds: `policies` has, by name, the mean return, its spread over episodes, the
-        normalized score and the mean length. `calibrated_percent_of_truth` is there when both are.
 
     Raises:
         MadocError: There is no policy, the truth is not known, or a number is out of range.
     """
-    if episodes < 1:
-        raise MadocError(f"expected at least 1 episode, got {episodes}")
-    key = stage_key(seed, "evaluating")
+    order = order or EvaluationOrder()
+    if order.episodes < 1:
+        raise MadocError(f"expected at least 1 episode, got {order.episodes}")
+    key = stage_key(order.seed, "evaluating")
     policies = find_policies(folder)
     policies = {name: policies[name] for name in names or policies}
     spec = _spec_with_truth(folder, policies)
-    known = spec["truth"] if truth is None else dict(truth)
-    if known is None:
+    truth = read_truth(order.truth) or spec.truth
+    if truth is None:
         raise MadocError(f"the true parameters of {folder} are not known; pass --truth FILE.json")
-    task = task_of_spec(spec)
-    check_truth(known, task.with_parameters(list(spec["parameters"])), physics=task.physics)
-    target = make_target(task, known)
-    found: dict[str, Any] = {}
+    machine = Machine.restored(spec)
+    task = machine.task
+    machine.check_truth(truth, task.with_parameters(list(spec.parameters)))
+    simulator, parameters = machine.at(truth)
+    summaries: dict[str, dict[str, float]] = {}
     total = len(policies) * task.max_episode_steps
     with bar(f"evaluating on {task.name}", total=total, unit="steps", quiet=quiet) as advance:
         for name, file in policies.items():
-            returns = evaluate(
-                load_policy(file),
-                target.simulator,
-                target.parameters,
-                key=key,
-                episodes=episodes,
-                advance=advance,
-            )
-            found[name] = returns.summary()
-    evaluation = {
-        "task": task.name,
-        "physics": task.physics,
-        "episodes": episodes,
-        "seed": seed,
-        "policies": found,
-    } | _share_of_truth(found)
-    write_json(folder / "evaluation.json", evaluation)
+            policy = load_policy(file)
+            returns = evaluate(policy, simulator, parameters, key=key, episodes=order.episodes, advance=advance)
+            summaries[name] = returns.summary()
+    share = _percent_of_truth(summaries)
+    evaluation = EvaluationRecord(task.name, task.physics, order.episodes, order.seed, summaries, share)
+    write_json(folder / "evaluation.json", evaluation.to_json())
     return evaluation
 
 
@@ -84,24 +64,23 @@ def find_policies(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
         raise MadocError(f"there is no run folder {folder}; check the path")
     files = [folder / "policy.npz", *sorted(folder.glob("policy-*/policy.npz"))]
-    found = {file.parent.resolve().name.removeprefix("policy-"): file for file in files if file.exists()}
-    if not found:
+    policies = {file.parent.resolve().name.removeprefix("policy-"): file for file in files if file.exists()}
+    if not policies:
         raise MadocError(f"there is no learnt policy in {folder}; learn one with: madoc learn {folder}")
-    return found
+    return policies
 
 
-def _spec_with_truth(folder: Path, policies: Mapping[str, Path]) -> dict[str, Any]:
+def _spec_with_truth(folder: Path, policies: Mapping[str, Path]) -> SpecRecord:
     """The spec of a run that says robot, physics and parameters; of several, one that knows the truth."""
     places = [folder / "calibration", folder, *(file.parent for file in policies.values())]
-    files = [place / "spec.json" for place in places]
-    specs = [spec for spec in (read_json(file) for file in files if file.exists()) if "physics" in spec]
-    specs = [spec for spec in specs if spec.get("command") in ("calibrate", "learn")]
+    specs = [spec for spec in map(read_spec, places) if spec.command in ("calibrate", "learn")]
     if not specs:
         raise MadocError(f"{folder} holds no run of madoc: there is no spec.json that names its robot")
-    return next((spec for spec in specs if spec["truth"] is not None), specs[0])
+    return next((spec for spec in specs if spec.truth is not None), specs[0])
 
 
-def _share_of_truth(found: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
-    if not {"calibrated", "truth"} <= set(found) or found["truth"]["return"] <= 0:
-        return {}
-    return {"calibrated_percent_of_truth": 100.0 * found["calibrated"]["return"] / found["truth"]["return"]}
+def _percent_of_truth(summaries: Mapping[str, Mapping[str, float]]) -> float | None:
+    """Return of the calibrated policy in percent of that learnt at the truth, where both are there."""
+    if not {"calibrated", "truth"} <= set(summaries) or summaries["truth"]["return"] <= 0:
+        return None
+    return 100.0 * summaries["calibrated"]["return"] / summaries["truth"]["return"]

@@ -1,16 +1,14 @@
-"""Export as a stage: a finished calibration as files for others' tools."""
+"""Export as a stage: a finished calibration as files for other tools."""
 
 from pathlib import Path
-from typing import Any
 
 from madoc import simulation
 from madoc.errors import MadocError
-from madoc.export import Found, Provenance, save_onnx, save_patch, save_randomization, save_sysid_parameters
+from madoc.export import Exported, Provenance, save_onnx, save_patch, save_randomization, save_sysid_parameters
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibration_stage import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
-from madoc.runs.files import read_json
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.simulation.mjcf import save_mjcf
 from madoc.simulation.write import nominal_values
 
@@ -39,8 +37,8 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dic
     simulator, result = simulation.make(calibrated.task), calibrated.result
     provenance = provenance_of(calibrated)
     model = calibrated.task.compile()
-    found = [
-        Found(parameter, result.parameters[parameter.name], nominal_values(model, parameter))
+    exported = [
+        Exported(parameter, result.parameters[parameter.name], nominal_values(model, parameter))
         for parameter in simulator.parameters.parameters
     ]
     files = {
@@ -50,9 +48,9 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dic
         "mujoco.sysid parameters": folder / "sysid_parameters.yaml",
     }
     changes = save_mjcf(simulator, result.mean, files["model"])
-    save_patch(files["patch"], found, provenance, changes=changes, stepping=_stepping(simulator))
-    save_randomization(files["randomization ranges"], found, provenance, result.covariance)
-    save_sysid_parameters(files["mujoco.sysid parameters"], found)
+    save_patch(files["patch"], exported, provenance, changes=changes, stepping=_stepping(simulator))
+    save_randomization(files["randomization ranges"], exported, provenance, result.covariance)
+    save_sysid_parameters(files["mujoco.sysid parameters"], exported)
     for name, file in policies.items():
         target = folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx")
         save_onnx(NumpyPolicy.load(file), target)
@@ -62,24 +60,24 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dic
 
 def provenance_of(calibrated: Calibrated) -> Provenance:
     """Where an estimate comes from, as its run folder remembers it."""
-    folder = calibrated.folder
-    spec: dict[str, Any] = read_json(folder / "spec.json") if (folder / "spec.json").exists() else {}
-    known = spec.get("data") or {}
-    result = read_json(folder / "result.json") if (folder / "result.json").exists() else {}
-    whole = folder.resolve()
+    verdict = calibrated.result.verdict
+    stored, whole = calibrated.spec.data, calibrated.folder.resolve()
+    data = (
+        {} if stored is None else {"paths": list(stored.paths), "rows": stored.rows, "fingerprint": stored.fingerprint}
+    )
     return Provenance(
         run=whole.parent.name if whole.name == "calibration" else whole.name,
         method=calibrated.result.method,
         seed=calibrated.seed,
-        data={name: known[name] for name in ("paths", "rows", "fingerprint") if name in known},
-        versions=spec.get("versions", {}),
-        verdict=result.get("verdict"),
+        data=data,
+        versions=calibrated.spec.versions,
+        verdict=None if verdict is None else verdict.to_json(),
         warnings=calibrated.result.warnings,
     )
 
 
-def _stepping(simulator: CpuSimulator) -> dict[str, Any]:
-    """How the model is stepped to move as it was calibrated to."""
+def _stepping(simulator: Simulator) -> dict[str, object]:
+    """How the model must be stepped to move as it was calibrated to."""
     task, steps = simulator.task, simulator.task.frame_skip
     channels = [
         {

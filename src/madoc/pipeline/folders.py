@@ -4,27 +4,26 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from madoc.errors import MadocError
 from madoc.runs.files import read_json
 from madoc.runs.run_folder import RunFolder
 
 ENDED = ("finished", "converged")
-"""How a stage ends whose successor may start."""
+"""The statuses of a stage after which the next one may start."""
 
 
 @contextmanager
 def working_folder(
-    path: Path, spec: dict[str, Any], *, resume: bool, keep: str = "checkpoint.npz"
+    path: Path, spec: dict[str, object], *, resume: bool, keep: str = "checkpoint.npz"
 ) -> Iterator[RunFolder]:
     """The locked folder of a run, new or, with `resume`, as it was left.
 
     Args:
         path: The folder.
-        spec: What is asked.
-        resume: Go on with the run it holds.
-        keep: The first file worth keeping: a new folder refused before it has one is taken away again.
+        spec: The settings of the run.
+        resume: Go on with the run that the folder holds.
+        keep: The first file worth keeping: a new folder is deleted if the run is refused before it has that file.
 
     Raises:
         MadocError: As `RunFolder.create` and `RunFolder.open`.

@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import jax
 
@@ -10,9 +9,10 @@ from madoc.calibration import CalibrationProblem, LeastSquares, Madoc
 from madoc.errors import MadocError
 
 REFINING_EPOCHS = 6
-"""Steps on all windows that least squares usually takes."""
-BESIDES = 1.15
-"""Cloning and grouping, over calibrating: measured with the defaults on Hopper."""
+"""Number of steps on all windows that least squares usually takes."""
+PREPARATION = 1.15
+"""Time of a whole run of Madoc over that of its calibrating epochs, as cloning and grouping come first: measured with
+the defaults on Hopper."""
 
 
 @dataclass(frozen=True)
@@ -20,10 +20,10 @@ class Forecast:
     """A method's time, or why it would refuse.
 
     Attributes:
-        method: Its name.
-        seconds: Expected; None where it refuses.
-        control_steps: It would simulate, at most.
-        refusal: A sentence; empty where it does not refuse.
+        method: Name of the method.
+        seconds: Expected duration; None where the method refuses the data.
+        control_steps: The most control steps that it would simulate.
+        refusal: Why it refuses the data; empty where it does not.
     """
 
     method: str
@@ -31,13 +31,13 @@ class Forecast:
     control_steps: int
     refusal: str = ""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Its fields."""
         return asdict(self)
 
     @property
     def sentence(self) -> str:
-        """In words."""
+        """The forecast in words."""
         if self.seconds is None:
             return f"{self.method} would refuse: {self.refusal}"
         return f"{self.method}: about {_duration(self.seconds)} for {self.control_steps:,} control steps"
@@ -65,8 +65,7 @@ def _least_squares(problem: CalibrationProblem, budget: int) -> Forecast:
 
 
 def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
-    starts: Any = "logged" if problem.states.starts_known else "policy"
-    method = Madoc(groups="one", starts=starts, cloning_epochs=0)
+    method = Madoc(groups="one", cloning_epochs=0)
     name = "madoc"
     try:
         state = method.init(problem, jax.random.key(0))
@@ -78,7 +77,7 @@ def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
     except MadocError as error:
         return Forecast(name, None, 0, str(error))
     epochs = budget / method.epoch_steps
-    return Forecast(name, times[0] + BESIDES * epochs * times[1], budget)
+    return Forecast(name, times[0] + PREPARATION * epochs * times[1], budget)
 
 
 def _duration(seconds: float) -> str:

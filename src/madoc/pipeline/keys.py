@@ -12,7 +12,7 @@ LARGEST_SEED = 2**32 - 1
 
 
 def seed_key(seed: int) -> PRNGKeyArray:
-    """The key of a seed, as a calibration uses it: its result names the seed.
+    """The random key of a seed, which calibrations use as it is: their results name the seed.
 
     Raises:
         MadocError: The seed is negative or too large.

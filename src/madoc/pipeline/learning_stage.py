@@ -1,21 +1,22 @@
 """Policy learning as a stage: in the calibrated simulator, over a distribution of it, or at a yardstick."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import get_args
 
 import numpy as np
 
 from madoc import simulation
 from madoc.calibration import CalibrationResult
+from madoc.data import Dataset
 from madoc.errors import MadocError, unknown_name
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.calibration_stage import Calibrated
-from madoc.pipeline.data_stage import check_truth, load_source, make_target, stored_robot
+from madoc.pipeline.data_stage import load_source, read_truth
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
+from madoc.pipeline.orders import Place, PolicyOrder
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
@@ -26,49 +27,23 @@ from madoc.policies import (
     learn_policy,
     require_reward,
 )
-from madoc.simulation import CpuSimulator
+from madoc.simulation import Simulator
 from madoc.types import entry_of
 
-PLACES = ("calibrated", "distribution", "uniform", "midrange", "truth")
+PLACES: tuple[str, ...] = get_args(Place)
 """Where a policy may be learnt: at the estimate, over the calibrated distribution, over the whole box, in the
 uncalibrated simulator, in the target itself."""
 
 
-@dataclass(frozen=True)
-class PolicyOrder:
-    """What a policy learner is asked.
-
-    Attributes:
-        at: One of `PLACES`.
-        method: A name in `LEARNERS`.
-        changes: Hyperparameters that differ from the method's own.
-        budget: Simulated control steps, or updates of a learner that does not simulate.
-        seed: Of all randomness.
-    """
-
-    at: str = "calibrated"
-    method: str = "sac"
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    budget: int = 300_000
-    seed: int = 0
-
-
 def learn_in(
-    out: Path,
-    calibrated: Calibrated,
-    order: PolicyOrder,
-    *,
-    truth: Mapping[str, float] | None = None,
-    resume: bool = False,
-    quiet: bool = True,
+    out: Path, calibrated: Calibrated, order: PolicyOrder, *, resume: bool = False, quiet: bool = False
 ) -> LearnedPolicy:
     """Learn a policy, and leave a run folder with `policy.npz`.
 
     Args:
         out: The folder.
         calibrated: The calibration.
-        order: What to learn, and where.
-        truth: The target's values by name; None takes those the calibration remembers.
+        order: What to learn, and where; without a truth, the one that the calibration remembers is taken.
         resume: Go on with the run in the folder.
         quiet: Show no progress.
 
@@ -85,21 +60,9 @@ def learn_in(
         )
     require_reward(calibrated.task)
     key = stage_key(order.seed, "learning")
-    known = calibrated.truth if truth is None else dict(truth)
-    simulator, parameters = _system(calibrated, order.at, known)
-    dataset = None
-    if entry.needs_data:
-        if calibrated.source is None:
-            raise MadocError(
-                f"{order.method} learns from logged data, and a bare result names no data; "
-                "give it the run folder of the calibration"
-            )
-        dataset = load_source(calibrated.source, calibrated.task, seed=calibrated.seed)
-        if dataset.disturbance.hidden_velocities:
-            raise MadocError(
-                f"{order.method} learns from whole observations, and {dataset.origin} hides velocities; "
-                "take a method that needs no data"
-            )
+    truth = read_truth(order.truth) or calibrated.spec.truth
+    simulator, parameters = _system(calibrated, order.at, truth)
+    dataset = _logged(calibrated, order.method) if entry.needs_data else None
     spec = {
         "command": "learn",
         "task": calibrated.task.name,
@@ -110,8 +73,8 @@ def learn_in(
         "hyperparameters": hyperparameters(method),
         "seed": order.seed,
         "budget": order.budget,
-        "truth": known,
-    } | stored_robot(calibrated.task)
+        "truth": truth,
+    } | calibrated.machine.stored()
     with working_folder(out, spec, resume=resume) as folder:
         # One that an interrupted run left would be taken for the finished policy after a kill.
         (out / "policy.npz").unlink(missing_ok=True)
@@ -126,19 +89,34 @@ def policy_folder_name(at: str, method: str) -> str:
     return f"policy-{at}" if method == "sac" else f"policy-{at}-{method}"
 
 
+def _logged(calibrated: Calibrated, method: str) -> Dataset:
+    """The data of a calibration, for a learner that learns from it."""
+    if calibrated.source is None:
+        raise MadocError(
+            f"{method} learns from logged data, and a bare result names no data; "
+            "give it the run folder of the calibration"
+        )
+    dataset = load_source(calibrated.source, calibrated.machine, seed=calibrated.seed)
+    if dataset.disturbance.hidden_velocities:
+        raise MadocError(
+            f"{method} learns from whole observations, and {dataset.origin} hides velocities; "
+            "take a method that needs no data"
+        )
+    return dataset
+
+
 def _system(
     calibrated: Calibrated, at: str, truth: Mapping[str, float] | None
-) -> tuple[CpuSimulator, np.ndarray | ParameterDistribution]:
+) -> tuple[Simulator, np.ndarray | ParameterDistribution]:
     """The simulator to learn in, and its physical values, or the distribution to draw them from."""
     if at not in PLACES:
         raise unknown_name("place to learn at", at, PLACES)
     if truth is not None:
-        check_truth(truth, calibrated.task, physics=calibrated.task.physics)
+        calibrated.machine.check_truth(truth, calibrated.task)
     if at == "truth":
         if truth is None:
             raise MadocError("the true parameters are not known here; pass --truth FILE.json")
-        target = make_target(calibrated.task, truth)
-        return target.simulator, target.parameters
+        return calibrated.machine.at(truth)
     simulator = simulation.make(calibrated.task)
     if at == "distribution":
         return simulator, _calibrated_distribution(simulator.parameters, calibrated.result)
@@ -153,7 +131,7 @@ def _calibrated_distribution(space: ParameterSpace, result: CalibrationResult) -
     return NormalParameters(space, result.mean, np.diag(result.std**2) if joint is None else np.asarray(joint))
 
 
-def _described(simulator: CpuSimulator, parameters: np.ndarray | ParameterDistribution) -> dict[str, Any]:
+def _described(simulator: Simulator, parameters: np.ndarray | ParameterDistribution) -> dict[str, float]:
     """Parameters by name for spec.json: a value, or the mean (mid-range of a box) of what they are drawn from."""
     if isinstance(parameters, NormalParameters):
         parameters = parameters.mean

@@ -1,75 +1,34 @@
 """The main job from one call: data, calibration, policies, evaluation, each stage skipped where it is done."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
-from madoc import data, robots
+from madoc import data
 from madoc.calibration import CALIBRATORS, CalibrationResult
-from madoc.data import Disturbance
 from madoc.errors import MadocError
-from madoc.pipeline.calibration_stage import (
-    Calibrated,
-    CalibrationOrder,
-    calibrate_in,
-    calibration_ended,
-    read_calibration,
-)
-from madoc.pipeline.data_stage import Source, load_source, record_named, split_name, stored_robot
+from madoc.pipeline.calibration_stage import Calibrated, calibrate_in, calibration_ended, read_calibration
+from madoc.pipeline.data_stage import Machine, load_source, read_truth, record_named, split_name
 from madoc.pipeline.evaluation_stage import evaluate_folder
 from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
 from madoc.pipeline.keys import seed_key
-from madoc.pipeline.learning_stage import PolicyOrder, learn_in
+from madoc.pipeline.learning_stage import learn_in
 from madoc.pipeline.methods import hyperparameters, make_method
+from madoc.pipeline.orders import (
+    CalibrationOrder,
+    EvaluationOrder,
+    Place,
+    PolicyOrder,
+    RecordOrder,
+    RunOrder,
+    Source,
+    parse_settings,
+)
+from madoc.pipeline.records import Summary, read_record
 from madoc.policies import LEARNERS, require_reward
 from madoc.runs.files import read_json
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What `run_all` is asked.
-
-    Attributes:
-        name: `TASK-QUALITY` to record, or a task's name with `data`.
-        data: A log to use instead of recording one.
-        transitions: Rows recorded, or kept of the log.
-        disturbance: What to put into them.
-        physics: `legacy` or `modern`; None takes the log's, and `legacy` where nothing says.
-        level: Ranges to search: `easy`, `normal` or `hard`.
-        parameters: Calibrate only these; empty takes all.
-        method: A name in `CALIBRATORS`.
-        changes: Hyperparameters of the method that differ from its own.
-        learner: A name in `LEARNERS`.
-        learner_changes: Hyperparameters of the learner that differ from its own.
-        calibration_budget: Simulated control steps for the calibration.
-        policy_budget: Simulated control steps for each policy, or updates of a learner that does not simulate.
-        episodes: For the evaluation of each policy.
-        yardsticks: Learn also at mid-range and at the truth, where the truth is known and it makes a difference.
-        seed: Of all randomness.
-        truth: The target's values by name; None takes the data's, if it has any.
-    """
-
-    name: str
-    data: Source | None = None
-    transitions: int = 200_000
-    disturbance: Disturbance = field(default_factory=Disturbance)
-    physics: str | None = None
-    level: str = "normal"
-    parameters: tuple[str, ...] = ()
-    method: str = "madoc"
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    learner: str = "sac"
-    learner_changes: Mapping[str, Any] = field(default_factory=dict)
-    calibration_budget: int = 300_000
-    policy_budget: int = 300_000
-    episodes: int = 20
-    yardsticks: bool = True
-    seed: int = 0
-    truth: Mapping[str, float] | None = None
-
-
-def run_all(plan: Plan, out: Path, *, resume: bool = False, quiet: bool = True) -> dict[str, Any]:
+def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = False) -> Summary:
     """Do the main job, and leave a folder with all of it.
 
     The folder holds `data.npz`, the run folders `calibration`, `policy-calibrated`, `policy-midrange` and
@@ -81,120 +40,111 @@ def run_all(plan: Plan, out: Path, *, resume: bool = False, quiet: bool = True) 
         it has what there was until that stage.
 
     Raises:
-        MadocError: The plan cannot be carried out.
+        MadocError: The order cannot be carried out.
     """
-    spec = _spec(plan)
+    order = replace(order, search=replace(order.search, method=order.search.method or "madoc"))
+    if order.data is not None:
+        order = replace(order, data=_source(order).absolute().paths[0])
+    machine = Machine.named(split_name(order.name)[0], order.search.physics)
+    spec = _spec(order, machine)
     with working_folder(out, spec, resume=resume, keep="data.npz") as folder:
         if (out / "summary.json").exists():
-            return read_json(out / "summary.json")
-        _data_stage(plan, out, quiet=quiet)
-        result = _calibration_stage(plan, out, quiet=quiet)
+            return read_record(Summary, out / "summary.json")
+        if not (out / "data.npz").exists():
+            data.save(_recorded_or_loaded(order, machine, quiet=quiet), out / "data.npz")
+        result = _calibrate(order, out, quiet=quiet)
         calibrated = read_calibration(out / "calibration")
-        summary = _beginning(plan, calibrated)
+        summary = _beginning(order, calibrated)
         if result.status not in ENDED:
-            return summary | {"status": result.status, "sentence": f"calibration: {result.sentence}"}
-        known = calibrated.truth is not None
-        compared = plan.yardsticks and known and LEARNERS[plan.learner].needs_parameters
-        for at in ("calibrated", "midrange", "truth") if compared else ("calibrated",):
-            policy = _policy_stage(plan, calibrated, at, out / f"policy-{at}", quiet=quiet)
-            summary["policies"][at] = policy
+            return replace(summary, status=result.status, sentence=f"calibration: {result.sentence}")
+        truth_known = calibrated.spec.truth is not None
+        compared = order.yardsticks and truth_known and LEARNERS[order.learner].needs_parameters
+        places: tuple[Place, ...] = ("calibrated", "midrange", "truth") if compared else ("calibrated",)
+        for at in places:
+            policy = _learn(order, calibrated, at, out / f"policy-{at}", quiet=quiet)
+            summary = replace(summary, policies={**summary.policies, at: policy})
             if policy["status"] not in ENDED:
-                return summary | {"status": policy["status"], "sentence": f"policy-{at}: {policy['sentence']}"}
-        if known:
-            summary["evaluation"] = evaluate_folder(
-                out, episodes=plan.episodes, seed=plan.seed, quiet=quiet, names=tuple(summary["policies"])
-            )
-        folder.write_json("summary.json", summary)
+                return replace(summary, status=str(policy["status"]), sentence=f"policy-{at}: {policy['sentence']}")
+        if truth_known:
+            asked = EvaluationOrder(order.episodes, order.search.seed)
+            summary = replace(summary, evaluation=evaluate_folder(out, asked, names=places, quiet=quiet))
+        folder.write_json("summary.json", summary.to_json())
         return summary
 
 
-def _spec(plan: Plan) -> dict[str, Any]:
-    """The plan as `spec.json` keeps it, refused here if any stage would refuse it."""
-    task_name, quality = split_name(plan.name)
-    robot = robots.resolve(task_name, plan.physics)
-    require_reward(robot)
-    if plan.data is None and not quality:
-        raise MadocError(f"expected TASK-QUALITY to record, as {task_name}-medium, or --data FILE to load")
+def _source(order: RunOrder) -> Source:
+    """The log of an order that names one."""
+    return Source((order.data or "",), order.transitions, order.reading)
+
+
+def _spec(order: RunOrder, machine: Machine) -> dict[str, object]:
+    """The order as `spec.json` keeps it, refused here if any stage would refuse it."""
+    require_reward(machine.task)
+    if order.data is None and not split_name(order.name)[1]:
+        raise MadocError(f"expected TASK-QUALITY to record, as {order.name}-medium, or --data FILE to load")
     for what, value in {
-        "transition": plan.transitions,
-        "control step of budget": plan.calibration_budget,
-        "control step of policy budget": plan.policy_budget,
-        "episode": plan.episodes,
+        "transition": order.transitions,
+        "control step of budget": order.search.budget,
+        "control step of policy budget": order.policy_budget,
+        "episode": order.episodes,
     }.items():
-        if value < 1:
+        if value is not None and value < 1:
             raise MadocError(f"expected at least 1 {what}, got {value}")
-    if plan.disturbance.friction != 1.0:
-        raise MadocError("a target of another friction is made by madoc record; pass its file as data")
-    seed_key(plan.seed)
-    fields = asdict(plan)
-    for kind, changes, entries in (("method", "changes", CALIBRATORS), ("learner", "learner_changes", LEARNERS)):
-        method = make_method(entries, fields[kind], fields.pop(changes))
-        fields[kind] = {"name": fields[kind], "hyperparameters": hyperparameters(method)}
-    return {"command": "run"} | fields | stored_robot(robot)
+    seed_key(order.search.seed)
+    calibrator = make_method(CALIBRATORS, order.search.method or "madoc", order.search.changes)
+    learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
+    resolved = {
+        "command": "run",
+        "truth": read_truth(order.truth),
+        "hyperparameters": hyperparameters(calibrator),
+        "policy_hyperparameters": hyperparameters(learner),
+    }
+    plain = replace(order, search=replace(order.search, set=(), starts=None), policy_set=())
+    return asdict(plain) | resolved | machine.stored()
 
 
-def _data_stage(plan: Plan, out: Path, *, quiet: bool) -> None:
-    """Leave `data.npz`."""
-    if (out / "data.npz").exists():
-        return
-    physics = plan.physics or "legacy"
-    if plan.data is None:
-        dataset = record_named(
-            plan.name,
-            transitions=plan.transitions,
-            physics=physics,
-            seed=plan.seed,
-            disturbance=plan.disturbance,
-            quiet=quiet,
-        )
-    else:
-        source = replace(plan.data, max_transitions=plan.transitions, disturbance=plan.disturbance)
-        dataset = load_source(source, robots.resolve(split_name(plan.name)[0], plan.physics), seed=plan.seed)
-    data.save(dataset, out / "data.npz")
+def _recorded_or_loaded(order: RunOrder, machine: Machine, *, quiet: bool) -> data.Dataset:
+    """The data of the run."""
+    seed, disturbance = order.search.seed, order.reading.disturbance
+    if order.data is not None:
+        return load_source(_source(order), machine, seed=seed)
+    physics = order.search.physics or "legacy"
+    asked = RecordOrder(order.name, order.transitions, seed, physics, disturbance.friction, disturbance)
+    return record_named(asked, quiet=quiet)
 
 
-def _calibration_stage(plan: Plan, out: Path, *, quiet: bool) -> CalibrationResult:
+def _calibrate(order: RunOrder, out: Path, *, quiet: bool) -> CalibrationResult:
     """Leave `calibration`."""
     folder = out / "calibration"
     if calibration_ended(folder) and ended(folder):
         return CalibrationResult.from_json(read_json(folder / "result.json"))
-    order = CalibrationOrder(
-        task=split_name(plan.name)[0],
-        source=Source((str(out / "data.npz"),), max_transitions=None),
-        physics=plan.physics,
-        level=plan.level,
-        parameters=plan.parameters,
-        method=plan.method,
-        changes=plan.changes,
-        budget=plan.calibration_budget,
-        seed=plan.seed,
-        truth=plan.truth,
-    )
-    return calibrate_in(folder, order, resume=holds_run(folder), quiet=quiet)
+    source = Source((str(out / "data.npz"),), max_transitions=None)
+    asked = CalibrationOrder(split_name(order.name)[0], source, order.search, truth=order.truth)
+    return calibrate_in(folder, asked, resume=holds_run(folder), quiet=quiet)
 
 
-def _policy_stage(plan: Plan, calibrated: Calibrated, at: str, folder: Path, *, quiet: bool) -> dict[str, Any]:
-    """Leave the folder of one policy; how its learning ended."""
+def _learn(order: RunOrder, calibrated: Calibrated, at: Place, folder: Path, *, quiet: bool) -> dict[str, object]:
+    """Leave the folder of one policy; returns how its learning ended."""
     if not ended(folder, "policy.npz"):
-        order = PolicyOrder(at, plan.learner, plan.learner_changes, plan.policy_budget, plan.seed)
-        learn_in(folder, calibrated, order, resume=holds_run(folder), quiet=quiet)
-    return read_json(folder / "result.json")
+        asked = PolicyOrder(order.learner, at, order.policy_set, order.policy_budget, order.search.seed)
+        learn_in(folder, calibrated, asked, resume=holds_run(folder), quiet=quiet)
+    return read_record(dict[str, object], folder / "result.json")
 
 
-def _beginning(plan: Plan, calibrated: Calibrated) -> dict[str, Any]:
+def _beginning(order: RunOrder, calibrated: Calibrated) -> Summary:
     """The summary of a run whose calibration is there."""
-    spec = read_json(calibrated.folder / "spec.json")
-    return {
-        "name": plan.name,
-        "status": "finished",
-        "sentence": "all stages are done"
-        if calibrated.truth is not None
+    stored = calibrated.spec.data
+    assert stored is not None
+    known = calibrated.spec.truth is not None
+    return Summary(
+        name=order.name,
+        status="finished",
+        sentence="all stages are done"
+        if known
         else "all stages are done that need no truth: the target is not known, so nothing was evaluated in it",
-        "task": calibrated.task.name,
-        "physics": calibrated.task.physics,
-        "seed": plan.seed,
-        "data": {"transitions": spec["data"]["rows"], "fingerprint": spec["data"]["fingerprint"]},
-        "calibration": calibrated.result.to_json(),
-        "policies": {},
-        "evaluation": None,
-    }
+        task=calibrated.task.name,
+        physics=calibrated.task.physics,
+        seed=order.search.seed,
+        data={"transitions": stored.rows, "fingerprint": stored.fingerprint},
+        calibration=calibrated.result.to_json(),
+    )

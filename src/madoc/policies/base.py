@@ -1,5 +1,6 @@
 """What a policy learner is given, and what it must offer."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -27,8 +28,8 @@ class PolicyProblem:
 
     Attributes:
         simulator: The source domain.
-        parameters: Physical values, one system a row; a vector (d,) is one system. Or a distribution, and systems
-            are drawn from it.
+        parameters: Physical values of one system, by name or as a vector (d,), or of several, one in each row. Or a
+            distribution that systems are drawn from.
         dataset: Logged transitions, for learners that use them.
 
     Raises:
@@ -36,17 +37,16 @@ class PolicyProblem:
     """
 
     simulator: Simulator
-    parameters: Float[np.ndarray, "systems parameters"] | ParameterDistribution
+    parameters: Float[np.ndarray, "systems parameters"] | Mapping[str, float] | ParameterDistribution
     dataset: Dataset | None = None
 
     def __post_init__(self) -> None:
         task = self.simulator.task
-        fixed = None if hasattr(self.parameters, "draw") else np.atleast_2d(np.asarray(self.parameters, np.float64))
-        size = self.parameters.size if fixed is None else fixed.shape[1]
-        if size != len(self.simulator.parameters):
-            raise MadocError(f"expected {len(self.simulator.parameters)} parameter values for {task.name}, got {size}")
-        if fixed is not None:
-            object.__setattr__(self, "parameters", fixed)
+        space = self.simulator.parameters
+        if not isinstance(self.parameters, ParameterDistribution):
+            object.__setattr__(self, "parameters", np.atleast_2d(space.vector(self.parameters)))
+        elif self.parameters.size != len(space):
+            raise MadocError(f"expected {len(space)} parameter values for {task.name}, got {self.parameters.size}")
         if self.dataset is not None:
             if self.dataset.task_name != task.name:
                 raise MadocError(f"the data was recorded from {self.dataset.task_name}, the simulator is {task.name}")
@@ -86,8 +86,10 @@ class PolicyProblem:
 
     def systems(self, key: PRNGKeyArray, count: int) -> Float[np.ndarray, "systems parameters"]:
         """Physical values of the systems to act in next: the fixed ones, or `count` fresh draws."""
-        fixed = self.parameters
-        return fixed if isinstance(fixed, np.ndarray) else fixed.draw(key, count)
+        parameters = self.parameters
+        if isinstance(parameters, ParameterDistribution):
+            return parameters.draw(key, count)
+        return self.simulator.parameters.vector(parameters)
 
 
 def require_data(problem: PolicyProblem, *, rows: int, outcomes: bool = True) -> Dataset:

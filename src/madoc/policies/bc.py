@@ -2,17 +2,15 @@
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray, PyTree
+from jaxtyping import PRNGKeyArray
 
-from madoc.errors import check_at_least
-from madoc.learning.cloning import clone
-from madoc.learning.networks import adam, scalars
+from madoc.data.dataset import spread_of
+from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, require_data
-from madoc.types import Epoch
+from madoc.types import Count, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -20,8 +18,7 @@ from madoc.types import Epoch
 class BCState:
     """Everything cloning carries."""
 
-    policy: TanhGaussianPolicy
-    optimiser: PyTree
+    clone: Clone
     key: PRNGKeyArray
 
 
@@ -36,13 +33,13 @@ class BC:
         learning_rate: Adam's.
     """
 
-    hidden: tuple[int, ...] = (256, 256)
-    epoch_updates: int = 1000
-    batch: int = 256
-    learning_rate: float = 3e-4
+    hidden: Layers = (256, 256)
+    epoch_updates: Count = 1000
+    batch: Count = 256
+    learning_rate: NotNegative = 3e-4
 
     def __post_init__(self) -> None:
-        check_at_least(self, hidden=1, epoch_updates=1, batch=1, learning_rate=0.0)
+        check_hyperparameters(self)
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> BCState:
         """A fresh policy that standardises observations as the data has them.
@@ -52,33 +49,25 @@ class BC:
         """
         dataset = require_data(problem, rows=self.batch, outcomes=False)
         of_policy, key = jax.random.split(key)
-        observation = np.asarray(dataset.transitions.observation)
-        spread = observation.std(0)
-        policy = TanhGaussianPolicy(
-            problem.simulator.task.observation_size,
-            problem.simulator.action_size,
-            self.hidden,
-            key=of_policy,
-            offset=observation.mean(0),
-            scale=np.where(spread > 1e-8, spread, 1.0),
-        )
-        return BCState(policy, adam(self.learning_rate).init(eqx.filter(policy, eqx.is_array)), key)
+        logged = dataset.transitions
+        scale = spread_of(np.asarray(logged.observation))
+        clone = fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy, scale=scale)
+        return BCState(clone, key)
 
     def step(self, problem: PolicyProblem, state: BCState) -> tuple[BCState, Epoch]:
         """`epoch_updates` updates."""
         of_update, key = jax.random.split(state.key)
-        policy, optimiser, metrics = clone(
-            state.policy,
-            state.optimiser,
-            (problem.logged["observation"], problem.logged["action"]),
+        pairs = problem.logged["observation"], problem.logged["action"]
+        clone, metrics = continue_cloning(
+            state.clone,
+            pairs,
             of_update,
-            optimiser=adam(self.learning_rate),
+            learning_rate=self.learning_rate,
             batch=self.batch,
-            count=self.epoch_updates,
+            updates=self.epoch_updates,
         )
-        epoch = Epoch(scalars(metrics), updates=self.epoch_updates, stage="cloning")
-        return BCState(policy, optimiser, key), epoch
+        return BCState(clone, key), Epoch(metrics, updates=self.epoch_updates, stage="cloning")
 
     def policy(self, state: BCState) -> TanhGaussianPolicy:
         """The policy learnt so far; deterministic without a key."""
-        return state.policy
+        return state.clone.policy

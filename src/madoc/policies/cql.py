@@ -6,14 +6,13 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, PRNGKeyArray
 
-from madoc.errors import check_at_least
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, bellman_target, critic_step, fresh
 from madoc.learning.cloning import cloning_loss
 from madoc.learning.cql_losses import cql_loss, proposals
 from madoc.learning.networks import scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.types import Epoch
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -49,22 +48,20 @@ class CQL:
         critic_learning_rate: Adam's, for the critics.
     """
 
-    hidden: tuple[int, ...] = (256, 256, 256)
-    critic_hidden: tuple[int, ...] = (256, 256, 256)
-    weight: float = 5.0
-    samples: int = 10
-    cloning_updates: int = 4000
-    epoch_updates: int = 20
-    batch: int = 256
-    discount: float = 0.99
-    target_rate: float = 0.005
-    policy_learning_rate: float = 1e-4
-    critic_learning_rate: float = 3e-4
+    hidden: Layers = (256, 256, 256)
+    critic_hidden: Layers = (256, 256, 256)
+    weight: NotNegative = 5.0
+    samples: Count = 10
+    cloning_updates: CountOrZero = 4000
+    epoch_updates: Count = 20
+    batch: Count = 256
+    discount: NotNegative = 0.99
+    target_rate: NotNegative = 0.005
+    policy_learning_rate: NotNegative = 1e-4
+    critic_learning_rate: NotNegative = 3e-4
 
     def __post_init__(self) -> None:
-        check_at_least(self, hidden=1, critic_hidden=1, weight=0.0, samples=1, cloning_updates=0, epoch_updates=1)
-        check_at_least(self, batch=1, discount=0.0, target_rate=0.0)
-        check_at_least(self, policy_learning_rate=0.0, critic_learning_rate=0.0)
+        check_hyperparameters(self)
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> CQLState:
         """Fresh networks.
@@ -118,11 +115,7 @@ class CQL:
                 self._descent,
             )
             learner, of_policy = actor_step(learner, observation, of_actor, self._descent, combine)
-            return learner, {
-                "critic_loss": loss,
-                "conservative_gap": gap,
-                "value_target": target.mean(),
-            } | of_policy
+            return learner, {"critic_loss": loss, "conservative_gap": gap, "value_target": target.mean()} | of_policy
 
         return scan_updates(update, learner, key, count)
 

@@ -15,14 +15,16 @@ What differs from `sac`, which is the paper's (arXiv 1812.05905), and where it c
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
+from pydantic import Field
 
-from madoc.errors import MadocError, check_at_least
+from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import (
     ActorCritic,
@@ -38,7 +40,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, UniformPolicy, remember, roll_on, start_acting
 from madoc.policies.judging import Judged, judge
-from madoc.types import Epoch
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 SMALLEST_DEVIATION = 1e-2
 """Added to the standard deviation of each observation value: a value that hardly moved yet may move far later."""
@@ -87,32 +89,29 @@ class FastSAC:
         judge_episodes: Episodes it is judged by. Their control steps are counted, but not against the budget.
     """
 
-    hidden: tuple[int, ...] = (128, 128)
-    environments: int = 64
-    epoch_steps: int = 2048
-    steps_per_update: int = 8
-    policy_delay: int = 2
-    warmup_steps: int = 10_000
-    batch: int = 256
-    discount: float = 0.99
-    target_rate: float = 0.005
-    learning_rate: float = 3e-4
-    replay_capacity: int = 1_000_000
+    hidden: Layers = (128, 128)
+    environments: Count = 64
+    epoch_steps: Count = 2048
+    steps_per_update: Count = 8
+    policy_delay: Count = 2
+    warmup_steps: Count = 10_000
+    batch: Annotated[int, Field(ge=2)] = 256
+    discount: NotNegative = 0.99
+    target_rate: NotNegative = 0.005
+    learning_rate: NotNegative = 3e-4
+    replay_capacity: Count = 1_000_000
     standardise: bool = True
-    logged_share: float = 0.0
-    judge_every: int = 10_000
-    judge_episodes: int = 10
+    logged_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    judge_every: CountOrZero = 10_000
+    judge_episodes: Count = 10
 
     def __post_init__(self) -> None:
-        check_at_least(self, hidden=1, environments=1, batch=2, replay_capacity=1, warmup_steps=1, policy_delay=1)
-        check_at_least(self, steps_per_update=1, discount=0.0, target_rate=0.0, learning_rate=0.0, logged_share=0.0)
-        check_at_least(self, judge_every=0, judge_episodes=1, epoch_steps=self.environments)
-        if self.logged_share > 1.0:
-            raise MadocError(f"expected logged_share of at most 1 for FastSAC, got {self.logged_share}")
-        if self._cycles < 1:
+        check_hyperparameters(self)
+        least = max(self.environments, self.steps_per_update * self.policy_delay)
+        if self.epoch_steps < least:
             raise MadocError(
-                f"expected epoch_steps of at least steps_per_update x policy_delay = "
-                f"{self.steps_per_update * self.policy_delay} for FastSAC, got {self.epoch_steps}"
+                f"expected epoch_steps of at least {least}, for a control step of each environment and an update of "
+                f"the policy, got {self.epoch_steps}"
             )
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> FastSACState:
@@ -134,16 +133,15 @@ class FastSAC:
         """Update on the rows seen so far; meanwhile act for `epoch_steps`, and judge the policy where that is due."""
         of_acting, of_update, of_judging, key = jax.random.split(state.key, 4)
         explores = state.interaction.control_steps < self.warmup_steps
-        policy = UniformPolicy(problem.simulator.action_size) if explores else state.learner.policy
-        judged, judging, judgement = state.judged, 0, {}
+        policy, judged = state.learner.policy, state.judged
+        epoch = Epoch(stage="exploring" if explores else "learning")
         with ThreadPoolExecutor(1) as second_thread:
             updating = None if explores else second_thread.submit(self._update, problem, state, of_update)
-            rolled = roll_on(problem, state.interaction, policy, of_acting, control_steps=self.epoch_steps)
+            acting = UniformPolicy(problem.simulator.action_size) if explores else policy
+            rolled = roll_on(problem, state.interaction, acting, of_acting, control_steps=self.epoch_steps)
             if self.judge_every and state.updates >= judged.last + self.judge_every:
-                judged, mean_return, judging = judge(
-                    problem, state.learner.policy, judged, of_judging, episodes=self.judge_episodes, spent=state.updates
-                )
-                judgement = {"judged_return": mean_return}
+                spent, episodes = state.updates, self.judge_episodes
+                judged, epoch = judge(problem, policy, judged, epoch, of_judging, episodes=episodes, spent=spent)
         learner, losses = (state.learner, {}) if updating is None else updating.result()
         interaction, metrics = remember(state.interaction, *rolled)
         if self.standardise:
@@ -153,12 +151,11 @@ class FastSAC:
         updates = 0 if explores else self._cycles * self.policy_delay
         acted = interaction.control_steps - state.interaction.control_steps
         following = FastSACState(learner, interaction, state.updates + updates, judged, key)
-        return following, Epoch(
-            metrics | judgement | losses,
-            control_steps=acted + judging,
-            unbudgeted=judging,
+        return following, replace(
+            epoch,
+            metrics=metrics | epoch.metrics | losses,
+            control_steps=acted + epoch.control_steps,
             updates=updates,
-            stage="exploring" if explores else "learning",
         )
 
     def _update(
@@ -198,8 +195,7 @@ class FastSAC:
     @property
     def _cycles(self) -> int:
         """Updates of the policy per epoch."""
-        acted = self.epoch_steps // self.environments * self.environments
-        return round(acted / (self.steps_per_update * self.policy_delay))
+        return self.epoch_steps // (self.steps_per_update * self.policy_delay)
 
     @property
     def _descent(self) -> Descent:

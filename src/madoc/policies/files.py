@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,10 +20,10 @@ def save_policy(policy: TanhGaussianPolicy, path: str | Path, *, task_name: str)
         np.savez(stream, allow_pickle=False, **_arrays(policy, task_name))
 
 
-def _arrays(policy: TanhGaussianPolicy, task_name: str) -> dict[str, Any]:
+def _arrays(policy: TanhGaussianPolicy, task_name: str) -> dict[str, np.ndarray]:
     """A policy as named arrays, float32, matrices (inputs, outputs)."""
     layers = policy.network.layers
-    arrays: dict[str, Any] = {"about": np.array(json.dumps({"task": task_name, "layers": len(layers)}))}
+    arrays: dict[str, np.ndarray] = {"about": np.array(json.dumps({"task": task_name, "layers": len(layers)}))}
     for index, layer in enumerate(layers):
         arrays[f"weight_{index}"] = np.asarray(layer.weight.T)
         arrays[f"bias_{index}"] = np.asarray(layer.bias)

@@ -1,13 +1,15 @@
 """H2O: logged rows and simulated ones together, the simulated ones trusted by their dynamics (arXiv 2206.13464)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray, PyTree
+from pydantic import Field
 
-from madoc.errors import check_at_least
+from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, bellman_target, critic_step, fresh
 from madoc.learning.dynamics_ratio import Discriminators, discriminator_loss, log_dynamics_ratio
@@ -17,8 +19,8 @@ from madoc.learning.networks import adam, descend, scalars, scan_updates
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, UniformPolicy, act_on, start_acting
-from madoc.types import Epoch
+from madoc.policies.interaction import Interaction, explore_or_act, start_acting
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -45,8 +47,8 @@ class H2OState:
 class H2O:
     """Dynamics-aware hybrid offline-and-online learning: SAC on half logged, half simulated rows.
 
-    Two discriminators tell logged from simulated transitions. Their ratio weighs the Bellman error of simulated rows,
-    and values are held down where simulated and real dynamics differ. Unlike the authors', policy and critics see
+    Two discriminators classify transitions as logged or simulated. Their ratio weighs the Bellman error of simulated
+    rows, and values are held down where simulated and real dynamics differ. Unlike the authors', policy and critics see
     standardised observations, and the discriminators (s, a) and s' - s, for which their input noise of 0.1 is a tenth
     of the spread.
 
@@ -62,38 +64,37 @@ class H2O:
         gap_samples: Next states drawn for the dynamics gap of a row.
         gap_spread: How wide, in units of a step's change.
         bound: Of the logits that s' adds to those of (s, a).
-        pair_bound: Of the logits of (s, a). The authors' is 2, as the other: that cannot say all that (s, a) tell while
-            the policy is where no data is, s' then says it in their place, and the ratio takes any simulated row for
-            false.
+        pair_bound: Of the logits of (s, a). The authors' is 2, like the other: too narrow where the policy is far
+            from the data. The logits of s' then make up for it, and the ratio rejects every simulated row.
         discount: γ.
         target_rate: τ of the target critics.
         learning_rate: Adam's, for everything.
         replay_capacity: Simulated rows kept.
     """
 
-    hidden: tuple[int, ...] = (256, 256)
-    environments: int = 20
-    epoch_steps: int = 1000
-    updates_per_step: float = 1.0
-    warmup_steps: int = 1000
-    batch: int = 256
-    weight: float = 0.01
-    noise: float = 0.1
-    gap_samples: int = 10
-    gap_spread: float = 1.0
-    bound: float = 2.0
-    pair_bound: float = 10.0
-    discount: float = 0.99
-    target_rate: float = 0.005
-    learning_rate: float = 3e-4
-    replay_capacity: int = 1_000_000
+    hidden: Layers = (256, 256)
+    environments: Count = 20
+    epoch_steps: Count = 1000
+    updates_per_step: NotNegative = 1.0
+    warmup_steps: CountOrZero = 1000
+    batch: Annotated[int, Field(ge=2)] = 256
+    weight: NotNegative = 0.01
+    noise: NotNegative = 0.1
+    gap_samples: Count = 10
+    gap_spread: NotNegative = 1.0
+    bound: NotNegative = 2.0
+    pair_bound: NotNegative = 10.0
+    discount: NotNegative = 0.99
+    target_rate: NotNegative = 0.005
+    learning_rate: NotNegative = 3e-4
+    replay_capacity: Count = 1_000_000
 
     def __post_init__(self) -> None:
-        check_at_least(self, hidden=1, environments=1, batch=2, replay_capacity=1, warmup_steps=0, weight=0.0)
-        check_at_least(self, epoch_steps=self.environments, updates_per_step=0.0, discount=0.0, noise=0.0)
-        check_at_least(
-            self, target_rate=0.0, learning_rate=0.0, gap_samples=1, gap_spread=0.0, bound=0.0, pair_bound=0.0
-        )
+        check_hyperparameters(self)
+        if self.epoch_steps < self.environments:
+            raise MadocError(
+                f"expected epoch_steps of at least the {self.environments} environments, got {self.epoch_steps}"
+            )
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> H2OState:
         """Fresh networks, an empty replay, rows at reset states.
@@ -115,29 +116,26 @@ class H2O:
     def step(self, problem: PolicyProblem, state: H2OState) -> tuple[H2OState, Epoch]:
         """Act for `epoch_steps` control steps, then update."""
         of_acting, of_update, key = jax.random.split(state.key, 3)
-        explores = state.interaction.control_steps < self.warmup_steps
-        policy = UniformPolicy(problem.simulator.action_size) if explores else self.policy(state)
-        interaction, metrics = act_on(problem, state.interaction, policy, of_acting, control_steps=self.epoch_steps)
+        interaction, epoch, due = explore_or_act(
+            problem,
+            state.interaction,
+            self.policy(state),
+            of_acting,
+            control_steps=self.epoch_steps,
+            warmup_steps=self.warmup_steps,
+            updates_per_step=self.updates_per_step,
+        )
         learning = state.learning
-        acted, count = interaction.control_steps - state.interaction.control_steps, 0
         if interaction.control_steps >= self.warmup_steps:
-            count = round(self.updates_per_step * acted)
             learning, losses = self._update(
-                learning, interaction.replay, problem.logged, problem.features, of_update, count
+                learning, interaction.replay, problem.logged, problem.features, of_update, due
             )
-            metrics |= scalars(losses)
-        epoch = Epoch(metrics, control_steps=acted, updates=count, stage="exploring" if explores else "learning")
+            epoch = replace(epoch, metrics=epoch.metrics | scalars(losses))
         return H2OState(learning, interaction, key), epoch
 
     @eqx.filter_jit
     def _update(
-        self,
-        learning: Learning,
-        seen: replay.Replay,
-        logged: Batch,
-        features: Features,
-        key: PRNGKeyArray,
-        count: int,
+        self, learning: Learning, seen: replay.Replay, logged: Batch, features: Features, key: PRNGKeyArray, count: int
     ) -> tuple[Learning, dict[str, Array]]:
         """`count` updates of discriminators, critics, policy and temperature."""
 
@@ -145,19 +143,21 @@ class H2O:
             of_logged, of_simulated, of_noise, of_critics, of_actor = jax.random.split(key, 5)
             real = draw_rows(logged, of_logged, self.batch // 2)
             simulated = replay.sample(seen, of_simulated, self.batch // 2)
-            discriminators, optimiser, told = self._tell_apart(learning, real, simulated, features, of_noise)
+            discriminators, optimiser, of_ratio = self._update_discriminators(
+                learning, real, simulated, features, of_noise
+            )
             learner, of_values = self._value(learning.learner, discriminators, real, simulated, features, of_critics)
             observation = jnp.concatenate([real["observation"], simulated["observation"]])
             learner, of_policy = actor_step(learner, observation, of_actor, self._descent)
-            return Learning(learner, discriminators, optimiser), told | of_values | of_policy
+            return Learning(learner, discriminators, optimiser), of_ratio | of_values | of_policy
 
         return scan_updates(update, learning, key, count)
 
-    def _tell_apart(
+    def _update_discriminators(
         self, learning: Learning, real: Batch, simulated: Batch, features: Features, key: PRNGKeyArray
     ) -> tuple[Discriminators, PyTree, dict[str, Array]]:
         """One step of the discriminators, on noisy inputs."""
-        described = [part for rows in (real, simulated) for part in _described(features, rows)]
+        described = [part for rows in (real, simulated) for part in features.described(rows)]
         keys = jax.random.split(key, len(described))
         noisy = [
             part + self.noise * jax.random.normal(part_key, part.shape)
@@ -184,7 +184,7 @@ class H2O:
     ) -> tuple[ActorCritic, dict[str, Array]]:
         """One step of the critics, without entropy in the backup."""
         of_real, of_simulated, of_gap = jax.random.split(key, 3)
-        pair, following = _described(features, simulated)
+        pair, following = features.described(simulated)
         ratio = dynamics_ratio(log_dynamics_ratio(discriminators, pair, following))
         gap = dynamics_gap(
             discriminators, pair, following, spread=self.gap_spread, samples=self.gap_samples, key=of_gap
@@ -220,8 +220,3 @@ class H2O:
     def policy(self, state: H2OState) -> TanhGaussianPolicy:
         """The policy learnt so far; deterministic without a key."""
         return state.learning.learner.policy
-
-
-def _described(features: Features, rows: Batch) -> tuple[Array, Array]:
-    observation = rows["observation"]
-    return features.pair(observation, rows["action"]), features.change(observation, rows["next_observation"])

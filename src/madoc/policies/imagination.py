@@ -20,7 +20,7 @@ LARGEST_CHANGE = 10.0
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Dreamers:
+class ImaginedRows:
     """Imagined rows under way: where they stand, and for how many steps they have been imagined."""
 
     observation: Float[Array, "rows observation"]
@@ -42,8 +42,8 @@ class Filter:
 
 
 @dataclass(frozen=True)
-class Dreaming:
-    """How it is done.
+class Imagination:
+    """Settings of imagined rollouts.
 
     Attributes:
         samples: Next states drawn from each elite; the one of the highest dynamics reward is kept.
@@ -58,9 +58,9 @@ class Dreaming:
     penalty: float
 
 
-def fall_asleep(logged: Float[Array, "logged observation"], rows: int, key: PRNGKeyArray) -> Dreamers:
+def start_imagining(logged: Float[Array, "logged observation"], rows: int, key: PRNGKeyArray) -> ImaginedRows:
     """Rows at logged observations."""
-    return Dreamers(_some(logged, rows, key), jnp.zeros(rows, jnp.int32))
+    return ImaginedRows(_some(logged, rows, key), jnp.zeros(rows, jnp.int32))
 
 
 def best_candidate(
@@ -72,19 +72,19 @@ def best_candidate(
     return candidates[best, rows], rewards[best, rows]
 
 
-def dream(
+def imagine(
     ensemble: Ensemble,
     believed: Filter,
     features: Features,
     policy: Policy,
-    dreamers: Dreamers,
+    under_way: ImaginedRows,
     *,
     logged: Float[Array, "logged observation"],
     terminated: Callable[[Array], Bool[Array, " rows"]],
-    settings: Dreaming,
+    settings: Imagination,
     steps: int,
     key: PRNGKeyArray,
-) -> tuple[Dreamers, Batch, dict[str, Array]]:
+) -> tuple[ImaginedRows, Batch, dict[str, Array]]:
     """Act for `steps` steps in every row; rows that end start again at logged observations.
 
     Observations stay within the logged ones' range, widened by its width on either side.
@@ -95,9 +95,9 @@ def dream(
     low, high = logged.min(0), logged.max(0)
     low, high = low - (high - low), high + (high - low)
 
-    def step(dreamers: Dreamers, key: PRNGKeyArray) -> tuple[Dreamers, tuple[Batch, dict[str, Array]]]:
+    def step(under_way: ImaginedRows, key: PRNGKeyArray) -> tuple[ImaginedRows, tuple[Batch, dict[str, Array]]]:
         of_action, of_sample, of_restart = jax.random.split(key, 3)
-        observation = dreamers.observation
+        observation = under_way.observation
         action = policy(observation, of_action)
         pair = features.pair(observation, action)
         mean, std = ensemble(pair)
@@ -124,20 +124,20 @@ def dream(
             "next_observation": following,
             "terminated": ends.astype(jnp.float32),
         }
-        again = ends | (dreamers.age + 1 >= settings.horizon)
+        again = ends | (under_way.age + 1 >= settings.horizon)
         fresh = _some(logged, len(observation), of_restart)
         state = jnp.where(jnp.broadcast_to(again[:, None], fresh.shape), fresh, following)
-        told = {
+        metrics = {
             "dynamics_reward": reality.mean(),
             "stopped": unreal.mean(),
             "penalty": penalty.mean(),
             "imagined_reward": reward.mean(),
         }
-        return Dreamers(state, jnp.where(again, 0, dreamers.age + 1)), (row, told)
+        return ImaginedRows(state, jnp.where(again, 0, under_way.age + 1)), (row, metrics)
 
-    dreamers, (rows, metrics) = jax.lax.scan(step, dreamers, jax.random.split(key, steps))
+    under_way, (rows, metrics) = jax.lax.scan(step, under_way, jax.random.split(key, steps))
     flat = {name: column.reshape(-1, *column.shape[2:]) for name, column in rows.items()}
-    return dreamers, flat, jax.tree.map(jnp.mean, metrics)
+    return under_way, flat, jax.tree.map(jnp.mean, metrics)
 
 
 def _some(logged: Array, rows: int, key: PRNGKeyArray) -> Array:

@@ -14,7 +14,7 @@ from madoc.learning import replay
 from madoc.learning.moments import Moments
 from madoc.policies.base import PolicyProblem
 from madoc.simulation.rollout import Rollout, Walkers, begin, reset_states, roll
-from madoc.types import Policy
+from madoc.types import Epoch, Policy
 
 COLUMNS: Sequence[str] = ("observation", "action", "reward", "next_observation", "terminated")
 
@@ -97,6 +97,30 @@ def remember(state: Interaction, rollout: Rollout, walkers: Walkers) -> tuple[In
     )
     metrics = {"failures": float(following.failures)}
     return following, metrics | ({"return_in_simulator": float(finished.mean())} if len(finished) else {})
+
+
+def explore_or_act(
+    problem: PolicyProblem,
+    state: Interaction,
+    policy: Policy,
+    key: PRNGKeyArray,
+    *,
+    control_steps: int,
+    warmup_steps: int,
+    updates_per_step: float,
+) -> tuple[Interaction, Epoch, int]:
+    """As `act_on`, with uniform random actions until `warmup_steps` control steps have been taken.
+
+    Returns:
+        What is carried now, the epoch so far, and how many updates are due.
+    """
+    explores = state.control_steps < warmup_steps
+    acting = UniformPolicy(problem.simulator.action_size) if explores else policy
+    following, metrics = act_on(problem, state, acting, key, control_steps=control_steps)
+    taken = following.control_steps - state.control_steps
+    due = round(updates_per_step * taken) if following.control_steps >= warmup_steps else 0
+    stage = "exploring" if explores else "learning"
+    return following, Epoch(metrics, control_steps=taken, updates=due, stage=stage), due
 
 
 class UniformPolicy(eqx.Module):

@@ -8,8 +8,9 @@ from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
 from madoc.policies.files import save_policy
 from madoc.policies.registry import LEARNERS
 from madoc.runs import loop
+from madoc.runs.budget import Budget, read_budget
 from madoc.runs.run_folder import RunFolder
-from madoc.types import Budget, Policy, State, Unit, entry_of, read_budget
+from madoc.types import Policy, State, Unit, entry_of
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def learn_policy(
     budget: Budget | str,
     folder: RunFolder | None = None,
     resume: bool = False,
-    quiet: bool = True,
+    quiet: bool = False,
     checkpoint_every: float = 60.0,
 ) -> LearnedPolicy:
     """Learn until the budget is spent.

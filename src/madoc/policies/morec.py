@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
+from pydantic import Field
 
-from madoc.errors import MadocError, check_at_least
+from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
 from madoc.learning.dynamics_ensemble import Ensemble, fit, holdout_error
@@ -17,8 +19,8 @@ from madoc.learning.features import Features
 from madoc.learning.networks import adam, scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.imagination import Dreamers, Dreaming, Filter, dream, fall_asleep
-from madoc.types import Epoch
+from madoc.policies.imagination import Filter, Imagination, ImaginedRows, imagine, start_imagining
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -33,7 +35,7 @@ class MORECState:
         opposition: What becomes the dynamics reward.
         learner: SAC.
         replay: Imagined rows.
-        dreamers: Where imagined rows stand.
+        under_way: Imagined rows and where they stand.
         key: The random key.
         preparing: Updates of models and discriminators so far.
     """
@@ -44,7 +46,7 @@ class MORECState:
     opposition: Opposition
     learner: ActorCritic
     replay: replay.Replay
-    dreamers: Dreamers
+    under_way: ImaginedRows
     key: PRNGKeyArray
     preparing: int
 
@@ -92,47 +94,42 @@ class MOREC:
         replay_capacity: Imagined rows kept.
     """
 
-    hidden: tuple[int, ...] = (256, 256)
-    model_hidden: tuple[int, ...] = (200, 200, 200, 200)
-    models: int = 7
-    elites: int = 5
-    model_updates: int = 20_000
-    discriminator_hidden: tuple[int, ...] = (128, 128)
-    discriminators: int = 40
-    discriminator_updates: int = 8000
-    noise: float = 0.1
-    samples: int = 2
+    hidden: Layers = (256, 256)
+    model_hidden: Layers = (200, 200, 200, 200)
+    models: Count = 7
+    elites: Count = 5
+    model_updates: Count = 20_000
+    discriminator_hidden: Layers = (128, 128)
+    discriminators: Count = 40
+    discriminator_updates: CountOrZero = 8000
+    noise: NotNegative = 0.1
+    samples: Count = 2
     threshold: float = 0.6
-    horizon: int = 100
-    penalty: float = 2.5
-    real: float = 0.05
-    imagined_per_update: int = 20
-    imagined_rows: int = 200
-    epoch_updates: int = 100
-    holdout_every: int = 100
-    batch: int = 256
-    discount: float = 0.99
-    target_rate: float = 0.005
-    model_learning_rate: float = 1e-3
-    policy_learning_rate: float = 1e-4
-    critic_learning_rate: float = 3e-4
-    replay_capacity: int = 100_000
+    horizon: Count = 100
+    penalty: NotNegative = 2.5
+    real: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.05
+    imagined_per_update: Count = 20
+    imagined_rows: Count = 200
+    epoch_updates: Count = 100
+    holdout_every: Annotated[int, Field(ge=2)] = 100
+    batch: Annotated[int, Field(ge=2)] = 256
+    discount: NotNegative = 0.99
+    target_rate: NotNegative = 0.005
+    model_learning_rate: NotNegative = 1e-3
+    policy_learning_rate: NotNegative = 1e-4
+    critic_learning_rate: NotNegative = 3e-4
+    replay_capacity: Count = 100_000
 
     def __post_init__(self) -> None:
-        check_at_least(self, hidden=1, model_hidden=1, discriminator_hidden=1, models=self.elites, elites=1)
-        check_at_least(self, model_updates=1, discriminators=1, discriminator_updates=0, samples=1, horizon=1)
-        check_at_least(self, noise=0.0, penalty=0.0, real=0.0, epoch_updates=1, holdout_every=2, batch=2)
-        check_at_least(self, imagined_per_update=1, imagined_rows=1, replay_capacity=1, discount=0.0)
-        check_at_least(self, target_rate=0.0, model_learning_rate=0.0)
-        check_at_least(self, policy_learning_rate=0.0, critic_learning_rate=0.0)
-        if self.real >= 1.0:
-            raise MadocError(f"expected a share of logged rows below 1 for MOREC, got {self.real}")
+        check_hyperparameters(self)
+        if self.models < self.elites:
+            raise MadocError(f"expected at least as many models as elites, {self.elites}, got {self.models}")
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> MORECState:
         """Fresh networks, an empty replay, rows at logged observations.
 
         Raises:
-            MadocError: No data, too little, data without rewards, or a task whose falls an observation cannot tell.
+            MadocError: No data, too little, data without rewards, or observations that do not determine the state.
         """
         task = problem.simulator.task
         require_data(problem, rows=max(self.batch, self.holdout_every))
@@ -161,7 +158,7 @@ class MOREC:
             adversary,
             fresh(*sizes, hidden=self.hidden, descent=self._descent, features=problem.features, key=keys[2]),
             replay.empty(self.replay_capacity, **columns, reward=(), terminated=()),
-            fall_asleep(problem.logged["observation"], self.imagined_rows, keys[3]),
+            start_imagining(problem.logged["observation"], self.imagined_rows, keys[3]),
             keys[4],
             0,
         )
@@ -199,7 +196,7 @@ class MOREC:
     def _update_models(
         self, ensemble: Ensemble, optimiser: PyTree, logged: Batch, features: Features, key: PRNGKeyArray
     ) -> tuple[Ensemble, PyTree, Int[Array, " elites"], dict[str, Array]]:
-        pair, change = _described(features, logged)
+        pair, change = features.described(logged)
         reward = (logged["reward"] - features.reward_offset) / features.reward_scale
         rows = (pair, jnp.concatenate([change, reward[:, None]], axis=-1))
         ensemble, optimiser, metrics = fit(
@@ -228,7 +225,7 @@ class MOREC:
     ) -> tuple[Opposition, dict[str, Array]]:
         return oppose(
             adversary,
-            _described(features, logged),
+            features.described(logged),
             key,
             optimiser=adam(self.model_learning_rate),
             batch=self.batch,
@@ -238,46 +235,46 @@ class MOREC:
 
     def _learn(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
         """Imagine, then update the policy."""
-        of_dreams, of_updates = jax.random.split(state.key)
+        of_imagination, of_updates = jax.random.split(state.key)
         task = problem.simulator.task
         assert task.state_from_observation is not None
         believed = Filter(state.elites, state.opposition.past)
-        dreamers, rows, told = self._dream(
+        under_way, rows, imagined = self._imagine(
             (task.terminated, task.state_from_observation),
             state.ensemble,
             believed,
             problem.features,
             state.learner.policy,
-            state.dreamers,
+            state.under_way,
             problem.logged["observation"],
-            of_dreams,
+            of_imagination,
         )
         seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
         learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
-        return replace(state, learner=learner, replay=seen, dreamers=dreamers), told | metrics
+        return replace(state, learner=learner, replay=seen, under_way=under_way), imagined | metrics
 
     @eqx.filter_jit
-    def _dream(
+    def _imagine(
         self,
         ends: tuple[Callable, Callable],
         ensemble: Ensemble,
         believed: Filter,
         features: Features,
         policy: TanhGaussianPolicy,
-        dreamers: Dreamers,
+        under_way: ImaginedRows,
         logged: Array,
         key: PRNGKeyArray,
-    ) -> tuple[Dreamers, Batch, dict[str, Array]]:
+    ) -> tuple[ImaginedRows, Batch, dict[str, Array]]:
         terminated, to_state = ends
-        return dream(
+        return imagine(
             ensemble,
             believed,
             features,
             policy,
-            dreamers,
+            under_way,
             logged=logged,
             terminated=lambda observation: terminated(to_state(observation)),
-            settings=Dreaming(self.samples, self.threshold, self.horizon, self.penalty),
+            settings=Imagination(self.samples, self.threshold, self.horizon, self.penalty),
             steps=-(-self.epoch_updates * self.imagined_per_update // self.imagined_rows),
             key=key,
         )
@@ -308,8 +305,3 @@ class MOREC:
     def policy(self, state: MORECState) -> TanhGaussianPolicy:
         """The policy learnt so far; deterministic without a key."""
         return state.learner.policy
-
-
-def _described(features: Features, logged: Batch) -> tuple[Array, Array]:
-    observation = logged["observation"]
-    return features.pair(observation, logged["action"]), features.change(observation, logged["next_observation"])

@@ -1,5 +1,7 @@
 """Every policy learner by the name that `madoc methods` lists."""
 
+from functools import partial
+
 from madoc.policies.base import PolicyLearner
 from madoc.policies.bc import BC
 from madoc.policies.cql import CQL
@@ -9,27 +11,29 @@ from madoc.policies.morec import MOREC
 from madoc.policies.sac import SAC
 from madoc.types import MethodEntry
 
-CLONING_WEIGHT = 2.5
-"""Weight of SAC's loss beside the cloning error: TD3+BC's."""
-_SAC_SHOWN = ("return_in_simulator", "temperature")
+CLONING = {"cloning": 2.5}
+"""SAC+BC's weight of SAC's loss beside the cloning error: TD3+BC's."""
+
+SAC_SHOWN = ("return_in_simulator", "temperature")
+
+_sac = partial(MethodEntry[PolicyLearner], kind=SAC, shown=SAC_SHOWN)
+_offline = partial(MethodEntry[PolicyLearner], unit="updates", simulates=False, needs_parameters=False)
 
 _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
-    MethodEntry(
-        "sac",
-        SAC,
-        "SAC in the calibrated simulator",
-        "Haarnoja et al., SAC",
-        2018,
-        shown=_SAC_SHOWN,
+    _sac(
+        name="sac",
+        summary="SAC in the calibrated simulator",
+        paper="Haarnoja et al., SAC",
+        year=2018,
         needs_data=False,
     ),
     MethodEntry(
         "fast-sac",
         FastSAC,
-        "SAC for cheap simulation: the least wall time",
-        "Seo et al., FastTD3",
-        2025,
-        shown=_SAC_SHOWN,
+        "SAC for cheap simulation: a good policy in minutes",
+        "Li et al., parallel Q-learning",
+        2023,
+        shown=SAC_SHOWN,
         needs_data=False,
     ),
     MethodEntry(
@@ -39,59 +43,39 @@ _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
         "Ball et al., RLPD",
         2023,
         {"logged_share": 0.5},
-        shown=_SAC_SHOWN,
+        shown=SAC_SHOWN,
     ),
-    MethodEntry(
-        "sac-bc",
-        SAC,
-        "SAC, cloning the data's actions too",
-        "Jiang et al., Madoc",
-        2024,
-        {"cloning": CLONING_WEIGHT},
-        shown=_SAC_SHOWN,
+    _sac(
+        name="sac-bc",
+        summary="SAC, cloning the data's actions too",
+        paper="Jiang et al., Madoc",
+        year=2024,
+        settings=CLONING,
     ),
-    MethodEntry(
-        "dr-bc",
-        SAC,
-        "SAC over the whole box, cloning the data",
-        "Tobin et al., randomization",
-        2017,
-        {"cloning": CLONING_WEIGHT, "randomize": True},
-        shown=_SAC_SHOWN,
+    _sac(
+        name="dr-bc",
+        summary="SAC over the whole box, cloning the data",
+        paper="Tobin et al., randomization",
+        year=2017,
+        settings=CLONING | {"randomize": True},
         needs_parameters=False,
     ),
-    MethodEntry(
-        "bc",
-        BC,
-        "clones the data's policy",
-        "Pomerleau, ALVINN",
-        1988,
-        shown=("cloning_loss",),
-        unit="updates",
-        simulates=False,
-        needs_parameters=False,
-    ),
-    MethodEntry(
+    _offline("bc", BC, "clones the data's policy", "Pomerleau, ALVINN", 1988, shown=("cloning_loss",)),
+    _offline(
         "cql",
         CQL,
         "conservative values, from the data alone",
         "Kumar et al., CQL",
         2020,
         shown=("conservative_gap", "value_target", "temperature"),
-        unit="updates",
-        simulates=False,
-        needs_parameters=False,
     ),
-    MethodEntry(
+    _offline(
         "morec",
         MOREC,
         "a learnt model, kept to what looks real",
         "Luo et al., MOREC",
         2024,
         shown=("model_error", "dynamics_reward", "value_target"),
-        unit="updates",
-        simulates=False,
-        needs_parameters=False,
     ),
     MethodEntry(
         "h2o",

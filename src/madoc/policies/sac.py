@@ -6,17 +6,17 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, PRNGKeyArray
 
-from madoc.errors import check_at_least
+from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
 from madoc.learning.networks import scalars, scan_updates
 from madoc.learning.sac_losses import cloned_actor_loss, cloning_error
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, UniformPolicy, act_on, start_acting
+from madoc.policies.interaction import Interaction, explore_or_act, start_acting
 from madoc.policies.judging import Judged, judge
 from madoc.policies.systems import UniformParameters
-from madoc.types import Epoch
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -56,25 +56,27 @@ class SAC:
         judge_episodes: Episodes it is judged by. Their control steps are counted, but not against the budget.
     """
 
-    hidden: tuple[int, ...] = (256, 256)
-    environments: int = 20
-    epoch_steps: int = 1000
-    updates_per_step: float = 1.0
-    warmup_steps: int = 5000
-    batch: int = 256
-    discount: float = 0.99
-    target_rate: float = 0.005
-    learning_rate: float = 3e-4
-    replay_capacity: int = 1_000_000
-    cloning: float | None = None
+    hidden: Layers = (256, 256)
+    environments: Count = 20
+    epoch_steps: Count = 1000
+    updates_per_step: NotNegative = 1.0
+    warmup_steps: CountOrZero = 5000
+    batch: Count = 256
+    discount: NotNegative = 0.99
+    target_rate: NotNegative = 0.005
+    learning_rate: NotNegative = 3e-4
+    replay_capacity: Count = 1_000_000
+    cloning: NotNegative | None = None
     randomize: bool = False
-    judge_every: int = 10_000
-    judge_episodes: int = 10
+    judge_every: CountOrZero = 10_000
+    judge_episodes: Count = 10
 
     def __post_init__(self) -> None:
-        check_at_least(self, hidden=1, environments=1, batch=1, replay_capacity=1, warmup_steps=0, cloning=0.0)
-        check_at_least(self, epoch_steps=self.environments, updates_per_step=0.0, discount=0.0)
-        check_at_least(self, target_rate=0.0, learning_rate=0.0, judge_every=0, judge_episodes=1)
+        check_hyperparameters(self)
+        if self.epoch_steps < self.environments:
+            raise MadocError(
+                f"expected epoch_steps of at least the {self.environments} environments, got {self.epoch_steps}"
+            )
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> SACState:
         """Fresh networks, an empty replay, rows at reset states.
@@ -96,33 +98,29 @@ class SAC:
     def step(self, problem: PolicyProblem, state: SACState) -> tuple[SACState, Epoch]:
         """Act for `epoch_steps` control steps, then update, then judge the policy where that is due."""
         of_acting, of_update, of_judging, key = jax.random.split(state.key, 4)
-        explores = state.interaction.control_steps < self.warmup_steps
-        policy = UniformPolicy(problem.simulator.action_size) if explores else state.learner.policy
-        interaction, metrics = act_on(
-            self._place(problem), state.interaction, policy, of_acting, control_steps=self.epoch_steps
+        interaction, epoch, due = explore_or_act(
+            self._place(problem),
+            state.interaction,
+            state.learner.policy,
+            of_acting,
+            control_steps=self.epoch_steps,
+            warmup_steps=self.warmup_steps,
+            updates_per_step=self.updates_per_step,
         )
         learner = state.learner
-        acted, count, judging = interaction.control_steps - state.interaction.control_steps, 0, 0
         if interaction.control_steps >= self.warmup_steps:
-            count = round(self.updates_per_step * acted)
             logged = problem.logged if self.cloning is not None else None
-            learner, losses = self._update(learner, interaction.replay, logged, of_update, count)
-            metrics |= scalars(losses)
+            learner, losses = self._update(learner, interaction.replay, logged, of_update, due)
+            epoch = replace(epoch, metrics=epoch.metrics | scalars(losses))
         following = replace(state, learner=learner, interaction=interaction, key=key)
-        due = self.judge_every and interaction.control_steps >= state.judged.last + self.judge_every
-        if due and learner is not state.learner:
-            judged, mean_return, judging = judge(
-                self._place(problem),
-                learner.policy,
-                state.judged,
-                of_judging,
-                episodes=self.judge_episodes,
-                spent=interaction.control_steps,
+        judges = self.judge_every and interaction.control_steps >= state.judged.last + self.judge_every
+        if judges and learner is not state.learner:
+            place, spent = self._place(problem), interaction.control_steps
+            judged, epoch = judge(
+                place, learner.policy, state.judged, epoch, of_judging, episodes=self.judge_episodes, spent=spent
             )
             following = replace(following, judged=judged)
-            metrics |= {"judged_return": mean_return}
-        stage = "exploring" if explores else "learning"
-        return following, Epoch(metrics, control_steps=acted + judging, unbudgeted=judging, updates=count, stage=stage)
+        return following, epoch
 
     @eqx.filter_jit
     def _update(

@@ -1,7 +1,7 @@
 """Where the parameters of the systems come from that a policy is learnt in: fixed values, or a distribution."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -11,6 +11,7 @@ from madoc.errors import MadocError
 from madoc.parameters import ParameterSpace
 
 
+@runtime_checkable
 class ParameterDistribution(Protocol):
     """Parameters to draw systems from. A learner draws again every epoch, one system an environment."""
 
@@ -37,8 +38,8 @@ class UniformParameters:
 
     def draw(self, key: PRNGKeyArray, count: int) -> Float[np.ndarray, "count parameters"]:
         """Physical values of `count` systems."""
-        unit = jax.random.uniform(key, (count, self.size), minval=-1.0, maxval=1.0)
-        return self.space.to_physical(np.asarray(unit))
+        scaled = jax.random.uniform(key, (count, self.size), minval=-1.0, maxval=1.0)
+        return self.space.to_physical(np.asarray(scaled))
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
 """Several runs on one page."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+from madoc.calibration.holdout import ToldApart
 from madoc.errors import MadocError
-from madoc.report.page import verdict_of, write_page
+from madoc.report.page import headline, write_page
 from madoc.report.reading import Run, read_run
+from madoc.report.sections.base import Shown, place, spread_of, unit_words
 from madoc.report.words import count, duration, number, parameter_title
 
 
@@ -27,111 +28,93 @@ def write_comparison(runs: Sequence[Path], out: Path | None = None) -> Path:
     return page
 
 
-def comparison_context(runs: Sequence[Run]) -> dict[str, Any]:
+def comparison_context(runs: Sequence[Run]) -> Shown:
     """What the template of several runs shows."""
-    names = _distinct_names(runs)
-    tasks = list(dict.fromkeys(str(run.spec.get("task", "")) for run in runs))
-    rows = [_run_row(run, name, index) for index, (run, name) in enumerate(zip(runs, names, strict=True))]
+    names = dict(zip(_distinct_names(runs), runs, strict=True))
+    parameters = dict.fromkeys(name for run in runs for name in run.parameters)
+    seconds = {name: run.result.seconds if run.result else None for name, run in names.items()}
+    errors = {name: run.error_percent for name, run in names.items()}
     return {
         "title": f"{len(runs)} runs compared",
-        "rows": rows,
-        "notes": _notes(runs, tasks),
-        "parameters": _parameter_rows(runs, names),
-        "costs": _bars(rows, runs, "seconds"),
-        "errors": _bars(rows, runs, "error"),
+        "rows": [_run_row(run, name, index) for index, (name, run) in enumerate(names.items())],
+        "notes": _notes(runs),
+        "parameters": [_parameter_row(parameter, names) for parameter in parameters],
+        "costs": _bars(seconds, duration),
+        "errors": _bars(errors, lambda value: f"{number(value, 3)} % of the range"),
     }
 
 
-def _run_row(run: Run, name: str, index: int) -> dict[str, Any]:
-    error, held = run.result.get("error") or {}, run.result.get("holdout") or {}
+def _run_row(run: Run, name: str, index: int) -> Shown:
+    held, result = run.holdout, run.result
     return {
         "name": name,
         "colour": f"g{index % 8}",
-        "verdict": verdict_of(run),
+        "verdict": headline(run),
         "method": run.method,
-        "holdout": number(100 * held["relative"], 3) if held.get("measure") == "prediction" else "–",
-        "task": run.spec.get("task", ""),
-        "error": number(error.get("mean_percent_of_range"), 3),
-        "steps": count(run.result["control_steps"]) if "control_steps" in run.result else "–",
-        "time": duration(run.result["seconds"]) if "seconds" in run.result else "–",
-        "seed": run.spec.get("seed", "–"),
-        "warnings": run.result.get("warnings", []),
+        "holdout": "–" if held is None or isinstance(held, ToldApart) else number(100 * held.score, 3),
+        "task": run.spec.task,
+        "error": number(run.error_percent, 3),
+        "steps": "–" if result is None else count(result.control_steps),
+        "time": "–" if result is None else duration(result.seconds),
+        "seed": "–" if run.spec.seed is None else run.spec.seed,
+        "warnings": run.warnings,
     }
 
 
-def _parameter_rows(runs: Sequence[Run], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Each parameter with a lane a run, on an axis that holds all their ranges."""
-    found = []
-    for parameter in dict.fromkeys(name for run in runs for name in run.parameters):
-        own = [(index, run.parameters[parameter], run) for index, run in enumerate(runs) if parameter in run.parameters]
-        low, high = min(row["low"] for _, row, _ in own), max(row["high"] for _, row, _ in own)
-
-        def place(value: float, low: float = low, high: float = high) -> float:
-            return round(min(max((value - low) / (high - low), 0.0), 1.0) * 100, 3)
-
-        truth = next((run.truth[parameter] for _, _, run in own if parameter in run.truth), None)
-        lanes = []
-        for index, row, _ in own:
-            ends = row.get("interval") or (row["estimate"] - row["std"], row["estimate"] + row["std"])
-            lanes.append(
-                {
-                    "name": names[index],
-                    "colour": f"g{index % 8}",
-                    "estimate": number(row["estimate"]),
-                    "at": place(row["estimate"]),
-                    "from": place(ends[0]),
-                    "to": place(ends[1]),
-                }
-            )
-        found.append(
-            {
-                "title": parameter_title(parameter),
-                "name": parameter,
-                "unit": own[0][1]["unit"].replace("1", "") if own[0][1]["unit"] == "1" else own[0][1]["unit"],
-                "low": number(low),
-                "high": number(high),
-                "truth": None if truth is None else number(truth),
-                "truth_at": None if truth is None else place(truth),
-                "lanes": lanes,
-            }
-        )
-    return found
-
-
-def _bars(rows: Sequence[dict[str, Any]], runs: Sequence[Run], what: str) -> list[dict[str, Any]]:
-    """A bar a run, for those that say; empty where none does."""
-    values = [
-        run.result.get("seconds") if what == "seconds" else (run.result.get("error") or {}).get("mean_percent_of_range")
-        for run in runs
+def _parameter_row(parameter: str, runs: Mapping[str, Run]) -> Shown:
+    """A parameter with a lane a run, on an axis that holds all their ranges."""
+    own = [
+        (name, f"g{index % 8}", run.parameters[parameter])
+        for index, (name, run) in enumerate(runs.items())
+        if parameter in run.parameters
     ]
-    largest = max((value for value in values if value is not None), default=0.0) or 1.0
-    return [
+    span = min(row.low for *_, row in own), max(row.high for *_, row in own)
+    truth = next((run.truth[parameter] for run in runs.values() if parameter in run.truth), None)
+    lanes = [
         {
-            "name": row["name"],
-            "colour": row["colour"],
-            "at": round(100 * value / largest, 2),
-            "words": duration(value) if what == "seconds" else f"{number(value, 3)} % of the range",
+            "name": name,
+            "colour": colour,
+            "estimate": number(row.estimate),
+            "at": place(row.estimate, *span),
+            "from": place(spread_of(row)[0], *span),
+            "to": place(spread_of(row)[1], *span),
         }
-        for row, value in zip(rows, values, strict=True)
+        for name, colour, row in own
+    ]
+    return {
+        "title": parameter_title(parameter),
+        "unit": unit_words(own[0][2].unit),
+        "low": number(span[0]),
+        "high": number(span[1]),
+        "truth": None if truth is None else number(truth),
+        "truth_at": None if truth is None else place(truth, *span),
+        "lanes": lanes,
+    }
+
+
+def _bars(values: Mapping[str, float | None], words: Callable[[float], str]) -> list[Shown]:
+    """A bar for every run that has a value."""
+    largest = max((value for value in values.values() if value is not None), default=0.0) or 1.0
+    return [
+        {"name": name, "colour": f"g{index % 8}", "at": round(100 * value / largest, 2), "words": words(value)}
+        for index, (name, value) in enumerate(values.items())
         if value is not None
     ]
 
 
 def _distinct_names(runs: Sequence[Run]) -> list[str]:
-    """Folder names; with those of their parents where two are alike."""
+    """Folder names; where two are alike with those of their parents, and numbered if that is not enough."""
     names = [run.name for run in runs]
-    if len(set(names)) == len(names):
-        return names
-    return [f"{run.whole.resolve().parent.name}/{run.name}" for run in runs]
+    if len(set(names)) < len(names):
+        names = [f"{run.whole.resolve().parent.name}/{run.name}" for run in runs]
+    return names if len(set(names)) == len(names) else [f"{name} ({at})" for at, name in enumerate(names, 1)]
 
 
-def _notes(runs: Sequence[Run], tasks: Sequence[str]) -> list[str]:
+def _notes(runs: Sequence[Run]) -> list[str]:
     """What makes these runs hard to compare."""
-    notes = []
-    if len(tasks) > 1:
-        notes.append(f"The runs are of different robots ({', '.join(tasks)}).")
-    data = {(run.spec.get("data") or {}).get("fingerprint") for run in runs}
-    if len(data) > 1:
+    tasks = list(dict.fromkeys(run.spec.task for run in runs))
+    notes = [f"The runs are of different robots ({', '.join(tasks)})."] if len(tasks) > 1 else []
+    if len({run.spec.data and run.spec.data.fingerprint for run in runs}) > 1:
         notes.append("The runs were calibrated to different data.")
     if any(not run.parameters for run in runs):
         notes.append("Not all of the runs have ended.")

@@ -2,15 +2,16 @@
 
 import datetime
 import functools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import jinja2
 
+from madoc.calibration.holdout import HoldOut, ToldApart
 from madoc.errors import MadocError
 from madoc.report import sections
 from madoc.report.reading import Run, read_run
+from madoc.report.sections import Shown
 from madoc.report.words import count, duration, number
 from madoc.runs.files import replacing
 
@@ -37,89 +38,89 @@ def write_report(run: Path, out: Path | None = None) -> Path:
     return page
 
 
-def run_context(run: Run) -> dict[str, Any]:
+def run_context(run: Run) -> Shown:
     """What the template of one run shows."""
     made = [section(run) for section in sections.ALL]
     if not run.parameters:
         made = [replace(each, absent=sections.NOT_ENDED) if each.data is None else each for each in made]
     return {
-        "title": f"{run.spec.get('task', 'robot')} · {run.method}",
+        "title": f"{run.spec.task} · {run.method}",
         "run": run,
-        "verdict": verdict_of(run),
+        "verdict": headline(run),
         "facts": _facts(run),
-        "warnings": run.result.get("warnings", []),
         "sections": made,
         "absent": [section for section in made if section.data is None],
         "ended": _ended(run),
     }
 
 
-def verdict_of(run: Run) -> dict[str, str]:
-    """The word on top, its colour, and its sentence; how the run ended where it was given no verdict."""
-    verdict = run.result.get("verdict")
-    if verdict:
-        word = str(verdict["word"])
-        return {
-            "word": word.replace("_", " "),
-            "tone": sections.TONES.get(word, "doubtful"),
-            "sentence": str(verdict["sentence"]),
-            "note": str(run.result.get("sentence", "")),
-        }
-    status = run.result.get("status")
-    if status is None or "parameters" not in run.result:
-        return {
-            "word": "NOT ENDED" if status is None else str(status).upper(),
-            "tone": "doubtful",
-            "sentence": "The run has not ended: this page shows what it has done so far.",
-            "note": str(run.result.get("sentence", "")),
-        }
-    sentence = {
-        "interrupted": "The run was interrupted: the estimate is that of the moment.",
-        "diverged": "The run stopped on a number that is none: do not use the estimate.",
-    }.get(status, "Nothing was held out, so this estimate was not tried on data it has not seen.")
-    return {
-        "word": "NO VERDICT" if status in ("finished", "converged") else str(status).upper(),
-        "tone": "bad" if status == "diverged" else "doubtful" if status == "interrupted" else "neutral",
-        "sentence": sentence,
-        "note": str(run.result.get("sentence", "")),
-    }
+@dataclass(frozen=True)
+class Headline:
+    """What stands on top of a page.
+
+    Attributes:
+        word: The verdict; how the run ended, where it was given none.
+        tone: Class that colours it.
+        sentence: The reason.
+        note: How the run ended.
+    """
+
+    word: str
+    tone: str
+    sentence: str
+    note: str
 
 
-def _facts(run: Run) -> list[dict[str, str]]:
-    """The few numbers worth the top of the page."""
-    facts = [*_held_out(run)]
-    error = run.result.get("error")
-    if error:
-        facts.append(
-            {
-                "title": "off the truth",
-                "value": f"{number(error['mean_percent_of_range'], 3)} %",
-                "note": "of the range, on average",
-            }
-        )
-    if run.result.get("control_steps") is not None:
-        facts.append({"title": "control steps", "value": count(run.result["control_steps"]), "note": "simulated"})
-    if run.result.get("seconds") is not None:
-        facts.append({"title": "time", "value": duration(run.result["seconds"]), "note": "wall clock"})
-    data = run.spec.get("data")
-    if isinstance(data, dict) and "rows" in data:
-        facts.append({"title": "log", "value": count(data["rows"]), "note": f"rows · {data.get('fingerprint', '')}"})
+_UNJUDGED = {
+    "interrupted": ("doubtful", "The run was interrupted: the estimate is that of the moment."),
+    "diverged": ("bad", "The run stopped on a number that is none: do not use the estimate."),
+}
+"""Tone and sentence of a run without a verdict, by how it ended."""
+
+
+def headline(run: Run) -> Headline:
+    """The verdict, or how the run ended where it was given none."""
+    if run.result is None:
+        sentence = "The run has not ended: this page shows what it has done so far."
+        return Headline((run.status or "NOT ENDED").upper(), "doubtful", sentence, run.sentence)
+    if run.result.verdict is not None:
+        verdict = run.result.verdict
+        return Headline(verdict.word.replace("_", " "), sections.TONES[verdict.word], verdict.sentence, run.sentence)
+    if run.result.status in _UNJUDGED:
+        return Headline(run.result.status.upper(), *_UNJUDGED[run.result.status], run.sentence)
+    sentence = "Nothing was held out, so this estimate was not tried on data it has not seen."
+    return Headline("NO VERDICT", "neutral", sentence, run.sentence)
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A number worth the top of the page."""
+
+    title: str
+    value: str
+    note: str
+
+
+def _facts(run: Run) -> list[Fact]:
+    facts = [_on_holdout(run.holdout)] if run.holdout else []
+    if run.error_percent is not None:
+        facts.append(Fact("off the truth", f"{number(run.error_percent, 3)} %", "of the range, on average"))
+    if run.result is not None:
+        facts.append(Fact("control steps", count(run.result.control_steps), "simulated"))
+        facts.append(Fact("time", duration(run.result.seconds), "wall clock"))
+    if run.spec.data is not None and run.spec.data.rows is not None:
+        facts.append(Fact("log", count(run.spec.data.rows), f"rows · {run.spec.data.fingerprint}"))
     return facts
 
 
-def _held_out(run: Run) -> list[dict[str, str]]:
+def _on_holdout(held: HoldOut) -> Fact:
     """The hold-out's measure in one number."""
-    held = run.result.get("holdout") or {}
-    if held.get("measure") == "prediction" and held.get("relative") is not None:
-        ends = [f"{number(100 * end, 3)} %" for end in held["relative_interval"]]
-        value, note = f"{number(100 * held['relative'], 3)} %", f"of mid-range's; {ends[0]} to {ends[1]}"
-        return [{"title": "error on the hold-out", "value": value, "note": note}]
-    area = (held.get("two_sample") or {}).get("estimate")
-    if area:
-        low, high = (number(end, 2) for end in area["interval"])
+    if isinstance(held, ToldApart):
+        low, high = (number(end, 2) for end in held.area_at_estimate.interval)
         note = f"area of a classifier, {low} to {high}; 0.5 is chance"
-        return [{"title": "told from the log", "value": number(area["area"], 2), "note": note}]
-    return []
+        return Fact("told from the log", number(held.area_at_estimate.area, 2), note)
+    value, low, high = (f"{number(100 * share, 3)} %" for share in (held.score, *held.score_interval))
+    return Fact("error on the hold-out", value, f"of mid-range's; {low} to {high}")
 
 
 def _ended(run: Run) -> str:
@@ -130,7 +131,7 @@ def _ended(run: Run) -> str:
     return datetime.datetime.fromtimestamp(file.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
 
 
-def write_page(page: Path, template: str, context: dict[str, Any]) -> None:
+def write_page(page: Path, template: str, context: Shown) -> None:
     """Render a template into a file, whole or not at all.
 
     Raises:
@@ -145,7 +146,7 @@ def write_page(page: Path, template: str, context: dict[str, Any]) -> None:
         stream.write(text.encode())
 
 
-def render(template: str, context: dict[str, Any]) -> str:
+def render(template: str, context: Shown) -> str:
     """A template's text; every word from a file is escaped."""
     return _environment().get_template(template).render(context | {"generator": GENERATOR})
 

@@ -6,14 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, TypeVar
 
 import numpy as np
-import yaml
 from jaxtyping import Float
+from pydantic import Field, TypeAdapter, ValidationError
+from ruamel.yaml import YAML, YAMLError
 
+from madoc.calibration import CalibrationResult, ParameterEstimate
+from madoc.calibration.holdout import HoldOut
 from madoc.errors import MadocError
+from madoc.robots.document import yaml_text
 from madoc.runs.files import read_json
+
+Record = TypeVar("Record")
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,67 @@ class Embeddings:
 
 
 @dataclass(frozen=True)
+class DataUsed:
+    """What a spec remembers of the data: number of rows, and a fingerprint of their content."""
+
+    rows: int | None = None
+    fingerprint: str = ""
+
+
+@dataclass(frozen=True)
+class RobotFile:
+    """The spec file of a robot of one's own: its name and its text."""
+
+    file: str = "its spec file"
+    spec: str = ""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What a calibration was asked, as far as a page shows it.
+
+    Attributes:
+        task: The robot.
+        method: A calibrator, or `auto`.
+        seed: Of all randomness.
+        parameters: Range of each parameter.
+        truth: True values by name, where they are known.
+        data: What was calibrated to.
+        robot: The robot's own file, if it has one.
+        versions: Of the libraries.
+        text: All of `spec.json`, as YAML, but for versions and robot.
+    """
+
+    task: str = "robot"
+    method: str | None = None
+    seed: int | None = None
+    parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
+    truth: dict[str, float] | None = None
+    data: DataUsed | None = None
+    robot: RobotFile | None = None
+    versions: dict[str, str] = field(default_factory=dict)
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class PolicyReturn:
+    """Mean return of a policy's episodes, its standard deviation, normalized score and mean length."""
+
+    mean: Annotated[float, Field(alias="return")]
+    std: Annotated[float, Field(alias="return_std")]
+    normalized: float
+    length: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Policies in the target: number of episodes of each, and returns by name."""
+
+    episodes: int
+    policies: dict[str, PolicyReturn]
+
+
+@dataclass(frozen=True)
 class Run:
     """What a run folder holds. Everything but the folder may be missing.
 
@@ -80,7 +147,9 @@ class Run:
         folder: Of the calibration.
         whole: The folder that was named: the calibration's, or that of `madoc run` around it.
         spec: What the calibration was asked.
-        result: How it ended.
+        result: What it returned; None while it has not ended.
+        status: How it ended; None while it has not.
+        sentence: The same in words.
         log: Its metrics.
         evidence: Held-out stretches.
         embeddings: What it learnt of which parameters act alike.
@@ -90,45 +159,59 @@ class Run:
     name: str
     folder: Path
     whole: Path
-    spec: dict[str, Any] = field(default_factory=dict)
-    result: dict[str, Any] = field(default_factory=dict)
+    spec: Spec = field(default_factory=Spec)
+    result: CalibrationResult | None = None
+    status: str | None = None
+    sentence: str = ""
     log: MetricLog | None = None
     evidence: Evidence | None = None
     embeddings: Embeddings | None = None
-    evaluation: dict[str, Any] | None = None
+    evaluation: Evaluation | None = None
 
-    @cached_property
-    def parameters(self) -> dict[str, dict[str, Any]]:
+    @property
+    def parameters(self) -> dict[str, ParameterEstimate]:
         """Estimates by name; empty while there is none."""
-        return self.result.get("parameters", {})
+        return {} if self.result is None else self.result.parameters
+
+    @property
+    def warnings(self) -> list[str]:
+        """What to know before trusting the result."""
+        return [] if self.result is None else self.result.warnings
+
+    @property
+    def holdout(self) -> HoldOut | None:
+        """What rows held out say, where there were any."""
+        return None if self.result is None else self.result.holdout
+
+    @property
+    def error_percent(self) -> float | None:
+        """Mean error in % of the ranges, where the truth is known."""
+        return self.result.error["mean_percent_of_range"] if self.result is not None and self.result.error else None
 
     @property
     def method(self) -> str:
-        """What calibrated: the method that was kept, where several were tried."""
-        return str(self.result.get("method") or self.spec.get("method", "an unknown method"))
+        """The method that calibrated: the one that was kept, where several were tried."""
+        return self.result.method if self.result is not None else self.spec.method or "an unknown method"
 
     @cached_property
     def units(self) -> dict[str, str]:
-        """Units of signals by name, as far as the spec of a robot of one's own says them."""
-        robot = self.spec.get("robot") or {}
+        """Units of signals by name, where the spec of a robot of one's own has them."""
         try:
-            signals = yaml.safe_load(robot.get("spec", "")) or {}
-            return {row["name"]: str(row["unit"]) for row in signals["signals"] if "unit" in row}
-        except (yaml.YAMLError, KeyError, TypeError):
+            spec = YAML(typ="safe").load(self.spec.robot.spec if self.spec.robot else "") or {}
+            return {row["name"]: str(row["unit"]) for row in spec["signals"] if "unit" in row}
+        except (YAMLError, KeyError, TypeError):
             return {}
 
-    @cached_property
+    @property
     def truth(self) -> dict[str, float]:
-        """True values by name, as far as they are known."""
-        return self.spec.get("truth") or {}
+        """True values by name, where they are known."""
+        return self.spec.truth or {}
 
     @cached_property
     def groups(self) -> dict[str, int]:
         """Group of each parameter, from 0; empty where all are one group."""
-        groups = self.result.get("groups", [])
-        if len(groups) < 2:
-            return {}
-        return {name: index for index, names in enumerate(groups) for name in names}
+        groups = [] if self.result is None else self.result.groups
+        return {name: index for index, names in enumerate(groups) for name in names} if len(groups) > 1 else {}
 
 
 def read_run(path: Path) -> Run:
@@ -143,21 +226,27 @@ def read_run(path: Path) -> Run:
     folder = path / "calibration" if (path / "calibration" / "spec.json").exists() else path
     if not (folder / "spec.json").exists():
         raise MadocError(f"{path} holds no calibration: there is no spec.json; name a folder of madoc calibrate or run")
-    spec = _object(folder / "spec.json")
-    if spec.get("command") == "learn":
+    asked = _object(folder / "spec.json")
+    if asked.get("command") == "learn":
         raise MadocError(f"{path} holds a policy, not a calibration; name the run folder it was learnt from")
-    result = _object(folder / "result.json")
-    method = _folder_of_method(folder, (result.get("holdout") or {}).get("chosen"))
+    shown = {name: value for name, value in asked.items() if name not in ("versions", "robot")}
+    spec = _typed(Spec, asked | {"text": yaml_text(shown, width=80)}, folder / "spec.json")
+    ended = _object(folder / "result.json")
+    result = CalibrationResult.from_json(ended) if "parameters" in ended else None
+    method = _folder_of_method(folder, result.holdout.chosen if result and result.holdout else None)
+    evaluation = _object(path / "evaluation.json")
     return Run(
         name=path.resolve().name,
         folder=folder,
         whole=path,
         spec=spec,
         result=result,
+        status=str(ended["status"]) if "status" in ended else None,
+        sentence=str(ended.get("sentence", "")),
         log=read_metrics(method / "metrics.jsonl"),
         evidence=read_evidence(folder / "evidence.npz"),
         embeddings=read_embeddings(method / "embeddings.npz"),
-        evaluation=_object(path / "evaluation.json") or None,
+        evaluation=_typed(Evaluation, evaluation, path / "evaluation.json") if evaluation else None,
     )
 
 
@@ -169,7 +258,7 @@ def read_metrics(path: Path) -> MetricLog | None:
     """
     if not path.exists():
         return None
-    lines: list[dict[str, Any]] = []
+    lines = []
     written = path.read_text(encoding="utf-8").splitlines()
     for number, text in enumerate(written, 1):
         try:
@@ -219,7 +308,21 @@ def _folder_of_method(folder: Path, chosen: str | None) -> Path:
     return max((log for log in logs if log.exists()), key=lambda log: log.stat().st_mtime, default=logs[0]).parent
 
 
-def _object(path: Path) -> dict[str, Any]:
+def _typed(kind: type[Record], fields: dict[str, object], path: Path) -> Record:
+    """A record of a file's fields.
+
+    Raises:
+        MadocError: A field is not what it should be.
+    """
+    try:
+        return TypeAdapter(kind).validate_python(fields)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise MadocError(f"{path} is damaged ({place}: {first['msg']}); restore it or delete it") from error
+
+
+def _object(path: Path) -> dict[str, object]:
     """A JSON object; empty where there is no such file.
 
     Raises:

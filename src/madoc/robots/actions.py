@@ -1,40 +1,37 @@
-"""Actions of a spec: actuators added to the model, and what -1 and 1 mean to each."""
+"""Actions of a spec: the actuators they add to the model, and the values that -1 and 1 stand for."""
 
 import mujoco
 import numpy as np
 
 from madoc.robots.draft import SCALES, Draft
-from madoc.robots.model import AddedActuator, is_single, is_slide, names_of
+from madoc.robots.model import AddedActuator, is_slide
 from madoc.robots.spec import ActionSpec
 from madoc.tasks.base import ActionChannel
 
 KNOWN_UNITS = (*SCALES, "N·m", "Nm", "N", "rad", "rad/s", "m", "m/s", "V", "A", "%", "1")
-"""Those of `SCALES` are converted; the others are the control's own, and only said."""
-
-
-def _joint(draft: Draft, index: int) -> int:
-    """The joint that an action names; a hinge or a slide."""
-    action, joints = draft.spec.actions[index], names_of(draft.plain, mujoco.mjtObj.mjOBJ_JOINT, draft.plain.njnt)
-    place = ("actions", index, "joint")
-    if action.joint not in joints:
-        raise draft.document.unknown(place, "the name of a joint", str(action.joint), joints)
-    joint = int(draft.plain.joint(action.joint).id)
-    if not is_single(draft.plain, joint):
-        raise draft.document.error(place, f"expected a hinge or a slide, got {action.joint!r}, which is a ball or free")
-    return joint
+"""Units of an action. Those of `SCALES` are converted; in the others a value is the control itself."""
 
 
 def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
-    """The actuator that an action needs; None where it names one of the model's."""
-    action, model, document = draft.spec.actions[index], draft.plain, draft.document
-    actuators = names_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)
+    """The actuator that an action adds to the model; None where the action names one of the model's.
+
+    Raises:
+        MadocError: The model lacks the joint or actuator, or the action does not fit it.
+    """
+    action, document = draft.spec.actions[index], draft.document
+    actuators = [actuator.name for actuator in draft.base.actuators if actuator.name]
     if action.joint is None:
         if action.actuator not in actuators:
             place = ("actions", index, "actuator")
             raise document.unknown(place, "the name of an actuator", str(action.actuator), actuators)
         return None
-    joint = _joint(draft, index)
-    slide = is_slide(model, joint)
+    place, joint = ("actions", index, "joint"), draft.base.joint(action.joint)
+    if joint is None:
+        joints = [joint.name for joint in draft.base.joints if joint.name]
+        raise document.unknown(place, "the name of a joint", action.joint, joints)
+    slide = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
+    if not slide and joint.type != mujoco.mjtJoint.mjJNT_HINGE:
+        raise document.error(place, f"expected a hinge or a slide, got {action.joint!r}, which is a ball or free")
     if action.means == ("torque" if slide else "force"):
         right, kind = ("force", "slide") if slide else ("torque", "hinge")
         raise document.error(("actions", index, "means"), f"expected means: {right} of the {kind} {action.joint!r}")
@@ -43,24 +40,31 @@ def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
             ("actions", index, "name"),
             f"the model has an actuator {action.name!r}; drive it with actuator: {action.name}, or choose another name",
         )
-    _check_free(draft, index, joint)
+    _check_free(draft, index)
     scale = SCALES.get(action.unit or "", 1.0)
-    assert action.low is not None and action.high is not None  # the spec has seen to it
+    assert action.low is not None and action.high is not None  # the spec requires both beside joint:
     ends = action.low * scale, action.high * scale
     if action.means in ("torque", "force"):
         return AddedActuator(action.name, action.joint, *ends)
     gain = action.kp if action.means == "position" else action.kd
-    assert gain is not None  # the spec has seen to it
+    assert gain is not None  # the spec requires kp of a position servo and kd of a velocity servo
     return AddedActuator(
         action.name, action.joint, *ends, gain, stiffness=action.kp or 0.0, damping=action.kd or 0.0, limit=action.limit
     )
 
 
 def action_channel(draft: Draft, model: mujoco.MjModel, index: int) -> ActionChannel:
-    """What an action's values mean to its actuator."""
+    """The channel of an action.
+
+    Raises:
+        MadocError: It has no limits, an unknown unit, or the actuator of another action.
+    """
     action = draft.spec.actions[index]
     name = action.actuator or action.name
-    actuator = int(model.actuator(name).id)
+    actuators = [model.actuator(number).name for number in range(model.nu)]
+    if name not in actuators:  # MuJoCo leaves out an actuator whose target is missing
+        raise draft.document.unknown(("actions", index, "actuator"), "the name of an actuator", name, actuators)
+    actuator = actuators.index(name)
     low, high = action.low, action.high
     if low is None or high is None:
         if not model.actuator_ctrllimited[actuator]:
@@ -86,7 +90,7 @@ def action_channel(draft: Draft, model: mujoco.MjModel, index: int) -> ActionCha
 
 
 def _action_unit(action: ActionSpec, model: mujoco.MjModel, actuator: int) -> str:
-    """The unit of a channel that names none: SI's, where the joint tells."""
+    """The SI unit of a channel without a given unit, from its joint; empty where it drives one of the model's own."""
     if action.joint is None:
         return ""
     slide = is_slide(model, int(model.actuator_trnid[actuator, 0]))
@@ -100,23 +104,21 @@ def _action_unit(action: ActionSpec, model: mujoco.MjModel, actuator: int) -> st
 
 
 def idle_actuators(model: mujoco.MjModel, actions: tuple[ActionChannel, ...]) -> tuple[str, ...]:
-    """A sentence on the actuators that no action drives."""
-    driven = {int(model.actuator(channel.actuator).id) for channel in actions}
-    idle = [actuator for actuator in range(model.nu) if actuator not in driven]
+    """A sentence about the actuators that no action drives; empty where there are none."""
+    driven = {channel.actuator for channel in actions}
+    names = [model.actuator(index).name for index in range(model.nu)]
+    idle = [name or f"number {index}" for index, name in enumerate(names) if name not in driven]
     if not idle:
         return ()
-    names = [
-        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator) or f"number {actuator}" for actuator in idle
-    ]
-    return (f"no action drives the model's actuators {', '.join(names)}: their control is always 0",)
+    return (f"no action drives the model's actuators {', '.join(idle)}: their control is always 0",)
 
 
-def _check_free(draft: Draft, index: int, joint: int) -> None:
+def _check_free(draft: Draft, index: int) -> None:
     """Refuse a joint that another actuator drives already."""
-    action, model, place = draft.spec.actions[index], draft.plain, ("actions", index, "joint")
-    for actuator in range(model.nu):
-        if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[actuator, 0] == joint:
-            name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator) or "without a name"
+    action, place = draft.spec.actions[index], ("actions", index, "joint")
+    for actuator in draft.base.actuators:
+        if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == action.joint:
+            name = actuator.name or "without a name"
             raise draft.document.error(
                 place,
                 f"the joint {action.joint!r} has an actuator {name!r} in the model; drive that with actuator: {name}, "

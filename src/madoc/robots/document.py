@@ -1,85 +1,63 @@
-"""A YAML file with the line of everything in it, so that a mistake is answered where it was made."""
+"""YAML with the line of everything in it, so that a mistake is reported where it was made; and YAML written."""
 
-import math
-import re
-from collections.abc import Iterable, Iterator
+import io
+from collections.abc import Iterable
 from dataclasses import dataclass
-from difflib import get_close_matches
-from typing import Any
 
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.constructor import RoundTripConstructor
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event
+from ruamel.yaml.nodes import MappingNode, Node
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, nearest_hint
 
 Place = tuple[str | int, ...]
-"""Where something stands: keys and positions, as `("signals", 0, "name")`."""
+"""Path to a value: keys and positions, as `("signals", 0, "name")`."""
 
 LARGEST = 200_000
-"""Bytes. A spec file of a robot with a hundred joints has some twenty thousand."""
+"""Largest size of a file in bytes; a larger one is refused. The spec of a robot with a hundred joints has 20,000."""
 DEEPEST = 20
-
-_INTEGER = re.compile(r"[-+]?[0-9]+")
-_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
-_WORDS = {
-    **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
-    **dict.fromkeys(("true", "True", "TRUE"), True),
-    **dict.fromkeys(("false", "False", "FALSE"), False),
-    **dict.fromkeys((".inf", "+.inf"), math.inf),
-    "-.inf": -math.inf,
-    ".nan": math.nan,
-}
+"""Deepest nesting of lists and mappings; anything deeper is refused."""
 
 
 @dataclass(frozen=True)
 class Document:
-    """What a YAML file says, and on which line.
+    """The content of a YAML file.
 
     Attributes:
-        file: Its name, for sentences.
-        data: Dictionaries, lists, text, numbers, booleans, None.
-        lines: The line of every place, counted from 1.
+        file: The name of the file, for error sentences.
+        data: Mappings and lists that know their lines, text, numbers, booleans or None.
     """
 
     file: str
-    data: Any
-    lines: dict[Place, int]
+    data: object
 
     def line(self, place: Place) -> int:
-        """The line of a place, or of what should have held it."""
-        while place not in self.lines:
-            place = place[:-1]
-        return self.lines[place]
+        """The line of a value, counted from 1; of the nearest part that would hold it where it is missing."""
+        part = self.data
+        line: int = part.lc.line if isinstance(part, CommentedMap | CommentedSeq) else 0
+        for key in place:
+            if not isinstance(part, CommentedMap | CommentedSeq) or key not in part.lc.data:
+                break
+            line, part = part.lc.data[key][0], part[key]
+        return line + 1
 
     def error(self, place: Place, sentence: str) -> MadocError:
-        """The refusal of what stands at a place."""
+        """An error about the value at a place, with the file and the line in front."""
         return MadocError(f"{self.file}, line {self.line(place)}: {sentence}")
 
     def unknown(self, place: Place, what: str, name: str, known: Iterable[str]) -> MadocError:
-        """The refusal of a name that is not among the known ones, with the nearest."""
-        names = list(known)
-        near = nearest(name, names)
-        if near:
-            hint = f"nearest: {', '.join(near)}"
-        else:
-            hint = f"there are: {', '.join(names[:12])}" if names else "there is none"
-        return self.error(place, f"expected {what}, got {name!r}; {hint}")
-
-
-def nearest(wanted: str, names: list[str]) -> list[str]:
-    """At most three names like the wanted one: those that hold it first, then those spelled like it."""
-    by_case = {name.lower(): name for name in names}
-    close = [by_case[name] for name in get_close_matches(wanted.lower(), list(by_case), n=3, cutoff=0.5)]
-    holding = [name for name in names if wanted and wanted.lower() in name.lower()]
-    return list(dict.fromkeys([*holding, *close]))[:3]
+        """An error about a name that is not among the known ones; it lists the nearest of them."""
+        return self.error(place, f"expected {what}, got {name!r}; {nearest_hint(name, known)}")
 
 
 def read_document(content: bytes, file: str) -> Document:
-    """Read YAML without tags, anchors or repeated keys.
-
-    Words are as in YAML 1.2: `1e-3` is a number, `on` is text.
+    """Read YAML 1.2 that has no tags, no anchors and no key twice.
 
     Raises:
-        MadocError: It is no such YAML; the sentence names the line.
+        MadocError: The content is not such YAML; the sentence names the line.
     """
     if len(content) > LARGEST:
         raise MadocError(
@@ -90,77 +68,66 @@ def read_document(content: bytes, file: str) -> Document:
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise MadocError(f"{file}, line {line}: expected text in UTF-8, got byte {content[error.start]:#x}") from error
+    reader = YAML()
+    reader.Constructor = _Constructor
     try:
         depth = 0
-        for event in yaml.parse(text, Loader=yaml.SafeLoader):
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            _refuse_cleverness(event, depth, file)
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-    except MadocError:
-        raise
-    except yaml.MarkedYAMLError as error:
+        for event in YAML().parse(text):
+            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+            _check_event(event, depth)
+        data = reader.load(text)
+    except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = file if mark is None else f"{file}, line {mark.line + 1}"
-        raise MadocError(f"{where}: this is not YAML: {error.problem or error.context}") from error
-    except yaml.YAMLError as error:
+        what = "" if isinstance(error, _Refusal) else "this is not YAML: "
+        raise MadocError(f"{where}: {what}{error.problem or error.context}") from error
+    except YAMLError as error:
         raise MadocError(f"{file}: this is not YAML: {' '.join(str(error).split())}") from error
     except (RecursionError, ValueError) as error:
         raise MadocError(f"{file}: this is not a YAML file that a robot's spec could be") from error
-    if root is None:
+    if data is None:
         raise MadocError(f"{file} is empty; write one with: madoc init MODEL")
-    lines: dict[Place, int] = {}
-    return Document(file, _value(root, (), _Reader(file, lines)), lines)
+    return Document(file, data)
 
 
-def _refuse_cleverness(event: yaml.Event, depth: int, file: str) -> None:
+def yaml_text(content: object, *, width: int = 110, flow: bool | None = None) -> str:
+    """Content as YAML, keys in their order; `flow` True writes all on one line, None only the innermost parts."""
+    writer = YAML(typ="safe", pure=True)
+    writer.default_flow_style, writer.width, writer.allow_unicode = flow, width, True
+    writer.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # keys keep their order
+    stream = io.StringIO()
+    writer.dump(content, stream)
+    return stream.getvalue()
+
+
+class _Refusal(MarkedYAMLError):
+    """YAML that is valid and yet not accepted in a spec."""
+
+
+def _check_event(event: Event, depth: int) -> None:
     """Refuse anchors, aliases, tags and deep nesting: a spec has no use for them, and they make YAML slow or unsafe."""
-    where = f"{file}, line {event.start_mark.line + 1}"
-    if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
-        raise MadocError(f"{where}: anchors and aliases (& and *) are not read here; write the value out")
-    if getattr(event, "tag", None):
-        raise MadocError(f"{where}: expected a plain value, got the tag {event.tag}; leave it out")
-    if depth > DEEPEST:
-        raise MadocError(f"{where}: nested more than {DEEPEST} deep, which no spec is")
+    if isinstance(event, AliasEvent) or getattr(event, "anchor", None):
+        problem = "anchors and aliases (& and *) are not read here; write the value out"
+    elif tag := getattr(event, "tag", None):
+        problem = f"expected a plain value, got the tag {tag}; leave it out"
+    elif depth > DEEPEST:
+        problem = f"nested more than {DEEPEST} deep, which no spec is"
+    else:
+        return
+    raise _Refusal(problem=problem, problem_mark=event.start_mark)
 
 
-@dataclass(frozen=True)
-class _Reader:
-    file: str
-    lines: dict[Place, int]
+class _Constructor(RoundTripConstructor):
+    """Takes only text as a key, and each key once."""
 
-    def error(self, node: yaml.Node, sentence: str) -> MadocError:
-        return MadocError(f"{self.file}, line {node.start_mark.line + 1}: {sentence}")
-
-
-def _value(node: yaml.Node, place: Place, reader: _Reader) -> Any:
-    reader.lines[place] = node.start_mark.line + 1
-    if isinstance(node, yaml.SequenceNode):
-        return [_value(child, (*place, index), reader) for index, child in enumerate(node.value)]
-    if isinstance(node, yaml.MappingNode):
-        return dict(_items(node, place, reader))
-    if isinstance(node, yaml.ScalarNode) and node.style is None:
-        return _plain(node.value)
-    return node.value
-
-
-def _items(node: yaml.MappingNode, place: Place, reader: _Reader) -> Iterator[tuple[str, Any]]:
-    seen: dict[str, int] = {}
-    for key_node, value_node in node.value:
-        if not isinstance(key_node, yaml.ScalarNode):
-            raise reader.error(key_node, "expected a word before the colon, got a list or a mapping")
-        key, line = key_node.value, key_node.start_mark.line + 1
-        if key in seen:
-            raise reader.error(key_node, f"{key!r} is given twice, first on line {seen[key]}; keep one")
-        seen[key] = line
-        value = _value(value_node, (*place, key), reader)
-        reader.lines[(*place, key)] = line
-        yield key, value
-
-
-def _plain(text: str) -> Any:
-    """A scalar without quotes, as YAML 1.2's core schema reads it."""
-    if text in _WORDS:
-        return _WORDS[text]
-    if _INTEGER.fullmatch(text) and len(text) < 20:
-        return int(text)
-    return float(text) if _NUMBER.fullmatch(text) else text
+    def check_mapping_key(
+        self, node: MappingNode, key_node: Node, mapping: CommentedMap, key: object, value: object
+    ) -> bool:
+        if not isinstance(key, str):
+            got = "a list or a mapping" if isinstance(key_node.value, list) else f"{key_node.value}; put it in quotes"
+            problem = f"expected a word before the colon, got {got}"
+        elif key in mapping:
+            problem = f"{key!r} is given twice, first on line {mapping.lc.data[key][0] + 1}; keep one"
+        else:
+            return True
+        raise _Refusal(problem=problem, problem_mark=key_node.start_mark)

@@ -1,4 +1,4 @@
-"""A spec on its way to a task: what it says, on which line, and the model as it is in its file."""
+"""A spec while it is made into a task: its content, its lines, and the model of its file."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 
 from madoc.robots.document import Document
-from madoc.robots.model import ModelFiles
 from madoc.robots.spec import RobotSpec
 
 SCALES: dict[str, float] = {
@@ -15,15 +14,13 @@ SCALES: dict[str, float] = {
     **dict.fromkeys(("cm", "cm/s"), 1e-2),
     **dict.fromkeys(("km/h",), 1.0 / 3.6),
 }
-"""Units that are not SI's, in SI's."""
+"""Units that are converted, each as a multiple of its SI unit."""
 
 
 @dataclass(frozen=True)
 class Draft:
-    """A spec with its lines, and the model as it is in its file."""
+    """A spec with its lines, and the MuJoCo spec of its model file, without the actuators that it adds."""
 
     spec: RobotSpec
     document: Document
-    files: ModelFiles
     base: mujoco.MjSpec
-    plain: mujoco.MjModel

@@ -1,6 +1,5 @@
-"""The first spec of a robot: written from its model, with comments that explain every part, and loadable as it is."""
+"""The first spec of a robot, written from its model: it loads as it is, and comments explain every part."""
 
-import json
 import os
 import re
 from collections.abc import Iterator
@@ -10,23 +9,27 @@ import mujoco
 import numpy as np
 
 from madoc.errors import MadocError
-from madoc.robots.model import ModelFiles, compiled, is_single, is_slide, joint_kind, names_of
+from madoc.robots.document import yaml_text
+from madoc.robots.expressions import Read
+from madoc.robots.model import ModelFiles, compiled, is_single, is_slide
 from madoc.runs.files import replacing
+from madoc.simulation.write import element_names
 from madoc.tasks import TASKS
 
-_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z]+)?|(position|velocity)\([A-Za-z_][A-Za-z0-9_]*\)")
-_WORDS = ("null", "true", "false", "y", "n", "yes", "no", "on", "off")
-_USUAL_STEP = 0.02
-"""s. Fifty actions a second."""
-_ACTIVE = 16
-"""Parameters proposed at once; more are written as comments."""
-_OF_FREE = (("x", "y", "z", "qw", "qx", "qy", "qz"), ("vx", "vy", "vz", "wx", "wy", "wz"))
 Fields = dict[str, str | float]
-_OF_BALL = (("qw", "qx", "qy", "qz"), ("wx", "wy", "wz"))
+_USUAL_STEP = 0.02
+"""Proposed time between two actions in s, rounded to a multiple of the model's timestep."""
+_ACTIVE = 16
+"""Largest number of parameters proposed; further ones are written as comments."""
+_PARTS = {
+    mujoco.mjtJoint.mjJNT_FREE: (("x", "y", "z", "qw", "qx", "qy", "qz"), ("vx", "vy", "vz", "wx", "wy", "wz")),
+    mujoco.mjtJoint.mjJNT_BALL: (("qw", "qx", "qy", "qz"), ("wx", "wy", "wz")),
+}
+"""Names of the values of a joint's position and velocity, where it has several."""
 
 
 def write_spec(model: Path, out: Path) -> None:
-    """Write the spec of a model's robot to a new file.
+    """Write a first spec for a model to a new file.
 
     Raises:
         MadocError: The file is there already, the folder is not, or the model cannot be used.
@@ -48,14 +51,14 @@ def write_spec(model: Path, out: Path) -> None:
 
 
 def spec_text(model: Path, out: Path) -> str:
-    """The commented spec of a model's robot, for a file at `out`.
+    """The text of a first spec for a model, with comments, for a file at `out`.
 
     Raises:
         MadocError: The model cannot be read, or nothing in it has a name.
     """
     files = ModelFiles.read(model)
-    made = compiled(files.spec(), files.main)
-    joints = names_of(made, mujoco.mjtObj.mjOBJ_JOINT, made.njnt)
+    made = compiled(files.spec, files.main)
+    joints = element_names(made, "joint")
     if not joints:
         raise MadocError(f"no joint of {model} has a name, and a spec reads joints by name; name them in the model")
     signals = list(_signals(made, joints))
@@ -111,45 +114,38 @@ def _signals(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[str, st
     """Name, expression and unit of every position, then of every velocity."""
     for kind in ("position", "velocity"):
         for joint in joints:
-            place = joint_kind(model, model.joint(joint).id)
-            speed = kind == "velocity"
-            reads = f"{kind}({joint if joint.isidentifier() else json.dumps(joint, ensure_ascii=False)})"
-            parts = {mujoco.mjtJoint.mjJNT_FREE: _OF_FREE, mujoco.mjtJoint.mjJNT_BALL: _OF_BALL}.get(place)
+            index = model.joint(joint).id
+            speed, reads = kind == "velocity", str(Read(kind, joint))
+            parts = _PARTS.get(int(model.jnt_type[index]))
             if parts is None:
-                unit = "m" if place == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+                unit = "m" if is_slide(model, index) else "rad"
                 yield (f"{joint}_speed", reads, f"{unit}/s") if speed else (joint, reads, unit)
                 continue
-            for index, part in enumerate(parts[speed]):
+            for at, part in enumerate(parts[speed]):
                 unit = "1" if part[0] == "q" else {"v": "m/s", "w": "rad/s"}.get(part[0], "m")
-                yield f"{joint}_{part}", f"{reads}[{index}]", unit
+                yield f"{joint}_{part}", f"{reads}[{at}]", unit
 
 
 def _sensors(model: mujoco.MjModel) -> Iterator[str]:
     """The model's sensors, as comments: a log seldom has them all."""
-    for sensor in names_of(model, mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor):
-        name = sensor if sensor.isidentifier() else json.dumps(sensor, ensure_ascii=False)
+    for sensor in element_names(model, "sensor"):
         size = int(model.sensor_dim[model.sensor(sensor).id])
-        for index in range(size):
-            label, part = (sensor, "") if size == 1 else (f"{sensor}_{index}", f"[{index}]")
-            yield f"  # - {_mapping(name=label, reads=f'sensor({name}){part}')}"
+        for index in [None] if size == 1 else range(size):
+            label = sensor if index is None else f"{sensor}_{index}"
+            yield f"  # - {_mapping(name=label, reads=str(Read('sensor', sensor, index)))}"
 
 
 def _unnamed(model: mujoco.MjModel) -> Iterator[str]:
-    """What cannot be used because it has no name."""
-    counts = {
-        "joint": (mujoco.mjtObj.mjOBJ_JOINT, model.njnt),
-        "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu),
-        "sensor": (mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor),
-    }
-    for what, (kind, count) in counts.items():
-        missing = count - len(names_of(model, kind, count))
+    """Comments on joints, actuators and sensors that cannot be used because they have no name."""
+    for what, count in (("joint", model.njnt), ("actuator", model.nu), ("sensor", model.nsensor)):
+        missing = count - len(element_names(model, what))
         if missing:
             yield f"  # {missing} {what}{'s' * (missing > 1)} of the model cannot be used here: give each a name there."
 
 
 def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Iterator[tuple[Fields, str]]:
     """The model's actuators; a torque on every joint where it has none."""
-    for actuator in names_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu):
+    for actuator in element_names(model, "actuator"):
         index = model.actuator(actuator).id
         name = f"{actuator}_command" if actuator in taken else actuator
         limited = bool(model.actuator_ctrllimited[index])
@@ -172,16 +168,16 @@ def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Itera
 
 
 def _parameters(model: mujoco.MjModel, joints: list[str]) -> Iterator[str]:
-    """Masses, stiffness, damping and friction, gains; friction, gains, and all past the first few, as comments."""
-    found = [*_masses(model), *_stiffness(model, joints), *_of_joints(model, joints), *_gains(model), *_contacts(model)]
+    """Parameters of bodies, joints, actuators and contacts; those less likely to matter are written as comments."""
+    rows = [*_masses(model), *_stiffness(model, joints), *_of_joints(model, joints), *_gains(model), *_contacts(model)]
     active = 0
-    for fields, comment, wanted in found:
+    for fields, comment, wanted in rows:
         active += wanted
         yield f"  {'' if wanted and active <= _ACTIVE else '# '}- {_mapping(**fields)}  # {comment}"
 
 
 def _masses(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
-    bodies = names_of(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
+    bodies = element_names(model, "body")
     for body in range(1, model.nbody):
         mass = float(model.body_mass[body])
         if mass <= 0.0 or model.body_weldid[body] == 0:
@@ -195,7 +191,7 @@ def _masses(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
 
 
 def _stiffness(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
-    """Of joints that have a spring."""
+    """Stiffness of joints that have a spring."""
     for joint in joints:
         index = model.joint(joint).id
         value = float(np.atleast_1d(model.jnt_stiffness[index])[0])
@@ -205,18 +201,18 @@ def _stiffness(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Field
 
 
 def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
-    """Damping and dry friction; a joint that nothing drives or damps may be no joint of the machine, as of a root."""
+    """Damping and dry friction of joints; those neither driven nor damped are comments, as they may be a root's."""
     on_joints = np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     # Through tendons an actuator may drive any joint.
     driven = set(model.actuator_trnid[:, 0]) if model.nu and on_joints.all() else set(range(model.njnt))
     for field, wanted in (("dof_damping", True), ("dof_frictionloss", False)):
         for joint in joints:
             index = model.joint(joint).id
-            if joint_kind(model, index) == mujoco.mjtJoint.mjJNT_FREE:
+            if int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_FREE:
                 continue
             dof = model.jnt_dofadr[index]
             value = float(getattr(model, field)[dof])
-            # Where the model says nothing: what would stop the joint, and all that hangs on it, in 0.1 s.
+            # Where the model has none: the damping that would stop the joint and all bodies on it in 0.1 s.
             high = 2 * value if value > 0 else 10 * float(model.dof_M0[dof])
             slide = is_slide(model, index)
             units = ("N·s/m", "N") if slide else ("N·m·s/rad", "N·m")
@@ -226,7 +222,7 @@ def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Field
 
 
 def _gains(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
-    for actuator in names_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu):
+    for actuator in element_names(model, "actuator"):
         value = float(model.actuator_gainprm[model.actuator(actuator).id, 0])
         if value > 0:
             yield _around("actuator_gain", actuator, value), f"the model has {value:.4g}", False
@@ -234,7 +230,7 @@ def _gains(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
 
 def _contacts(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
     """Sliding friction of what collides."""
-    for geom in names_of(model, mujoco.mjtObj.mjOBJ_GEOM, model.ngeom):
+    for geom in element_names(model, "geom"):
         index = model.geom(geom).id
         value = float(model.geom_friction[index, 0])
         if value > 0 and (model.geom_contype[index] or model.geom_conaffinity[index]):
@@ -246,22 +242,24 @@ def _around(field: str, element: str, value: float) -> Fields:
 
 
 def _round(value: float) -> float:
-    """Two digits: a range is no measurement."""
+    """The value with two digits, which are enough for a range."""
     return float(np.format_float_positional(value, precision=2, fractional=False)) if value > 0 else value
 
 
 def _mapping(**fields: str | float) -> str:
     """A YAML mapping on one line."""
-    return "{" + ", ".join(f"{key}: {_quoted(value)}" for key, value in fields.items()) + "}"
+    return _quoted({key: value if isinstance(value, str) else _number(value) for key, value in fields.items()})
 
 
-def _quoted(value: str | float) -> str:
-    """Text or a number as YAML reads it back."""
-    if not isinstance(value, str):
-        return f"{value:.12g}"
-    plain = _PLAIN.fullmatch(value) and value.lower() not in _WORDS
-    file = re.fullmatch(r"[A-Za-z_.][A-Za-z0-9_./-]*[A-Za-z]", value) and value.lower() not in _WORDS
-    return value if plain or file else json.dumps(value, ensure_ascii=False)
+def _number(value: float) -> float:
+    """A number with twelve digits, and without a point where it is whole."""
+    short = float(f"{value:.12g}")
+    return int(short) if short.is_integer() else short
+
+
+def _quoted(value: str | Fields) -> str:
+    """Text or a mapping as YAML on one line, with quotes where they are needed."""
+    return yaml_text(value, width=10_000, flow=True).removesuffix("...\n").strip()
 
 
 def _relative(model: Path, folder: Path) -> str:

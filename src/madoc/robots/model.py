@@ -1,32 +1,32 @@
-"""The model of a robot: its files, read once and whole, and a MuJoCo spec made of them with the spec's actuators."""
+"""The model of a robot: its files, read once and completely, and the MuJoCo spec that is made of them."""
 
 import base64
 import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from madoc.errors import MadocError
+from madoc.tasks.base import compiled_model
 
 _MESH = re.compile(r"""<mesh[^>]*\bfilename\s*=\s*["']([^"']+)["']""")
 
 
 @dataclass(frozen=True)
 class ModelFiles:
-    """A model file and all that it includes.
+    """A model file and all files that it refers to.
 
     Attributes:
         main: Name of the model file.
-        contents: By path from the model file's folder, or as the model names it.
+        files: Path from the model file's folder, or the name that the model uses, and content of each file.
     """
 
     main: str
-    contents: Mapping[str, bytes]
+    files: tuple[tuple[str, bytes], ...]
 
     @classmethod
     def read(cls, path: Path) -> "ModelFiles":
@@ -39,38 +39,45 @@ class ModelFiles:
         if is_urdf(contents[path.name]):
             for name in dict.fromkeys(_MESH.findall(contents[path.name].decode(errors="replace"))):
                 contents[name] = _read(_mesh_path(name, path))
-            return cls(path.name, contents)
+            return cls(path.name, tuple(contents.items()))
         try:
-            found = mujoco.mju_getXMLDependencies(str(path))
+            dependencies = mujoco.mju_getXMLDependencies(str(path))
         except (ValueError, mujoco.FatalError):
-            found = []  # compiling it tells better what is wrong
-        for file in map(Path, found):
+            dependencies = []  # compiling the model gives the better error
+        for file in map(Path, dependencies):
             if file != path and file.resolve() != path.resolve():
                 contents[_from(file, path.parent)] = _read(file, path.name)
-        return cls(path.name, contents)
+        return cls(path.name, tuple(contents.items()))
 
-    def to_json(self) -> dict[str, Any]:
-        """Text as text, anything else compressed."""
-        return {"main": self.main, "contents": {name: _stored(content) for name, content in self.contents.items()}}
+    def to_json(self) -> dict[str, object]:
+        """The files for JSON: text as it is, anything else compressed."""
+        return {"main": self.main, "contents": {name: _stored(content) for name, content in self.files}}
 
     @classmethod
-    def from_json(cls, stored: Mapping[str, Any]) -> "ModelFiles":
-        """What `to_json` made."""
-        return cls(stored["main"], {name: _restored(content) for name, content in stored["contents"].items()})
+    def from_json(cls, stored: Mapping[str, object]) -> "ModelFiles":
+        """The files that `to_json` wrote.
+
+        Raises:
+            ValueError: The content is damaged, or it is not of `to_json`.
+        """
+        main, contents = stored.get("main"), stored.get("contents")
+        if not isinstance(main, str) or not isinstance(contents, Mapping):
+            raise ValueError("its model has no main file or no contents")
+        return cls(main, tuple((name, _restored(content)) for name, content in contents.items()))
 
     def spec(self) -> mujoco.MjSpec:
-        """A MuJoCo spec of it, in which what has no name of its own is named by what it belongs to.
+        """A MuJoCo spec of the model, in which joints and actuators without a name are named by what they belong to.
 
         A joint takes the name of its body, where it is the only one there, and an actuator that of its joint.
 
         Raises:
-            MadocError: MuJoCo does not take it; the sentence is MuJoCo's.
+            MadocError: MuJoCo refuses the model; the sentence is MuJoCo's.
         """
+        others = dict(self.files)
         try:
-            text = self.contents[self.main].decode()
+            text = others.pop(self.main).decode()
         except UnicodeDecodeError as error:
             raise MadocError(f"model {self.main} is not text; expected MJCF or URDF") from error
-        others = {name: content for name, content in self.contents.items() if name != self.main}
         includes = {name: content for name, content in others.items() if PurePosixPath(name).suffix == ".xml"}
         assets = {name: content for name, content in others.items() if name not in includes}
         try:
@@ -87,16 +94,16 @@ class ModelFiles:
 
 @dataclass(frozen=True)
 class AddedActuator:
-    """An actuator that a spec adds to a joint: force = gain · control + bias of position and velocity.
+    """An actuator that a spec adds to a joint: force = gain · control - stiffness · position - damping · velocity.
 
     Attributes:
-        name: Of the action channel.
-        joint: What it drives.
-        low: Smallest control; the simulation never leaves the range, and an exported model says it.
-        high: Largest.
-        gain: Of the control.
-        stiffness: What the force falls by per position.
-        damping: What the force falls by per velocity.
+        name: Name of the action channel.
+        joint: The joint it drives.
+        low: Smallest control; MuJoCo clips controls to the range, in an exported model too.
+        high: Largest control.
+        gain: Force per control.
+        stiffness: Force per position, in SI units.
+        damping: Force per velocity, in SI units.
         limit: Largest force; None is unlimited.
     """
 
@@ -113,7 +120,7 @@ class AddedActuator:
 def make_model(
     base: mujoco.MjSpec, added: tuple[AddedActuator, ...] = (), timestep: float | None = None
 ) -> mujoco.MjSpec:
-    """A copy of a spec with actuators of its own, and another timestep if one is given."""
+    """A copy of a spec with added actuators, and with another timestep if one is given."""
     spec = base.copy()
     if timestep is not None:
         spec.option.timestep = timestep
@@ -131,14 +138,14 @@ def make_model(
     return spec
 
 
-def compiled(spec: mujoco.MjSpec, file: str) -> mujoco.MjModel:
-    """The model.
+def compiled(spec: Callable[[], mujoco.MjSpec], file: str) -> mujoco.MjModel:
+    """The shared model of a spec (`tasks.base.compiled_model`).
 
     Raises:
-        MadocError: It does not compile; the sentence is MuJoCo's.
+        MadocError: The model of this file does not compile; the sentence is MuJoCo's.
     """
     try:
-        return spec.compile()
+        return compiled_model(spec)
     except (ValueError, mujoco.FatalError) as error:
         raise MadocError(f"model {file} does not compile: {_one_line(error)}") from error
 
@@ -149,28 +156,21 @@ def is_urdf(content: bytes) -> bool:
     return first is not None and first[1] == b"robot"
 
 
-def joint_kind(model: mujoco.MjModel, joint: int) -> mujoco.mjtJoint:
-    """Hinge, slide, ball or free."""
-    return mujoco.mjtJoint(int(model.jnt_type[joint]))
-
-
 def is_slide(model: mujoco.MjModel, joint: int) -> bool:
-    """Whether a joint slides; what turns has other units."""
-    return joint_kind(model, joint) == mujoco.mjtJoint.mjJNT_SLIDE
+    """Whether a joint slides; a joint that turns has other units."""
+    return int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_SLIDE
 
 
 def is_single(model: mujoco.MjModel, joint: int) -> bool:
     """Whether a joint is a hinge or a slide, with one position and one velocity."""
-    return joint_kind(model, joint) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    return int(model.jnt_type[joint]) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-def names_of(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[str]:
-    """Names of all elements of a kind that have one."""
-    return [name for index in range(count) if (name := mujoco.mj_id2name(model, kind, index))]
-
-
-def _name_by_owner(owned: list[tuple[Any, str]], everything: Any) -> None:
-    """Name what has no name by its owner, unless that name is taken or would be given twice."""
+def _name_by_owner(
+    owned: list[tuple[mujoco.MjsJoint | mujoco.MjsActuator, str]],
+    everything: Iterable[mujoco.MjsJoint | mujoco.MjsActuator],
+) -> None:
+    """Name parts without a name by their owner, unless that name is taken or would be given twice."""
     taken = [part.name for part in everything]
     wanted = [owner for part, owner in owned if not part.name]
     for part, owner in owned:
@@ -189,17 +189,15 @@ def _read(path: Path, owner: str = "") -> bytes:
 
 
 def _mesh_path(name: str, model: Path) -> Path:
-    """Where a URDF's mesh lies: beside the model, or in the package that the model is part of."""
+    """Path of a URDF's mesh: beside the model, or in the package that the model is part of."""
     bare = re.sub(r"^(package|file)://", "", name)
     inside = PurePosixPath(bare).parts[1:] if name.startswith("package://") else PurePosixPath(bare).parts
     candidates = [model.parent / bare, *(folder.joinpath(*inside) for folder in model.parents[:3])]
     candidates.append(model.parent / PurePosixPath(bare).name)
-    found = [path for path in candidates if path.is_file()]
-    if not found:
-        raise MadocError(
-            f"{model.name} refers to {name}, which is neither beside it nor in its package; check the path"
-        )
-    return found[0]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise MadocError(f"{model.name} refers to {name}, which is neither beside it nor in its package; check the path")
 
 
 def _from(file: Path, folder: Path) -> str:
@@ -217,7 +215,12 @@ def _stored(content: bytes) -> str | dict[str, str]:
 
 
 def _restored(stored: str | Mapping[str, str]) -> bytes:
-    return stored.encode() if isinstance(stored, str) else zlib.decompress(base64.b64decode(stored["zlib_base64"]))
+    if isinstance(stored, str):
+        return stored.encode()
+    try:
+        return zlib.decompress(base64.b64decode(stored["zlib_base64"]))
+    except (zlib.error, TypeError, KeyError) as error:
+        raise ValueError(f"a file of its model is damaged ({error})") from error
 
 
 def _one_line(error: Exception) -> str:

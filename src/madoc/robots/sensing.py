@@ -1,78 +1,69 @@
 """Signals as functions: of a state, of the model's sensors, and back to a state where they determine it."""
 
-import contextlib
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
-from madoc.robots.document import nearest
+from madoc.errors import nearest_hint
 from madoc.robots.expressions import Expression, ExpressionError, Read
-from madoc.robots.model import joint_kind, names_of
+from madoc.simulation.write import element_names
 from madoc.tasks.base import Batch
 
 _POSITIONS = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}
 _VELOCITIES = {mujoco.mjtJoint.mjJNT_FREE: 6, mujoco.mjtJoint.mjJNT_BALL: 3}
+Span = tuple[int, int]
+"""Address of the first value, and number of values."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a model keeps what can be read.
+    """Addresses of a model's positions, velocities and sensor values.
 
     Attributes:
-        position: Joint -> where its values stand in a state, and how many.
-        velocity: The same of its speeds.
-        sensor: Sensor -> where its values stand in sensordata, and how many.
-        physical: Values of (qpos, qvel).
+        position: Joint -> address of its position in a state, and its number of values.
+        velocity: Joint -> address of its velocity in a state, and its number of values.
+        sensor: Sensor -> address of its reading in sensordata, and its number of values.
+        physical: Number of values of (qpos, qvel).
         accelerating: Sensors that depend on the control as well.
     """
 
-    position: dict[str, tuple[int, int]]
-    velocity: dict[str, tuple[int, int]]
-    sensor: dict[str, tuple[int, int]]
+    position: dict[str, Span]
+    velocity: dict[str, Span]
+    sensor: dict[str, Span]
     physical: int
     accelerating: frozenset[str]
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> "Layout":
         """The layout of a model."""
-        joints = {name: model.joint(name).id for name in names_of(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt)}
-        sensors = {name: model.sensor(name).id for name in names_of(model, mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor)}
-        kinds = {name: joint_kind(model, index) for name, index in joints.items()}
+        joints = [model.joint(name) for name in element_names(model, "joint")]
+        sensors = [model.sensor(name) for name in element_names(model, "sensor")]
+        accelerating = (one.name for one in sensors if int(one.needstage[0]) == mujoco.mjtStage.mjSTAGE_ACC)
         return cls(
-            position={
-                name: (int(model.jnt_qposadr[index]), _POSITIONS.get(kinds[name], 1)) for name, index in joints.items()
-            },
+            position={one.name: (int(one.qposadr[0]), _POSITIONS.get(int(one.type[0]), 1)) for one in joints},
             velocity={
-                name: (int(model.nq + model.jnt_dofadr[index]), _VELOCITIES.get(kinds[name], 1))
-                for name, index in joints.items()
+                one.name: (int(model.nq + one.dofadr[0]), _VELOCITIES.get(int(one.type[0]), 1)) for one in joints
             },
-            sensor={
-                name: (int(model.sensor_adr[index]), int(model.sensor_dim[index])) for name, index in sensors.items()
-            },
+            sensor={one.name: (int(one.adr[0]), int(one.dim[0])) for one in sensors},
             physical=int(model.nq + model.nv),
-            accelerating=frozenset(
-                name
-                for name, index in sensors.items()
-                if mujoco.mjtStage(int(model.sensor_needstage[index])) == mujoco.mjtStage.mjSTAGE_ACC
-            ),
+            accelerating=frozenset(accelerating),
         )
 
     def address(self, read: Read) -> int:
-        """Where a value stands, in the state or in sensordata.
+        """Address of a value in the state or in sensordata.
 
         Raises:
             ExpressionError: The model has no such joint or sensor, or not so many values.
         """
-        known: dict[str, tuple[int, int]] = getattr(self, read.kind)
+        known: dict[str, Span] = getattr(self, read.kind)
         what = "sensor" if read.kind == "sensor" else "joint"
         if read.name not in known:
-            near = nearest(read.name, list(known)) or list(known)[:12]
-            listed = f"nearest: {', '.join(near)}" if near else f"it names no {what}"
-            raise ExpressionError(f"the model has no {what} {read.name!r}; {listed}")
+            hint = nearest_hint(read.name, known, none=f"it names no {what}")
+            raise ExpressionError(f"the model has no {what} {read.name!r}; {hint}")
         start, count = known[read.name]
         if read.index is None and count > 1:
             raise ExpressionError(f"{read} has {count} values; pick one, as {read}[0]")
@@ -83,11 +74,11 @@ class Layout:
 
 @dataclass(frozen=True)
 class Signals:
-    """What a robot observes: pure functions, batched, on NumPy or JAX arrays.
+    """The observation of a robot: pure functions, batched, on NumPy or JAX arrays.
 
     Attributes:
-        expressions: One a signal, in order.
-        layout: Of the model.
+        expressions: The expression of each signal, in order.
+        layout: The addresses in the model.
     """
 
     expressions: tuple[Expression, ...]
@@ -95,7 +86,7 @@ class Signals:
 
     @property
     def read_sensors(self) -> frozenset[str]:
-        """Names of the sensors they read."""
+        """Names of the sensors that the signals read."""
         return frozenset(
             read.name for expression in self.expressions for read in expression.reads if read.kind == "sensor"
         )
@@ -109,46 +100,46 @@ class Signals:
         return self._stacked(self.expressions, state, sensordata)
 
     def undetermined(self) -> tuple[str, ...]:
-        """Joint positions and velocities that no signal, as a weighted sum of such, has a part in."""
+        """A sentence for each joint position and velocity that appears in no signal that is a weighted sum."""
         sums = [affine[0] for expression in self.expressions if (affine := expression.affine()) is not None]
-        told = {self.layout.address(read) for reads in sums for read in reads if read.kind != "sensor"}
+        covered = {self.layout.address(read) for reads in sums for read in reads if read.kind != "sensor"}
         return tuple(
             f"no signal is the {kind} of {joint}"
             for kind in ("position", "velocity")
             for joint, (start, count) in getattr(self.layout, kind).items()
-            if not told >= set(range(start, start + count))
+            if not covered >= set(range(start, start + count))
         )
 
     def _stacked(self, expressions: Sequence[Expression], state: Batch, sensordata: Batch | None) -> Batch:
-        namespace: Any = state.__array_namespace__()
+        namespace = state.__array_namespace__()
 
         def look_up(read: Read) -> Batch:
-            source: Any = sensordata if read.kind == "sensor" else state
+            source: Batch = sensordata if read.kind == "sensor" else state
             return source[..., self.layout.address(read)]
 
         with quiet_arithmetic():
             return namespace.stack([expression.value(look_up, namespace) for expression in expressions], axis=-1)
 
     def rebuild(self) -> Callable[[Batch], Batch] | None:
-        """Observation -> (qpos, qvel), where weighted sums of single reads determine them all; else None."""
+        """Observation -> (qpos, qvel), where signals that are weighted sums determine them all; else None."""
         forward, constant = self._weights()
         backward = _inverse(forward)
         return None if backward is None else lambda observation: (observation - constant) @ backward
 
     def posture(self) -> Callable[[Batch], Batch] | None:
-        """Observation -> (qpos, qvel) as far as weighted sums tell, NaN elsewhere; None where they tell no position."""
+        """Observation -> (qpos, qvel), NaN for values not determined; None where no position is determined."""
         forward, constant = self._weights()
-        backward, told = _partial_inverse(forward)
+        backward, determined = _partial_inverse(forward)
         positions = [start + step for start, count in self.layout.position.values() for step in range(count)]
-        if not told[positions].any():
+        if not determined[positions].any():
             return None
-        blank = np.where(told, 0.0, np.nan)
+        blank = np.where(determined, 0.0, np.nan)
         return lambda observation: (observation - constant) @ backward + blank
 
     def _weights(self) -> tuple[Float[np.ndarray, "signals state"], Float[np.ndarray, " signals"]]:
-        """Of (qpos, qvel) in every signal that is a weighted sum of them, and its constant; others are 0."""
-        size = self.layout.physical
-        forward, constant = np.zeros((len(self.expressions), size)), np.zeros(len(self.expressions))
+        """Coefficients of (qpos, qvel) and constant of each signal that is a weighted sum of them; 0 for others."""
+        count = len(self.expressions)
+        forward, constant = np.zeros((count, self.layout.physical)), np.zeros(count)
         for row, expression in enumerate(self.expressions):
             affine = expression.affine()
             if affine is None or any(read.kind == "sensor" for read in affine[0]):
@@ -160,7 +151,7 @@ class Signals:
 
 
 def _inverse(forward: Float[np.ndarray, "signals state"]) -> Float[np.ndarray, "signals state"] | None:
-    """From observations, less their constants, to states; each value from a signal that is it alone if there is one."""
+    """Map from observations, less their constants, to states; a signal that reads one value alone gives that value."""
     alone = np.count_nonzero(forward, axis=1) == 1
     backward = np.zeros_like(forward)
     for column in range(forward.shape[1]):
@@ -169,26 +160,27 @@ def _inverse(forward: Float[np.ndarray, "signals state"]) -> Float[np.ndarray, "
             backward[rows[0], column] = 1.0 / forward[rows[0], column]
     if backward.any(0).all():
         return backward
-    scale = np.abs(forward).max(1, initial=0.0, keepdims=True)
-    even = np.divide(forward, scale, out=np.zeros_like(forward), where=scale > 0)
-    if np.linalg.matrix_rank(even) < forward.shape[1]:
-        return None
-    return (np.linalg.pinv(even) / np.where(scale > 0, scale, 1.0).T).T
+    even, scale = _scaled_rows(forward)
+    return (np.linalg.pinv(even) / scale.T).T if np.linalg.matrix_rank(even) == forward.shape[1] else None
 
 
 def _partial_inverse(
     forward: Float[np.ndarray, "signals state"],
 ) -> tuple[Float[np.ndarray, "signals state"], Bool[np.ndarray, " state"]]:
-    """From observations, less their constants, to those values of a state that they determine, and which these are."""
+    """Map from observations, less their constants, to the values of a state they determine, and which these are."""
+    even, scale = _scaled_rows(forward)
+    inverse = np.linalg.pinv(even)
+    determined = np.abs(inverse @ even - np.eye(forward.shape[1])).max(0) < 1e-9
+    return (inverse / scale.T).T * determined, determined
+
+
+def _scaled_rows(forward: Float[np.ndarray, "signals state"]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows divided by their largest coefficient, and these divisors (1 for a row of zeros)."""
     scale = np.abs(forward).max(1, initial=0.0, keepdims=True)
     even = np.divide(forward, scale, out=np.zeros_like(forward), where=scale > 0)
-    inverse = np.linalg.pinv(even)
-    told = np.abs(inverse @ even - np.eye(forward.shape[1])).max(0) < 1e-9
-    return (inverse / np.where(scale > 0, scale, 1.0).T).T * told, told
+    return even, np.where(scale > 0, scale, 1.0)
 
 
-@contextlib.contextmanager
-def quiet_arithmetic() -> Any:
-    """What has no value is NaN or infinite, and found as such; NumPy needs to say no more."""
-    with np.errstate(all="ignore"):
-        yield
+def quiet_arithmetic() -> AbstractContextManager[None]:
+    """No warnings of NumPy where an expression has no value: it is then NaN or infinite, and checked as such."""
+    return np.errstate(all="ignore")

@@ -1,4 +1,4 @@
-"""Signals of a spec: expressions that the model can answer, in the unit they say."""
+"""Signals of a spec: their expressions, checked against the model, and their units."""
 
 import mujoco
 import numpy as np
@@ -10,7 +10,11 @@ from madoc.robots.sensing import Layout, Signals, quiet_arithmetic
 
 
 def read_signals(draft: Draft, model: mujoco.MjModel) -> Signals:
-    """What is observed, tried once at the model's initial state."""
+    """The signals of a spec.
+
+    Raises:
+        MadocError: An expression does not parse, has no value, reads what the model lacks, or has another unit.
+    """
     expressions = []
     layout = Layout.of(model)
     for index, signal in enumerate(draft.spec.signals):
@@ -31,32 +35,32 @@ def read_signals(draft: Draft, model: mujoco.MjModel) -> Signals:
     return Signals(tuple(expressions), layout)
 
 
-def _plain_unit(draft: Draft, expression: Expression) -> str:
-    """The SI unit of an expression that is one joint's position or speed as it is; else empty."""
+def _plain_unit(model: mujoco.MjModel, expression: Expression) -> str:
+    """The SI unit of an expression that is one joint's position or velocity, unscaled; else empty."""
     affine = expression.affine()
     if affine is None or len(affine[0]) != 1:
         return ""
     ((read, weight),) = affine[0].items()
     if read.kind == "sensor" or weight != 1.0:
         return ""
-    joint = int(draft.plain.joint(read.name).id)
-    if not is_single(draft.plain, joint):
+    joint = int(model.joint(read.name).id)
+    if not is_single(model, joint):
         return ""
-    return ("m" if is_slide(draft.plain, joint) else "rad") + ("/s" if read.kind == "velocity" else "")
+    return ("m" if is_slide(model, joint) else "rad") + ("/s" if read.kind == "velocity" else "")
 
 
-def signal_unit(draft: Draft, expression: Expression, index: int) -> str:
-    """What a signal is in: what the spec says, else what its joint tells; empty where neither does."""
-    return draft.spec.signals[index].unit or _plain_unit(draft, expression)
+def signal_unit(draft: Draft, model: mujoco.MjModel, expression: Expression, index: int) -> str:
+    """The unit of a signal: the spec's, else the one that follows from its joint; empty where neither gives one."""
+    return draft.spec.signals[index].unit or _plain_unit(model, expression)
 
 
 def _check_unit(draft: Draft, model: mujoco.MjModel, index: int, expression: Expression) -> None:
-    """Refuse `position(JOINT)` in deg: the unit is only a word, the expression has to convert."""
-    plain, said = _plain_unit(draft, expression), draft.spec.signals[index].unit
-    if plain and said in SCALES:
+    """Refuse `position(JOINT)` in deg: the unit converts nothing, the expression has to."""
+    plain, given = _plain_unit(model, expression), draft.spec.signals[index].unit
+    if plain and given in SCALES:
         angle = plain.startswith("rad")
-        hint = " * 180 / pi" if angle else f" * {1.0 / SCALES[said]:g}"
+        hint = " * 180 / pi" if angle else f" * {1.0 / SCALES[given]:g}"
         raise draft.document.error(
             ("signals", index, "unit"),
-            f"{expression.text} is in {plain}, not in {said}; write reads: {expression.text}{hint}, or unit: {plain}",
+            f"{expression.text} is in {plain}, not in {given}; write reads: {expression.text}{hint}, or unit: {plain}",
         )

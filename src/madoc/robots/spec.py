@@ -1,17 +1,17 @@
-"""The spec file of a robot: what may stand in it, checked before any model is read."""
+"""The spec file of a robot: its keys and their types, checked before any model is read."""
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, get_args
+from functools import lru_cache
+from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import ErrorDetails
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter
-from madoc.robots.document import Document, Place, nearest, read_document
+from madoc.robots.document import Document, Place, read_document
 from madoc.tasks import TASKS
-
-VERSION = 1
 
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]+$")]
 File = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00-\x1f]+$")]
@@ -20,7 +20,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class Part(BaseModel):
-    """Strict: no unknown key, and no value is converted into another type."""
+    """A part of the spec: no unknown key is accepted, and no value is converted into another type."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -71,7 +71,6 @@ class ActionSpec(Part):
             for key in ("kd", "limit"):
                 given = getattr(self, key) is not None
                 _refuse(given and not servo, f"{key}: means nothing beside means: {self.means}")
-        _refuse(not _one(self.low, self.high) and self.low is None, "")
         _refuse(_one(self.low, self.high), "expected both low: and high:, got one of them")
         if self.low is not None and self.high is not None:
             _refuse(self.low >= self.high, f"expected low below high, got {self.low:g} and {self.high:g}")
@@ -91,8 +90,7 @@ class ParameterSpec(Part):
     @field_validator("field")
     @classmethod
     def _known(cls, field: str) -> str:
-        near = nearest(field, list(FIELDS))
-        hint = f"nearest: {', '.join(near)}" if near else f"there are: {', '.join(FIELDS)}"
+        hint = nearest_hint(field, FIELDS)
         _refuse(field not in FIELDS, f"expected a field that can be calibrated, got {field!r}; {hint}")
         return field
 
@@ -106,10 +104,10 @@ class ParameterSpec(Part):
         return self
 
     def parameter(self, unit: str = "") -> Parameter:
-        """The parameter, in its field's unit or another.
+        """The parameter, in the unit of its field or in another.
 
         Raises:
-            MadocError: It is none.
+            MadocError: The values do not make a parameter.
         """
         element = tuple(self.elements) if self.elements else self.element or ""
         return Parameter(self.field, element, self.low, self.high, self.name or "", unit)
@@ -156,11 +154,12 @@ class RobotSpec(Part):
         return name
 
 
+@lru_cache(maxsize=32)
 def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
-    """A spec and the lines of its parts.
+    """A spec and the lines of its parts; the same content is parsed once.
 
     Raises:
-        MadocError: One sentence on the first thing that is wrong, with its line.
+        MadocError: One sentence about the first mistake, with its line.
     """
     document = read_document(content, file)
     if not isinstance(document.data, dict):
@@ -178,8 +177,8 @@ def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
 
 
 def _refuse(wrong: bool, sentence: str) -> None:
-    """Pydantic takes ValueErrors of validators."""
-    if wrong and sentence:
+    """Pydantic reports the ValueErrors of validators."""
+    if wrong:
         raise ValueError(sentence)
 
 
@@ -187,22 +186,19 @@ def _one(first: object, second: object) -> bool:
     return (first is None) != (second is None)
 
 
-def _place(detail: Any) -> Place:
-    """Where in the document; pydantic marks keys of a dictionary in a way of its own."""
+def _place(detail: ErrorDetails) -> Place:
+    """The place of an error in the document, without pydantic's mark for a key of a dictionary."""
     return tuple(part for part in detail["loc"] if part != "[key]")
 
 
-def _sentence(detail: Any, place: Place) -> str:
+def _sentence(detail: ErrorDetails, place: Place) -> str:
     kind, got = detail["type"], detail["input"]
     what = ".".join(str(part) for part in place if not isinstance(part, int))
     if kind == "missing":
         *whole, key = place
         return f"expected {key}: {'here' if not whole else 'in this part of ' + str(whole[0])}"
     if kind == "extra_forbidden":
-        known = _keys_at(place[:-1])
-        near = nearest(str(place[-1]), known)
-        hint = f"nearest: {', '.join(near)}" if near else f"there are: {', '.join(known)}"
-        return f"unknown key {place[-1]!r}; {hint}"
+        return f"unknown key {place[-1]!r}; {nearest_hint(str(place[-1]), _keys_at(place[:-1]))}"
     if kind == "value_error":
         return str(detail["ctx"]["error"])
     if kind == "string_type" and isinstance(got, int | float):
@@ -224,14 +220,12 @@ def _sentence(detail: Any, place: Place) -> str:
     return f"expected {expected} in {what}, got {_shown(got)}"
 
 
-def _shown(value: Any) -> str:
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    text = (
-        {dict: "keys and values", type(None): "nothing"}.get(type(value), repr(value))
-        if value != []
-        else "an empty list"
-    )
+def _shown(value: object) -> str:
+    if isinstance(value, dict):
+        return "keys and values"
+    if value is None or value == []:
+        return "nothing" if value is None else "an empty list"
+    text = str(value) if isinstance(value, float) and not math.isfinite(value) else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
@@ -247,7 +241,7 @@ def _keys_at(place: Place) -> list[str]:
     return list(part.model_fields)
 
 
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+def _models_in(annotation: object) -> Iterator[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inner in get_args(annotation):

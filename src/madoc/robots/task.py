@@ -1,26 +1,25 @@
-"""From a spec and a model to a task."""
+"""A robot made of its spec and its model."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from functools import lru_cache, partial
+from pathlib import Path
 
 import jax
 import mujoco
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from madoc import simulation
 from madoc.errors import MadocError
 from madoc.robots.actions import action_channel, added_actuator, idle_actuators
-from madoc.robots.document import Document
 from madoc.robots.draft import Draft
 from madoc.robots.expressions import ExpressionError, Read, parse
 from madoc.robots.model import ModelFiles, compiled, make_model
 from madoc.robots.sensing import Signals, quiet_arithmetic
 from madoc.robots.signals import read_signals, signal_unit
 from madoc.robots.space import parameter_space
-from madoc.robots.spec import RobotSpec
-from madoc.simulation.cpu import CpuSimulator
+from madoc.robots.spec import RobotSpec, read_spec
 from madoc.tasks.base import ActionChannel, Batch, Task
 
 
@@ -34,33 +33,50 @@ class Signal:
 
 
 @dataclass(frozen=True)
-class Parts:
-    """A task and what it was made of, for people to look at."""
+class Robot:
+    """A robot that a user describes in a spec file.
 
+    Attributes:
+        path: The spec file.
+        spec: The content of that file.
+        task: The robot as a task, like any other.
+        signals: The values of an observation, in order.
+        undetermined: Sentences on the positions and velocities that an observation does not determine.
+        notes: Sentences on what a user should know of the robot.
+    """
+
+    path: Path
+    spec: RobotSpec
     task: Task
     signals: tuple[Signal, ...]
     undetermined: tuple[str, ...]
     notes: tuple[str, ...]
 
+    @property
+    def actions(self) -> tuple[ActionChannel, ...]:
+        """The values of an action, in order; data has them in [-1, 1] of `low` and `high`."""
+        return self.task.actions
 
-def make_task(spec: RobotSpec, document: Document, files: ModelFiles, source: dict[str, Any]) -> Parts:
-    """The task that a spec describes.
+
+@lru_cache(maxsize=32)
+def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
+    """The robot that a spec describes; of the same content, the same robot.
 
     Raises:
         MadocError: Spec and model do not fit; the sentence names the line of the spec.
     """
+    spec, document = read_spec(content, file)
     try:
         base = files.spec()
-        draft = Draft(spec, document, files, base, compiled(base.copy(), files.main))
     except MadocError as error:
         raise document.error(("model",), str(error)) from error
+    draft = Draft(spec, document, base)
     _check_names(draft)
-    added = tuple(found for found in map(partial(added_actuator, draft), range(len(spec.actions))) if found is not None)
-    factory = partial(make_model, base, added, spec.timestep)
     try:
-        model = compiled(factory(), files.main)
-    except MadocError as error:
-        raise document.error(("actions",), str(error)) from error
+        factory, model = _model(draft, files.main)
+    except MadocError:
+        _check_compiles(draft, files.main)
+        raise
     signals = read_signals(draft, model)
     actions = tuple(action_channel(draft, model, index) for index in range(len(spec.actions)))
     space, frame_skip = parameter_space(draft, model), _frame_skip(draft, model)
@@ -91,21 +107,40 @@ def make_task(spec: RobotSpec, document: Document, files: ModelFiles, source: di
         signals=names,
         sense=signals.sense if signals.read_sensors else None,
         rewarded=spec.reward is not None,
-        source=source,
+        source={"file": file, "spec": content.decode("utf-8-sig"), "model": files.to_json()},
     )
     try:
-        CpuSimulator(task, threads=1)
+        simulation.make(task, threads=1)
     except MadocError as error:
         raise document.error(("model",), str(error)) from error
     shown = tuple(
-        Signal(given.name, signal_unit(draft, expression, index), expression.text)
+        Signal(given.name, signal_unit(draft, model, expression, index), expression.text)
         for index, (given, expression) in enumerate(zip(spec.signals, signals.expressions, strict=True))
     )
-    return Parts(task, shown, signals.undetermined(), idle_actuators(model, actions))
+    return Robot(Path(file), spec, task, shown, signals.undetermined(), idle_actuators(model, actions))
+
+
+def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco.MjModel]:
+    """The function that builds the MuJoCo spec with the added actuators, and its model."""
+    actuators = (added_actuator(draft, index) for index in range(len(draft.spec.actions)))
+    added = tuple(actuator for actuator in actuators if actuator is not None)
+    factory = partial(make_model, draft.base, added, draft.spec.timestep)
+    try:
+        return factory, compiled(factory, file)
+    except MadocError as error:
+        raise draft.document.error(("actions",), str(error)) from error
+
+
+def _check_compiles(draft: Draft, file: str) -> None:
+    """Refuse a model file that does not compile by itself: the mistake is then there, and not in the actions."""
+    try:
+        compiled(draft.base.copy, file)
+    except MadocError as error:
+        raise draft.document.error(("model",), str(error)) from error
 
 
 def _check_names(draft: Draft) -> None:
-    """No two signals or actions of one name, and no log column for something that is not there."""
+    """Refuse a name given to two signals or actions, and a log column for a name that neither has."""
     names: dict[str, tuple[str, int]] = {}
     for kind in ("signals", "actions"):
         for index, part in enumerate(getattr(draft.spec, kind)):
@@ -136,7 +171,11 @@ def _frame_skip(draft: Draft, model: mujoco.MjModel) -> int:
 def _reward(
     draft: Draft, signals: Signals, actions: tuple[ActionChannel, ...]
 ) -> Callable[[Batch, Batch, Batch], Batch]:
-    """(state, action, next state) -> reward: the spec's expression, or 0."""
+    """(state, action, next state) -> reward: the spec's expression, or 0 where it has none.
+
+    Raises:
+        MadocError: The expression does not parse, has no value, or reads a signal that needs a sensor.
+    """
     if draft.spec.reward is None:
         return _no_reward
     of_signals = {signal.name: index for index, signal in enumerate(draft.spec.signals)}

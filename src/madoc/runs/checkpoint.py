@@ -2,7 +2,7 @@
 
 import json
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +19,7 @@ State = TypeVar("State")
 FORMAT = 2
 """Version of the file's layout: one `.npy` member a leaf, and `checkpoint.json` for all the rest."""
 
-_VALUES: dict[str, tuple[type, Callable[[str], Any]]] = {
+_VALUES: dict[str, tuple[type, Callable[[str], object]]] = {
     "bool": (bool, lambda text: text == "True"),
     "int": (int, int),
     "float": (float, float),
@@ -60,7 +60,7 @@ Layout = dict[str, Leaf]
 """The leaves of a state by path, for example `state.actor.layers[0].weight`."""
 
 
-def layout(state: Any) -> Layout:
+def layout(state: object) -> Layout:
     """What the leaves of a state are.
 
     Raises:
@@ -81,7 +81,7 @@ def difference(got: Layout, expected: Layout) -> str | None:
     return None
 
 
-def first_non_finite(state: Any) -> str | None:
+def first_non_finite(state: object) -> str | None:
     """The path of the first leaf that holds a NaN or an infinity; None if there is none."""
     for path, leaf in _leaves(state):
         if _is_inexact(leaf) and not np.isfinite(np.asarray(leaf)).all():
@@ -89,7 +89,7 @@ def first_non_finite(state: Any) -> str | None:
     return None
 
 
-def save(path: Path, state: Any, extra: dict[str, Any]) -> None:
+def save(path: Path, state: object, extra: Mapping[str, object]) -> None:
     """Write a state, and a small JSON dictionary beside it, whole or not at all.
 
     Leaves go to the disk one after the other, so a large replay buffer is never copied as a whole. Equal
@@ -149,18 +149,18 @@ def load(path: Path, like: State) -> tuple[State, dict[str, Any]]:
     return jax.tree.unflatten(jax.tree.structure(like), leaves), about["extra"]
 
 
-def _leaves(state: Any) -> list[tuple[str, Any]]:
+def _leaves(state: object) -> list[tuple[str, object]]:
     flat, _ = jax.tree_util.tree_flatten_with_path(state)
     return [("state" + jax.tree_util.keystr(path), leaf) for path, leaf in flat]
 
 
-def _is_inexact(leaf: Any) -> bool:
+def _is_inexact(leaf: object) -> bool:
     if isinstance(leaf, np.ndarray | np.generic | jax.Array):
         return bool(jnp.issubdtype(leaf.dtype, jnp.inexact))
     return isinstance(leaf, float)
 
 
-def _describe(path: str, leaf: Any) -> Leaf:
+def _describe(path: str, leaf: object) -> Leaf:
     if isinstance(leaf, jax.Array):
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             return Leaf("key", str(jax.random.key_impl(leaf)), leaf.shape)
@@ -179,7 +179,7 @@ def _describe(path: str, leaf: Any) -> Leaf:
     )
 
 
-def _to_numpy(leaf: Any) -> np.ndarray:
+def _to_numpy(leaf: object) -> np.ndarray:
     """The numbers of a leaf in a dtype that the npy format knows."""
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         leaf = jax.random.key_data(leaf)
@@ -188,7 +188,7 @@ def _to_numpy(leaf: Any) -> np.ndarray:
     return array.view(f"u{array.dtype.itemsize}") if foreign else array
 
 
-def _restore(archive: zipfile.ZipFile, name: str, leaf: Leaf, values: dict[str, str]) -> Any:
+def _restore(archive: zipfile.ZipFile, name: str, leaf: Leaf, values: dict[str, str]) -> object:
     if leaf.kind == "value":
         return _VALUES[leaf.dtype][1](values[name])
     with archive.open(f"{name}.npy") as member:

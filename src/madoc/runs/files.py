@@ -42,7 +42,7 @@ def remove_leftovers(folder: Path) -> None:
         leftover.unlink(missing_ok=True)
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: object) -> None:
     """Write `value` as readable strict JSON, whole or not at all.
 
     Raises:
@@ -53,7 +53,7 @@ def write_json(path: Path, value: Any) -> None:
         stream.write(content.encode())
 
 
-def json_text(value: Any, *, what: str, indent: int | None = None) -> str:
+def json_text(value: object, *, what: str, indent: int | None = None) -> str:
     """Strict JSON on one line, or indented.
 
     Raises:
@@ -80,7 +80,7 @@ def read_json(path: Path) -> Any:
         raise MadocError(f"{path} is not valid JSON ({error}); restore it or delete it") from error
 
 
-def _unwritable(value: Any, place: str) -> str | None:
+def _unwritable(value: object, place: str) -> str | None:
     """Where in a nested value, and what, JSON cannot express."""
     if value is None or isinstance(value, bool | int | str):
         return None
@@ -95,7 +95,7 @@ def _unwritable(value: Any, place: str) -> str | None:
         inner = (_unwritable(child, f"{place}[{index}]") for index, child in enumerate(value))
     else:
         return f"{place} is a {type(value).__name__}, expected a number, string, list, dict or null"
-    return next((found for found in inner if found), None)
+    return next((place for place in inner if place), None)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -6,16 +6,17 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal
+from typing import Generic, Literal
 
 from jaxtyping import PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.runs import checkpoint
+from madoc.runs.budget import Budget, Seconds
 from madoc.runs.interruption import interruptible
 from madoc.runs.progress import Moment, display
 from madoc.runs.run_folder import RunFolder, RunLog
-from madoc.types import Budget, Epoch, Method, Metrics, Problem, Seconds, State, Unit
+from madoc.types import Epoch, Method, Metrics, Problem, State, Unit
 
 Status = Literal["finished", "converged", "interrupted", "diverged"]
 
@@ -159,7 +160,7 @@ class _Session(Generic[State]):
 
     def __init__(
         self,
-        method: Method[Any, State],
+        method: object,
         state: State,
         budget: Budget,
         unit: Unit,

@@ -1,4 +1,4 @@
-"""What a waiting user sees on standard error: a bar in a terminal, now and then a line anywhere else."""
+"""Progress on standard error: a bar in a terminal, a line every few seconds anywhere else."""
 
 import sys
 import time
@@ -10,21 +10,21 @@ from dataclasses import dataclass, field
 from madoc.types import Metrics
 
 LINE_SECONDS = 10.0
-"""Least time between two plain lines of one stage."""
+"""Shortest time in s between two plain lines of one stage."""
 
 _WINDOW_SECONDS = 30.0
-"""Rate and time left are those of this last while."""
+"""Length in s of the most recent period, from which the rate and the time left are computed."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """Where some work stands.
+    """The progress of some work at one moment.
 
     Attributes:
-        fraction: How much is done, 0 to 1.
-        done: The same, counted in the work's unit.
-        stage: What is being done now, in a short word.
-        metrics: Up to three numbers worth watching; of more, the first three are shown.
+        fraction: Share that is done, from 0 to 1.
+        done: The same as a count, in the work's unit.
+        stage: The present stage, in a short word.
+        metrics: Numbers to show beside it; of more than three, the first three are shown.
     """
 
     fraction: float
@@ -38,7 +38,7 @@ Show = Callable[[Moment], None]
 
 @contextmanager
 def display(description: str, *, unit: str, quiet: bool = False) -> Iterator[Show]:
-    """Show work as it goes on.
+    """Show the progress of work of unknown size.
 
     `with display("Madoc", unit="control steps") as show: show(Moment(0.1, 500, "cloning"))`.
     """
@@ -73,7 +73,7 @@ def bar(description: str, *, total: int, unit: str, quiet: bool = False) -> Iter
 
 
 class _Pace:
-    """Rate and time left, from the moments of the last while."""
+    """The rate and the time left, computed from the most recent moments."""
 
     def __init__(self, unit: str) -> None:
         self._unit = unit

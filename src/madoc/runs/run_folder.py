@@ -1,13 +1,12 @@
-"""The folder of one run: what was asked, what was measured, where to go on. It has one writer."""
+"""The folder of one run: its settings, its logs and its checkpoint, written by one process at a time."""
 
 import os
 import platform
 import warnings
+from collections.abc import Mapping
 from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
-from types import TracebackType
-from typing import Any
 
 import filelock
 import numpy as np
@@ -17,30 +16,30 @@ from madoc.runs.files import json_text, read_json, remove_leftovers, write_json
 from madoc.types import Metrics, Unit
 
 _FREE = ("budget", "versions")
-"""Keys of a spec that may differ when a run is resumed."""
+"""The keys of a spec that may differ when a run is resumed."""
 
 
 class RunFolder:
-    """A locked run folder; a context manager that unlocks it.
+    """A locked run folder; as a context manager it unlocks the folder at the end.
 
-    Files: `spec.json` (what was asked, with versions), `metrics.jsonl` (one line an epoch), `tensorboard/`,
-    `checkpoint.npz` (all that is needed to go on), `result.json` (when the run has ended), `diverged.npz`
-    (the bad state, if there was one). All are written whole or not at all, but for the logs, which grow.
+    It holds `spec.json` (the settings and versions), `metrics.jsonl` (one line for each epoch), `tensorboard/`,
+    `checkpoint.npz` (all that is needed to resume), `result.json` (once the run has ended), and `diverged.npz` (the
+    last state, if it held a NaN). All files but the logs, which grow, are written whole or not at all.
     """
 
-    def __init__(self, path: Path, spec: dict[str, Any], lock: filelock.BaseFileLock) -> None:
-        """Use `create` or `open`."""
+    def __init__(self, path: Path, spec: Mapping[str, object], lock: filelock.BaseFileLock) -> None:
+        """Call `create` or `open` instead."""
         self.path = path
         self.spec = spec
         self._lock = lock
 
     @classmethod
-    def create(cls, path: str | Path, spec: dict[str, Any]) -> "RunFolder":
+    def create(cls, path: str | Path, spec: Mapping[str, object]) -> "RunFolder":
         """Make the folder of a new run.
 
         Args:
             path: The folder; made if missing.
-            spec: What was asked, as JSON: method, hyperparameters, data, seed, budget. Versions are added.
+            spec: The run's settings as JSON: method, hyperparameters, data, seed, budget. Versions are added.
 
         Raises:
             MadocError: The folder already holds a run, is locked, or cannot be written.
@@ -55,18 +54,18 @@ class RunFolder:
             on_refusal.callback(lock.release)
             if (path / "spec.json").exists():
                 raise MadocError(f"{path} already holds a run; pass --resume to go on or choose another --out")
-            folder = cls(path, spec | {"versions": versions()}, lock)
+            folder = cls(path, {**spec, "versions": versions()}, lock)
             folder.write_json("spec.json", folder.spec)
             on_refusal.pop_all()
         return folder
 
     @classmethod
-    def open(cls, path: str | Path, spec: dict[str, Any] | None = None) -> "RunFolder":
+    def open(cls, path: str | Path, spec: Mapping[str, object] | None = None) -> "RunFolder":
         """Lock the folder of an earlier run, to go on with it or to add to it.
 
         Args:
             path: The folder.
-            spec: What is asked now; must equal what was asked then, but for `budget`. None to not compare.
+            spec: The settings now, which must be those of the run but for `budget`; None compares nothing.
 
         Raises:
             MadocError: The folder is missing, holds no run, is locked, or holds a run with another spec.
@@ -87,9 +86,7 @@ class RunFolder:
     def __enter__(self) -> "RunFolder":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -98,42 +95,43 @@ class RunFolder:
 
     @property
     def checkpoint(self) -> Path:
-        """Where the last good state is."""
+        """The file of the last good state."""
         return self.path / "checkpoint.npz"
 
     @property
     def diverged(self) -> Path:
-        """Where the state goes that made a run stop on a NaN."""
+        """The file of the state that made a run stop on a NaN."""
         return self.path / "diverged.npz"
 
     @property
     def result(self) -> Path:
-        """How the run ended; missing while it has not."""
+        """The file that says how the run ended; it is missing until then."""
         return self.path / "result.json"
 
-    def write_json(self, name: str, value: Any) -> None:
+    def write_json(self, name: str, value: object) -> None:
         """Write a JSON file of this folder, whole or not at all."""
         write_json(self.path / name, value)
 
     def log(self, offset: int, spent: int, *, unit: Unit = "control steps") -> "RunLog":
-        """The logs, cut back to a checkpoint's `offset` (bytes) and what it had `spent`; 0, 0 for a new run."""
+        """The logs, cut back to the `offset` in bytes and the count `spent` of a checkpoint; 0 and 0 for a new run."""
         return RunLog(self.path, offset, spent, unit)
 
-    def _agree_on(self, spec: dict[str, Any]) -> None:
-        """Refuse another spec; note other versions; take the new budget."""
-        then = _flat({key: value for key, value in self.spec.items() if key not in _FREE})
-        now = _flat({key: value for key, value in spec.items() if key not in _FREE})
-        for key in [*then, *now]:
-            if key not in then or key not in now or then[key] != now[key]:
-                was, is_now = (_shortened(said.get(key, "not given")) for said in (then, now))
+    def _agree_on(self, spec: Mapping[str, object]) -> None:
+        """Refuse other settings, warn of other versions, and take over a new budget."""
+        before, now = (_flat({key: asked[key] for key in asked if key not in _FREE}) for asked in (self.spec, spec))
+        for key in [*before, *now]:
+            if before.get(key) != now.get(key):
+                was, is_now = (_shortened(asked.get(key, "not given")) for asked in (before, now))
                 raise MadocError(
                     f"cannot resume {self.path}: {key} was {was}, is now {is_now}; "
                     "resume with the same settings or choose another --out"
                 )
+        recorded = self.spec.get("versions")
+        then = recorded if isinstance(recorded, dict) else {}
         changed = [
-            f"{name} {self.spec.get('versions', {}).get(name)} (now {version})"
+            f"{name} {then.get(name)} (now {version})"
             for name, version in versions().items()
-            if self.spec.get("versions", {}).get(name) != version
+            if then.get(name) != version
         ]
         if changed:
             warnings.warn(
@@ -141,15 +139,15 @@ class RunFolder:
                 stacklevel=3,
             )
         if "budget" in spec and spec["budget"] != self.spec.get("budget"):
-            self.spec = self.spec | {"budget": spec["budget"]}
+            self.spec = {**self.spec, "budget": spec["budget"]}
             self.write_json("spec.json", self.spec)
 
 
 class RunLog:
-    """The growing logs of a run, `metrics.jsonl` and TensorBoard events; closed at the end of its block."""
+    """The growing logs of a run, `metrics.jsonl` and TensorBoard events; as a context manager it closes them."""
 
     def __init__(self, path: Path, offset: int, spent: int, unit: Unit) -> None:
-        """Use `RunFolder.log`."""
+        """Call `RunFolder.log` instead."""
         from tensorboardX import SummaryWriter  # slow to import, and only runs with a folder need it
 
         self._count = count_name(unit)
@@ -166,21 +164,14 @@ class RunLog:
     def __enter__(self) -> "RunLog":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self._lines.close()
         self._events.close()
 
     def append(self, metrics: Metrics, *, stage: str, spent: int, seconds: float) -> None:
         """Add one epoch. A NaN or infinite metric is logged as null."""
         finite = {name: value if np.isfinite(value) else None for name, value in metrics.items()}
-        line = {
-            self._count: spent,
-            "seconds": round(seconds, 3),
-            "stage": stage,
-            "metrics": finite,
-        }
+        line = {self._count: spent, "seconds": round(seconds, 3), "stage": stage, "metrics": finite}
         self._lines.write(json_text(line, what="metrics.jsonl").encode() + b"\n")
         self._lines.flush()
         for name, value in finite.items():
@@ -196,23 +187,23 @@ class RunLog:
 
 
 def count_name(unit: Unit) -> str:
-    """What JSON calls a count of that unit: `control_steps`, `updates`."""
+    """The key in JSON of a count in that unit: `control_steps` or `updates`."""
     return unit.replace(" ", "_")
 
 
 def versions() -> dict[str, str]:
-    """Versions of what decides a run's bits, by name."""
-    found = {"python": platform.python_version()}
+    """Versions of the packages that decide the bits of a run, by name."""
+    installed = {"python": platform.python_version()}
     for name, package in {"madoc": "madoc-calibration", "jax": "jax", "mujoco": "mujoco"}.items():
         try:
-            found[name] = metadata.version(package)
+            installed[name] = metadata.version(package)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            installed[name] = "not installed"
+    return installed
 
 
 def _lock(path: Path) -> filelock.BaseFileLock:
-    """Lock a folder and clear it of what a killed writer left."""
+    """Lock a folder, and delete what a killed writer left half-written."""
     lock = filelock.FileLock(path / ".lock", timeout=0, thread_local=False)
     try:
         lock.acquire()
@@ -225,7 +216,7 @@ def _lock(path: Path) -> filelock.BaseFileLock:
 
 
 def _cut(path: Path, offset: int) -> Path:
-    """Drop the lines after a checkpoint: the resumed run writes them again."""
+    """Drop the lines after a checkpoint, which the resumed run writes again."""
     size = path.stat().st_size if path.exists() else 0
     if size < offset:
         raise MadocError(f"{path} has {size} bytes, its checkpoint says {offset}; restore it or start a new run")
@@ -234,9 +225,9 @@ def _cut(path: Path, offset: int) -> Path:
     return path
 
 
-def _flat(spec: Any, prefix: str = "") -> dict[str, str]:
+def _flat(spec: object, prefix: str = "") -> dict[str, str]:
     """Nested dictionaries as one, with dotted keys and JSON values."""
-    if isinstance(spec, dict) and spec:
+    if isinstance(spec, Mapping) and spec:
         return {
             key: value
             for name, child in spec.items()
@@ -246,5 +237,5 @@ def _flat(spec: Any, prefix: str = "") -> dict[str, str]:
 
 
 def _shortened(text: str) -> str:
-    """A value in a sentence: a robot's whole model would hide the rest."""
+    """A value short enough for a sentence, which a robot's whole model is not."""
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,11 +1,11 @@
-"""Simulators: parameters bound to a system, systems stepped over two batch axes."""
+"""Simulators: parameters are bound to systems, and systems step states over two batch axes."""
 
 from madoc.simulation.base import Simulator, System
 from madoc.simulation.cpu import CpuSimulator
 from madoc.tasks.base import Task
 
 
-def make(task: Task, *, threads: int | None = None) -> CpuSimulator:
+def make(task: Task, *, threads: int | None = None) -> Simulator:
     """The simulator of a task, on `threads` cores (default: all this process may use).
 
     Raises:
@@ -14,4 +14,4 @@ def make(task: Task, *, threads: int | None = None) -> CpuSimulator:
     return CpuSimulator(task, threads=threads)
 
 
-__all__ = ["CpuSimulator", "Simulator", "System", "make"]
+__all__ = ["Simulator", "System", "make"]

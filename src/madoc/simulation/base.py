@@ -1,20 +1,22 @@
-"""A simulator binds parameters; what it returns steps states. A backend is these two methods."""
+"""What a simulator backend provides: a simulator binds parameters, and the systems it returns step states."""
 
+from collections.abc import Mapping
 from typing import Protocol
 
+import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from madoc.parameters import ParameterSpace
 from madoc.tasks.base import Task
 
 
 class System(Protocol):
-    """Dynamics at fixed parameters: `systems` of them, each with any number of rows."""
+    """Dynamics at fixed parameters: `count` systems, each with any number of rows."""
 
     @property
     def count(self) -> int:
-        """How many systems, the first axis of every state."""
+        """Number of systems, the first axis of every state."""
         ...
 
     def step(
@@ -24,16 +26,20 @@ class System(Protocol):
         ...
 
     def observe(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows observation"]:
-        """What the sensors of these systems show there, with the bias each has; NaN where a state is NaN."""
+        """Observations of these states with the bias of each system's sensors; NaN where a state is NaN."""
         ...
 
     def unbiased(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows state"]:
-        """States rebuilt from logged observations, corrected for the bias that each system's sensors have."""
+        """States rebuilt from logged observations, corrected for the bias of each system's sensors."""
+        ...
+
+    def replaced(self, systems: Int[np.ndarray, " some"], parameters: Float[np.ndarray, "some parameters"]) -> "System":
+        """These systems, with those of the given indices bound to other physical values."""
         ...
 
 
 class Simulator(Protocol):
-    """A source domain whose parameters can be chosen."""
+    """The source domain: a robot whose parameters can be chosen. A backend is this class and its `System`."""
 
     @property
     def task(self) -> Task:
@@ -42,19 +48,28 @@ class Simulator(Protocol):
 
     @property
     def parameters(self) -> ParameterSpace:
-        """What can be bound, in order."""
+        """The parameters that can be bound, in order."""
         ...
 
     @property
     def initial_state(self) -> Float[np.ndarray, " state"]:
-        """Where an episode starts before noise."""
+        """State at the start of an episode, before the noise of a reset."""
         ...
 
     @property
     def action_size(self) -> int:
-        """Motors."""
+        """Number of values per action."""
         ...
 
-    def bind(self, parameters: Float[np.ndarray, "systems parameters"]) -> System:
-        """Dynamics at the given physical values, one system a row."""
+    @property
+    def control_step(self) -> float:
+        """Time between two actions in s."""
+        ...
+
+    def bind(self, parameters: Float[np.ndarray, "*systems parameters"] | Mapping[str, float]) -> System:
+        """Dynamics at physical values: those of one system, by name or as a vector, or of one system in each row."""
+        ...
+
+    def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
+        """The MuJoCo model at the given physical values, to export; owned by the caller."""
         ...

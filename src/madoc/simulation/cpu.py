@@ -2,25 +2,25 @@
 
 import copy
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import mujoco
 import mujoco.rollout
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
 from madoc.simulation.delay import blend, delay_weights, in_effect
-from madoc.simulation.write import find_elements, nearest_names, write_parameters
+from madoc.simulation.write import find_elements, write_parameters
 from madoc.tasks.base import Task
 
 _CLOCK = 1.0
-"""s. Every row starts its step at this time; MuJoCo resets an exploding simulation, and its clock tells."""
+"""Time in s at which every row starts its step; MuJoCo resets a simulation that diverges, which its clock shows."""
 
 _ROWS_FOR_ALL_THREADS = 8
-"""Below this many rows waking a second thread costs more than it saves."""
+"""Number of rows from which all threads step them; with fewer, waking a second thread costs more than it saves."""
 
 
 class CpuSimulator:
@@ -28,7 +28,7 @@ class CpuSimulator:
 
     Args:
         task: The robot.
-        threads: How many cores step it; all that this process may use by default.
+        threads: Number of cores that step it; by default all that this process may use.
 
     Raises:
         MadocError: A parameter names an element that the model does not have.
@@ -37,7 +37,7 @@ class CpuSimulator:
     def __init__(self, task: Task, *, threads: int | None = None) -> None:
         self.task = task
         self.threads = threads or len(os.sched_getaffinity(0))
-        self._model = task.compile()
+        self._model = task.model
         if self._model.na or self._model.nmocap:
             raise MadocError(f"{task.name}: models with actuator activations or mocap bodies are not supported")
         for parameter in task.parameters.parameters:
@@ -53,33 +53,36 @@ class CpuSimulator:
 
     @property
     def parameters(self) -> ParameterSpace:
-        """What can be bound, in order."""
+        """The parameters that can be bound, in order."""
         return self.task.parameters
 
     @property
     def initial_state(self) -> Float[np.ndarray, " state"]:
-        """The model's own (qpos0, 0), and the actions that rest there."""
+        """The model's (qpos0, 0), followed by the pending actions at rest."""
         rest = [channel.rest for channel in self.task.actions] or self.action_size * [0.0]
         return np.concatenate([self._model.qpos0, np.zeros(self._model.nv), np.tile(rest, self.task.pending)])
 
     @property
     def action_size(self) -> int:
         """Values per action."""
-        return len(self.task.actions) or int(self._model.nu)
+        return self.task.action_size
 
     @property
     def control_step(self) -> float:
         """Seconds per control step."""
         return float(self._model.opt.timestep) * self.task.frame_skip
 
-    def bind(self, parameters: Float[np.ndarray, "systems parameters"]) -> "CpuSystem":
-        """Copy the model once per row of physical values and write them.
+    def bind(self, parameters: Float[np.ndarray, "*systems parameters"] | Mapping[str, float]) -> "CpuSystem":
+        """Copy the model once for each system, and write the system's physical values into it.
+
+        Args:
+            parameters: Values of one system, by name or as a vector, or of several, one in each row.
 
         Raises:
             MadocError: Values are not finite, not one per parameter, or below a physical bound.
         """
-        values = np.asarray(parameters, dtype=np.float64)
-        if values.ndim != 2 or values.shape[1] != len(self.parameters):
+        values = np.atleast_2d(self.parameters.vector(parameters))
+        if values.ndim != 2:
             raise MadocError(f"expected parameters of shape (systems, {len(self.parameters)}), got {values.shape}")
         if not np.isfinite(values).all():
             raise MadocError("expected finite parameters, got NaN or infinity")
@@ -98,7 +101,7 @@ class CpuSimulator:
         return CpuSystem(self, models, delay=self._delays(values), bias=self._biases(values))
 
     def _delays(self, values: Float[np.ndarray, "systems parameters"]) -> Float[np.ndarray, " systems"]:
-        """Seconds from an action to its effect."""
+        """Time in s from an action to its effect."""
         delay, longest = self._summed(values, "action_delay", ())[:, 0], self.task.pending * self.control_step
         if (delay > longest + 1e-9).any():
             raise MadocError(
@@ -108,7 +111,7 @@ class CpuSimulator:
         return np.minimum(delay, longest)
 
     def _biases(self, values: Float[np.ndarray, "systems parameters"]) -> Float[np.ndarray, "systems _"] | None:
-        """What the sensors read too much, one value a signal; None where no bias is calibrated."""
+        """Bias of each signal; None where no bias is calibrated."""
         if all(parameter.field != "signal_bias" for parameter in self.parameters.parameters):
             return None
         return self._summed(values, "signal_bias", self.task.signals)
@@ -116,16 +119,16 @@ class CpuSimulator:
     def _summed(
         self, values: Float[np.ndarray, "systems parameters"], field: str, elements: tuple[str, ...]
     ) -> Float[np.ndarray, "systems elements"]:
-        """The values of a field by element, 0 where none is calibrated; one column where it has no elements."""
-        found = np.zeros((len(values), max(1, len(elements))))
+        """The values of a field by element, 0 where none is calibrated; one column where the field has no elements."""
+        sums = np.zeros((len(values), max(1, len(elements))))
         for parameter, column in zip(self.parameters.parameters, values.T, strict=True):
             if parameter.field == field:
                 for index in [elements.index(element) for element in parameter.elements] or [0]:
-                    found[:, index] += column
-        return found
+                    sums[:, index] += column
+        return sums
 
     def _controls(self, action: Float[np.ndarray, "*rows action"]) -> Float[np.ndarray, "*rows control"]:
-        """What the model's actuators get for an action; those that no channel drives get 0."""
+        """Controls of the model's actuators for an action; 0 for actuators that no action channel drives."""
         if not self.task.actions:
             return action
         control = np.zeros((*action.shape[:-1], self._model.nu))
@@ -133,15 +136,15 @@ class CpuSimulator:
         return control
 
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
-        """A MuJoCo model of its own at the given physical values."""
+        """A MuJoCo model at the given physical values, owned by the caller."""
         return self.bind(np.asarray(values)[None]).models[0]
 
 
 class CpuSystem:
     """Systems at fixed parameters; states are (qpos, qvel, pending actions).
 
-    The solver's warm start is always 0, so a step is a function of state, action and parameters alone,
-    whatever the number of threads.
+    The solver's warm start is always 0, so a step depends on state, action and parameters alone, whatever the number
+    of threads.
     """
 
     def __init__(
@@ -160,13 +163,26 @@ class CpuSystem:
 
     @property
     def count(self) -> int:
-        """How many systems."""
+        """Number of systems."""
         return len(self.models)
+
+    def replaced(
+        self, systems: Int[np.ndarray, " some"], parameters: Float[np.ndarray, "some parameters"]
+    ) -> "CpuSystem":
+        """These systems, with those of the given indices bound to other parameters."""
+        new, models, delay = self._simulator.bind(parameters), list(self.models), self._delay.copy()
+        for index, model in zip(systems, new.models, strict=True):
+            models[index] = model
+        delay[systems] = new._delay
+        bias = None if self._bias is None else self._bias.copy()
+        if bias is not None:
+            bias[systems] = new._bias
+        return CpuSystem(self._simulator, models, delay=delay, bias=bias)
 
     def step(
         self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
     ) -> Float[np.ndarray, "systems rows state"]:
-        """One control step of `frame_skip` physics steps; a row that explodes comes back as NaN.
+        """One control step of `frame_skip` physics steps; a row whose simulation diverges comes back as NaN.
 
         Raises:
             MadocError: States or actions do not have the shape of these systems.
@@ -185,17 +201,17 @@ class CpuSystem:
         return np.concatenate([moved, np.where(failed, np.nan, kept)], axis=-1)
 
     def observe(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows observation"]:
-        """What the sensors show, with each system's bias; NaN where a state is NaN.
+        """Observations with each system's bias; NaN where a state is NaN.
 
-        A sensor of the model is read in a forward pass under the control that is in effect, as far as the state
-        carries it (`Task.pending`), else under none.
+        A sensor of the model is read in a forward pass under the control that is in effect, where the state carries it
+        (`Task.pending`), else under no control.
         """
         task = self._simulator.task
         seen = task.observe(state) if task.sense is None else task.sense(state, self._sensordata(state))
         return seen if self._bias is None else seen + self._bias[:, None]
 
     def unbiased(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows state"]:
-        """States rebuilt from logged observations, corrected for the bias that each system's sensors have."""
+        """States rebuilt from logged observations, corrected for the bias of each system's sensors."""
         rebuild = self._simulator.task.state_from_observation or self._simulator.task.posture
         if self._bias is None or rebuild is None:
             return state
@@ -213,9 +229,9 @@ class CpuSystem:
             control[:] = self._simulator._controls(last).reshape(total, 1, -1)
         trajectory, sensors = np.zeros((total, 1, self._start.shape[1])), np.zeros((total, 1, model.nsensordata))
         moved = self._roll_out(state[..., : self._physical], control, trajectory, sensors)
-        found = sensors[:, 0].reshape(*state.shape[:2], -1).copy()
-        found[np.isnan(moved).any(-1)] = np.nan
-        return found
+        sensordata = sensors[:, 0].reshape(*state.shape[:2], -1).copy()
+        sensordata[np.isnan(moved).any(-1)] = np.nan
+        return sensordata
 
     def _pending(self, state: Float[np.ndarray, "systems rows state"]) -> np.ndarray:
         """Past actions, newest first: (systems, rows, pending, action)."""
@@ -229,7 +245,7 @@ class CpuSystem:
         trajectory: Float[np.ndarray, "total steps 1+physical"],
         sensors: Float[np.ndarray, "total steps sensor"],
     ) -> Float[np.ndarray, "systems rows physical"]:
-        """Physics steps under given controls; where they lead, and in place what was passed and sensed on the way."""
+        """States after the physics steps under given controls; `trajectory` and `sensors` are filled in place."""
         simulator, steps = self._simulator, control.shape[1]
         self._start[:, 1:] = state.reshape(self._start.shape[0], -1)
         bad = ~np.isfinite(self._start).all(1)
@@ -284,30 +300,22 @@ class CpuSystem:
 
 
 def _check_elements(model: mujoco.MjModel, task: Task, parameter: Parameter) -> None:
-    """Refuse a parameter of an element that neither the model nor the task has."""
+    """Refuse a parameter of an element that the model, or for a signal the task, does not have."""
     if FIELDS[parameter.field].element != "signal":
         find_elements(model, parameter)
         return
     for element in parameter.elements:
         if element not in task.signals:
-            near = nearest_names(element, list(task.signals)) or list(task.signals[:8])
-            listed = f"nearest: {', '.join(near)}" if near else "none of its observation's values has a name"
-            raise MadocError(f"{parameter.name}: {task.name} has no signal {element!r}; {listed}")
+            hint = nearest_hint(element, task.signals, none="none of its observation's values has a name")
+            raise MadocError(f"{parameter.name}: {task.name} has no signal {element!r}; {hint}")
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep MuJoCo's word on an exploding row (stderr, MUJOCO_LOG.TXT in the working directory) to itself.
-
-    Such rows come back as NaN and are counted.
-    """
+    """Suppress MuJoCo's warning about a row that diverges (on stderr and in MUJOCO_LOG.TXT): it comes back as NaN."""
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(_ignore)
+    mujoco.set_mju_user_warning(lambda _: None)
     try:
         yield
     finally:
         mujoco.set_mju_user_warning(before)
-
-
-def _ignore(_: str) -> None:
-    pass

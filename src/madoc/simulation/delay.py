@@ -7,7 +7,7 @@ from jaxtyping import Float
 def delay_weights(
     delay: Float[np.ndarray, " systems"], *, control_step: float, physics_steps: int, pending: int
 ) -> Float[np.ndarray, "systems physics_steps actions"]:
-    """How much of each action, newest first, the actuators get in each physics step of a control step.
+    """Weight of each action, newest first, in the control of each physics step of a control step.
 
     The action chosen m control steps ago, at -m T, takes effect at τ - m T and holds until the next one does. In the
     physics step where the switch falls, the two are blended by the time each holds, so that what follows changes
@@ -16,8 +16,8 @@ def delay_weights(
     Args:
         delay: τ of each system in seconds, at most `pending` control steps.
         control_step: T in seconds.
-        physics_steps: How many a control step has.
-        pending: Past actions at hand, beside the newest.
+        physics_steps: Number of physics steps per control step.
+        pending: Number of past actions in a state, besides the newest.
     """
     step = control_step / physics_steps
     ends = step * np.arange(1, physics_steps + 1)
@@ -41,5 +41,5 @@ def blend(
 
 
 def in_effect(delay: Float[np.ndarray, " systems"], control_step: float) -> np.ndarray:
-    """Which pending action holds at the end of a control step, 0 the newest: the last one that has taken effect."""
+    """Index of the pending action in effect at the end of a control step; 0 is the newest."""
     return np.maximum(np.ceil(delay / control_step - 1e-9).astype(int) - 1, 0)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,7 +17,7 @@ from madoc.runs.files import replacing
 from madoc.simulation.base import Simulator
 
 DIGITS = 17
-"""Significant digits that give back every float64; MuJoCo writes 6 of its own accord."""
+"""Number of significant digits that determine a float64; MuJoCo by itself writes 6."""
 
 ASSETS = "assets"
 """Folder of meshes, height fields and textures beside a written model."""
@@ -28,13 +27,13 @@ _LONG_NUMBER = re.compile(r'(?<=["\s])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?=["\s])'
 
 @dataclass(frozen=True)
 class Change:
-    """One attribute that a bound model has otherwise than the robot's own.
+    """One attribute in which a bound model differs from the robot's own.
 
     Attributes:
-        element: Kind and name, as `joint foot_joint`; `option` for what belongs to no element.
-        attribute: As MJCF calls it.
-        old: Before, one value or several.
-        new: After.
+        element: Kind and name, as `joint foot_joint`; `option` for the options of the model.
+        attribute: The attribute's name in MJCF.
+        old: Its value or values in the robot's own model.
+        new: Its value or values in the bound model.
     """
 
     element: str
@@ -44,17 +43,17 @@ class Change:
 
 
 def spec_at(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> tuple[mujoco.MjSpec, list[Change]]:
-    """The robot's spec with physical values written into it, and what that changed.
+    """The robot's spec with physical values written into it, and the attributes that this changed.
 
-    Where an inertia changes, all are made explicit: what geoms, total masses or bounds would have made of them
-    when compiled is then already in the numbers.
+    Where an inertia changes, all inertias are made explicit, so that compiling the spec does not infer them again from
+    geoms, total masses or bounds.
 
     Raises:
-        MadocError: A value changes something of the model that this does not know to write.
+        MadocError: A value changes a part of the model that cannot be written.
     """
     spec = simulator.task.spec()
     nominal = _compiled(spec)
-    bound = bound_model(simulator, values)
+    bound = simulator.model(values)
     changes: list[Change] = []
     for group, write in _GROUPS.items():
         changes += write(spec, group, nominal, bound)
@@ -62,28 +61,19 @@ def spec_at(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> t
     return spec, changes
 
 
-def bound_model(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
-    """The compiled model that a bound system steps."""
-    models = getattr(simulator.bind(np.asarray(values, dtype=np.float64)[None]), "models", None)
-    if models is None:
-        raise MadocError(f"{type(simulator).__name__} steps no MuJoCo model that could be written as MJCF")
-    model: mujoco.MjModel = models[0]
-    return model
-
-
 def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], path: Path) -> list[Change]:
     """Write the calibrated model as MJCF, its assets in a folder beside it, and check it by loading it again.
 
     Args:
         simulator: The robot.
-        values: Physical values, one a parameter.
+        values: Physical values, one for each parameter.
         path: The file; its folder exists.
 
     Returns:
-        What the model has otherwise than the robot's own.
+        The attributes in which the model differs from the robot's own.
 
     Raises:
-        MadocError: The file cannot be written, an asset is missing, or what was written is not the bound model.
+        MadocError: The file cannot be written, an asset is missing, or the written model is not the bound one.
     """
     spec, changes = spec_at(simulator, values)
     _gather_assets(spec, path.parent)
@@ -96,15 +86,15 @@ def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], pa
         read_back = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise MadocError(f"MuJoCo does not read back the model it wrote to {path}: {error}") from error
-    _refuse_difference(bound_model(simulator, values), read_back, f"read back from {path}")
+    _refuse_difference(simulator.model(values), read_back, f"read back from {path}")
     return changes
 
 
 def shortest_numbers(text: str) -> str:
-    """XML with every number as short as it can be and still be the same float64: `0.05`, not `0.050000000000000003`."""
+    """XML with the shortest form of every number that is the same float64: `0.05`, not `0.050000000000000003`."""
 
-    def shorten(found: re.Match[str]) -> str:
-        written = found.group()
+    def shorten(number: re.Match[str]) -> str:
+        written = number.group()
         return repr(float(written)) if len(written) > DIGITS else written
 
     return _LONG_NUMBER.sub(shorten, text)
@@ -118,7 +108,7 @@ def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def _refuse_difference(wanted: mujoco.MjModel, got: mujoco.MjModel, where: str) -> None:
-    """Refuse a model that is not the bound one in every number (to the last bits of derived constants)."""
+    """Refuse a model that differs from the bound one in a number, but for rounding of derived constants."""
     for name in _float_fields(wanted):
         ours, theirs = np.asarray(getattr(wanted, name)), np.asarray(getattr(got, name))
         if ours.shape != theirs.shape:
@@ -136,7 +126,7 @@ def _refuse_difference(wanted: mujoco.MjModel, got: mujoco.MjModel, where: str) 
 
 
 def _float_fields(model: mujoco.MjModel) -> list[str]:
-    """Names of the arrays of numbers of a model, but for what only colours and places it in a picture."""
+    """Names of a model's arrays of floats, without those that only matter for rendering."""
     drawn = ("bvh", "cam_", "geom_rgba", "light_", "mat_", "mesh_", "oct_", "site_rgba", "skin_", "tex_")
     names = [name for name in dir(model) if not name.startswith(("_", *drawn))]
     arrays = {name: getattr(model, name) for name in names}
@@ -145,10 +135,10 @@ def _float_fields(model: mujoco.MjModel) -> list[str]:
 
 @contextmanager
 def _precision(digits: int) -> Iterator[None]:
-    """Have MuJoCo write numbers with so many digits.
+    """Make MuJoCo write numbers with this number of digits.
 
-    Its library exports the setting without a binding in Python. Where a build has none, what is written is
-    rounded, and the check that follows every writing refuses it.
+    Its library exports the setting without a binding in Python. A build without it writes rounded numbers, and the
+    check after every writing refuses them.
     """
     files = sorted(Path(mujoco.__file__).parent.glob(f"*mujoco*{mujoco.__version__}*")) or sorted(
         Path(mujoco.__file__).parent.glob("mujoco*.dll")
@@ -168,7 +158,7 @@ def _precision(digits: int) -> Iterator[None]:
 
 
 def _gather_assets(spec: mujoco.MjSpec, folder: Path) -> None:
-    """Copy the files a model is made of beside it, and name them from there."""
+    """Copy the files that a model refers to into the folder beside it, and refer to the copies."""
     files: dict[str, str] = {}
     owners = [*spec.meshes, *spec.hfields, *spec.textures, *spec.skins]
     for owner in owners:
@@ -186,7 +176,7 @@ def _gather_assets(spec: mujoco.MjSpec, folder: Path) -> None:
 
 
 def _gathered(spec: mujoco.MjSpec, file: str, own_folder: str, folder: Path, files: dict[str, str]) -> str:
-    """The name, in the folder of assets, of a copy of a file of the model."""
+    """Name of the copy of a file in the folder of assets; copied at the first call."""
     wanted = str(Path(own_folder) / file)
     if wanted not in files:
         name = Path(file).name
@@ -242,7 +232,7 @@ def _write_inertia(spec: mujoco.MjSpec, _: str, nominal: mujoco.MjModel, bound: 
 
 
 def _write_rows(spec: mujoco.MjSpec, group: str, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
-    """Attributes of elements that stand one to one in a row of an array of the model."""
+    """Write attributes of elements that are equal to a row of an array of the model."""
     kind, attribute, array = group.split()
     changes = []
     for element in getattr(spec, f"{kind}s" if kind != "body" else "bodies"):
@@ -254,7 +244,7 @@ def _write_rows(spec: mujoco.MjSpec, group: str, nominal: mujoco.MjModel, bound:
     return changes
 
 
-def _assign(element: Any, attribute: str, new: list[float]) -> None:
+def _assign(element: mujoco.MjsBody | mujoco.MjsJoint, attribute: str, new: list[float]) -> None:
     """Set an attribute of an element: a number, or the first numbers of an array."""
     if np.ndim(getattr(element, attribute)):
         getattr(element, attribute)[: len(new)] = new
@@ -290,4 +280,4 @@ _GROUPS: dict[str, _Writer] = {
     "actuator gainprm actuator_gainprm": _write_rows,
     "actuator biasprm actuator_biasprm": _write_rows,
 }
-"""What of a model a parameter may change, and how that is written into a spec."""
+"""Parts of a model that a parameter may change (kind, attribute and array), and how each is written into a spec."""

@@ -15,13 +15,13 @@ from madoc.tasks.base import Task
 from madoc.types import Policy, Transitions
 
 Starts = Callable[[PRNGKeyArray, int], Float[np.ndarray, "count state"]]
-"""Draws that many states to start rows at."""
+"""(key, count) -> states at which rows start."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Walkers:
-    """Rows under way: their states, and how many control steps each has lived since its start."""
+    """Rows of a rollout: their states, and the control steps since each started."""
 
     state: Float[np.ndarray, "systems rows state"]
     age: Int[np.ndarray, "systems rows"]
@@ -29,19 +29,19 @@ class Walkers:
 
 @dataclass(frozen=True)
 class Rollout:
-    """What a rollout saw, time first. Rows whose simulation failed are not `valid`."""
+    """Transitions of a rollout, time on the first axis. Rows whose simulation failed are not `valid`."""
 
     transitions: Transitions
     valid: Bool[np.ndarray, "steps systems rows"]
 
     @property
     def failures(self) -> int:
-        """Rows that exploded."""
+        """Number of rows whose simulation failed."""
         return int((~self.valid).sum())
 
 
 def reset_states(simulator: Simulator) -> Starts:
-    """Starts as the task's own reset draws them."""
+    """Starts drawn by the task's own reset."""
 
     def draw(key: PRNGKeyArray, count: int) -> np.ndarray:
         noise = _reset_noise(simulator.task.reset_noise, key, count)
@@ -60,7 +60,7 @@ def chosen_states(states: Float[np.ndarray, "logged state"]) -> Starts:
 
 
 def unbiased_starts(system: System, starts: Starts) -> Starts:
-    """Starts at states rebuilt from the log, corrected for the bias that the sensors of each system have."""
+    """Starts at states rebuilt from the log, corrected for the bias of each system's sensors."""
 
     def draw(key: PRNGKeyArray, count: int) -> np.ndarray:
         states = starts(key, count)
@@ -91,17 +91,17 @@ def roll(
     A row that terminates, fails, or reaches the task's time limit starts again at a state from `starts`.
 
     Args:
-        system: Where to act.
+        system: The systems to act in.
         task: The robot's functions of state.
-        policy: Who acts; sampled with `key`, deterministic where `key` is None.
-        walkers: Where the rows stand.
+        policy: The policy; sampled with `key`, deterministic where `key` is None.
+        walkers: The states of the rows.
         steps: Control steps per row.
-        starts: Where ended rows start again.
+        starts: The states at which ended rows start again.
         key: Randomness of the actions.
         restart_key: Randomness of the restarts.
 
     Returns:
-        Transitions with axes (steps, systems, rows), and where the rows stand now.
+        Transitions with axes (steps, systems, rows), and the states of the rows afterwards.
     """
     state, age = walkers.state, walkers.age
     observation = system.observe(state)
@@ -141,7 +141,7 @@ def act(
     key: PRNGKeyArray | None,
     step: np.int32,
 ) -> Array:
-    """Actions of a policy, jitted; step `step` of the stream `key`, deterministic without a key."""
+    """Actions of a policy, jitted: sampled with the key of this step, deterministic without a key."""
     return policy(jnp.asarray(observation), None if key is None else jax.random.fold_in(key, step))
 
 
@@ -159,7 +159,7 @@ def replay_actions(
     rows: int,
     key: PRNGKeyArray,
 ) -> Rollout:
-    """One control step from logged states under the actions logged there, `rows` drawn for each system."""
+    """One control step from logged states under their logged actions; `rows` of them are drawn for each system."""
     chosen = np.asarray(jax.random.randint(key, (system.count, rows), 0, len(states)))
     state, action = system.unbiased(states[chosen]), actions[chosen]
     next_state = system.step(state, action)

@@ -1,4 +1,4 @@
-"""Parameters that change nothing: found from logged rows before any budget is spent on them."""
+"""Insensitive parameters: those that change no next state are found before any budget is spent on them."""
 
 import jax
 import numpy as np
@@ -16,16 +16,16 @@ def insensitive(
     key: PRNGKeyArray,
     rows: int = 64,
 ) -> tuple[list[str], int]:
-    """Which parameters change no next state, nor what is seen of it, bit for bit, at either end of their range.
+    """Parameters that change no bit of any next state or observation at either end of their range.
 
-    All others stay at mid-range. A row counts only where both simulations succeeded.
+    All other parameters stay at mid-range. A row counts only where both simulations succeeded.
 
     Args:
-        simulator: Whose parameters.
+        simulator: The simulator.
         states: States to step from, typically logged ones.
         actions: The actions taken there.
-        key: Draws the rows.
-        rows: How many rows are drawn, without repetition, if there are that many.
+        key: Randomness of the rows.
+        rows: Number of rows drawn without repetition; all where there are fewer.
 
     Returns:
         The names, in the order of the parameters, and the control steps spent: rows · (2 d + 1).
@@ -65,10 +65,10 @@ def refuse_insensitive(
     key: PRNGKeyArray,
     rows: int = 64,
 ) -> int:
-    """Control steps spent on finding that every parameter changes some next state.
+    """Check that every parameter changes some next state; returns the control steps spent on it.
 
     Raises:
-        MadocError: Some parameter changes none: no method could calibrate it.
+        MadocError: A parameter changes none, so no method could calibrate it.
     """
     names, control_steps = insensitive(simulator, states, actions, key=key, rows=rows)
     if names:

@@ -1,4 +1,4 @@
-"""Velocities from positions: what a joint's quaternion or angle did within so many seconds."""
+"""Velocities from positions: the change of a joint's position, or of its quaternion, over time."""
 
 import mujoco
 import numpy as np
@@ -18,43 +18,43 @@ def velocities_between(
 
     Args:
         task: The robot.
-        before: States of which only the positions count.
-        after: The same, later.
+        before: Earlier states, of which only the positions are used.
+        after: Later states, of which only the positions are used.
         steps: Control steps between them, at least 1.
     """
-    model = task.compile()
+    model = task.model
     seconds = steps * task.frame_skip * model.opt.timestep
     start, end = before[:, : model.nq], after[:, : model.nq]
     if model.nq == model.nv:
         return (end - start) / seconds[:, None]
-    found = np.zeros((len(start), model.nv))
-    for velocity, *row in zip(found, seconds, start, end, strict=True):
+    velocities = np.zeros((len(start), model.nv))
+    for velocity, *row in zip(velocities, seconds, start, end, strict=True):
         mujoco.mj_differentiatePos(model, velocity, *row)
-    return found
+    return velocities
 
 
 def with_velocities(
     task: Task, states: Float[np.ndarray, "rows state"], velocities: Float[np.ndarray, "rows velocity"]
 ) -> Float[np.ndarray, "rows state"]:
-    """(qpos, qvel) with the given velocities where it has none (NaN)."""
-    positions = task.compile().nq
+    """(qpos, qvel) with the given velocities where the state has NaN."""
+    positions = task.model.nq
     padded = np.concatenate([states[:, :positions], np.nan_to_num(velocities)], axis=-1)
     return np.where(np.isnan(states), padded, states)
 
 
 def missing_velocities(task: Task) -> Int[np.ndarray, " velocities"]:
-    """Where in a state the velocities stand that an observation does not tell, of a task with a `posture`."""
+    """Indices in a state of the velocities that an observation does not determine, for a task with a `posture`."""
     assert task.posture is not None
     unknown = np.isnan(np.asarray(task.posture(np.zeros(task.observation_size))))
-    positions = task.compile().nq
+    positions = task.model.nq
     return positions + np.flatnonzero(unknown[positions:])
 
 
 def unseen_positions(task: Task) -> tuple[str, ...]:
-    """Joints of which an observation does not show every coordinate, so that their velocity is not in its changes."""
+    """Joints whose position an observation does not show completely, so that differences do not give their velocity."""
     if task.posture is None:
         return ()
-    model = task.compile()
+    model = task.model
     blind = np.isnan(np.asarray(task.posture(np.zeros((1, task.observation_size)))))[0, : model.nq]
     if task.sense is None:
         state = np.concatenate([model.qpos0, np.zeros(model.nv)])
@@ -75,5 +75,5 @@ def refuse_unseen_positions(task: Task) -> None:
     if joints:
         raise MadocError(
             f"an observation of {task.name} does not show the position of {', '.join(joints)}, so its velocity cannot "
-            "be had from positions; take least-squares, which estimates it, or madoc with starts=policy"
+            "be computed from positions; use least-squares, which estimates it, or madoc with starts=policy"
         )

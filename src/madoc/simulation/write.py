@@ -1,25 +1,25 @@
 """Parameters into a MuJoCo model: elements found by name, values written, derived constants recomputed."""
 
 from collections.abc import Callable, Sequence
-from difflib import get_close_matches
 
 import mujoco
 import numpy as np
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter
 
 MASS_FLOOR = 1e-3
-"""kg. A massless body explodes, and the paper's ranges start at 0."""
+"""Smallest mass of a body in kg; smaller values are raised to it, as the motion of a massless body diverges."""
 
 INERTIA_FLOOR = 1e-9
-"""kg·m². A body without inertia explodes."""
+"""Smallest moment of inertia of a body in kg·m²; smaller values are raised to it for the same reason."""
 
 _OBJECTS = {
     "body": mujoco.mjtObj.mjOBJ_BODY,
     "joint": mujoco.mjtObj.mjOBJ_JOINT,
     "geom": mujoco.mjtObj.mjOBJ_GEOM,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
 }
 
 _INERTIAL_FRAMES = (mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA, mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT)
@@ -28,7 +28,7 @@ _INERTIAL_FRAMES = (mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA, mujoco.mjtSameFrame
 def write_parameters(
     model: mujoco.MjModel, data: mujoco.MjData, parameters: Sequence[Parameter], values: np.ndarray
 ) -> None:
-    """Write physical values (d,) into a model in place, then recompute what depends on them (`mj_setConst`).
+    """Write physical values (d,) into a model in place, then recompute the constants derived from them (`mj_setConst`).
 
     Raises:
         MadocError: A parameter names an element that the model does not have, or scales a mass of 0.
@@ -36,19 +36,28 @@ def write_parameters(
     for parameter, value in zip(parameters, values, strict=True):
         if FIELDS[parameter.field].in_model:
             for element in find_elements(model, parameter):
-                _WRITERS[parameter.field](model, element, float(value))
+                _write(model, parameter.field, element, float(value))
     mujoco.mj_setConst(model, data)
 
 
 def nominal_values(model: mujoco.MjModel, parameter: Parameter) -> tuple[float, ...]:
-    """What a model has where a parameter would be written, one value an element; 0 for a delay and for biases.
+    """The values in a model that a parameter would replace, one for each element; 0 for a delay and for biases.
 
     Raises:
         MadocError: The model has no such element.
     """
     if not FIELDS[parameter.field].in_model:
         return tuple(0.0 for _ in parameter.elements or (0,))
-    return tuple(float(_READERS[parameter.field](model, element)) for element in find_elements(model, parameter))
+    return tuple(
+        float(_NUMBERS[parameter.field](model, element).flat[0]) for element in find_elements(model, parameter)
+    )
+
+
+def _write(model: mujoco.MjModel, field: str, element: int, value: float) -> None:
+    if field in _WRITERS:
+        _WRITERS[field](model, element, value)
+    else:
+        _NUMBERS[field](model, element)[:] = max(value, MASS_FLOOR) if field == "body_mass" else value
 
 
 def find_elements(model: mujoco.MjModel, parameter: Parameter) -> list[int]:
@@ -71,24 +80,16 @@ def _find_element(model: mujoco.MjModel, parameter_name: str, kind: str, element
         joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, element)
         index = int(model.jnt_bodyid[joint]) if joint >= 0 else -1
     if index < 0:
-        names = element_names(model, kind)
-        near = nearest_names(element, names) or names[:8]
-        listed = f"nearest: {', '.join(near)}" if near else f"it names no {kind}"
-        raise MadocError(f"{parameter_name}: the model has no {kind} {element!r}; {listed}")
+        hint = nearest_hint(element, element_names(model, kind), none=f"it names no {kind}")
+        raise MadocError(f"{parameter_name}: the model has no {kind} {element!r}; {hint}")
     return index
 
 
 def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Names of all elements of a kind (`body`, `joint`, `geom`, `actuator`)."""
-    count = {"body": model.nbody, "joint": model.njnt, "geom": model.ngeom, "actuator": model.nu}[kind]
-    names = (mujoco.mj_id2name(model, _OBJECTS[kind], index) for index in range(count))
+    """Names of the elements of a kind (`body`, `joint`, `geom`, `actuator`, `sensor`) that have one."""
+    count = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "actuator": "nu", "sensor": "nsensor"}[kind]
+    names = (mujoco.mj_id2name(model, _OBJECTS[kind], index) for index in range(getattr(model, count)))
     return [name for name in names if name]
-
-
-def nearest_names(wanted: str, names: list[str]) -> list[str]:
-    """At most three: names that hold the wanted one first, then those spelled like it."""
-    close = get_close_matches(wanted, names, n=3, cutoff=0.4)
-    return list(dict.fromkeys([*(name for name in names if wanted in name), *close]))[:3]
 
 
 def _dofs(model: mujoco.MjModel, joint: int) -> slice:
@@ -96,36 +97,29 @@ def _dofs(model: mujoco.MjModel, joint: int) -> slice:
     return slice(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + len(model.joint(joint).damping))
 
 
-def _gravity(model: mujoco.MjModel, _: int, value: float) -> None:
-    model.opt.gravity[2] = value
-
-
-def _body_mass(model: mujoco.MjModel, body: int, value: float) -> None:
-    model.body_mass[body] = max(value, MASS_FLOOR)
-
-
-def _body_mass_and_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
+def _write_mass_and_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
     mass = max(value, MASS_FLOOR)
     if model.body_mass[body] == 0.0:
-        name = _name(model, body)
+        name = model.body(body).name
         raise MadocError(f"body_mass_and_inertia: body {name!r} has no mass to scale; use body_mass instead")
     model.body_inertia[body] *= mass / model.body_mass[body]
     model.body_mass[body] = mass
 
 
-def _body_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
+def _write_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
     largest = model.body_inertia[body].max()
     if largest == 0.0:
-        raise MadocError(f"body_inertia: body {_name(model, body)!r} has no inertia to scale; give it one in the model")
+        name = model.body(body).name
+        raise MadocError(f"body_inertia: body {name!r} has no inertia to scale; give it one in the model")
     model.body_inertia[body] *= max(value, INERTIA_FLOOR) / largest
 
 
-def _body_com(model: mujoco.MjModel, body: int, value: float) -> None:
+def _write_centre_of_mass(model: mujoco.MjModel, body: int, value: float) -> None:
     distance = np.linalg.norm(model.body_ipos[body])
     if distance == 0.0:
         raise MadocError(
-            f"body_com: the centre of mass of body {_name(model, body)!r} is at its origin, so it has no direction to "
-            "move in; place it in the model"
+            f"body_com: the centre of mass of body {model.body(body).name!r} is at its origin, so it has no direction "
+            "to move in; place it in the model"
         )
     before = model.body_ipos[body].copy()
     model.body_ipos[body] *= value / distance
@@ -145,32 +139,8 @@ def _keep_shapes(model: mujoco.MjModel, body: int, moved: np.ndarray) -> None:
         model.bvh_aabb[first : first + count, :3] -= turned
 
 
-def _name(model: mujoco.MjModel, body: int) -> str:
-    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or ""
-
-
-def _dof_damping(model: mujoco.MjModel, joint: int, value: float) -> None:
-    model.dof_damping[_dofs(model, joint)] = value
-
-
-def _dof_armature(model: mujoco.MjModel, joint: int, value: float) -> None:
-    model.dof_armature[_dofs(model, joint)] = value
-
-
-def _dof_frictionloss(model: mujoco.MjModel, joint: int, value: float) -> None:
-    model.dof_frictionloss[_dofs(model, joint)] = value
-
-
-def _jnt_stiffness(model: mujoco.MjModel, joint: int, value: float) -> None:
-    model.jnt_stiffness[joint] = value
-
-
-def _geom_friction(model: mujoco.MjModel, geom: int, value: float) -> None:
-    model.geom_friction[geom, 0] = value
-
-
-def _actuator_gain(model: mujoco.MjModel, actuator: int, value: float) -> None:
-    """A servo pulls with gain · (target - what it has): the gain is in its bias as well, with the other sign."""
+def _write_gain(model: mujoco.MjModel, actuator: int, value: float) -> None:
+    """A servo pulls with gain · (target - position or velocity): the gain is in its bias too, with the other sign."""
     gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
     for term in (1, 2):  # of the position, of the velocity
         if gain != 0.0 and bias[term] == -gain and not bias[1:term].any():
@@ -179,34 +149,26 @@ def _actuator_gain(model: mujoco.MjModel, actuator: int, value: float) -> None:
     model.actuator_gainprm[actuator, 0] = value
 
 
-def _first_dof(model: mujoco.MjModel, joint: int) -> int:
-    return int(model.jnt_dofadr[joint])
-
+_NUMBERS: dict[str, Callable[[mujoco.MjModel, int], np.ndarray]] = {
+    "gravity": lambda model, _: model.opt.gravity[2:],
+    "body_mass": lambda model, body: model.body_mass[body : body + 1],
+    "body_mass_and_inertia": lambda model, body: model.body_mass[body : body + 1],
+    "body_inertia": lambda model, body: model.body_inertia[body].max(keepdims=True),
+    "body_com": lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]),
+    "dof_damping": lambda model, joint: model.dof_damping[_dofs(model, joint)],
+    "dof_armature": lambda model, joint: model.dof_armature[_dofs(model, joint)],
+    "dof_frictionloss": lambda model, joint: model.dof_frictionloss[_dofs(model, joint)],
+    "jnt_stiffness": lambda model, joint: model.jnt_stiffness[joint : joint + 1],
+    "geom_friction": lambda model, geom: model.geom_friction[geom, :1],
+    "actuator_gain": lambda model, actuator: model.actuator_gainprm[actuator, :1],
+}
+"""The numbers of an element that a field stands for, the first of which is its value. A field without a writer of its
+own is written into all of them."""
 
 _WRITERS: dict[str, Callable[[mujoco.MjModel, int, float], None]] = {
-    "gravity": _gravity,
-    "body_mass": _body_mass,
-    "body_mass_and_inertia": _body_mass_and_inertia,
-    "body_inertia": _body_inertia,
-    "body_com": _body_com,
-    "dof_damping": _dof_damping,
-    "dof_armature": _dof_armature,
-    "dof_frictionloss": _dof_frictionloss,
-    "jnt_stiffness": _jnt_stiffness,
-    "geom_friction": _geom_friction,
-    "actuator_gain": _actuator_gain,
+    "body_mass_and_inertia": _write_mass_and_inertia,
+    "body_inertia": _write_inertia,
+    "body_com": _write_centre_of_mass,
+    "actuator_gain": _write_gain,
 }
-
-_READERS: dict[str, Callable[[mujoco.MjModel, int], float]] = {
-    "gravity": lambda model, _: model.opt.gravity[2],
-    "body_mass": lambda model, body: model.body_mass[body],
-    "body_mass_and_inertia": lambda model, body: model.body_mass[body],
-    "body_inertia": lambda model, body: model.body_inertia[body].max(),
-    "body_com": lambda model, body: float(np.linalg.norm(model.body_ipos[body])),
-    "dof_damping": lambda model, joint: model.dof_damping[_first_dof(model, joint)],
-    "dof_armature": lambda model, joint: model.dof_armature[_first_dof(model, joint)],
-    "dof_frictionloss": lambda model, joint: model.dof_frictionloss[_first_dof(model, joint)],
-    "jnt_stiffness": lambda model, joint: model.jnt_stiffness[joint],
-    "geom_friction": lambda model, geom: model.geom_friction[geom, 0],
-    "actuator_gain": lambda model, actuator: model.actuator_gainprm[actuator, 0],
-}
+"""Fields whose value changes other numbers of the model too."""

@@ -1,6 +1,7 @@
-"""Robots and what is asked of them. One file a robot; `TASKS` finds them by name."""
+"""The robots of the paper, one file each; `TASKS` lists them by name."""
 
 from collections.abc import Callable
+from functools import cache
 
 from madoc.errors import unknown_name
 from madoc.tasks.ant import ant
@@ -17,8 +18,9 @@ TASKS: dict[str, Callable[[str], Task]] = {
 }
 
 
+@cache
 def make(name: str, physics: str = "legacy") -> Task:
-    """A task by name.
+    """The task of a name; the same object each time, so that its model is compiled once.
 
     Raises:
         MadocError: No task has that name, or `physics` is neither `legacy` nor `modern`.

@@ -1,25 +1,31 @@
-"""What a task is: a model, and pure batched functions between state, observation, reward and end."""
+"""A task: a model, and pure batched functions of state, observation, reward and termination."""
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import jax
 import mujoco
 from jaxtyping import PRNGKeyArray
 
 from madoc.errors import MadocError
-from madoc.parameters import Parameter, ParameterSpace
+from madoc.parameters import ParameterSpace
 
 Batch = Any
-"""A NumPy or JAX array with any leading axes; task functions work on both, so every backend shares them."""
+"""A NumPy or JAX array with any leading axes; the functions of a task work on both, so every backend shares them."""
+
+_MODELS: WeakKeyDictionary[Callable[[], mujoco.MjSpec], mujoco.MjModel] = WeakKeyDictionary()
+"""Compiled models by the function that builds their spec; a model is dropped together with its function."""
 
 
-def healthy_reward(state: Batch, action: Batch, next_state: Batch, healthy: Batch, *, dt: float, cost: float) -> Batch:
-    """Speed along the first coordinate (m/s), 1 where healthy, less `cost` times the squared action."""
-    speed = (next_state[..., 0] - state[..., 0]) / dt
-    return speed + healthy - cost * (action**2).sum(-1)
+def compiled_model(spec: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
+    """The model of a spec, compiled once for each function that builds it. It is shared, so nobody may change it."""
+    if spec not in _MODELS:
+        _MODELS[spec] = spec().compile()
+    return _MODELS[spec]
 
 
 def scaled_friction(spec: Callable[[], mujoco.MjSpec], factor: float) -> mujoco.MjSpec:
@@ -30,32 +36,18 @@ def scaled_friction(spec: Callable[[], mujoco.MjSpec], factor: float) -> mujoco.
     return changed
 
 
-Span = tuple[float, float]
-
-
-def paper_space(gravity: Span, masses: dict[str, Span], dampings: dict[str, Span]) -> ParameterSpace:
-    """The paper's kind of box: gravity, masses of bodies (kg), damping of joints (N·m·s/rad), in this order."""
-    return ParameterSpace(
-        (
-            Parameter("gravity", "", *gravity),
-            *(Parameter("body_mass", body, *span) for body, span in masses.items()),
-            *(Parameter("dof_damping", joint, *span) for joint, span in dampings.items()),
-        )
-    )
-
-
 @dataclass(frozen=True)
 class ActionChannel:
-    """One value of an action: which actuator it goes to, and what -1 and 1 mean there.
+    """One value of an action: its actuator, and the values that -1 and 1 stand for.
 
     Attributes:
-        name: What its column is called.
+        name: Name of the value and of its column in a log.
         actuator: Name of the model's actuator.
-        low: What an action of -1 stands for, in `unit`.
-        high: What an action of 1 stands for, in `unit`.
-        unit: Of `low`, `high` and the log's column.
-        scale: The actuator's control is this many times the value in `unit`.
-        rest: The action that is taken to have come before an episode begins.
+        low: The value of an action of -1, in `unit`.
+        high: The value of an action of 1, in `unit`.
+        unit: The unit of `low`, `high` and the log's column.
+        scale: Ratio of the actuator's control to the value in `unit`.
+        rest: The action assumed before an episode begins, in [-1, 1].
     """
 
     name: str
@@ -69,7 +61,7 @@ class ActionChannel:
 
 @dataclass(frozen=True)
 class Task:
-    """A robot and what is asked of it, without any truth about the target.
+    """A robot and its reward, without the true parameters of the target.
 
     The state is (qpos, qvel, pending actions), float64, on the last axis. Functions are pure and batched over leading
     axes.
@@ -80,25 +72,26 @@ class Task:
         spec: Builds the MuJoCo spec, at its nominal parameters.
         frame_skip: Physics steps per control step.
         observation_size: Values per observation.
-        observe: state -> observation, where no sensor needs a system (`System.observe` does it for every robot).
+        observe: state -> observation, for a task without `sense` (`System.observe` works for every task).
         reward: (state, action, next_state) -> reward.
         terminated: next_state -> whether the task has ended there (a fall).
         reset_noise: (key, count) -> offsets (count, state_size) added to the model's initial state.
         parameters: What can be calibrated, with the paper's normal ranges.
         ranges: Other boxes by level (`easy`, `normal`, `hard`).
-        groups: How many groups the paper forms for this robot.
+        groups: Number of parameter groups that Madoc forms.
         max_episode_steps: Time limit in control steps; reaching it truncates.
         reference_returns: Returns of (random, expert) for the normalized score, from D4RL.
         state_from_observation: observation -> (qpos, qvel); None where the observation does not determine them.
         rebuildable: observation -> whether `state_from_observation` is exact for that row.
-        velocities: How many values at the end of an observation are velocities; 0 where they cannot be told apart.
-        pending: How many past actions a state carries behind (qpos, qvel), newest first, each in [-1, 1].
-        actions: What the values of an action mean; empty where they are the model's controls as they are.
+        velocities: Number of velocities at the end of an observation; 0 where they are not there in one block.
+        pending: Number of past actions in a state behind (qpos, qvel), newest first, each in [-1, 1].
+        actions: The channels of an action; empty where its values are the model's controls.
         signals: Names of the observation's values; empty where they have none.
         sense: (state, sensordata) -> observation, where it reads the model's sensors.
-        rewarded: Whether `reward` says anything; without it nothing can be learnt or judged.
-        source: What makes this task again (`robots.restore`), as JSON; None where its name does.
-        posture: observation -> (qpos, qvel) as far as it tells, NaN elsewhere; None where it tells no position.
+        rewarded: Whether the task has a reward; without one no policy can be learnt or evaluated.
+        source: The files of a robot's spec as JSON, from which `robots.restore` makes the task again; None for a task
+            that its name determines.
+        posture: observation -> (qpos, qvel), NaN for values not determined; None where no position is determined.
     """
 
     name: str
@@ -123,17 +116,22 @@ class Task:
     signals: tuple[str, ...] = ()
     sense: Callable[[Batch, Batch], Batch] | None = None
     rewarded: bool = True
-    source: Mapping[str, Any] | None = None
+    source: Mapping[str, object] | None = None
     posture: Callable[[Batch], Batch] | None = None
 
     @property
     def action_size(self) -> int:
         """Values per action."""
-        return len(self.actions) or int(self.compile().nu)
+        return len(self.actions) or int(self.model.nu)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model at nominal parameters, compiled once and shared: read it, and `compile` one to change."""
+        return compiled_model(self.spec)
 
     def compile(self) -> mujoco.MjModel:
-        """A fresh model at nominal parameters."""
-        return self.spec().compile()
+        """A copy of the model at nominal parameters, free to be changed."""
+        return copy.copy(self.model)
 
     def with_level(self, level: str) -> "Task":
         """The same task searched in its `easy`, `normal` or `hard` ranges (the paper's appendix D).

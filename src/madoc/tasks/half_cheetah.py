@@ -2,22 +2,8 @@
 
 from functools import partial
 
-import jax
-from jaxtyping import PRNGKeyArray
-
-from madoc.tasks.base import Batch, Task, paper_space
-from madoc.tasks.physics import load_robot
-from madoc.tasks.planar import (
-    always_rebuildable,
-    observe_without_x,
-    planar_state_from_observation,
-    uniform_and_normal_noise,
-)
-
-CONTROL_STEP = 0.05
-TOTAL_MASS = 14.0
-BODIES = ("torso", "bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
-JOINTS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
+from madoc.tasks.base import Batch, Task
+from madoc.tasks.walking import forward_reward, uniform_and_normal_noise, walking_task
 
 # Table 6, Jiang et al. 2024: gravity, masses 1-7, damping 3-8.
 RANGES = {
@@ -33,42 +19,27 @@ RANGES = {
 
 def half_cheetah(physics: str = "legacy") -> Task:
     """The HalfCheetah of D4RL and Gymnasium: 17 observations, 6 motors, 14 parameters."""
-    spaces = {
-        level: paper_space(gravity, dict(zip(BODIES, masses, strict=True)), dict(zip(JOINTS, dampings, strict=True)))
-        for level, (gravity, masses, dampings) in RANGES.items()
-    }
-    return Task(
-        name="halfcheetah",
-        physics=physics,
-        spec=partial(load_robot, "half_cheetah.xml", physics, TOTAL_MASS),
-        frame_skip=5,
-        observation_size=17,
-        observe=observe_without_x,
-        reward=reward,
-        terminated=terminated,
-        reset_noise=reset_noise,
-        parameters=spaces["normal"],
-        ranges=spaces,
-        groups=6,
-        max_episode_steps=1000,
-        reference_returns=(-280.178953, 12135.0),
-        state_from_observation=planar_state_from_observation,
-        rebuildable=always_rebuildable,
+    return walking_task(
+        "halfcheetah",
+        "half_cheetah.xml",
+        physics,
+        bodies=("torso", "bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"),
+        joints=("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"),
+        ranges=RANGES,
+        positions=9,
         velocities=9,
+        root=1,
+        clipped=False,
+        frame_skip=5,
+        reward=partial(forward_reward, dt=0.05, cost=0.1),
+        terminated=never_terminated,
+        reset_noise=partial(uniform_and_normal_noise, positions=9, velocities=9, scale=0.1),
+        groups=6,
+        reference_returns=(-280.178953, 12135.0),
+        total_mass=14.0,
     )
 
 
-def reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
-    """Forward speed (m/s) less 0.1 of the squared action (Gymnasium v5)."""
-    speed = (next_state[..., 0] - state[..., 0]) / CONTROL_STEP
-    return speed - 0.1 * (action**2).sum(-1)
-
-
-def terminated(next_state: Batch) -> Batch:
-    """Never."""
+def never_terminated(next_state: Batch) -> Batch:
+    """False for every row."""
     return next_state[..., 0] != next_state[..., 0]
-
-
-def reset_noise(key: PRNGKeyArray, count: int) -> jax.Array:
-    """Uniform ±0.1 on positions, normal with deviation 0.1 on velocities."""
-    return uniform_and_normal_noise(key, count, positions=9, velocities=9, scale=0.1)

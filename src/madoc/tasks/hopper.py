@@ -2,63 +2,44 @@
 
 from functools import partial
 
-import jax
-from jaxtyping import PRNGKeyArray
+from madoc.tasks.base import Batch, Task
+from madoc.tasks.walking import healthy_reward, uniform_noise, walking_task
 
-from madoc.tasks.base import Batch, Task, healthy_reward, paper_space
-from madoc.tasks.physics import load_robot
-from madoc.tasks.planar import (
-    observe_clipped,
-    observe_is_unclipped,
-    planar_state_from_observation,
-    uniform_noise,
-)
-
-CONTROL_STEP = 0.008
 HEALTHY_STATE = 100.0
+"""Bound of every coordinate but x; the task ends beyond it."""
 HEALTHY_HEIGHT = 0.7
+"""Lowest height of the torso in m; the task ends below it."""
 HEALTHY_ANGLE = 0.2
-BODIES = ("torso", "thigh", "leg", "foot")
-JOINTS = ("thigh_joint", "leg_joint", "foot_joint")
+"""Largest tilt of the torso in rad; the task ends beyond it."""
 
 # Table 7, Jiang et al. 2024: gravity, masses 1-4, damping 3-5.
 RANGES = {
-    "easy": ((-15, -5), ((3, 4), (3.5, 4.5), (2, 3), (4.5, 5.5)), (0, 2)),
-    "normal": ((-30, 0), ((3, 5), (3, 5), (2, 4), (4, 6)), (0, 3)),
-    "hard": ((-50, 0), ((2, 6), (2, 6), (1, 5), (3, 7)), (0, 4)),
+    "easy": ((-15, -5), ((3, 4), (3.5, 4.5), (2, 3), (4.5, 5.5)), 3 * ((0, 2),)),
+    "normal": ((-30, 0), ((3, 5), (3, 5), (2, 4), (4, 6)), 3 * ((0, 3),)),
+    "hard": ((-50, 0), ((2, 6), (2, 6), (1, 5), (3, 7)), 3 * ((0, 4),)),
 }
 
 
 def hopper(physics: str = "legacy") -> Task:
-    """The Hopper of D4RL and Gymnasium: 11 observations, 3 motors, 8 parameters."""
-    spaces = {
-        level: paper_space(gravity, dict(zip(BODIES, masses, strict=True)), dict.fromkeys(JOINTS, damping))
-        for level, (gravity, masses, damping) in RANGES.items()
-    }
-    return Task(
-        name="hopper",
-        physics=physics,
-        spec=partial(load_robot, "hopper.xml", physics),
-        frame_skip=4,
-        observation_size=11,
-        observe=observe_clipped,
-        reward=reward,
-        terminated=terminated,
-        reset_noise=reset_noise,
-        parameters=spaces["normal"],
-        ranges=spaces,
-        groups=4,
-        max_episode_steps=1000,
-        reference_returns=(-20.272305, 3234.3),
-        state_from_observation=planar_state_from_observation,
-        rebuildable=partial(observe_is_unclipped, positions=5),
+    """The Hopper of D4RL and Gymnasium v5: 11 observations, 3 motors, 8 parameters."""
+    return walking_task(
+        "hopper",
+        "hopper.xml",
+        physics,
+        bodies=("torso", "thigh", "leg", "foot"),
+        joints=("thigh_joint", "leg_joint", "foot_joint"),
+        ranges=RANGES,
+        positions=6,
         velocities=6,
+        root=1,
+        clipped=True,
+        frame_skip=4,
+        reward=partial(healthy_reward, terminated=terminated, dt=0.008, cost=1e-3),
+        terminated=terminated,
+        reset_noise=partial(uniform_noise, size=12, scale=5e-3),
+        groups=4,
+        reference_returns=(-20.272305, 3234.3),
     )
-
-
-def reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
-    """Forward speed (m/s), 1 for being healthy, less 0.001 of the squared action (Gymnasium v5)."""
-    return healthy_reward(state, action, next_state, ~terminated(next_state), dt=CONTROL_STEP, cost=1e-3)
 
 
 def terminated(next_state: Batch) -> Batch:
@@ -66,8 +47,3 @@ def terminated(next_state: Batch) -> Batch:
     height, angle = next_state[..., 1], next_state[..., 2]
     within = (abs(next_state[..., 2:]) < HEALTHY_STATE).all(-1)
     return ~(within & (height > HEALTHY_HEIGHT) & (abs(angle) < HEALTHY_ANGLE))
-
-
-def reset_noise(key: PRNGKeyArray, count: int) -> jax.Array:
-    """Uniform ±0.005 on positions and velocities."""
-    return uniform_noise(key, count, size=12, scale=5e-3)

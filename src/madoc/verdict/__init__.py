@@ -1,7 +1,20 @@
 """Is an estimate to be trusted: judged on rows that no method has seen, without any truth."""
 
+from madoc.calibration.holdout import Fitted, HoldOut, Predicted, ToldApart, Verdict, Word
 from madoc.verdict.assessment import Assessment, assess
 from madoc.verdict.bench import Bench
-from madoc.verdict.judge import WORDS, Verdict, judge
+from madoc.verdict.judge import WORDS, judge
 
-__all__ = ["WORDS", "Assessment", "Bench", "Verdict", "assess", "judge"]
+__all__ = [
+    "WORDS",
+    "Assessment",
+    "Bench",
+    "Fitted",
+    "HoldOut",
+    "Predicted",
+    "ToldApart",
+    "Verdict",
+    "Word",
+    "assess",
+    "judge",
+]

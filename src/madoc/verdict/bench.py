@@ -1,135 +1,206 @@
-"""What estimates of one problem are judged on: a log in two parts, and ways to replay what is held out."""
+"""What estimates of one problem are judged on: rows calibrated to, rows held out, and ways to replay the latter."""
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypedDict
 
 import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from sklearn.neighbors import NearestNeighbors
 
-from madoc.calibration.base import CalibrationProblem
-from madoc.data.split import Split
-from madoc.identification import noise as sensors
+from madoc.calibration import CalibrationProblem
+from madoc.calibration.holdout import AgainstChance, Area
+from madoc.data import Dataset
+from madoc.diagnosis.channels import signal_names
+from madoc.errors import MadocError
+from madoc.identification.excitation import expected_half_widths
+from madoc.identification.noise import difference_noise
 from madoc.identification.states import logged_states
 from madoc.identification.windows import consecutive_rows, evenly
 from madoc.learning.dynamics_ratio import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
-from madoc.tasks import Task
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
-from madoc.verdict.statistics import better_than_chance
-from madoc.verdict.two_sample import Told, WindowView, behaviour, rolled, tell_apart
+from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance, shares_of_ranges
+from madoc.verdict.two_sample import WindowView, behaviour, rolled, tell_apart
 
+FEWEST_HELD = 10
+"""Smallest number of rows held out, at least 1. With fewer, even perfect predictions could be chance."""
 _NEIGHBOURS = 5000
-"""Kept rows among which the nearest is looked for."""
+"""Largest number of training rows among which the nearest neighbour of a held-out row is looked for."""
 _LONGEST_ROLLOUT = 1000
+"""Largest length of a rollout in control steps; longer episodes of the log are not imitated to their end."""
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What estimates of one problem are judged on; what they share is worked out once.
+    """What estimates of one problem are judged on. What they share is computed once, when it is first needed.
 
     Attributes:
-        split: The log, in what methods see and what is held out.
-        simulator: The robot.
-        key: Randomness of the clone and of its rollouts.
+        problem: What methods are given: the rows to calibrate to, and the simulator.
+        held_out: Rows that no method has seen.
+        key: Randomness of the cloned policy and of its rollouts.
+        split: How the rows were held out, in a sentence.
+
+    Raises:
+        MadocError: Too few rows are held out, or they are not of the simulator's robot.
     """
 
-    split: Split
-    simulator: Simulator
+    problem: CalibrationProblem
+    held_out: Dataset
     key: PRNGKeyArray
+    split: str = ""
 
-    @cached_property
-    def problem(self) -> CalibrationProblem:
-        """What methods are given."""
-        return CalibrationProblem(self.split.kept, self.simulator)
+    def __post_init__(self) -> None:
+        if len(self.held_out) < FEWEST_HELD:
+            raise MadocError(
+                f"expected at least {FEWEST_HELD} rows held out to judge a result by, got {len(self.held_out)} beside "
+                f"{len(self.problem.dataset)}; log more, or hold out a larger share"
+            )
+        object.__setattr__(self, "held_out", CalibrationProblem(self.held_out, self.simulator).dataset)
 
-    @cached_property
+    @property
+    def simulator(self) -> Simulator:
+        """The robot, with the ranges of its parameters."""
+        return self.problem.simulator
+
+    @property
     def scaling(self) -> Scaling:
-        """Of the rows kept."""
-        return self.problem.scalings["standardised"]
+        """Scaling of observations and actions by the rows calibrated to."""
+        return self.problem.features.standardised
 
     @property
-    def measure(self) -> str:
-        """`prediction` where windows can be replayed, else `two-sample`."""
-        return "prediction" if self.rebuilds or self.fitted is not None else "two-sample"
+    def change(self) -> Float[np.ndarray, " observation"]:
+        """Typical change of each signal in one step, of the rows calibrated to: the unit of residuals."""
+        return self.problem.typical_change
 
     @property
-    def rebuilds(self) -> bool:
-        """Whether an observation tells the state."""
-        return self.simulator.task.state_from_observation is not None
+    def states_known(self) -> bool:
+        """Whether states can be rebuilt from observations."""
+        return self.problem.states.kind == "exact"
 
     @cached_property
     def replays(self) -> Replays:
-        """Windows of the hold-out."""
-        return replays_of(self.split.held, self.simulator, self.scaling.next_scale)
+        """Windows of the hold-out to replay from logged states, where those are known."""
+        return replays_of(self.held_out, self.simulator, self.change)
 
     @cached_property
     def fitted(self) -> FittedReplays | None:
-        """Windows of the hold-out whose starts are to be fitted: where velocities are hidden, and no more than that."""
-        if self.rebuilds or not self.problem.states.starts_known or self.split.held.disturbance.shuffled != "none":
+        """Windows of the hold-out whose starting states are to be fitted; None where they cannot be."""
+        if self.problem.states.kind != "approximate" or self.held_out.disturbance.shuffled != "none":
             return None
-        return fitted_replays_of(self.split.held, self.simulator, self.scaling.next_scale)
+        return fitted_replays_of(self.held_out, self.simulator, self.change)
 
     @cached_property
     def clone(self) -> TanhGaussianPolicy:
-        """Who acted, to act in the simulator where states cannot be rebuilt."""
-        return behaviour(self.split.kept, self.key)
+        """A clone of the policy that acted in the log, for rollouts where states cannot be rebuilt."""
+        return behaviour(self.problem.dataset, self.key)
 
     @cached_property
     def view(self) -> WindowView:
-        """How rows are shown to the classifier where states cannot be rebuilt."""
-        return WindowView.of(self.split.kept, self.scaling)
+        """The features of rows that the classifier gets where states cannot be rebuilt."""
+        return WindowView.of(self.problem.dataset, self.scaling)
 
     @cached_property
-    def middle_apart(self) -> Told:
-        """How well rows of mid-range are told from those held out, where states cannot be rebuilt."""
-        return self.rolled_apart(np.zeros(len(self.simulator.parameters)))
+    def mid_range_apart(self) -> Area:
+        """How well a classifier tells rollouts at mid-range from the hold-out, where states cannot be rebuilt."""
+        return self.rollouts_apart(np.zeros(len(self.simulator.parameters)))
 
     @cached_property
     def judged_rows(self) -> Int[np.ndarray, " rows"]:
-        """Rows of the hold-out at which single steps are looked at: in pairs that follow each other, if there are."""
-        held = self.split.held
-        if not self.rebuilds:
+        """Rows of the hold-out whose single steps are judged: pairs of consecutive rows, if there are any."""
+        held = self.held_out
+        if not self.states_known:
             return evenly(np.arange(len(held)), MOST_WINDOWS)
         rows = logged_states(held, self.simulator.task)[1]
         pairs = evenly(rows[consecutive_rows(held, rows)], MOST_WINDOWS)
         return np.unique(np.concatenate([pairs, pairs + 1])) if len(pairs) else evenly(rows, MOST_WINDOWS)
 
     @cached_property
-    def model_free(self) -> dict[str, dict[str, float]]:
-        """Whether rows follow from each other at all: by staying where they are, or by doing as a row nearby did."""
-        held, kept = self.split.held.transitions, self.split.kept.transitions
-        rows, near = self.judged_rows, evenly(np.arange(len(self.split.kept)), _NEIGHBOURS)
-        wanted, known = self.scaling.features(held.take(rows))[0], self.scaling.features(kept.take(near))[0]
-        nearest = NearestNeighbors(n_neighbors=1).fit(known).kneighbors(wanted, return_distance=False)[:, 0]
-        guesses = {
-            "staying in place": np.asarray(held.observation)[rows],
-            "the nearest row": np.asarray(kept.next_observation)[near[nearest]],
-        }
-        return {name: self.follows(guess) for name, guess in guesses.items()}
+    def model_free(self) -> tuple[AgainstChance, ...]:
+        """Predictions of next observations without a model: the present observation, or the next of a row nearby."""
+        held, kept = self.held_out.transitions, self.problem.dataset.transitions
+        rows, near = self.judged_rows, evenly(np.arange(len(kept)), _NEIGHBOURS)
+        wanted, candidates = self.scaling.features(held.take(rows))[0], self.scaling.features(kept.take(near))[0]
+        nearest = NearestNeighbors(n_neighbors=1).fit(candidates).kneighbors(wanted, return_distance=False)[:, 0]
+        return (
+            self.against_chance("staying in place", np.asarray(held.observation)[rows]),
+            self.against_chance("the nearest row", np.asarray(kept.next_observation)[near[nearest]]),
+        )
 
-    def follows(self, guess: Float[np.ndarray, "rows observation"]) -> dict[str, float]:
-        """How far predictions of the judged rows are from chance."""
-        held, rows = self.split.held, self.judged_rows
-        spread = self.scaling.pair_scale[: guess.shape[1]]
-        here = np.asarray(held.transitions.observation)[rows]
-        guess = np.where(np.isfinite(guess), guess, here)
-        followed = np.asarray(held.transitions.next_observation)[rows]
-        episodes = held.episode_of(rows)
-        return better_than_chance(guess / spread, followed / spread, episodes)
+    def against_chance(self, prediction: str, predicted: Float[np.ndarray, "rows observation"]) -> AgainstChance:
+        """Compare predicted next observations of the judged rows with random pairings of the same rows."""
+        held, rows = self.held_out.transitions, self.judged_rows
+        spread = self.scaling.pair_scale[: predicted.shape[1]]
+        predicted = np.where(np.isfinite(predicted), predicted, np.asarray(held.observation)[rows])
+        followed, episodes = np.asarray(held.next_observation)[rows], self.held_out.episode_of(rows)
+        return AgainstChance(prediction, *better_than_chance(predicted / spread, followed / spread, episodes))
 
-    def rolled_apart(self, unit: Float[np.ndarray, " d"]) -> Told:
-        """The two-sample test of rollouts under the clone, whose sensors are as noisy as those of the log."""
-        parameters, held = self.simulator.parameters.to_physical(unit), self.split.held
+    def rollouts_apart(self, unit: Float[np.ndarray, " d"]) -> Area:
+        """How well a classifier tells rollouts of the cloned policy, with noise on the sensors, from the hold-out."""
+        held = self.held_out
         length = int(np.clip(np.median(held.episode_ends - held.episode_starts), 2, _LONGEST_ROLLOUT))
-        noise, key = sensors.difference_noise(self.split.kept), jax.random.fold_in(self.key, 1)
-        simulated = rolled(self.clone, self.simulator, parameters, length=length, key=key, noise=noise)
+        simulated = rolled(
+            self.clone,
+            self.simulator,
+            self.simulator.parameters.to_physical(unit),
+            length=length,
+            key=jax.random.fold_in(self.key, 1),
+            noise=difference_noise(self.problem.dataset),
+        )
         return tell_apart(self.view.sample(held), self.view.sample(simulated), overlap=True)
 
 
-def signal_names(task: Task) -> tuple[str, ...]:
-    """Names of the values of an observation."""
-    return task.signals or tuple(f"observation[{index}]" for index in range(task.observation_size))
+class CommonFields(TypedDict):
+    """What the records of all measures hold; see `madoc.calibration.holdout.Judged`."""
+
+    split: str
+    rows: int
+    episodes: int
+    estimate: dict[str, float]
+    interval_shares: dict[str, float]
+    against_chance: tuple[AgainstChance, ...]
+    noise: dict[str, float]
+    control_steps: int
+
+
+def common_fields(
+    bench: Bench,
+    unit: Float[np.ndarray, " d"],
+    interval: Float[np.ndarray, "d 2"] | None,
+    *,
+    at: Float[np.ndarray, " d"],
+    residual: Float[np.ndarray, " channels"],
+    by_model: tuple[AgainstChance, ...],
+    noise: Float[np.ndarray, " channels"],
+    control_steps: int,
+) -> CommonFields:
+    """What every measure says of an estimate.
+
+    Args:
+        bench: The hold-out.
+        unit: The estimate in [-1, 1].
+        interval: Its 95 % intervals in physical units, if known.
+        at: Parameters in [-1, 1] at which the best possible intervals are computed.
+        residual: Standard deviation of what those intervals take for noise, in typical changes of a step.
+        by_model: Simulated next observations against chance.
+        noise: Standard deviation of the sensors' noise, in typical changes of a step.
+        control_steps: Simulated so far.
+    """
+    space, problem = bench.simulator.parameters, bench.problem
+    residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
+    half, spent = expected_half_widths(problem.states, problem.dataset, problem.simulator, at, residual)
+    shares = shares_of_ranges(half, interval, space.high - space.low)
+    signals = signal_names(bench.simulator.task)[: len(noise)]
+    return CommonFields(
+        split=bench.split,
+        rows=len(bench.held_out),
+        episodes=len(bench.held_out.episode_starts),
+        estimate=dict(zip(space.names, unit.tolist(), strict=True)),
+        interval_shares=dict(zip(space.names, shares.tolist(), strict=True)),
+        against_chance=(*by_model, *bench.model_free),
+        noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
+        control_steps=control_steps + spent,
+    )

@@ -17,7 +17,7 @@ from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.states import states_of
 from madoc.identification.windows import evenly, rows_that_fit
 from madoc.simulation.base import Simulator
-from madoc.verdict.prediction import FEWEST_WINDOWS, WORST
+from madoc.verdict.prediction import FEWEST_WINDOWS, magnitudes
 
 FITTED = 10
 """Control steps at the beginning of a window whose observations determine its start."""
@@ -84,9 +84,7 @@ class FittedReplays:
         self, residuals: Float[np.ndarray, "systems windows readings channels"]
     ) -> Float[np.ndarray, "windows systems horizons channels"]:
         """|residual| at the horizons, windows first; a failed window counts as the worst that did not fail."""
-        size = np.abs(residuals[:, :, FITTED + np.array(self.horizons)])
-        worst = np.maximum(np.nanmax(np.where(np.isfinite(size), size, 0.0), axis=(0, 1)), WORST)
-        return np.moveaxis(np.where(np.isfinite(size), size, worst), 0, 1)
+        return magnitudes(residuals[:, :, FITTED + np.array(self.horizons)])
 
     def deviation(self, residuals: Float[np.ndarray, "windows readings channels"]) -> Float[np.ndarray, " channels"]:
         """Noise of each channel, in typical changes of a step, from the residuals of the fitted stretch."""

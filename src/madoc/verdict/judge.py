@@ -1,13 +1,21 @@
-"""The verdict: one word and one sentence with its numbers, from what the hold-out says."""
+"""The verdict: one word, and a sentence with the numbers behind it."""
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from madoc.verdict.assessment import NEGLIGIBLE, Assessment
-
-Word = Literal["CALIBRATED", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
+from madoc.calibration.holdout import (
+    Area,
+    Fitted,
+    HoldOut,
+    Predicted,
+    PredictionError,
+    PredictionErrors,
+    ToldApart,
+    Verdict,
+    Word,
+)
+from madoc.verdict.statistics import NEGLIGIBLE
 
 WORDS: dict[Word, str] = {
     "CALIBRATED": "the hold-out is predicted better than by mid-range, about as well as parameters can",
@@ -18,190 +26,205 @@ WORDS: dict[Word, str] = {
 }
 
 CHANCE = 0.01
-"""Of all ways to predict together: how often rows paired at random may do as well."""
+"""Probability in [0, 1] that some prediction is as good by chance; above it the data is rejected."""
 SKILL = 0.1
-"""A median error smaller by less than a tenth than at random is nothing to calibrate to, however sure it is."""
+"""Skill of the best prediction, at most 1; below it there is nothing to calibrate to, however certain it is."""
 ABOVE_NOISE = 2.0
-"""Times the error that noise alone leaves. The noise is known to about ±50 % from a few hundred rows."""
+"""Ratio of an error to that of noise alone, at least 1; above it noise does not explain the error. The noise is known
+to about ±50 % from a few hundred rows."""
 EXPLAINED = 0.1
-"""Share of squared residuals said by state and action on unseen rows; noise alone gives at most a few percent."""
+"""Share in [0, 1] of squared residuals that state and action explain on unseen rows; above it residuals are
+systematic. Noise alone gives at most a few percent."""
 WHITE = 0.2
-"""Autocorrelation past which residuals are not white: four deviations of that of 400 independent rows."""
+"""Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
 AT_END = 0.98
-"""In [-1, 1], past which a parameter is pinned at the end of its range."""
-UNTOLD = 0.5
-"""A 95 % interval over half of the range or more has told little: the range alone had said it to ±½."""
+"""Position in [-1, 1] of its range; past it, to either side, a parameter counts as pinned to the end."""
+OPEN = 0.5
+"""Share in [0, 1] of its range that a parameter's 95 % interval covers; from it on the parameter counts as open."""
 GAINED = 0.75
-"""Share of what parameters could gain over mid-range on the hold-out that an estimate must have gained."""
+"""Share in [0, 1] of the possible gain over mid-range on the hold-out; with less, an estimate is no improvement."""
 WORTH_GAINING = 0.05
-"""Where parameters could make mid-range's error smaller by less than this share, mid-range is as good."""
+"""Share in [0, 1] of mid-range's error that parameters can remove; below it mid-range is as good."""
 TOLD_APART = 0.65
-"""Area under the curve past which a classifier tells log and simulator apart. A clone's rollouts come to about 0.55
-in the true simulator."""
+"""Area under the curve in [0.5, 1]; above it a classifier tells log and simulator apart. Rollouts of a cloned policy
+come to about 0.55 in the true simulator."""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What to make of an estimate.
-
-    Attributes:
-        word: A key of `WORDS`.
-        sentence: Why, with the numbers.
-        parameters: Which ones are meant, if it is about some.
-    """
-
-    word: Word
-    sentence: str
-    parameters: tuple[str, ...] = ()
-
-    def to_json(self) -> dict[str, Any]:
-        """As JSON."""
-        return asdict(self) | {"parameters": list(self.parameters)}
+def judge(holdout: HoldOut) -> Verdict:
+    """The first verdict that applies: rejected data, a mismatch, open parameters, no improvement; else calibrated."""
+    return (
+        _rejected(holdout)
+        or _mismatch(holdout)
+        or _open(holdout)
+        or _no_improvement(holdout)
+        or Verdict("CALIBRATED", f"{_how_good(holdout)}, and every parameter is known to within half of its range")
+    )
 
 
-def judge(found: Assessment) -> Verdict:
-    """The first that applies: rejected data, a mismatch, open parameters, no improvement; else calibrated."""
-    for doubt in (_rejected, _mismatch, _open, _no_better):
-        verdict = doubt(found)
-        if verdict is not None:
-            return verdict
-    return Verdict("CALIBRATED", f"{_how_good(found)}, and every parameter is told to within half of its range")
+def explains_all(holdout: HoldOut) -> bool:
+    """Whether an estimate leaves no more of the hold-out than noise does, at any horizon."""
+    if isinstance(holdout, ToldApart):
+        return holdout.area_at_estimate.interval[0] <= 0.5
+    return not _beyond_noise(holdout.errors.estimate, holdout.errors.noise)
 
 
-def explains_all(found: Assessment) -> bool:
-    """Whether an estimate leaves of the hold-out no more than noise does, at any horizon."""
-    if found.measure == "two-sample":
-        return found.areas["estimate"].low <= 0.5
-    left, noise = found.errors["estimate"], found.errors["noise"]
-    return all(left[at] <= max(NEGLIGIBLE, ABOVE_NOISE * noise[at]) for at in left)
-
-
-def _rejected(found: Assessment) -> Verdict | None:
-    if found.chance <= CHANCE and found.skill >= SKILL:
+def _rejected(holdout: HoldOut) -> Verdict | None:
+    if holdout.chance <= CHANCE and holdout.clearest.skill >= SKILL:
         return None
     return Verdict(
         "DATA_REJECTED",
         "next observations do not follow from their rows: the best prediction is "
-        f"{100 * max(found.skill, 0.0):.0f} % nearer than rows paired at random (p = {min(1.0, found.chance):.2g}); "
-        "check the order of the rows and which columns are read",
+        f"{100 * max(holdout.clearest.skill, 0.0):.0f} % nearer than rows paired at random "
+        f"(p = {min(1.0, holdout.chance):.2g}); check the order of the rows and which columns are read",
     )
 
 
-def _mismatch(found: Assessment) -> Verdict | None:
-    pinned = _pinned(found)
-    if found.measure == "two-sample":
-        told, before = found.areas["estimate"], found.areas["mid-range"]
-        if told.low <= TOLD_APART or told.area >= before.area:
-            return None
-        more = f", and {', '.join(pinned)} at the end of the range" if pinned else ""
-        return Verdict(
-            "MODEL_MISMATCH",
-            f"a classifier still tells rows of the simulator from those held out, {_area(told)} after {_area(before)} "
-            f"at mid-range (0.5 is chance){more}: the model cannot move as the data does, or the search is not at its "
-            "end",
-            pinned,
-        )
-    left, noise = found.errors["nearby best"], found.errors["noise"]
-    beyond = [at for at in left if left[at] > max(NEGLIGIBLE, ABOVE_NOISE * noise[at])]
-    reasons = []
-    if found.explained > EXPLAINED:
-        reasons.append(f"state and action explain {100 * found.explained:.0f} % of it")
-    if found.autocorrelation > WHITE:
-        reasons.append(f"it is correlated from step to step ({found.autocorrelation:.2f})")
+def _mismatch(holdout: HoldOut) -> Verdict | None:
+    match holdout:
+        case Predicted():
+            reasons = _systematic(holdout.explained, "state and action")
+            if holdout.autocorrelation > WHITE:
+                reasons.append(f"it is correlated from step to step ({holdout.autocorrelation:.2f})")
+            return _mismatch_of_errors(holdout.errors, reasons, _pinned(holdout), "")
+        case Fitted():
+            reasons = _systematic(holdout.explained, "readings and actions")
+            return _mismatch_of_errors(holdout.errors, reasons, _pinned(holdout), " behind a fitted start")
+        case ToldApart():
+            return _mismatch_of_areas(holdout.area_at_mid_range, holdout.area_at_estimate, _pinned(holdout))
+
+
+def _mismatch_of_errors(
+    errors: PredictionErrors, reasons: list[str], pinned: tuple[str, ...], where: str
+) -> Verdict | None:
+    """Parameters nearby leave more than noise, and what they leave does not look like noise."""
+    beyond = _beyond_noise(errors.nearby_best, errors.noise)
     if pinned:
-        reasons.append(f"{', '.join(pinned)} at the end of the range")
+        reasons = [*reasons, _at_end(pinned)]
     if not beyond or not reasons:
         return None
-    at = max(beyond, key=lambda horizon: left[horizon] / max(noise[horizon], NEGLIGIBLE))
+    left, noise = max(beyond, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
     return Verdict(
         "MODEL_MISMATCH",
-        f"the best parameters nearby leave {_size(left[at])} of a step's change after {_steps(at)} on the hold-out, "
-        f"where noise leaves {_size(noise[at])}, and {', '.join(reasons)}: the model cannot explain the data "
-        f"({_change(found)} at the estimate)",
+        f"the best parameters nearby leave {left.mean:.2g} of a step's change after {_steps(left.steps)}{where} on the "
+        f"hold-out, where noise leaves {noise.mean:.2g}, and {', '.join(reasons)}: the model cannot explain the data "
+        f"({_change(errors)} at the estimate)",
         pinned,
     )
 
 
-def _open(found: Assessment) -> Verdict | None:
-    names = tuple(name for name, share in zip(found.names, found.shares, strict=True) if share >= UNTOLD)
-    if not names:
+def _mismatch_of_areas(before: Area, after: Area, pinned: tuple[str, ...]) -> Verdict | None:
+    if after.interval[0] <= TOLD_APART or after.area >= before.area:
         return None
-    least = float(min(share for share in found.shares if share >= UNTOLD))
+    more = f", and {_at_end(pinned)}" if pinned else ""
+    return Verdict(
+        "MODEL_MISMATCH",
+        f"a classifier still tells rows of the simulator from those held out, {_area(after)} after {_area(before)} at "
+        f"mid-range (0.5 is chance){more}: the model cannot move as the data does, or the search is not at its end",
+        pinned,
+    )
+
+
+def _open(holdout: HoldOut) -> Verdict | None:
+    shares = {name: share for name, share in holdout.interval_shares.items() if share >= OPEN}
+    if not shares:
+        return None
     return Verdict(
         "NOT_IDENTIFIABLE",
-        f"the data leaves {', '.join(names)} open: a 95 % interval covers {100 * least:.0f} % of the range or more; "
-        "leave out all but one of those that act alike, or log motions that excite them",
-        names,
+        f"the data leaves {', '.join(shares)} open: a 95 % interval covers {100 * min(shares.values()):.0f} % of the "
+        "range or more; leave out all but one of those that act alike, or log motions that excite them",
+        tuple(shares),
     )
 
 
-def _no_better(found: Assessment) -> Verdict | None:
-    if found.measure == "two-sample":
-        told, before = found.areas["estimate"], found.areas["mid-range"]
-        if told.high < before.area and told.area < before.low and told.area <= TOLD_APART:
-            return None
-        if before.area <= TOLD_APART:
-            return Verdict(
-                "NO_IMPROVEMENT",
-                f"mid-range is as good: a classifier hardly tells its rows from those held out, {_area(before)}, nor "
-                f"those of the estimate, {_area(told)} (0.5 is chance)",
-            )
-        return Verdict(
-            "NO_IMPROVEMENT",
-            f"a classifier tells rows of the simulator from those held out as well as at mid-range: {_area(told)} "
-            f"after {_area(before)} (0.5 is chance)",
-        )
-    if found.best > 1.0 - WORTH_GAINING:
-        return Verdict(
-            "NO_IMPROVEMENT",
-            f"mid-range is as good: parameters nearby leave {100 * found.best:.0f} % of its error on the hold-out "
-            f"({_change(found)} at the estimate)",
-        )
-    gained = (1.0 - found.relative) / (1.0 - found.best)
-    if found.relative_interval[1] < 1.0 and gained >= GAINED:
-        return None
-    return Verdict(
-        "NO_IMPROVEMENT",
-        f"{_how_good(found)}, where parameters nearby leave {_percent(found.best)}: the search is not at its end; give "
-        "it a larger budget or another method",
-    )
+def _no_improvement(holdout: HoldOut) -> Verdict | None:
+    if isinstance(holdout, ToldApart):
+        sentence = _no_better_areas(holdout.area_at_mid_range, holdout.area_at_estimate)
+    else:
+        sentence = _no_better_errors(holdout.errors)
+    return Verdict("NO_IMPROVEMENT", sentence) if sentence else None
 
 
-def _pinned(found: Assessment) -> tuple[str, ...]:
-    return tuple(name for name, value in zip(found.names, found.unit, strict=True) if abs(value) > AT_END)
-
-
-def _how_good(found: Assessment) -> str:
-    if found.measure == "two-sample":
-        told, before = found.areas["estimate"], found.areas["mid-range"]
+def _no_better_errors(errors: PredictionErrors) -> str:
+    """Why an estimate is no improvement by its prediction errors; empty if it is one."""
+    if errors.nearby_relative > 1.0 - WORTH_GAINING:
         return (
-            f"a classifier tells rows of the simulator from those held out with an area of {_area(told)}, after "
-            f"{_area(before)} at mid-range (0.5 is chance)"
+            f"mid-range is as good: parameters nearby leave {100 * errors.nearby_relative:.0f} % of its error on the "
+            f"hold-out ({_change(errors)} at the estimate)"
         )
-    low, high = found.relative_interval
+    gained = (1.0 - errors.relative) / (1.0 - errors.nearby_relative)
+    if errors.relative_interval[1] < 1.0 and gained >= GAINED:
+        return ""
     return (
-        f"the prediction error on the hold-out is {_percent(found.relative)} of mid-range's (95 % interval "
-        f"{_percent(low)} to {_percent(high)}; {_change(found)} of a step's change)"
+        f"{_how_small(errors)}, where parameters nearby leave {_percent(errors.nearby_relative)}: the search is not at "
+        "its end; give it a larger budget or another method"
     )
 
 
-def _change(found: Assessment) -> str:
-    """Errors after the fewest and the most steps: mid-range, then the estimate."""
-    before, after = found.errors["mid-range"], found.errors["estimate"]
-    at = max(before)
-    return f"{_size(before[at])} → {_size(after[at])} after {_steps(at)}"
+def _no_better_areas(before: Area, after: Area) -> str:
+    """Why an estimate is no improvement by the classifier's areas; empty if it is one."""
+    if after.interval[1] < before.area and after.area < before.interval[0] and after.area <= TOLD_APART:
+        return ""
+    if before.area <= TOLD_APART:
+        return (
+            f"mid-range is as good: a classifier hardly tells its rows from those held out, {_area(before)}, nor "
+            f"those of the estimate, {_area(after)} (0.5 is chance)"
+        )
+    return (
+        f"a classifier tells rows of the simulator from those held out as well as at mid-range: {_area(after)} after "
+        f"{_area(before)} (0.5 is chance)"
+    )
 
 
-def _area(told: Any) -> str:
-    return f"{told.area:.2f} [{told.low:.2f}, {told.high:.2f}]"
+def _how_good(holdout: HoldOut) -> str:
+    if not isinstance(holdout, ToldApart):
+        return _how_small(holdout.errors)
+    return (
+        "a classifier tells rows of the simulator from those held out with an area of "
+        f"{_area(holdout.area_at_estimate)}, after {_area(holdout.area_at_mid_range)} at mid-range (0.5 is chance)"
+    )
+
+
+def _how_small(errors: PredictionErrors) -> str:
+    low, high = map(_percent, errors.relative_interval)
+    return (
+        f"the prediction error on the hold-out is {_percent(errors.relative)} of mid-range's (95 % interval {low} to "
+        f"{high}; {_change(errors)} of a step's change)"
+    )
+
+
+def _beyond_noise(
+    errors: Sequence[PredictionError], noise: Iterable[PredictionError]
+) -> list[tuple[PredictionError, PredictionError]]:
+    """The errors that noise does not explain, each with that of noise alone."""
+    pairs = zip(errors, noise, strict=True)
+    return [(left, alone) for left, alone in pairs if left.mean > max(NEGLIGIBLE, ABOVE_NOISE * alone.mean)]
+
+
+def _systematic(explained: float, inputs: str) -> list[str]:
+    return [f"{inputs} explain {100 * explained:.0f} % of it"] if explained > EXPLAINED else []
+
+
+def _pinned(holdout: HoldOut) -> tuple[str, ...]:
+    return tuple(name for name, value in holdout.estimate.items() if abs(value) > AT_END)
+
+
+def _at_end(pinned: tuple[str, ...]) -> str:
+    return f"{', '.join(pinned)} at the end of the range"
+
+
+def _change(errors: PredictionErrors) -> str:
+    """Errors after the most steps: at mid-range, then at the estimate."""
+    before, after = errors.mid_range[-1], errors.estimate[-1]
+    return f"{before.mean:.2g} → {after.mean:.2g} after {_steps(after.steps)}"
+
+
+def _area(area: Area) -> str:
+    low, high = area.interval
+    return f"{area.area:.2f} [{low:.2f}, {high:.2f}]"
 
 
 def _steps(count: int) -> str:
     return "1 step" if count == 1 else f"{count} steps"
-
-
-def _size(value: float) -> str:
-    return f"{value:.2g}"
 
 
 def _percent(share: float) -> str:

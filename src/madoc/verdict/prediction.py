@@ -25,6 +25,7 @@ NEARBY_STEPS = 8
 _STILL = 1e-7
 """Largest component of a step in [-1, 1] at which the search ends."""
 _DAMPING = 1e-6
+"""Relative damping of a step; 0 is none."""
 _KEPT = 2
 """Points compared over all horizons: the last, and the one before in case the last step left the minimum."""
 
@@ -63,9 +64,7 @@ class Replays:
         self, residuals: Float[np.ndarray, "systems windows steps observation"]
     ) -> Float[np.ndarray, "windows systems horizons observation"]:
         """|residual| at the horizons, windows first; a failed window counts as the worst that did not fail."""
-        size = np.abs(residuals[:, :, np.array(self.horizons) - 1])
-        worst = np.maximum(np.nanmax(np.where(np.isfinite(size), size, 0.0), axis=(0, 1)), WORST)
-        return np.moveaxis(np.where(np.isfinite(size), size, worst), 0, 1)
+        return magnitudes(residuals[:, :, np.array(self.horizons) - 1])
 
     def noise_floor(
         self, held: Dataset, unit: Float[np.ndarray, " d"], deviation: Float[np.ndarray, " observation"]
@@ -94,6 +93,15 @@ class Replays:
         return replace(windows, actions=windows.actions[:, :1], following=windows.following[:, :1])
 
 
+def magnitudes(
+    residuals: Float[np.ndarray, "systems windows horizons channels"],
+) -> Float[np.ndarray, "windows systems horizons channels"]:
+    """|residual|, windows first; a failed window counts as the worst that did not fail, and at least as `WORST`."""
+    size = np.abs(residuals)
+    worst = np.maximum(np.nanmax(np.where(np.isfinite(size), size, 0.0), axis=(0, 1)), WORST)
+    return np.moveaxis(np.where(np.isfinite(size), size, worst), 0, 1)
+
+
 def replays_of(held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " observation"]) -> Replays:
     """Windows spread evenly over the rows held out.
 
@@ -119,10 +127,10 @@ def replays_of(held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " o
 def nearby_best(replays: Replays, unit: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, "points d"], int]:
     """Where Gauss-Newton steps on single steps of the windows lead from an estimate, and their cost.
 
-    They look at the rows held out, so none is an estimate: they tell what the parameters could explain at best.
+    The steps look at the rows held out, so none of the points is an estimate: they show what parameters could explain.
     """
     windows = replays.single_steps()
-    found, spent = [], 0
+    reached, spent = [], 0
     for _ in range(NEARBY_STEPS):
         points = difference_points(unit)
         residuals = window_residuals(replays.simulator, windows, points, replays.scale)
@@ -133,7 +141,7 @@ def nearby_best(replays: Replays, unit: Float[np.ndarray, " d"]) -> tuple[Float[
         scale = scale_of(around.residuals, "cauchy")
         step = damped_step(*triangular_factors(around, scale, "cauchy"), unit, _DAMPING)
         unit = unit + step
-        found.append(unit)
+        reached.append(unit)
         if np.abs(step).max() < _STILL:
             break
-    return np.array(found[-_KEPT:]).reshape(-1, len(unit)), spent
+    return np.array(reached[-_KEPT:]).reshape(-1, len(unit)), spent

@@ -1,8 +1,7 @@
-"""A selftest: could this data find a truth? One is planted in the same model, the logged actions replayed in it."""
+"""A selftest: would this data recover a truth? One is planted in the model, and the logged actions replayed in it."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import jax
 import numpy as np
@@ -14,15 +13,17 @@ from madoc.calibration.result import CalibrationResult
 from madoc.data import Dataset, Disturbance, disturb, hide_velocities
 from madoc.data.dataset import starts_after
 from madoc.errors import MadocError
-from madoc.identification.states import logged_states
+from madoc.identification.states import states_of
+from madoc.identification.windows import successive_windows
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import reset_states
+from madoc.tasks import Task
 from madoc.types import Transitions
 
 RECOVERABLE = 10.0
-"""% of its range that a parameter may be off: a fifth of what mid-range is off at worst."""
+"""Largest error of a recovered parameter in % of its range: a fifth of the largest error of mid-range."""
 INNER = 0.8
-"""Planted truths lie in this share of [-1, 1], so that none is found by standing at the end of its range."""
+"""Largest |parameter| of a planted truth in [-1, 1], so that none is recovered by being at the end of its range."""
 STRETCH = 25
 """Control steps after which a replay begins anew at a logged state: open-loop, it would leave where the robot was."""
 LONGEST = 1000
@@ -31,7 +32,7 @@ LONGEST = 1000
 
 @dataclass(frozen=True)
 class Planted:
-    """One parameter of one planted truth, the first being 1; `interval` and `covered` where the method says one."""
+    """One parameter of one planted truth, counted from 1; `interval` and `covered` where the method has intervals."""
 
     name: str
     unit: str
@@ -45,15 +46,15 @@ class Planted:
 
 @dataclass(frozen=True)
 class Selftest:
-    """What a selftest showed.
+    """Whether calibrations to planted data recovered what was planted.
 
     Attributes:
-        method: What was run.
+        method: The method that was run.
         rows: Every parameter of every planted truth.
-        recoverable: Names of parameters that were found every time.
+        recoverable: Names of the parameters that were recovered every time.
         sentence: The same in words.
-        noise: Put on the planted data, by signal, in its unit.
-        control_steps: Simulated, of all runs.
+        noise: Standard deviation of the noise on the planted data by signal, in its unit.
+        control_steps: Simulated in all runs.
     """
 
     method: str
@@ -68,7 +69,7 @@ class Selftest:
         """Whether every parameter is recoverable."""
         return set(self.recoverable) == {row.name for row in self.rows}
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """As JSON."""
         return asdict(self) | {"passed": self.passed}
 
@@ -83,31 +84,31 @@ def plant(
 ) -> Dataset:
     """The log as it would be if the simulator at `truth` were the robot: its actions, its starts, its noise.
 
-    From a logged state every `STRETCH` rows; where none can be rebuilt, from resets at the beginning of each episode.
+    Replays begin at a logged state every `STRETCH` rows; where states cannot be rebuilt, at a reset for each episode.
     Every replay is an episode, and ends where its simulation failed or the task ended. Where the log's velocities are
-    differences of its positions, so are the planted ones.
+    finite differences of its positions, so are the planted ones.
 
     Args:
-        dataset: Whose actions.
-        simulator: What is planted in.
-        truth: Physical values.
-        noise: Deviation of the sensors' noise, in their units.
-        key: Of the resets and the noise.
+        dataset: The log whose actions are replayed.
+        simulator: The model.
+        truth: Physical values of its parameters.
+        noise: Standard deviation of the sensors' noise, in their units.
+        key: Randomness of the resets and the noise.
 
     Raises:
         MadocError: Not one row could be simulated.
     """
     of_start, of_noise = jax.random.split(key)
     system, task = simulator.bind(truth[None]), simulator.task
-    if task.state_from_observation is None:
+    states = states_of(dataset, simulator)
+    if states.kind != "exact":
         first = dataset.episode_starts
         lengths = np.minimum(dataset.episode_ends - first, LONGEST)
         state = reset_states(simulator)(of_start, len(first))[None]
     else:
-        states, rows = logged_states(dataset, task)
-        chosen, lengths = _stretches(dataset, rows)
-        first = rows[chosen]
-        state = system.unbiased(states[None, chosen])
+        chosen, lengths = successive_windows(dataset, states.rows, STRETCH)
+        first = states.rows[chosen]
+        state = system.unbiased(states.states[None, chosen])
     logged = np.asarray(dataset.transitions.action)
     alive, frames = np.ones(len(first), dtype=bool), []
     for step in range(int(lengths.max())):
@@ -121,28 +122,32 @@ def plant(
     before, action, following, ended, valid = (np.swapaxes(np.stack(part), 0, 1) for part in zip(*frames, strict=True))
     if not valid.any():
         raise MadocError(f"{task.name}: no logged action could be simulated at a planted truth; check the ranges")
-    drawn = np.asarray(jax.random.normal(of_noise, (len(first), before.shape[1] + 1, len(noise))), np.float64) * noise
-    rows_at = [column[valid] for column in (before + drawn[:, :-1], action, following + drawn[:, 1:], ended)]
-    last = valid & ~np.pad(valid, ((0, 0), (0, 1)))[:, 1:]
-    ends = last[valid]
-    zeros = np.zeros(len(ends))
-    transitions = Transitions(rows_at[0], rows_at[1], zeros, rows_at[2], rows_at[3], ends & ~rows_at[3])
+    shape = len(first), before.shape[1] + 1, len(noise)
+    drawn = np.asarray(jax.random.normal(of_noise, shape), np.float64) * noise
+    ends, terminated = (valid & ~np.pad(valid, ((0, 0), (0, 1)))[:, 1:])[valid], ended[valid]
+    transitions = Transitions(
+        (before + drawn[:, :-1])[valid],
+        action[valid],
+        np.zeros(len(ends)),
+        (following + drawn[:, 1:])[valid],
+        terminated,
+        ends & ~terminated,
+    )
     origin = f"planted in {dataset.origin}"
     planted = Dataset(transitions, starts_after(ends), task.name, task.physics, origin, None, Disturbance())
-    if dataset.disturbance.velocities != "differences":
-        return planted
-    # Of a robot of one's own velocities were put in behind its signals; the others show them by themselves.
+    return planted if dataset.disturbance.velocities != "differences" else _with_differences(planted, task, of_noise)
+
+
+def _with_differences(planted: Dataset, task: Task, key: PRNGKeyArray) -> Dataset:
+    """The dataset with velocities that are finite differences of positions in place of the simulated ones."""
+    # For a robot of one's own velocities were added behind its signals; the other robots observe them by themselves.
     shown, hidden = (task, True) if task.source is None else (hide_velocities(task), False)
     if not hidden:
-        seen = slice(shown.observation_size)
-        cut = replace(
-            transitions,
-            observation=transitions.observation[:, seen],
-            next_observation=transitions.next_observation[:, seen],
-        )
+        rows, seen = planted.transitions, slice(shown.observation_size)
+        cut = replace(rows, observation=rows.observation[:, seen], next_observation=rows.next_observation[:, seen])
         planted = replace(planted, transitions=cut)
     asked = Disturbance(hidden_velocities=hidden, velocities="differences")
-    return replace(disturb(planted, asked, shown, of_noise), disturbance=Disturbance(velocities="differences"))
+    return replace(disturb(planted, asked, shown, key), disturbance=Disturbance(velocities="differences"))
 
 
 def selftest(
@@ -156,13 +161,12 @@ def selftest(
     budget: int,
     quiet: bool = True,
 ) -> Selftest:
-    """Plant a truth a key, and calibrate to what it makes of the log with the first method that does not refuse.
+    """Plant one truth for each key, and calibrate to its data with the first method that does not refuse it.
 
     Raises:
         MadocError: Every method refuses, or nothing can be planted.
     """
-    space, found, spent = simulator.parameters, [], 0
-    name = ""
+    space, rows, spent, name = simulator.parameters, list[Planted](), 0, ""
     for index, key in enumerate(keys, 1):
         of_truth, of_plant, of_method = jax.random.split(key, 3)
         truth = space.to_physical(
@@ -172,36 +176,21 @@ def selftest(
         method = _first_willing(methods, problem, of_method)
         result = calibrate(method, problem, key=of_method, budget=budget, quiet=quiet)
         if result.status == "interrupted":
-            raise KeyboardInterrupt  # what was broken off says nothing of the data
+            raise KeyboardInterrupt  # an interrupted calibration says nothing of the data
         if result.status == "diverged":
-            raise MadocError(f"truth {index} could not be looked for: {result.sentence}")
+            raise MadocError(f"truth {index} could not be calibrated to: {result.sentence}")
         name, spent = result.method, spent + result.control_steps
-        found += _rows(result, truth, index)
-    worst = {
-        parameter: max(row.percent_of_range for row in found if row.name == parameter) for parameter in space.names
-    }
+        rows += _rows(result, truth, index)
+    worst = {parameter: max(row.percent_of_range for row in rows if row.name == parameter) for parameter in space.names}
     recoverable = tuple(parameter for parameter, off in worst.items() if off <= RECOVERABLE)
     return Selftest(
         method=name,
-        rows=tuple(found),
+        rows=tuple(rows),
         recoverable=recoverable,
-        sentence=_sentence(worst, recoverable, len(keys)) + _of_intervals(found),
+        sentence=_sentence(worst, recoverable, len(keys)) + _of_intervals(rows),
         noise=dict(zip(signals, noise.tolist(), strict=True)),
         control_steps=spent,
     )
-
-
-def _stretches(dataset: Dataset, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions in `rows` at which replays begin, and how long each is."""
-    episode = dataset.episode_of(rows)
-    chosen, lengths, until = [], [], -1
-    for position, (row, end) in enumerate(zip(rows, dataset.episode_ends[episode], strict=True)):
-        if row >= until:
-            length = min(STRETCH, int(end - row))
-            chosen.append(position)
-            lengths.append(length)
-            until = row + length
-    return np.array(chosen), np.array(lengths)
 
 
 def _first_willing(methods: Sequence[Calibrator], problem: CalibrationProblem, key: PRNGKeyArray) -> Calibrator:

@@ -1,20 +1,26 @@
-"""Numbers with intervals: resampled episodes, ranks of two samples, and how far a pairing is from chance."""
+"""Means with confidence intervals from resampled episodes, ranks of two samples, and predictions against chance."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import rankdata
 
+from madoc.calibration.holdout import PredictionError, PredictionErrors
+
+NEGLIGIBLE = 1e-3
+"""Residual in typical changes of a signal in one step. No sensor is as good, and no use of a model notices less."""
 RESAMPLES = 500
-"""Enough for a 95 % interval: its ends vary by about a tenth of its width (Efron and Tibshirani 1993, section 13.3)."""
+"""Number of bootstrap samples. The ends of a 95 % interval then vary by about a tenth of its width (Efron and
+Tibshirani 1993, section 13.3)."""
 CONFIDENCE = 0.95
+"""Level of confidence intervals, in (0, 1)."""
 FEWEST_EPISODES = 5
-"""With fewer, episodes say little of how they differ, and windows are resampled in their place."""
+"""Smallest number of episodes that are resampled whole; with fewer, single windows are resampled."""
 SHUFFLES = 499
+"""Number of random pairings. The smallest p-value is then 1 / 500."""
 _CAPPING = 20
-"""Random pairings that say what hardly any pair exceeds."""
-"""The smallest p-value is then 1 / 500."""
+"""Number of random pairings whose 95th percentile of errors caps the error of a row."""
 
 
 def resampled(
@@ -40,9 +46,91 @@ def resampled(
 
 
 def interval_of(draws: Float[np.ndarray, "resamples *kinds"]) -> Float[np.ndarray, "2 *kinds"]:
-    """The percentile interval."""
+    """The percentile interval of bootstrap samples."""
     tail = 50.0 * (1.0 - CONFIDENCE)
     return np.percentile(draws, [tail, 100.0 - tail], axis=0)
+
+
+def prediction_errors(
+    sizes: Float[np.ndarray, "windows points horizons signals"],
+    floor: Float[np.ndarray, "windows horizons signals"],
+    best: int,
+    *,
+    episodes: Int[np.ndarray, " windows"],
+    horizons: Sequence[int],
+    signals: Sequence[str],
+    failed: int,
+) -> PredictionErrors:
+    """Prediction errors of several points at each horizon, with confidence intervals.
+
+    Args:
+        sizes: Absolute residuals: at mid-range, at the estimate, then at points near it.
+        floor: Absolute residuals that noise alone would leave.
+        best: The point, not mid-range, with the smallest errors.
+        episodes: The episode of each window.
+        horizons: Control steps ahead.
+        signals: Their names.
+        failed: Number of windows that failed in simulation at the estimate.
+    """
+    means, draws = sizes.mean((0, -1)), resampled(sizes.mean(-1), episodes)
+    relative = relative_to_first(means)
+    noise_alone = relative_to_first(np.stack([means[0], floor.mean((0, -1))]))[1]
+    low, high = interval_of(relative_to_first(draws)[:, 1])
+    mid_range, estimate, nearby_best, noise = (
+        _by_horizon(kind, episodes, horizons, signals) for kind in (sizes[:, 0], sizes[:, 1], sizes[:, best], floor)
+    )
+    return PredictionErrors(
+        mid_range=mid_range,
+        estimate=estimate,
+        nearby_best=nearby_best,
+        noise=noise,
+        relative=float(relative[1]),
+        relative_interval=(float(low), float(high)),
+        nearby_relative=float(max(relative[best], min(relative[1], noise_alone))),
+        windows=len(sizes),
+        failed_windows=failed,
+    )
+
+
+def best_of(sizes: Float[np.ndarray, "windows points horizons signals"]) -> int:
+    """The point with the smallest errors; the first, mid-range, is not one of the candidates."""
+    return 1 + int(np.argmin(relative_to_first(sizes.mean((0, -1)))[1:]))
+
+
+def _by_horizon(
+    sizes: Float[np.ndarray, "windows horizons signals"],
+    episodes: Int[np.ndarray, " windows"],
+    horizons: Sequence[int],
+    signals: Sequence[str],
+) -> tuple[PredictionError, ...]:
+    low, high = interval_of(resampled(sizes.mean(-1), episodes)).tolist()
+    by_signal = [dict(zip(signals, row, strict=True)) for row in sizes.mean(0).tolist()]
+    means = [float(sizes[:, index].mean()) for index in range(len(horizons))]
+    columns = zip(horizons, means, zip(low, high, strict=True), by_signal, strict=True)
+    return tuple(PredictionError(*row) for row in columns)
+
+
+def relative_to_first(errors: Float[np.ndarray, "*draws points horizons"]) -> Float[np.ndarray, "*draws points"]:
+    """Each point's error over the first point's, mean over horizons; at least 1 where the first's is negligible."""
+    first = errors[..., :1, :]
+    nothing = first <= NEGLIGIBLE
+    return np.asarray(
+        np.where(nothing, np.maximum(1.0, errors / NEGLIGIBLE), errors / np.where(nothing, 1.0, first))
+    ).mean(-1)
+
+
+def shares_of_ranges(
+    half: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None, width: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, " d"]:
+    """Share of each range that the 95 % interval covers, at most 1: the method's own, and no less than the best one.
+
+    Args:
+        half: Half of the best possible interval in [-1, 1].
+        interval: The method's, in physical units, if it has one.
+        width: Of each range, in physical units.
+    """
+    share = half if interval is None else np.maximum(half, (interval[:, 1] - interval[:, 0]) / width)
+    return np.minimum(share, 1.0)
 
 
 def area_under_curve(
@@ -50,7 +138,7 @@ def area_under_curve(
     real: Bool[np.ndarray, " rows"],
     weights: Float[np.ndarray, " rows"] | None = None,
 ) -> float:
-    """How often a real row's score is above a simulated row's, ties counted half; rows may count unequally."""
+    """Probability that a real row's score is above a simulated row's, ties counted half; rows may be weighted."""
     if weights is None:
         ranks, count = rankdata(scores), int(real.sum())
         return float((ranks[real].sum() - count * (count + 1) / 2.0) / (count * (len(real) - count)))
@@ -68,17 +156,15 @@ def better_than_chance(
     groups: Int[np.ndarray, " rows"],
     *,
     seed: int = 0,
-) -> dict[str, Any]:
-    """Whether predictions belong to the rows they were made for: against the same rows paired at random.
+) -> tuple[float, float]:
+    """Permutation test of whether predictions belong to the rows they were made for.
 
-    Rows are exchanged within their group where groups have several rows on average, else among all: what only tells
-    one run from another is no dynamics.
-
-    Errors are means, each row's cut off at what hardly any random pair exceeds: a median would only speak of the rows
-    at rest where those are most.
+    Rows are exchanged within their group where groups have two rows or more on average, else among all: what tells one
+    run from another is not dynamics. The error is a mean in which each row's error is capped at the 95th percentile of
+    random pairings; a median would ignore the rows in motion where most rows are at rest.
 
     Returns:
-        `skill`, 1 - error over the median error at random, and `p`, how often chance does as well.
+        The skill, 1 - error over the median error of random pairings, and the p-value.
     """
     rng = np.random.default_rng(seed)
     _, member, sizes = np.unique(groups, return_inverse=True, return_counts=True)
@@ -86,7 +172,7 @@ def better_than_chance(
         member = np.zeros_like(member)
     home = np.argsort(member, kind="stable")
 
-    def sizes_of(of: np.ndarray) -> np.ndarray:
+    def errors(of: np.ndarray) -> np.ndarray:
         return np.abs(predicted - of).mean(-1)
 
     def shuffled() -> np.ndarray:
@@ -94,15 +180,12 @@ def better_than_chance(
         order[home] = np.lexsort((rng.random(len(member)), member))
         return followed[order]
 
-    cap = np.percentile(np.concatenate([sizes_of(shuffled()) for _ in range(_CAPPING)]), 95)
+    cap = np.percentile(np.concatenate([errors(shuffled()) for _ in range(_CAPPING)]), 95)
 
-    def error(of: np.ndarray) -> float:
-        return float(np.minimum(sizes_of(of), cap).mean())
+    def mean_error(of: np.ndarray) -> float:
+        return float(np.minimum(errors(of), cap).mean())
 
-    paired = error(followed)
-    chance = np.array([error(shuffled()) for _ in range(SHUFFLES)])
+    paired = mean_error(followed)
+    chance = np.array([mean_error(shuffled()) for _ in range(SHUFFLES)])
     typical = float(np.median(chance))
-    return {
-        "skill": 0.0 if typical == 0.0 else 1.0 - paired / typical,
-        "p": float((1 + (chance <= paired).sum()) / (1 + SHUFFLES)),
-    }
+    return 0.0 if typical == 0.0 else 1.0 - paired / typical, float((1 + (chance <= paired).sum()) / (1 + SHUFFLES))

@@ -1,4 +1,4 @@
-"""Are residuals noise, or do they follow from where the robot was and what it did?"""
+"""Whether residuals are noise, or can be predicted from where the robot was and what it did."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,43 +8,57 @@ from sklearn.model_selection import KFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
+from madoc.identification.noise import clipped
+
 FOLDS = 5
+"""Number of folds of the cross-validation."""
 _FEWEST = 2 * FOLDS
+"""Smallest number of rows that regressions are fitted to; of fewer, nothing counts as explained."""
+_ROUNDING = 1e-6
+"""Residual in typical changes of a step, below which it is the tolerance of MuJoCo's solver at contacts."""
 
 EXPLAINERS = {
     "a linear function": lambda: make_pipeline(StandardScaler(), RidgeCV(np.logspace(-3, 3, 7))),
     "trees": lambda: ExtraTreesRegressor(10, min_samples_leaf=3, random_state=0),
 }
-"""What tries to say a residual from state and action: motion in the large, and contacts."""
+"""Regressions of residuals on state and action: a linear one for motion in the large, trees for contacts."""
 
 
 def explained(
-    pairs: Float[np.ndarray, "rows pair"], residuals: Float[np.ndarray, "rows observation"]
+    inputs: Float[np.ndarray, "rows inputs"], residuals: Float[np.ndarray, "rows observation"]
 ) -> tuple[float, Float[np.ndarray, "rows observation"]]:
-    """The share of the squared residuals that observation and action say, on rows the explainer has not seen.
+    """The share of the squared residuals that a regression on the inputs explains, by cross-validation.
 
     Returns:
-        The share of the better explainer, at least 0 (a constant residual is said, too), and what it says.
+        The share of the better regression, at least 0 (a constant residual counts as explained), and its predictions.
     """
     total = float((residuals**2).sum())
-    best, said = 0.0, np.zeros_like(residuals)
+    best, explanation = 0.0, np.zeros_like(residuals)
     wanted = residuals.ravel() if residuals.shape[1] == 1 else residuals
-    if len(pairs) < _FEWEST or total == 0.0:
-        return best, said
+    if len(inputs) < _FEWEST or np.sqrt((residuals**2).mean(0)).max() <= _ROUNDING:
+        return best, explanation
     for make in EXPLAINERS.values():
         guess = np.empty_like(residuals)
-        for seen, unseen in KFold(FOLDS).split(pairs):
-            model = make().fit(pairs[seen], wanted[seen])
-            guess[unseen] = np.reshape(model.predict(pairs[unseen]), (len(unseen), -1))
+        for seen, unseen in KFold(FOLDS).split(inputs):
+            model = make().fit(inputs[seen], wanted[seen])
+            guess[unseen] = np.reshape(model.predict(inputs[unseen]), (len(unseen), -1))
         share = 1.0 - float(((residuals - guess) ** 2).sum()) / total
         if share > best:
-            best, said = share, guess
-    return best, said
+            best, explanation = share, guess
+    return best, explanation
+
+
+def explained_at_end(
+    inputs: Float[np.ndarray, "windows inputs"], residuals: Float[np.ndarray, "windows steps observation"]
+) -> float:
+    """The share of the last residuals of windows that the inputs explain: small errors add up until there."""
+    done = np.isfinite(residuals).all((1, 2))
+    return explained(inputs[done], clipped(residuals[done, -1]))[0] if done.any() else 0.0
 
 
 def autocorrelation(
     first: Float[np.ndarray, "pairs observation"], second: Float[np.ndarray, "pairs observation"]
 ) -> float:
-    """Of residuals of steps that follow each other, all signals together: 0 if independent, -½ of pure sensor noise."""
+    """Correlation of residuals of consecutive steps over all signals: 0 if independent, -½ of pure sensor noise."""
     size = float(np.sqrt((first**2).sum() * (second**2).sum()))
     return 0.0 if size == 0.0 else float((first * second).sum()) / size

@@ -1,10 +1,8 @@
-"""A classifier two-sample test: can anything tell logged from simulated rows (Lopez-Paz and Oquab 2017)?"""
+"""A classifier two-sample test of logged against simulated rows (Lopez-Paz and Oquab 2017)."""
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from sklearn.ensemble import HistGradientBoostingClassifier
@@ -12,13 +10,14 @@ from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import StratifiedKFold
 from threadpoolctl import threadpool_limits
 
+from madoc.calibration.holdout import Area
 from madoc.data import Dataset
 from madoc.data.dataset import starts_after
 from madoc.identification.windows import evenly
-from madoc.learning.cloning import clone
+from madoc.learning.cloning import continue_cloning, fresh_clone
 from madoc.learning.dynamics_ratio import Scaling
-from madoc.learning.networks import adam
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.learning.window_features import LoggedFeatures
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import begin, reset_states, roll
 from madoc.types import Transitions
@@ -26,31 +25,31 @@ from madoc.verdict.prediction import Replays
 from madoc.verdict.statistics import area_under_curve, interval_of
 
 MOST_ROWS = 1000
-"""Of either kind: an area under the curve of so many is known to ±0.025."""
+"""Largest number of rows of either kind: the area under the curve of so many is known to ±0.025."""
 RESOLUTION = 0.1
-"""Of the typical change of motion. Without noise a classifier would tell parameters a millionth off."""
+"""Standard deviation of the noise put on changes of motion, in typical ones; 0 is none. Without it a classifier would
+tell parameters apart that differ by a millionth."""
 _FITTED = 5000
-"""Rows that the line goes through."""
+"""Largest number of rows that the linear prediction is fitted to."""
 FOLDS = 5
-TREES = 40
-LEAVES = 8
-BINS = 32
-"""Small trees, and few: some hundred rows hold no more."""
+TREES, LEAVES, BINS = 40, 8, 32
+"""Number of folds, of trees, of leaves and of bins of a feature: few and small, as for some hundred rows."""
 ODDS_LIMIT = 10.0
-"""Rows count at most so unequally; past this there is no overlap to speak of."""
+"""Largest weight of a row, and one over the smallest, at least 1; past it logs and rollouts hardly overlap."""
 CLONING = (20, 200, 256, 1e-3)
-"""Epochs, updates in each, rows an update, Adam's rate."""
+"""Number of epochs, updates in each, rows of an update, and Adam's learning rate."""
 _RESAMPLES = 200
+"""Number of bootstrap samples of the area."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Rows as a classifier sees them.
+    """Rows as features of a classifier.
 
     Attributes:
-        before: What was seen and done up to a moment: one row, or two where one observation is not the state.
-        after: What followed, less what was seen before.
-        episodes: The episode of each.
+        before: Observation and action of a row, and of the row before it where one observation is not the state.
+        after: The change that followed.
+        episodes: The episode of each row.
     """
 
     before: Float[np.ndarray, "rows before"]
@@ -65,33 +64,21 @@ class Sample:
         return Sample(self.before[rows], self.after[rows], self.episodes[rows])
 
 
-@dataclass(frozen=True)
-class Told:
-    """How well logged and simulated rows are told apart: the area under the curve and its 95 % interval."""
-
-    area: float
-    low: float
-    high: float
-    rows: int
-
-
-def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Told:
-    """Cross-validated area under the curve of rows that the classifier has not seen.
-
-    Too few rows for that tell nothing: an area of 0.5, its interval from 0 to 1.
+def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Area:
+    """Cross-validated area under the ROC curve; 0.5 with an interval from 0 to 1 where there are too few rows.
 
     Args:
         real: Logged rows.
-        simulated: Others.
-        overlap: Whether they come from different places. Simulated ones are then weighed by how likely a second
-            classifier finds what came before them in the log, so that only what followed is compared.
+        simulated: Simulated rows.
+        overlap: Whether the two kinds are differently distributed before the change. Simulated rows are then weighted
+            by the odds, of a second classifier, that what came before is of the log, so that only changes are compared.
     """
     real, simulated = (part.take(evenly(np.arange(len(part)), MOST_ROWS)) for part in (real, simulated))
     count = len(real) + len(simulated)
     if not len(simulated):
-        return Told(1.0, 1.0, 1.0, count)  # nothing of the simulator is left to compare: it is no robot at all
+        return Area(1.0, (1.0, 1.0), count)  # every simulation failed: it is no robot at all
     if min(len(real), len(simulated)) < FOLDS:
-        return Told(0.5, 0.0, 1.0, count)
+        return Area(0.5, (0.0, 1.0), count)
     label = np.repeat([True, False], [len(real), len(simulated)])
     before = np.concatenate([real.before, simulated.before])
     after = np.concatenate([real.after, simulated.after])
@@ -102,7 +89,7 @@ def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Told:
         weight = np.where(label, 1.0, odds / odds[~label].mean())
     scores = _unseen(np.concatenate([before, after], axis=1), label, weight)
     area = area_under_curve(scores, label, weight)
-    return Told(area, *_interval(scores, label, weight), len(label))
+    return Area(area, _interval(scores, label, weight), len(label))
 
 
 def replayed(
@@ -111,15 +98,15 @@ def replayed(
     residuals: Float[np.ndarray, "windows steps observation"],
     noise: Float[np.ndarray, "windows steps observation"],
 ) -> tuple[Sample, Sample]:
-    """A random half of the windows as they were logged, the others as simulated with what noise does to them.
+    """A random half of the windows as they were logged, the other half as simulated, with noise added.
 
-    What came before is where a window starts and its mean action, what followed is how far it leads.
+    `before` is the first observation and the mean action of a window, `after` the change over the whole window.
 
     Args:
         replays: The windows.
-        scaling: How observations and actions become features.
-        residuals: Simulated less logged observations, in steps' changes.
-        noise: What noise alone would leave, in the same unit.
+        scaling: Scaling of observations and actions.
+        residuals: Simulated minus logged observations, in typical changes of a step.
+        noise: Residuals that noise alone would leave, in the same unit.
     """
     windows, episodes = replays.windows, replays.episodes
     start, end = replays.observation, windows.following[:, -1]
@@ -134,33 +121,15 @@ def replayed(
 
 
 def behaviour(kept: Dataset, key: PRNGKeyArray) -> TanhGaussianPolicy:
-    """A clone of who acted in the log, to act in the simulator where logged states cannot be rebuilt."""
+    """A clone of the policy that acted in the log, to act in the simulator where logged states cannot be rebuilt."""
     epochs, updates, batch, rate = CLONING
-    logged = kept.transitions
     of_policy, of_batches = jax.random.split(key)
-    observation = np.asarray(logged.observation)
-    policy = TanhGaussianPolicy(
-        observation.shape[1],
-        logged.action.shape[1],
-        (64, 64),
-        key=of_policy,
-        offset=observation.mean(0),
-        scale=np.maximum(observation.std(0), 1e-3),
-    )
-    optimiser = adam(rate)
-    state = optimiser.init(eqx.filter(policy, eqx.is_array))
-    pairs = jnp.asarray(logged.observation, jnp.float32), jnp.asarray(logged.action, jnp.float32)
+    clone = fresh_clone(kept.transitions, (64, 64), learning_rate=rate, key=of_policy)
+    pairs = LoggedFeatures(kept).pairs
     for epoch in range(epochs):
-        policy, state, _ = clone(
-            policy,
-            state,
-            pairs,
-            jax.random.fold_in(of_batches, epoch),
-            optimiser=optimiser,
-            batch=batch,
-            count=updates,
-        )
-    return policy
+        of_epoch = jax.random.fold_in(of_batches, epoch)
+        clone, _ = continue_cloning(clone, pairs, of_epoch, learning_rate=rate, batch=batch, updates=updates)
+    return clone.policy
 
 
 def rolled(
@@ -172,7 +141,7 @@ def rolled(
     key: PRNGKeyArray,
     noise: Float[np.ndarray, " observation"],
 ) -> Dataset:
-    """Episodes from the task's reset under a clone, as long as those of the log, with the sensors' noise."""
+    """Episodes of a cloned policy from the task's reset, with noise on the sensors."""
     task = simulator.task
     rows = max(1, -(-2 * MOST_ROWS // length))
     of_start, of_action, of_restart = jax.random.split(key, 3)
@@ -209,15 +178,15 @@ def rolled(
 
 @dataclass(frozen=True)
 class WindowView:
-    """How rows are shown to the classifier where one observation is not the state; made from the rows kept.
+    """Features of rows for the classifier where one observation is not the state; fitted to the rows calibrated to.
 
-    What came before is what was seen and done in two rows that follow each other (in one, where none do), what followed
-    is how the motion changed, `RESOLUTION` of it blurred, and what of that a line through the rows kept does not say.
+    `before` holds observation and action of two consecutive rows, or of one where none are consecutive. `after` holds
+    the change of motion, with noise of `RESOLUTION`, and its residual of a linear prediction from `before`.
 
     Attributes:
-        scaling: Of observations and actions.
-        spread: Of the change of motion.
-        line: From what came before to how the motion changed.
+        scaling: Scaling of observations and actions.
+        spread: Standard deviation of the changes of motion.
+        line: The linear prediction of changes of motion.
     """
 
     scaling: Scaling
@@ -226,7 +195,7 @@ class WindowView:
 
     @classmethod
     def of(cls, kept: Dataset, scaling: Scaling) -> "WindowView":
-        """The view of a log."""
+        """The features fitted to a log."""
         before, after, _ = _change_of_motion(kept, scaling)
         spread = np.where(after.std(0) > 1e-8, after.std(0), 1.0)
         chosen = evenly(np.arange(len(before)), _FITTED)
@@ -234,16 +203,16 @@ class WindowView:
         return cls(scaling, spread, line)
 
     def sample(self, dataset: Dataset) -> Sample:
-        """The rows of a dataset."""
+        """The features of the rows of a dataset."""
         before, after, episodes = _change_of_motion(dataset, self.scaling)
         after = after / self.spread
         after = after + RESOLUTION * np.random.default_rng(len(after)).standard_normal(after.shape)
-        unsaid = after - np.reshape(self.line.predict(before), after.shape)
-        return Sample(before, np.concatenate([after, unsaid], axis=1), episodes)
+        residual = after - np.reshape(self.line.predict(before), after.shape)
+        return Sample(before, np.concatenate([after, residual], axis=1), episodes)
 
 
 def _change_of_motion(dataset: Dataset, scaling: Scaling) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What came before, how the motion changed after it, and the episode of each window."""
+    """What came before, the change of motion after it, and the episode of each row."""
     logged = dataset.transitions
     second = np.setdiff1d(np.arange(len(dataset)), dataset.episode_starts)
     rows = second if len(second) else np.arange(len(dataset))
@@ -262,7 +231,7 @@ def _unseen(
     label: Bool[np.ndarray, " rows"],
     weight: Float[np.ndarray, " rows"] | None,
 ) -> Float[np.ndarray, " rows"]:
-    """How likely each row is a logged one, by a classifier that has not seen it."""
+    """Probability that each row is a logged one, by a classifier that was not trained on it."""
     scores = np.empty(len(label))
     with threadpool_limits(1):  # the same bits on any number of cores, and no threads that wait for each other
         for seen, unseen in StratifiedKFold(FOLDS, shuffle=True, random_state=0).split(features, label):
@@ -275,7 +244,7 @@ def _unseen(
 
 
 def _interval(scores: np.ndarray, label: np.ndarray, weight: np.ndarray | None) -> tuple[float, float]:
-    """Percentiles over resampled rows of each kind."""
+    """95 % bootstrap interval of the area, rows of each kind resampled."""
     rng = np.random.default_rng(0)
     kinds = [np.flatnonzero(label), np.flatnonzero(~label)]
     draws = []

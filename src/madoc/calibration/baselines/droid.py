@@ -6,10 +6,12 @@ every channel is in units of its typical change in one step, and both distances 
 """
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
+from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines import evolution
@@ -20,10 +22,9 @@ from madoc.calibration.baselines.population_search import (
     mean_with_failures,
     next_generation,
 )
-from madoc.errors import check_at_least
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import first_rows
-from madoc.types import Epoch
+from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
 
 
 def trajectory_cost(
@@ -49,15 +50,15 @@ class Droid:
         tolerance: Share of each range; it stops once the search is narrower in all of them. 0 never stops.
     """
 
-    horizon: int = 5
-    windows: int = 20
-    absolute: float = 1.0
-    squared: float = 1.0
-    population: int | None = None
-    tolerance: float = 1e-5
+    horizon: Count = 5
+    windows: Count = 20
+    absolute: NotNegative = 1.0
+    squared: NotNegative = 1.0
+    population: Annotated[int, Field(ge=4)] | None = None
+    tolerance: NotNegative = 1e-5
 
     def __post_init__(self) -> None:
-        check_at_least(self, horizon=1, windows=1, population=4, tolerance=0.0, absolute=0.0, squared=0.0)
+        check_hyperparameters(self)
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
         """The search about mid-range.
@@ -66,7 +67,7 @@ class Droid:
             MadocError: No state can be rebuilt, no episode is long enough, or the next observations are shuffled.
         """
         problem.require_pairs()
-        first_rows(problem.dataset, problem.logged_rows, self.horizon)
+        first_rows(problem.dataset, problem.states.exact()[1], self.horizon)
         return SearchState(evolution.begin(np.zeros(len(problem.simulator.parameters))), key, 0)
 
     def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:

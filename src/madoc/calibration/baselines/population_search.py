@@ -1,4 +1,4 @@
-"""What searches by CMA-ES share: their state, the rows they replay, the cost of a failure, the estimate."""
+"""What methods that search by CMA-ES share: state, replayed windows, cost of failed simulations, estimate."""
 
 from dataclasses import dataclass, replace
 
@@ -33,9 +33,10 @@ def draw_windows(problem: CalibrationProblem, steps: int, count: int, key: PRNGK
     Raises:
         MadocError: No state can be rebuilt, or no episode is long enough.
     """
-    possible = first_rows(problem.dataset, problem.logged_rows, steps)
+    states, rows = problem.states.exact()
+    possible = first_rows(problem.dataset, rows, steps)
     chosen = possible[np.asarray(jax.random.randint(key, (count,), 0, len(possible)))]
-    return windows_at(problem.dataset, problem.logged_states[chosen], problem.logged_rows[chosen], steps)
+    return windows_at(problem.dataset, states[chosen], rows[chosen], steps)
 
 
 def mean_with_failures(costs: Float[np.ndarray, "candidates windows"]) -> Float[np.ndarray, " candidates"]:
@@ -58,7 +59,7 @@ def next_generation(
     control_steps: int,
     tolerance: float,
 ) -> tuple[SearchState, Epoch]:
-    """The state once the candidates' costs are known, and the epoch that has found them out."""
+    """Update the search with the candidates' costs; also the epoch that evaluated them."""
     search = evolution.tell(state.search, candidates, costs)
     metrics = {"cost": float(costs.min()), "deviation": evolution.widest_deviation(search)}
     epoch = Epoch(metrics, control_steps, converged=evolution.settled(search, tolerance))
@@ -73,7 +74,6 @@ def estimate_from_search(problem: CalibrationProblem, state: SearchState) -> Est
     return Estimate(
         mean=space.to_physical(state.search.mean),
         std=np.sqrt(np.diag(covariance)),
-        groups=(tuple(range(len(space))),),
         failures=state.failures,
         warnings=at_end_of_range(state.search.mean, space.names),
         covariance=covariance,

@@ -1,4 +1,4 @@
-"""The yardsticks that cost nothing: the middle of every range, and the whole box as randomization."""
+"""Baselines that simulate nothing: the middle of every range, and a uniform distribution over the ranges."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ class UncalibratedState:
 
 @dataclass(frozen=True)
 class Uncalibrated:
-    """What is known before any data is looked at. It simulates nothing and converges in its first epoch.
+    """The estimate without any data. It simulates nothing and converges in its first epoch.
 
     Attributes:
         randomised: False is `nominal`: mid-range without a spread, the simulator as it comes. True is `uniform`:
@@ -44,7 +44,6 @@ class Uncalibrated:
         return Estimate(
             mean=space.middle,
             std=std,
-            groups=(tuple(range(len(space))),),
             warnings=("nothing was calibrated: this is the middle of every range, whatever the data says",),
             covariance=np.diag(std**2),
         )

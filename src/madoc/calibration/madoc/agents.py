@@ -1,4 +1,4 @@
-"""What calibration updates: discriminators, group critics, actors, their prior; and the update itself."""
+"""The networks and distributions that calibration trains, and one update of all of them."""
 
 from dataclasses import dataclass, replace
 
@@ -8,30 +8,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from madoc.calibration.madoc.actors import (
-    Actors,
-    actor_loss,
-    divergence,
-    draw_parameters,
-    initial_actors,
-    prior_weight,
-)
+from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_parameters, initial_actors, prior_weight
 from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
 from madoc.learning.networks import adam, descend, moving_average, scan_updates
+from madoc.types import Count, Layers, NotNegative, check_hyperparameters
 
 AT_BOUND = 0.95
-"""A reward past this share of its bound is counted as saturated."""
+"""Share of the reward's bound past which a reward counts as saturated."""
 BLUR_RANGE = (0.01, 0.3)
-"""Shares of a step's spread; it starts at the largest. Below the smallest the networks cannot follow s', and are as
-unsure as if the domains were the same."""
+"""Limits of the blur, in units of a step's standard deviation; it starts at the upper one. Below the lower one the
+networks cannot resolve differences in s'."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Agents:
-    """What updates change.
+    """Everything that updates change.
 
     Attributes:
         discriminators: Tell logged from simulated rows.
@@ -41,7 +35,7 @@ class Agents:
         prior: Its moving average, the p of Eq. (13).
         average: A moving average of the actors for reading the estimate.
         log_blur: Log of the noise on s' features that both discriminators see.
-        updates: How many there were.
+        updates: Number of updates so far.
     """
 
     discriminators: Discriminators
@@ -84,26 +78,29 @@ class AgentSettings:
         blur_rate: How fast it is steered.
     """
 
-    hidden: tuple[int, ...] = (128, 128)
-    critic_hidden: tuple[int, ...] = (64, 64)
-    bound: float = 2.0
-    pair_bound: float = 10.0
+    hidden: Layers = (128, 128)
+    critic_hidden: Layers = (64, 64)
+    bound: NotNegative = 2.0
+    pair_bound: NotNegative = 10.0
     weigh_overlap: bool = True
-    dropout: float = 0.0
-    batch: int = 256
-    actor_batch: int = 64
-    discriminator_rate: float = 1e-3
-    critic_rate: float = 1e-3
-    actor_rate: float = 3e-3
-    judge_rate: float = 0.01
-    entropy_weight: float = 0.05
-    prior_time: float = 2e5
-    prior_largest: float = 10.0
-    prior_rate: float = 0.1
-    prior_every: int = 10
-    average_rate: float = 1e-3
-    reward_size: float = 1.0
-    blur_rate: float = 3e-3
+    dropout: NotNegative = 0.0
+    batch: Count = 256
+    actor_batch: Count = 64
+    discriminator_rate: NotNegative = 1e-3
+    critic_rate: NotNegative = 1e-3
+    actor_rate: NotNegative = 3e-3
+    judge_rate: NotNegative = 0.01
+    entropy_weight: NotNegative = 0.05
+    prior_time: NotNegative = 2e5
+    prior_largest: NotNegative = 10.0
+    prior_rate: NotNegative = 0.1
+    prior_every: Count = 10
+    average_rate: NotNegative = 1e-3
+    reward_size: NotNegative = 1.0
+    blur_rate: NotNegative = 3e-3
+
+    def __post_init__(self) -> None:
+        check_hyperparameters(self)
 
     def init(self, *, window: int, observation: int, parameters: int, groups: int, key: PRNGKeyArray) -> Agents:
         """Fresh networks; actors and prior at N(0, 1). `window` is the size of what stands for (s, a)."""
@@ -193,7 +190,7 @@ class AgentSettings:
     def _steer_blur(
         self, agents: Agents, reward: Float[Array, " rows"], share: Float[Array, " rows"]
     ) -> tuple[Agents, dict[str, Array]]:
-        """More blur where the discriminators are too sure, less where they cannot tell."""
+        """Widen the blur if the mean |reward| is above its set size, narrow it if below."""
         size = (share * jnp.abs(reward)).mean()
         surplus = jnp.clip(size - self.reward_size, -1.0, 1.0)
         log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *np.log(BLUR_RANGE))

@@ -18,21 +18,20 @@ from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.agents import BLUR_RANGE, Agents, AgentSettings
 from madoc.calibration.madoc.collection import Features, StartMode, collect, empty_rows, remember, sensed, starts_of
 from madoc.calibration.madoc.grouping import GroupingVAE
-from madoc.calibration.madoc.sensing import noise_deviation, said_of_observations, window_length
+from madoc.calibration.madoc.sensing import noise_deviation, observation_warnings, window_length
 from madoc.calibration.madoc.value_decomposition import Mixing
 from madoc.calibration.madoc.watch import Watch
-from madoc.errors import MadocError, check_at_least
+from madoc.errors import MadocError
 from madoc.learning import replay
-from madoc.learning.cloning import clone
+from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
 from madoc.learning.networks import adam, scalars
-from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.learning.window_features import WindowScaling
 from madoc.simulation.rollout import Walkers, begin
-from madoc.types import Epoch
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 Grouping = Literal["learned", "one", "each"]
 GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
-"""Parameter draws an epoch, and control steps a row lives under one draw, by start mode."""
+"""Parameter draws per epoch, and control steps of a row under one draw, by start mode."""
 PAPER: dict[str, Any] = {
     "starts": "policy",
     "features": "raw",
@@ -67,10 +66,9 @@ PAPER: dict[str, Any] = {
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MadocState:
-    """Everything Madoc carries. `labels` are groups by parameter; counts are epochs done of each stage."""
+    """Everything Madoc carries. `labels` are the parameters' groups, `grouped` counts epochs of grouping."""
 
-    policy: TanhGaussianPolicy
-    policy_optimiser: PyTree
+    clone: Clone
     vae: GroupingVAE
     vae_optimiser: PyTree
     schemes: Int[np.ndarray, "votes d"]
@@ -80,7 +78,6 @@ class MadocState:
     walkers: Walkers
     watch: Watch
     key: PRNGKeyArray
-    cloned: int
     grouped: int
     failures: int
 
@@ -95,11 +92,11 @@ class Madoc:
         group_count: Learned groups; None takes the task's own number.
         starts: `policy` (free running from resets, the paper's), `logged` (short rollouts from logged states
             under the clone; velocities from positions where they are hidden) or `replay` (one step from logged state
-            and action).
+            and action). None takes `logged` where states are known, else `policy`.
         window: Rows (s, a) that the discriminators see before s'; None takes 1 where an observation determines the
             state, as the paper does, else 3.
-        sensor_noise: Put on simulated observations, as a share of a step's typical change; None takes what the data
-            says of itself, `estimated` looks for it in the data.
+        sensor_noise: Put on simulated observations, as a share of a step's typical change; None takes the share that
+            the data declares, `estimated` estimates it from the data.
         features: `standardised` (s, a) and s' - s, or `raw` as the paper's.
         hidden: Units per layer of clone and VAE.
         cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
@@ -109,8 +106,8 @@ class Madoc:
         grouping_updates: Updates in each.
         epoch_steps: Control steps an epoch.
         updates: Calibration updates an epoch.
-        draws: Parameter draws an epoch; None takes 20, 100, 100 for the three starts.
-        horizon: Control steps under one draw; None takes 50, 5, 1 for the three starts.
+        draws: Parameter draws an epoch; None takes 20, 100, 100 for `policy`, `logged`, `replay`.
+        horizon: Control steps under one draw; None takes 50, 5, 1 for `policy`, `logged`, `replay`.
         batch: Rows a cloning or grouping update.
         learning_rate: Adam's, for clone and VAE.
         replay_capacity: Simulated rows kept.
@@ -120,49 +117,33 @@ class Madoc:
 
     mixing: Mixing = "dop"
     groups: Grouping = "learned"
-    group_count: int | None = None
-    starts: StartMode = "logged"
-    window: int | None = None
-    sensor_noise: float | Literal["estimated"] | None = None
+    group_count: Count | None = None
+    starts: StartMode | None = None
+    window: Count | None = None
+    sensor_noise: NotNegative | Literal["estimated"] | None = None
     features: Features = "standardised"
-    hidden: tuple[int, ...] = (128, 128)
-    cloning_epochs: int = 40
-    cloning_updates: int = 200
+    hidden: Layers = (128, 128)
+    cloning_epochs: CountOrZero = 40
+    cloning_updates: Count = 200
     keep_cloning: bool = False
-    grouping_epochs: int = 10
-    grouping_updates: int = 200
-    epoch_steps: int = 1000
-    updates: int = 100
-    draws: int | None = None
-    horizon: int | None = None
-    batch: int = 256
-    learning_rate: float = 1e-3
-    replay_capacity: int = 50_000
-    patience: int = 150
+    grouping_epochs: Count = 10
+    grouping_updates: Count = 200
+    epoch_steps: Count = 1000
+    updates: Count = 100
+    draws: Count | None = None
+    horizon: Count | None = None
+    batch: Count = 256
+    learning_rate: NotNegative = 1e-3
+    replay_capacity: Count = 50_000
+    patience: CountOrZero = 150
     agents: AgentSettings = field(default_factory=AgentSettings)
 
     def __post_init__(self) -> None:
-        counts = (
-            "group_count",
-            "window",
-            "hidden",
-            "grouping_epochs",
-            "epoch_steps",
-            "updates",
-            "draws",
-            "horizon",
-            "batch",
-        )
-        check_at_least(self, **dict.fromkeys((*counts, "cloning_updates", "grouping_updates", "replay_capacity"), 1))
-        check_at_least(self, cloning_epochs=0, learning_rate=0.0, patience=0)
+        check_hyperparameters(self)
         if self.starts == "replay" and self.horizon not in (None, 1):
             raise MadocError(f"starts=replay replays single steps: expected horizon 1 or none, got {self.horizon}")
         if self.starts == "replay" and self.window not in (None, 1):
             raise MadocError(f"starts=replay replays single steps: expected window 1 or none, got {self.window}")
-        if isinstance(self.sensor_noise, float | int) and not (
-            np.isfinite(self.sensor_noise) and self.sensor_noise >= 0
-        ):
-            raise MadocError(f"expected sensor_noise of 0 or more, got {self.sensor_noise}")
 
     @classmethod
     def paper(cls, **changes: Any) -> "Madoc":
@@ -180,31 +161,17 @@ class Madoc:
             MadocError: Rows are to start at logged states, but those cannot be rebuilt.
         """
         task, simulator = problem.simulator.task, problem.simulator
-        count, observation, action = len(simulator.parameters), task.observation_size, simulator.action_size
+        count = len(simulator.parameters)
         scaling, _ = self._windows(problem)
         window, following = scaling.sizes
         groups = self._group_count(problem)
         of_policy, of_vae, of_agents, of_start, key = jax.random.split(key, 5)
-        logged = np.asarray(problem.dataset.transitions.observation)
-        policy = TanhGaussianPolicy(
-            observation,
-            action,
-            self.hidden,
-            key=of_policy,
-            offset=logged.mean(0),
-            scale=np.maximum(logged.std(0), 1e-3),
-        )
         vae = GroupingVAE(count, window, following, self.hidden, key=of_vae)
-        agents = self.agents.init(
-            window=window,
-            observation=following,
-            parameters=count,
-            groups=groups,
-            key=of_agents,
-        )
+        agents = self.agents.init(window=window, observation=following, parameters=count, groups=groups, key=of_agents)
         return MadocState(
-            policy=policy,
-            policy_optimiser=adam(self.learning_rate).init(eqx.filter(policy, eqx.is_array)),
+            clone=fresh_clone(
+                problem.dataset.transitions, self.hidden, learning_rate=self.learning_rate, key=of_policy
+            ),
             vae=vae,
             vae_optimiser=adam(self.learning_rate).init(eqx.filter(vae, eqx.is_array)),
             schemes=np.zeros((max(1, self.grouping_epochs // 20), count), dtype=np.int64),
@@ -214,7 +181,6 @@ class Madoc:
             walkers=_out_of_step(self._begin(problem, self._geometry(problem)[0], of_start), task.max_episode_steps),
             watch=watch.begin_watch(agents.average),
             key=key,
-            cloned=0,
             grouped=0,
             failures=0,
         )
@@ -226,17 +192,17 @@ class Madoc:
 
     def estimate(self, problem: CalibrationProblem, state: MadocState) -> Estimate:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
-        space, best = problem.simulator.parameters, state.watch.best
-        unit, std = np.tanh(np.asarray(best.mean, np.float64)), np.exp(np.asarray(best.log_std, np.float64))
+        space, best, starts = problem.simulator.parameters, state.watch.best, self._start_mode(problem)
+        scaled, std = np.tanh(np.asarray(best.mean, np.float64)), np.exp(np.asarray(best.log_std, np.float64))
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
-            mean=space.to_physical(unit),
-            std=(1.0 - unit**2) * std * (space.high - space.low) / 2.0,
+            mean=space.to_physical(scaled),
+            std=(1.0 - scaled**2) * std * (space.high - space.low) / 2.0,
             groups=tuple(tuple(group) for group in groups),
             failures=state.failures,
             warnings=(
-                *watch.warnings(state.watch, unit, space.names),
-                *said_of_observations(problem, self._window(problem), self._deviation(problem), self.starts),
+                *watch.warnings(state.watch, scaled, space.names),
+                *observation_warnings(problem, self._window(problem), self._deviation(problem), starts),
             ),
         )
 
@@ -246,7 +212,7 @@ class Madoc:
 
     def _stage(self, state: MadocState) -> str:
         """What the next epoch does."""
-        if self._will_clone and state.cloned < self.cloning_epochs:
+        if self._will_clone and state.clone.epochs < self.cloning_epochs:
             return "cloning"
         if 1 < len(state.agents.critics.weight) < len(state.labels) and state.grouped < self.grouping_epochs:
             return "grouping"
@@ -256,16 +222,19 @@ class Madoc:
     def _will_clone(self) -> bool:
         return self.starts != "replay"
 
+    def _start_mode(self, problem: CalibrationProblem) -> StartMode:
+        return self.starts or ("logged" if problem.states.starts_known else "policy")
+
     def _geometry(self, problem: CalibrationProblem) -> tuple[int, int]:
         """Draws, and control steps of a row: `horizon` of them end a window."""
-        draws, horizon = GEOMETRY[self.starts]
+        draws, horizon = GEOMETRY[self._start_mode(problem)]
         return self.draws or draws, (self.horizon or horizon) + self._window(problem) - 1
 
     def _window(self, problem: CalibrationProblem) -> int:
-        return window_length(problem, self.window, self.starts)
+        return window_length(problem, self.window, self._start_mode(problem))
 
     def _windows(self, problem: CalibrationProblem) -> tuple[WindowScaling, tuple[Array, Array]]:
-        return problem.windows(self.features, self._window(problem))
+        return problem.features.windows(self.features, self._window(problem))
 
     def _deviation(self, problem: CalibrationProblem) -> Float[np.ndarray, " observation"]:
         return noise_deviation(problem, self.sensor_noise)
@@ -277,24 +246,20 @@ class Madoc:
 
     def _begin(self, problem: CalibrationProblem, systems: int, key: PRNGKeyArray) -> Walkers:
         rows = max(1, self.epoch_steps // (systems * self._geometry(problem)[1]))
-        return begin(starts_of(problem, self.starts), key, systems=systems, rows=rows)
+        return begin(starts_of(problem, self._start_mode(problem)), key, systems=systems, rows=rows)
 
     def _clone(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         of_batches, key = jax.random.split(state.key)
-        policy, optimiser_state, metrics = clone(
-            state.policy,
-            state.policy_optimiser,
-            problem.pairs,
+        clone, metrics = continue_cloning(
+            state.clone,
+            problem.features.pairs,
             of_batches,
-            optimiser=adam(self.learning_rate),
+            learning_rate=self.learning_rate,
             batch=self.batch,
-            count=self.cloning_updates,
+            updates=self.cloning_updates,
         )
-        cloned = {"policy": policy, "policy_optimiser": optimiser_state, "cloned": state.cloned + 1}
-        following = replace(state, key=key, **cloned)
-        return following, Epoch(
-            scalars(metrics), stage="cloning", fraction=following.cloned / max(1, self.cloning_epochs)
-        )
+        epoch = Epoch(metrics, stage="cloning", fraction=clone.epochs / max(1, self.cloning_epochs))
+        return replace(state, clone=clone, key=key), epoch
 
     def _group(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         count = len(problem.simulator.parameters)
@@ -303,8 +268,8 @@ class Madoc:
         draws = grouping.one_at_a_time(of_draws, count)
         rollout, _ = collect(
             problem,
-            self.starts,
-            state.policy,
+            self._start_mode(problem),
+            state.clone.policy,
             draws,
             self._begin(problem, count, of_start),
             steps=self._geometry(problem)[1],
@@ -344,11 +309,11 @@ class Madoc:
         systems, steps = self._geometry(problem)
         scaling, logged = self._windows(problem)
         draws = np.asarray(draw_parameters(state.agents.actors, of_draws, systems)[0], dtype=np.float64)
-        fresh = self.starts == "logged"
+        fresh = self._start_mode(problem) == "logged"
         rollout, walkers = collect(
             problem,
-            self.starts,
-            state.policy,
+            self._start_mode(problem),
+            state.clone.policy,
             draws,
             self._begin(problem, systems, of_start) if fresh else state.walkers,
             steps=steps,
@@ -381,12 +346,12 @@ class Madoc:
         metrics |= {"mismatch": watched.mismatch, "failures": float(following.failures)}
         if self.keep_cloning and self._will_clone:
             cloned, cloning = self._clone(problem, following)
-            following, metrics = replace(cloned, cloned=state.cloned), metrics | cloning.metrics
+            following, metrics = cloned, metrics | cloning.metrics
         stalled = watch.stalled(watched, self.patience) if self.patience else None
         return following, Epoch(metrics, control_steps=rollout.valid.size, converged=stalled)
 
 
 def _out_of_step(walkers: Walkers, max_age: int) -> Walkers:
-    """Rows that did not all start at once: ages spread evenly, so that time limits do not fall together."""
+    """Walkers whose ages are spread evenly, so that they do not reach the time limit together."""
     count = walkers.age.size
     return replace(walkers, age=(np.arange(count) * max_age // count).reshape(walkers.age.shape))

@@ -1,4 +1,4 @@
-"""Where Madoc's simulated rows come from: three ways to start, and the buffer they are kept in."""
+"""How Madoc simulates rows: three ways to start rollouts, and the replay buffer of their features."""
 
 from dataclasses import replace
 from typing import Literal
@@ -20,7 +20,6 @@ from madoc.simulation.rollout import (
     roll,
     unbiased_starts,
 )
-from madoc.simulation.velocities import refuse_unseen_positions
 from madoc.types import Policy
 
 StartMode = Literal["policy", "logged", "replay"]
@@ -28,19 +27,17 @@ Features = Literal["standardised", "raw"]
 
 
 def starts_of(problem: CalibrationProblem, mode: StartMode) -> Starts:
-    """Where rows start and start again: at the task's resets (`policy`), else at logged states.
+    """Where rollouts start, and start again: at resets of the task (`policy`), else at logged states.
 
-    Where logged states cannot be rebuilt, their velocities are taken from positions.
+    Where velocities are not observed, those of `logged` starts are finite differences of positions.
 
     Raises:
-        MadocError: Positions are not known either, or not all of them.
+        MadocError: Some positions are not observed, or states to replay from are not exact.
     """
     if mode == "policy":
         return reset_states(problem.simulator)
-    if mode == "logged" and problem.states.kind != "exact":
-        refuse_unseen_positions(problem.simulator.task)
-        return chosen_states(problem.states.guesses()[0])
-    return chosen_states(problem.logged_states)
+    logged = problem.states
+    return chosen_states(logged.states if mode == "logged" and logged.starts_known else logged.exact()[0])
 
 
 def collect(
@@ -68,33 +65,20 @@ def collect(
     simulator = problem.simulator
     system = simulator.bind(simulator.parameters.to_physical(draws))
     if mode == "replay":
-        states, actions = problem.logged_states, problem.logged_actions
-        rows = walkers.age.shape[1]
+        states, logged = problem.states.exact()
+        actions, rows = np.asarray(problem.dataset.transitions.action)[logged], walkers.age.shape[1]
         return replay_actions(system, simulator.task, states, actions, rows=rows, key=keys[0]), walkers
     starts = starts_of(problem, mode)
     if mode == "logged":  # every walker stands at a logged state
         starts, walkers = unbiased_starts(system, starts), replace(walkers, state=system.unbiased(walkers.state))
-    return roll(
-        system,
-        simulator.task,
-        policy,
-        walkers,
-        steps=steps,
-        starts=starts,
-        key=keys[0],
-        restart_key=keys[1],
-    )
+    return roll(system, simulator.task, policy, walkers, steps=steps, starts=starts, key=keys[0], restart_key=keys[1])
 
 
 def empty_rows(problem: CalibrationProblem, scaling: WindowScaling, capacity: int) -> replay.Replay:
     """A buffer of features, the draw each row was simulated under, and which parameter was moved for it."""
     window, following = scaling.sizes
     return replay.empty(
-        capacity,
-        pair=(window,),
-        following=(following,),
-        parameters=(len(problem.simulator.parameters),),
-        identity=(),
+        capacity, pair=(window,), following=(following,), parameters=(len(problem.simulator.parameters),), identity=()
     )
 
 
@@ -122,9 +106,9 @@ def remember(
 
 
 def sensed(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:
-    """The rollout as sensors that noisy would have shown it; a reading that ends one row begins the next.
+    """The rollout with sensor noise on its observations; each observation is the same at the end and start of rows.
 
-    What the policy acted on stays as it was.
+    The policy acted on observations without noise.
     """
     if not deviation.any():
         return rollout

@@ -20,8 +20,8 @@ PROJECTED = 3
 class GroupingVAE(eqx.Module):
     """Encoder: identity -> embedding. Decoder: (s, a, ξ_i, embedding) -> s'.
 
-    Eq. (10) without its KL term, as the paper trains it (appendix C): identities are to be told apart, nothing
-    is to be generated, so the embedding is its mean.
+    Eq. (10) without its KL term, as the paper trains it (appendix C): the embedding only has to distinguish
+    parameters, nothing is generated from it, so it is the encoder's mean.
     """
 
     encoder: Network

@@ -1,4 +1,4 @@
-"""What Madoc makes of partial and noisy observations: how many rows it looks at, and what its own readings carry."""
+"""How Madoc adapts to partial and noisy observations: longer windows, and noise on simulated observations."""
 
 from typing import Literal
 
@@ -8,11 +8,11 @@ from jaxtyping import Float
 from madoc.calibration.base import CalibrationProblem
 
 HIDDEN_WINDOW = 3
-"""Rows where velocities are hidden: two readings tell a velocity, a third the acceleration that it came with."""
+"""Window length, in rows, where velocities are hidden: two rows give a velocity, a third an acceleration."""
 
 
 def window_length(problem: CalibrationProblem, asked: int | None, starts: str) -> int:
-    """Rows (s, a) before s': as many as asked for, else 1 where one tells the state or is replayed."""
+    """Window length in rows: the one asked for, else 1 where observations determine states or rows are replayed."""
     seen = problem.states.kind == "exact"
     return asked or (1 if seen or starts == "replay" else HIDDEN_WINDOW)
 
@@ -20,7 +20,7 @@ def window_length(problem: CalibrationProblem, asked: int | None, starts: str) -
 def noise_deviation(
     problem: CalibrationProblem, asked: float | Literal["estimated"] | None
 ) -> Float[np.ndarray, " observation"]:
-    """Of the noise that simulated observations are given: as asked, looked for, or what the data says of itself."""
+    """Standard deviation of the noise put on simulated observations, by default that which the data declares."""
     if asked == "estimated":
         return problem.estimated_noise
     share = problem.dataset.disturbance.noise if asked is None else float(asked)
@@ -28,16 +28,16 @@ def noise_deviation(
     return share / np.sqrt(1.0 + 2.0 * share**2) * problem.typical_change
 
 
-def said_of_observations(
+def observation_warnings(
     problem: CalibrationProblem, window: int, deviation: Float[np.ndarray, " observation"], starts: str
 ) -> tuple[str, ...]:
-    """What else the estimate rests on where observations are partial or noisy, one sentence each."""
-    found = []
+    """Assumptions behind the estimate where observations are partial or noisy, one sentence each."""
+    sentences = []
     if problem.states.kind != "exact":
-        found.append(f"states cannot be rebuilt from the data: discriminators see windows of {window} rows")
+        sentences.append(f"states cannot be rebuilt from the data: discriminators see windows of {window} rows")
         if starts == "logged":
-            found.append("rollouts start at states whose velocities were taken from positions, which is not exact")
+            sentences.append("rollouts start at states whose velocities were taken from positions, which is not exact")
     if deviation.any():
         share = 100.0 * np.median(deviation / problem.typical_change)
-        found.append(f"simulated observations were given sensor noise of {share:.2g} % of a step's change")
-    return tuple(found)
+        sentences.append(f"simulated observations were given sensor noise of {share:.2g} % of a step's change")
+    return tuple(sentences)

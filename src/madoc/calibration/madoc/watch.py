@@ -1,27 +1,28 @@
-"""Madoc watches itself: is the reward saturated, is it still getting closer, which estimate was best. No truth."""
+"""Madoc monitors itself, without the truth: whether the reward is saturated, and which estimate was the best."""
 
 from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
 
+from madoc.calibration.cautions import at_end_of_range
 from madoc.calibration.madoc.actors import Actors
 from madoc.types import Metrics
 
 SMOOTHING = 0.1
-"""Share of an epoch in the running averages."""
+"""Weight of the newest epoch in the exponential moving averages."""
 PROGRESS = 0.02
-"""A mismatch smaller by this share is progress."""
+"""Relative decrease of the mismatch that counts as progress; smaller ones lead to a stop once patience is over."""
 SETTLING = 30
-"""Epochs in which discriminators and blur find each other."""
+"""Epochs until discriminators and blur have settled; the mismatch of earlier ones is not compared."""
 TELLING = 0.7
-"""Share of the steered reward size below which a blur is still being found, or can no longer be."""
+"""Least ratio of the reward's size to its set value at which the mismatch of an epoch is used."""
 CLOSE = 0.25
-"""A mismatch within this share of the lowest is as good: the later estimate is the better one."""
+"""Relative excess over the lowest mismatch that still counts as equally good; of equals the latest is taken."""
 AT_END = 0.95
-"""In [-1, 1], past which a parameter is said to stand at the end of its range: entropy keeps it from the end itself."""
+"""Absolute value in [-1, 1] past which a warning names the parameter; entropy keeps estimates from the end itself."""
 SATURATED = 0.5
-"""Share of rows at the reward's bound past which a user is warned."""
+"""Share of rows whose reward is at its bound past which a warning is given."""
 
 
 @jax.tree_util.register_dataclass
@@ -35,9 +36,9 @@ class Watch:
             unsure as they are steered to be (its size times |reward| over what that is steered to), or the mean
             |reward| where there is no blur.
         at_bound: Share of rows whose reward stands at its bound.
-        best_mismatch: The lowest `mismatch` since it could be told.
-        milestone: The mismatch when it last fell by a share worth the name, ...
-        milestone_epoch: ... and when that was.
+        best_mismatch: The lowest `mismatch` since it has been compared.
+        milestone: The mismatch when it last made progress.
+        milestone_epoch: The epoch in which it did.
         best: The actors' moving average when the mismatch was last close to its lowest.
     """
 
@@ -60,9 +61,9 @@ def observe(
 ) -> Watch:
     """Take in one epoch; keep its estimate unless the mismatch has been clearly lower.
 
-    A blur says something once the discriminators have settled and it has left its largest; and while they can tell
-    at it, that is while the mean |reward| is near the size it is `steered_to` (0 where there is no blur), or the
-    blur can become no smaller. Before that, and without a blur, the latest estimate is the best.
+    The blur measures the mismatch once the discriminators have settled and it is below its upper limit, provided that
+    the mean |reward| is near the size it is `steered_to` (0 without a blur), or the blur is at its lower limit.
+    Before that, and without a blur, the latest estimate is the best.
     """
     blur, size, at_bound = metrics["blur"], metrics["reward_size"], metrics["reward_at_bound"]
     mismatch = blur * size / steered_to if steered_to else size
@@ -95,20 +96,17 @@ def stalled(watch: Watch, patience: int) -> str | None:
     )
 
 
-def warnings(watch: Watch, unit: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
-    """What a user should know of the estimate `unit` (d,) in [-1, 1], one sentence each."""
-    found = []
+def warnings(watch: Watch, scaled: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
+    """What a user should know of the estimate `scaled` (d,) in [-1, 1], one sentence each."""
+    sentences = []
     if watch.epochs < SETTLING:
-        found.append(
+        sentences.append(
             f"{watch.epochs} epochs of calibration are fewer than the {SETTLING} in which the discriminators settle; "
             "give it a larger budget"
         )
     if watch.at_bound > SATURATED:
-        found.append(
+        sentences.append(
             f"the discriminators are sure of {watch.at_bound:.0%} of the simulated rows (reward at its bound), "
             "so the reward has no slope; start rollouts at logged states, or narrow the ranges"
         )
-    at_end = [name for name, value in zip(names, unit, strict=True) if abs(value) > AT_END]
-    if at_end:
-        found.append(f"at the end of its range: {', '.join(at_end)}; widen the range or doubt the model")
-    return tuple(found)
+    return *sentences, *at_end_of_range(scaled, names, beyond=AT_END)

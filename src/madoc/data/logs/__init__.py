@@ -1,6 +1,6 @@
-"""A user's own logs: `read` makes a dataset of files and folders, for a robot whose spec names their columns.
+"""Logs of a user's robot: `read` makes a dataset of files and folders, for a robot whose spec names their columns.
 
-One file a format; each yields runs of named columns, `assembly.py` makes transitions of them.
+Each format has one reader, which returns runs of named columns; `assembly.py` makes transitions of them.
 """
 
 import os
@@ -23,7 +23,7 @@ from madoc.data.logs.assembly import assemble, wanted_columns
 from madoc.data.logs.tables import Run, Table
 from madoc.data.minari_reader import recognises as is_minari
 from madoc.data.validation import require_file, validate
-from madoc.errors import MadocError
+from madoc.errors import MadocError, listed
 from madoc.robots import Robot
 
 
@@ -33,8 +33,8 @@ class LogFormat:
 
     Attributes:
         read: (path, wanted columns) -> runs.
-        suffixes: Of its files; empty where it is a folder.
-        description: What it looks like, for lists.
+        suffixes: Endings of its files; empty where it is a folder.
+        description: A short description of the layout, for lists.
     """
 
     read: Callable[[Path, Collection[str]], list[Run]]
@@ -43,30 +43,32 @@ class LogFormat:
 
 
 LOG_FORMATS: dict[str, LogFormat] = {
-    "csv": LogFormat(csv_reader.read, (".csv", ".tsv", ".txt"), "a header, then a line a row"),
-    "npz": LogFormat(npz_reader.read, (".npz",), "an array a column"),
-    "hdf5": LogFormat(hdf5_reader.read, (".h5", ".hdf5", ".hdf"), "a dataset a column; numbered groups are runs"),
-    "parquet": LogFormat(parquet_reader.read, (".parquet", ".pq"), "a column a column"),
+    "csv": LogFormat(csv_reader.read, (".csv", ".tsv", ".txt"), "a header, then one line for each row"),
+    "npz": LogFormat(npz_reader.read, (".npz",), "one array for each column"),
+    "hdf5": LogFormat(
+        hdf5_reader.read, (".h5", ".hdf5", ".hdf"), "one dataset for each column; numbered groups are runs"
+    ),
+    "parquet": LogFormat(parquet_reader.read, (".parquet", ".pq"), "columns of numbers or of lists"),
     "mcap": LogFormat(mcap_reader.read, (".mcap",), "topics of JSON or ROS 2 messages"),
-    "minari": LogFormat(minari_runs.read, (), "a Minari directory: an episode a run"),
-    "lerobot": LogFormat(lerobot_reader.read, (), "a LeRobot directory: an episode a run"),
+    "minari": LogFormat(minari_runs.read, (), "a Minari directory: each episode is a run"),
+    "lerobot": LogFormat(lerobot_reader.read, (), "a LeRobot directory: each episode is a run"),
 }
 
 _BY_SUFFIX = {suffix: name for name, entry in LOG_FORMATS.items() for suffix in entry.suffixes}
 _SUFFIX_LIST = ", ".join(_BY_SUFFIX)
 _NOT_LOGS = frozenset((".yaml", ".yml", ".xml", ".urdf", ".md", ".json", ".pdf", ".png", ".jpg", ".stl", ".obj", ""))
-"""What lies beside logs without being one."""
+"""Endings of files that lie beside logs; they are skipped without a note."""
 _OF_A_RUN = ("metrics.jsonl", "result.json")
-"""Beside spec.json they mark a run folder, under way or ended."""
+"""Files that, beside spec.json, mark a run folder of Madoc."""
 
 
 def read(
     paths: str | os.PathLike | Iterable[str | os.PathLike], robot: Robot, *, clip_actions: bool = False
 ) -> Dataset:
-    """Read logs of a robot: files, folders of files, several of either; a run a file, or an episode of one.
+    """Read logs of a robot from files and folders; each file, or each episode in one, is a run.
 
-    Observations are the spec's signals in its order and units, actions are brought to [-1, 1] by their ranges, rewards
-    are 0 and nothing terminates. What was cut or resampled on the way is in the dataset's `findings`.
+    Observations are the spec's signals in its order and units, actions are scaled to [-1, 1] by their ranges, rewards
+    are 0 and nothing terminates. The dataset's `findings` tell what was cut or resampled.
 
     Args:
         paths: A file or folder, or several.
@@ -84,12 +86,15 @@ def read(
     runs: list[Run] = []
     ignored: list[str] = []
     for source in sources:
-        found, others = _runs(source, wanted)
-        runs += found
+        of_source, others = _runs(source, wanted)
+        runs += of_source
         ignored += others
     origin = str(sources[0]) + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
     dataset = validate(assemble(_distinct(runs), robot, origin=origin, clip_actions=clip_actions), robot.task)
-    return dataset if not ignored else _told(dataset, ignored)
+    if ignored:
+        finding = Finding("note", f"{listed(ignored, 3)} were not read: no reader knows them", dataset.origin)
+        dataset = replace(dataset, findings=(finding, *dataset.findings))
+    return dataset
 
 
 def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
@@ -116,12 +121,13 @@ def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
     for file in known:
         require_file(file)
         name = file.relative_to(source).as_posix()
-        runs += [_renamed(run, file.name, name) for run in _entry(file).read(file, wanted)]
+        of_file = _entry(file).read(file, wanted)
+        runs += [replace(run, name=run.name.replace(file.name, name, 1)) for run in of_file]
     return runs, [file.relative_to(source).as_posix() for file in others if not _is_prose(file)]
 
 
 def _is_of_a_run_folder(file: Path, source: Path) -> bool:
-    """Whether Madoc wrote it: a run folder among the logs holds arrays too."""
+    """Whether a file is in a run folder of Madoc, which holds arrays too."""
     folders = (folder for folder in file.parents if folder.is_relative_to(source))
     return any(
         (folder / "spec.json").is_file() and any((folder / name).is_file() for name in _OF_A_RUN) for folder in folders
@@ -139,10 +145,6 @@ def _entry(file: Path) -> LogFormat:
     return LOG_FORMATS[_BY_SUFFIX[suffix]]
 
 
-def _renamed(run: Run, before: str, after: str) -> Run:
-    return Run(run.name.replace(before, after, 1), run.tables, run.timed)
-
-
 def _distinct(runs: list[Run]) -> list[Run]:
     """Runs of equal names, from files of equal names in several folders, numbered."""
     seen: dict[str, int] = {}
@@ -150,14 +152,8 @@ def _distinct(runs: list[Run]) -> list[Run]:
     for run in runs:
         seen[run.name] = seen.get(run.name, 0) + 1
         count = seen[run.name]
-        named.append(run if count == 1 else Run(f"{run.name} ({count})", run.tables, run.timed))
+        named.append(run if count == 1 else replace(run, name=f"{run.name} ({count})"))
     return named
-
-
-def _told(dataset: Dataset, ignored: list[str]) -> Dataset:
-    shown = ", ".join(ignored[:3]) + (f" and {len(ignored) - 3} more" if len(ignored) > 3 else "")
-    finding = Finding("note", f"{shown} were not read: no reader knows them", dataset.origin)
-    return replace(dataset, findings=(finding, *dataset.findings))
 
 
 __all__ = ["LOG_FORMATS", "LogFormat", "Run", "Table", "read"]

@@ -1,37 +1,37 @@
-"""From runs to a dataset of a robot: its columns found, checked, cut where they break, actions brought to [-1, 1]."""
+"""From runs to a dataset of a robot: columns are found, checked and cut where they break, actions scaled to [-1, 1]."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from madoc.data.dataset import Dataset, close_episodes
 from madoc.data.findings import Finding
-from madoc.data.logs.tables import Run, Table, as_numbers, listed
-from madoc.data.logs.timing import Resample, Series, check_ascending, common_grid, on_grid, steady_links
+from madoc.data.logs.tables import Run, Table, as_numbers
+from madoc.data.logs.timing import Series, check_ascending, common_grid, on_grid, steady_links
 from madoc.data.validation import ACTION_TOLERANCE
-from madoc.errors import MadocError
+from madoc.errors import MadocError, nearest_hint
 from madoc.robots import Robot
 from madoc.robots.spec import LogSpec
 from madoc.types import Transitions
 
 DEFAULT_TIME = "time"
 _MOST_LOST = 0.5
-"""A run that loses a larger share of its rows is refused."""
+"""Largest share of a run's rows that may be unusable; a run that loses more is refused."""
+_BROKEN = "NaN, infinity or nothing in a signal or action"
 
 
 @dataclass(frozen=True)
 class Stretches:
-    """A run as the robot sees it.
+    """The signals and actions of a run, a control step apart.
 
     Attributes:
         observation: Signals by row.
         action: Actions by row, in their units.
-        linked: Whether a row is followed by the next one, a control step later.
-        series: To name rows of the log by; None once they were resampled.
-        findings: What is to be said.
+        linked: Whether the next row follows a control step later.
+        series: The rows of the log, to name them in errors; None where they were resampled.
+        findings: Notes and warnings.
     """
 
     observation: Float[np.ndarray, "rows signals"]
@@ -50,7 +50,7 @@ def wanted_columns(robot: Robot) -> dict[str, str]:
 def assemble(runs: Sequence[Run], robot: Robot, *, origin: str, clip_actions: bool = False) -> Dataset:
     """A dataset of all runs; every stretch without a break is an episode, named after its run.
 
-    Row k says what was observed and what was then done, until row k + 1; the last action of a stretch is not used.
+    Row k holds an observation and the action taken until row k + 1; the last action of a stretch is not used.
 
     Raises:
         MadocError: A column is missing or not numbers, time is not as the spec says, too many rows are broken, actions
@@ -96,7 +96,7 @@ def assemble(runs: Sequence[Run], robot: Robot, *, origin: str, clip_actions: bo
 
 
 def stretches(run: Run, robot: Robot) -> Stretches:
-    """A run's columns, on the robot's control steps.
+    """The columns of a run on the robot's control steps.
 
     Raises:
         MadocError: As `assemble`.
@@ -107,34 +107,32 @@ def stretches(run: Run, robot: Robot) -> Stretches:
     tables = list(dict.fromkeys(homes.values()))
     if len(tables) > 1 and layout.resample is None:
         raise _several_tables(run, wanted, homes)
-    signals = [channel.name for channel in robot.signals]
-    everything = [*signals, *(channel.name for channel in robot.actions)]
-    if layout.resample is None:
-        series, findings = _series(run, run.tables[tables[0]], [wanted[name] for name in everything], layout)
-        if run.timed:
-            check_ascending(series)
-            linked, odd = steady_links(series, control_step, layout.tolerance)
-            findings += odd
-        else:
-            linked = np.ones(max(0, len(series.time) - 1), dtype=bool)
-            what = f"its format keeps no times: rows are taken to be {control_step:g} s apart"
-            findings.append(Finding("note", what, run.name))
-        width = len(signals)
-        observation, action = series.values[:, :width], series.values[:, width:]
-        whole, lost = _whole(series, observation, action)
-        return Stretches(observation, action, linked & whole, series, (*findings, *lost))
-    return _resampled(run, robot, wanted, homes)
+    if layout.resample is not None:
+        return _resampled(run, robot, wanted, homes)
+    series, findings = _series(run, run.tables[tables[0]], list(wanted.values()), layout)
+    if run.timed:
+        check_ascending(series)
+        linked, odd = steady_links(series, control_step, layout.tolerance)
+        findings += odd
+    else:
+        linked = np.ones(max(0, len(series.time) - 1), dtype=bool)
+        what = f"its format keeps no times: rows are taken to be {control_step:g} s apart"
+        findings.append(Finding("note", what, run.name))
+    width = len(robot.signals)
+    observation, action = series.values[:, :width], series.values[:, width:]
+    whole, lost = _whole(series, observation, action)
+    return Stretches(observation, action, linked & whole, series, (*findings, *lost))
 
 
 def _homes(run: Run, wanted: Mapping[str, str], layout: LogSpec) -> dict[str, int]:
-    """Which table each wanted column is in."""
-    found: dict[str, int] = {}
+    """The table of each wanted column."""
+    homes: dict[str, int] = {}
     for name, column in wanted.items():
         home = next((index for index, table in enumerate(run.tables) if column in table.columns), None)
         if home is None:
             raise _no_column(run, name, column)
-        found[name] = home
-    return found
+        homes[name] = home
+    return homes
 
 
 def _no_column(run: Run, name: str, column: str) -> MadocError:
@@ -142,11 +140,9 @@ def _no_column(run: Run, name: str, column: str) -> MadocError:
     for table in run.tables:
         if column in table.others:
             return MadocError(f"expected numbers in column {called} of {run.name}, got {table.others[column]}")
-    names = run.names
-    close = get_close_matches(column.lower(), [known.lower() for known in names], n=3, cutoff=0.5)
-    near = [known for known in names if known.lower() in close or column.lower() in known.lower()][:3]
-    hint = f"nearest: {', '.join(near)}" if near else f"there are: {listed(names)}"
-    return MadocError(f"no column {called} in {run.name}; {hint}; name it under log: columns: in the spec")
+    return MadocError(
+        f"no column {called} in {run.name}; {nearest_hint(column, run.names)}; name it under log: columns: in the spec"
+    )
 
 
 def _several_tables(run: Run, wanted: Mapping[str, str], homes: Mapping[str, int]) -> MadocError:
@@ -185,50 +181,42 @@ def _series(run: Run, table: Table, columns: Sequence[str], layout: LogSpec) -> 
     findings = []
     if len(rows) < len(time):
         first = table.place(int(np.flatnonzero(~known)[0]))
-        _refuse_if_most(run.name, len(time) - len(rows), len(time), f"no finite time in column {clock!r}", first)
-        findings.append(
-            Finding(
-                "warning",
-                f"{len(time) - len(rows)} of {len(time):,} rows have no finite time, the first {first}: left out",
-                run.name,
-                "look at the recorder",
-            )
-        )
+        what = f"no finite time in column {clock!r}"
+        findings = [_lost(run.name, len(time) - len(rows), len(time), what, first, "left out")]
     return Series(time[rows], values[rows], table, rows, run.name), findings
 
 
-def _whole(
-    series: Series, observation: Float[np.ndarray, "rows signals"], action: Float[np.ndarray, "rows actions"]
-) -> tuple[Bool[np.ndarray, " links"], list[Finding]]:
-    """Which rows are all numbers and followed by signals that are; and what to say of the others."""
-    seen, done = np.isfinite(observation).all(-1), np.isfinite(action).all(-1)
-    broken = np.flatnonzero(~(seen & done))
-    findings = []
-    if len(broken) and not (len(broken) == 1 and broken[0] == len(seen) - 1 and seen[-1]):
-        first = series.place(int(broken[0]))
-        _refuse_if_most(series.run, len(broken), len(seen), "NaN, infinity or nothing in a signal or action", first)
-        findings.append(
-            Finding(
-                "warning",
-                f"{len(broken)} of {len(seen):,} rows hold NaN, infinity or nothing in a signal or action, the first "
-                f"{first}: the run is cut there",
-                series.run,
-                "look at the recorder",
-            )
-        )
-    return seen[:-1] & done[:-1] & seen[1:], findings
+def _lost(run: str, broken: int, rows: int, what: str, first: str, consequence: str) -> Finding:
+    """A warning about rows that cannot be used.
 
-
-def _refuse_if_most(run: str, broken: int, rows: int, what: str, first: str) -> None:
+    Raises:
+        MadocError: They are more than half of the rows.
+    """
     if broken > _MOST_LOST * rows:
         raise MadocError(
             f"expected numbers in {run}, got {what} in {broken:,} of {rows:,} rows, the first {first}; record it again "
             "or name other columns"
         )
+    sentence = f"{broken} of {rows:,} rows have {what}, the first {first}: {consequence}"
+    return Finding("warning", sentence, run, "look at the recorder")
+
+
+def _whole(
+    series: Series, observation: Float[np.ndarray, "rows signals"], action: Float[np.ndarray, "rows actions"]
+) -> tuple[Bool[np.ndarray, " links"], list[Finding]]:
+    """Whether a row has only numbers and is followed by signals that are numbers; and a warning about the others."""
+    seen, done = np.isfinite(observation).all(-1), np.isfinite(action).all(-1)
+    broken = np.flatnonzero(~(seen & done))
+    links = seen[:-1] & done[:-1] & seen[1:]
+    # The last row of a run may lack its action, which is not used.
+    if not len(broken) or (len(broken) == 1 and broken[0] == len(seen) - 1 and seen[-1]):
+        return links, []
+    first = series.place(int(broken[0]))
+    return links, [_lost(series.run, len(broken), len(seen), _BROKEN, first, "the run is cut there")]
 
 
 def _resampled(run: Run, robot: Robot, wanted: Mapping[str, str], homes: Mapping[str, int]) -> Stretches:
-    """Signals held or interpolated on control steps, actions always held: a command counts until the next."""
+    """A run on control steps: signals held or interpolated, actions always held, as a command holds until the next."""
     layout, control_step = robot.spec.log, robot.spec.control_step
     if not run.timed:
         raise MadocError(f"{run.name} keeps no times, so it cannot be resampled; leave log: resample: out")
@@ -239,11 +227,11 @@ def _resampled(run: Run, robot: Robot, wanted: Mapping[str, str], homes: Mapping
             names = [channel.name for channel in channels if homes[channel.name] == home]
             if not names:
                 continue
-            series, told = _series(run, run.tables[home], [wanted[name] for name in names], layout)
+            series, untimed = _series(run, run.tables[home], [wanted[name] for name in names], layout)
             check_ascending(series)
             series, lost = _without_broken(series)
             pieces.append((series, names, acting))
-            findings += [*told, *lost]
+            findings += [*untimed, *lost]
     grid = common_grid([series for series, _, _ in pieces], control_step)
     kept = np.ones(len(grid), dtype=bool)
     columns: dict[str, np.ndarray] = {}
@@ -264,7 +252,7 @@ def _resampled(run: Run, robot: Robot, wanted: Mapping[str, str], homes: Mapping
         Finding(
             "note",
             f"rows {' and '.join(f'{rate:.4g}' for rate in rates)} s apart (median) were brought to {control_step:g} "
-            f"s: signals {_how(layout.resample)}, actions held",
+            f"s: signals {'interpolated' if layout.resample == 'linear' else 'held'}, actions held",
             run.name,
             "actions between two control steps are lost; a smaller control_step keeps them"
             if rates and rates[0] < 0.6 * control_step
@@ -276,33 +264,21 @@ def _resampled(run: Run, robot: Robot, wanted: Mapping[str, str], homes: Mapping
     return Stretches(observation, action, kept[:-1] & kept[1:], None, tuple(dict.fromkeys(findings)))
 
 
-def _how(resample: Resample | None) -> str:
-    return "interpolated" if resample == "linear" else "held"
-
-
 def _without_broken(series: Series) -> tuple[Series, list[Finding]]:
-    """Rows that are all numbers; where some are left out the series has a gap."""
+    """The rows that have only numbers, and a warning about the others, where the series then has a gap."""
     whole = np.isfinite(series.values).all(-1)
     broken = np.flatnonzero(~whole)
     if not len(broken):
         return series, []
     first = series.place(int(broken[0]))
-    _refuse_if_most(series.run, len(broken), len(whole), "NaN, infinity or nothing in a signal or action", first)
-    finding = Finding(
-        "warning",
-        f"{len(broken)} of {len(whole):,} rows hold NaN, infinity or nothing, the first {first}: left out before "
-        "resampling",
-        series.run,
-        "look at the recorder",
-    )
-    kept = Series(series.time[whole], series.values[whole], series.table, series.rows[whole], series.run)
-    return kept, [finding]
+    lost = _lost(series.run, len(broken), len(whole), _BROKEN, first, "left out before resampling")
+    return Series(series.time[whole], series.values[whole], series.table, series.rows[whole], series.run), [lost]
 
 
 def _to_unit(
     part: Stretches, used: np.ndarray, robot: Robot, run: str, *, clip_actions: bool
 ) -> Float[np.ndarray, "rows actions"]:
-    """Actions in [-1, 1] of their channels' ranges.
+    """Actions scaled to [-1, 1] by the ranges of their channels.
 
     Raises:
         MadocError: One is outside, and clipping was not asked for.

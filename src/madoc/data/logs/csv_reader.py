@@ -1,4 +1,4 @@
-"""CSV, TSV and their kin: a line of names, then a line a row."""
+"""CSV, TSV and similar files: a line of names, then one line for each row."""
 
 import csv
 from collections.abc import Collection, Iterator
@@ -71,7 +71,7 @@ def _is_number(text: str) -> bool:
 
 
 def _all_numbers(path: Path, names: list[str], separator: str, first: int) -> Table | None:
-    """The quick way, for files that hold numbers alone; None for others, and for those without rows."""
+    """The table of a file that has only numbers, read by NumPy; None for others, and for files without rows."""
     with path.open(encoding="utf-8-sig") as file:
         lines = [number for number, text in enumerate(file, 1) if number > first and _is_row(text)]
     if not lines:

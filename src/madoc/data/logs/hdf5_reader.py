@@ -1,4 +1,4 @@
-"""HDF5: a dataset a column or a matrix of several; groups that look alike are runs."""
+"""HDF5: a dataset is a column, or a matrix of several; numbered groups with equal names in them are runs."""
 
 import re
 from collections.abc import Collection
@@ -34,7 +34,7 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
 
 
 def _runs(file: h5py.File) -> list[tuple[h5py.Group, bool]]:
-    """The groups that are runs, and whether they were told by their numbers."""
+    """The groups that are runs, and whether they are numbered groups."""
     group: h5py.Group = file
     while True:
         children = [child for child in group.values() if isinstance(child, h5py.Group)]
@@ -52,9 +52,9 @@ def _number(group: h5py.Group) -> tuple[int, str]:
 
 
 def _names(group: h5py.Group) -> list[str]:
-    found: list[str] = []
-    group.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None)
-    return found
+    names: list[str] = []
+    group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return names
 
 
 def _arrays(group: h5py.Group) -> dict[str, np.ndarray]:

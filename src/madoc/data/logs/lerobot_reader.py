@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, wanted: Collection[str]) -> list[Run]:
-    """A run an episode. Elements of `observation.state` are `observation.state[0]`, ...
+    """One run for each episode. Elements of `observation.state` are `observation.state[0]`, ...
 
     Where meta/info.json names them, they are `observation.state[shoulder]` as well.
 
@@ -46,7 +45,7 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
     return [_run(path, episode, parts, features) for episode, parts in sorted(episodes.items())]
 
 
-def _run(path: Path, episode: int, parts: list[dict[str, np.ndarray]], features: Mapping[str, Any]) -> Run:
+def _run(path: Path, episode: int, parts: list[dict[str, np.ndarray]], features: Mapping[str, object]) -> Run:
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     named: dict[str, np.ndarray] = {}
     for name, values in arrays.items():
@@ -57,7 +56,7 @@ def _run(path: Path, episode: int, parts: list[dict[str, np.ndarray]], features:
     return Run(f"{path.name}/episode_{episode}", tables_of(named, clock=CLOCK))
 
 
-def _element_names(feature: Any) -> list[str]:
+def _element_names(feature: object) -> list[str]:
     """Names of a feature's elements: a list, or one in a dictionary (`{"motors": [...]}`)."""
     names = feature.get("names") if isinstance(feature, dict) else None
     if isinstance(names, dict):

@@ -1,15 +1,18 @@
-"""MCAP: topics of JSON or ROS 2 messages, each with a clock of its own."""
+"""MCAP: topics of JSON or ROS 2 messages, each with its own clock."""
 
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from madoc.data.logs.tables import Run, Table
 from madoc.errors import MadocError
+
+if TYPE_CHECKING:
+    from mcap.records import Channel, Message, Schema
 
 CLOCK = "log_time"
 EXTRA = 'pip install "madoc-calibration[logs]"'
@@ -23,16 +26,16 @@ class _Topic:
     publish_times: list[int] = field(default_factory=list)
     stamps: list[int | None] = field(default_factory=list)
     rows: list[dict[str, float]] = field(default_factory=list)
-    decode: Callable[[bytes], Any] | None = None
+    decode: Callable[[bytes], object] | None = None
 
 
 def read(path: Path, wanted: Collection[str]) -> list[Run]:
-    """One run, a table a topic. A field is called by topic and path: `/joints.position[0]`.
+    """One run with a table for each topic. A column is named by topic and path of a field: `/joints.position[0]`.
 
-    Where a message names its elements, as sensor_msgs/JointState does in `name`, these stand in the brackets:
+    Where a message names its elements, as sensor_msgs/JointState does in `name`, the names are in the brackets:
     `/joints.position[shoulder]`. Each topic has `log_time`, `publish_time` and, where it is stamped, `header.stamp`, in
-    s since the first message of the file. Only topics that a wanted column is of are decoded whole; of the others one
-    message, so that their columns are known.
+    s since the first message of the file. Topics with a wanted column are decoded completely; of the others one message
+    is, so that their columns are known.
 
     Raises:
         MadocError: The library is missing, the file is damaged or cut short, or no topic can be decoded.
@@ -69,7 +72,7 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
     return [Run(path.name, tuple(_table(name, topic, origin, others) for name, topic in topics.items()))]
 
 
-def _messages(path: Path) -> Iterator[tuple[Any, Any, Any]]:
+def _messages(path: Path) -> Iterator[tuple["Channel", "Schema | None", "Message"]]:
     try:
         from mcap.exceptions import McapError
         from mcap.reader import make_reader
@@ -88,8 +91,8 @@ def _messages(path: Path) -> Iterator[tuple[Any, Any, Any]]:
         ) from error
 
 
-def _decoder(channel: Any, schema: Any) -> Callable[[bytes], Any] | None:
-    """What decodes the messages of a channel; None where nothing here does."""
+def _decoder(channel: "Channel", schema: "Schema | None") -> Callable[[bytes], object] | None:
+    """The decoder of a channel's messages; None for an unknown encoding."""
     if channel.message_encoding == "json":
         return json.loads
     if channel.message_encoding == "cdr" and schema is not None:
@@ -105,8 +108,8 @@ def _of_topic(column: str, topic: str) -> bool:
     return column.startswith((f"{topic}.", f"{topic}[")) or column == topic
 
 
-def _flat(name: str, value: Any, elements: list[str] | None = None) -> Iterator[tuple[str, float]]:
-    """Numbers in a message, by path; text and what is empty is left out."""
+def _flat(name: str, value: object, elements: list[str] | None = None) -> Iterator[tuple[str, float]]:
+    """Numbers in a message by path; text and empty fields are left out."""
     if isinstance(value, bool | int | float):
         yield name, float(value)
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
@@ -123,28 +126,28 @@ def _flat(name: str, value: Any, elements: list[str] | None = None) -> Iterator[
             yield from _flat(f"{name}.{key}", part, known)
 
 
-def _parts(value: Any) -> dict[str, Any]:
+def _parts(value: object) -> dict[str, object]:
     """Fields of a decoded message."""
     if value is None:
         return {}
     if isinstance(value, Mapping):
         return {str(key): part for key, part in value.items()}
-    slots: Any = getattr(value, "__slots__", ())
+    slots: Collection[str] = getattr(value, "__slots__", ())
     fields = getattr(value, "__dict__", None) or {key: getattr(value, key) for key in slots}
     return {key: part for key, part in fields.items() if not key.startswith("_")}
 
 
-def _stamp(content: Any) -> int | None:
-    """When a ROS message says it was measured, in ns."""
-    stamp = _parts(_parts(content).get("header")).get("stamp")
-    parts = _parts(stamp)
-    if not {"sec", "nanosec"} <= parts.keys():
+def _stamp(content: object) -> int | None:
+    """Time in ns at which a ROS message says it was measured; None for a message without a stamp."""
+    parts = _parts(_parts(_parts(content).get("header")).get("stamp"))
+    seconds, nanoseconds = parts.get("sec"), parts.get("nanosec")
+    if not isinstance(seconds, int | float) or not isinstance(nanoseconds, int | float):
         return None
-    return int(parts["sec"]) * 1_000_000_000 + int(parts["nanosec"])
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
 def _table(name: str, topic: _Topic, origin: int, others: Mapping[str, str]) -> Table:
-    """Rows as columns, NaN where a message lacks a field; in the order they were logged in."""
+    """Messages as columns, NaN where a message lacks a field, in the order of logging."""
     names = list(dict.fromkeys(key for row in topic.rows for key in row))
     columns = {key: np.array([row.get(key, np.nan) for row in topic.rows]) for key in names}
     clocks: dict[str, Sequence[int | None]] = {

@@ -1,8 +1,7 @@
-"""Minari datasets as logs: a run an episode, without times."""
+"""Minari datasets as logs: one run for each episode, without times."""
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from madoc.data.minari_reader import local_directory, read_episodes
 
 
 def read(path: Path, wanted: Collection[str]) -> list[Run]:
-    """The episodes. Columns are `observations[0]`, ... and `actions[0]`, ...; of a dictionary `observations/key[0]`.
+    """One run for each episode, with columns `observations[0]`, `actions[0]`, ...; or `observations/key[0]`, ....
 
     The last row of an episode has an observation and no action.
 
@@ -29,7 +28,7 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
     ]
 
 
-def _flat(name: str, values: Any, *, padded: bool = False) -> dict[str, np.ndarray]:
+def _flat(name: str, values: object, *, padded: bool = False) -> dict[str, np.ndarray]:
     if isinstance(values, dict):
         parts = (_flat(f"{name}/{key}", value, padded=padded) for key, value in values.items())
     elif isinstance(values, tuple):

@@ -1,4 +1,4 @@
-"""npz: an array a column, or a matrix of several."""
+"""npz: an array is a column, a matrix is several."""
 
 from collections.abc import Collection
 from pathlib import Path

@@ -1,6 +1,6 @@
-"""What every reader of logs yields: runs, each of tables of named columns."""
+"""The result of every reader of logs: runs, each with tables of named columns."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,10 +9,10 @@ from jaxtyping import Float, Int
 from madoc.errors import MadocError
 
 Column = np.ndarray
-"""One value a row: numbers, flags, times (datetime64), or text that may be numbers."""
+"""One value per row: numbers, flags, times (datetime64), or text that may be numbers."""
 
 WIDEST = 1000
-"""Values a row from which an array is a picture, not a vector."""
+"""Largest number of values per row; an array with more is taken for a picture and not read."""
 
 _MISSING = frozenset(("", "nan", "na", "n/a", "none", "null", "-"))
 
@@ -23,9 +23,9 @@ class Table:
 
     Attributes:
         columns: By name, all equally long.
-        clock: The column with the format's own time, in s; None where the format keeps none.
-        lines: The line of each row in a text file; None elsewhere.
-        others: Columns that are not one number a row, and what they are.
+        clock: The column with the format's own time, in s; None where the format has none.
+        lines: The line of each row in a text file; None for other formats.
+        others: Columns that are not one number per row, with their kind.
     """
 
     columns: Mapping[str, Column]
@@ -37,18 +37,18 @@ class Table:
         return len(next(iter(self.columns.values()), ()))
 
     def place(self, row: int) -> str:
-        """A row in words."""
+        """The name of a row in an error."""
         return f"row {row}" if self.lines is None else f"line {self.lines[row]}"
 
 
 @dataclass(frozen=True)
 class Run:
-    """One recording without a break that its recorder knew of: a file, or an episode in one.
+    """One recording: a file, or an episode in one.
 
     Attributes:
         name: The file, and the episode in it.
-        tables: Those of one clock each. Most formats have one; MCAP has one a topic.
-        timed: Whether the format keeps times at all; where not, rows are one control step apart by its definition.
+        tables: Tables, each with one clock. Most formats have one table; MCAP has one per topic.
+        timed: Whether the format keeps times; otherwise its rows are one control step apart by definition.
     """
 
     name: str
@@ -62,9 +62,9 @@ class Run:
 
 
 def tables_of(arrays: Mapping[str, np.ndarray], *, clock: str | None = None) -> tuple[Table, ...]:
-    """Arrays as tables, those of equal length together; a vector a row becomes columns `name[0]`, `name[1]`, ...
+    """Arrays as tables, one for each length; a matrix becomes columns `name[0]`, `name[1]`, ...
 
-    Scalars, pictures and objects are kept as what they are called only.
+    Of scalars, pictures and objects only the name is kept.
     """
     grouped: dict[int, dict[str, Column]] = {}
     others: dict[str, str] = {}
@@ -86,7 +86,7 @@ def tables_of(arrays: Mapping[str, np.ndarray], *, clock: str | None = None) -> 
 
 
 def _unreadable(array: np.ndarray) -> str:
-    """What an array is, if it is not numbers, flags, times or text by row."""
+    """The kind of an array that is not numbers, flags, times or text by row; empty for others."""
     if array.ndim == 0:
         return "a single value"
     if array.ndim > 2 or (array.ndim == 2 and array.shape[1] > WIDEST):
@@ -109,7 +109,7 @@ def as_numbers(table: Table, name: str, run: str) -> Float[np.ndarray, " rows"]:
 
 
 def _seconds(values: np.ndarray) -> Float[np.ndarray, " rows"]:
-    """Times as s since the first that is there; whole nanoseconds are subtracted before anything is rounded."""
+    """Times as s since the first one; whole nanoseconds are subtracted before anything is rounded."""
     kind = "datetime64[ns]" if values.dtype.kind == "M" else "timedelta64[ns]"
     known = ~np.isnat(values)
     whole = values.astype(kind).astype(np.int64)
@@ -132,17 +132,9 @@ def _number(cell: object, table: Table, name: str, run: str, row: int) -> float:
 
 
 def _hint(text: str) -> str:
-    """What may be wrong with a cell that is no number."""
+    """A likely cause of a cell that is not a number, or what to do about it."""
     if text.count(",") == 1 and text.replace(",", "").lstrip("+-").isdigit():
         return "; a decimal comma? write numbers with a point"
     if text[:4].isdigit() and (":" in text or text[4:5] == "-"):
         return "; a date? write times as seconds"
     return "; leave the cell empty where the value is missing"
-
-
-def listed(names: Iterable[str], most: int = 12) -> str:
-    """Names for a sentence, cut short."""
-    known = list(names)
-    if not known:
-        return "none"
-    return ", ".join(known[:most]) + (f" and {len(known) - most} more" if len(known) > most else "")

@@ -1,4 +1,4 @@
-"""Time in a log: whether rows are a control step apart, where it has gaps, and other rates brought to ours if asked."""
+"""Time in a log: whether rows are a control step apart, where it has gaps, and resampling where it is asked for."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,10 +13,10 @@ from madoc.errors import MadocError
 Resample = Literal["hold", "linear"]
 
 GAP = 3.0
-"""Times the usual time step: where a log that is resampled has no row for so long, it has a gap."""
+"""Longest time between two rows of a resampled log, in median time steps; anything longer is a gap."""
 _FACTORS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}
 _ROUNDING = 1e-6
-"""Of a control step: two times closer than this are the same."""
+"""Largest difference between equal times, as a share of a control step."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Series:
     """Columns of one run that share their rows, without those whose time is unknown.
 
     Attributes:
-        time: s.
-        values: Signals, then actions, as the robot orders those that are in this table.
-        table: Where they come from.
-        rows: Their rows there.
-        run: Of what.
+        time: Time of each row in s.
+        values: The signals, then the actions, of this table, in the robot's order.
+        table: The table that the columns are from.
+        rows: The row in that table for each row here.
+        run: Name of the run.
     """
 
     time: Float[np.ndarray, " rows"]
@@ -38,7 +38,7 @@ class Series:
     run: str
 
     def place(self, row: int) -> str:
-        """A row in words."""
+        """The name of a row in an error."""
         return self.table.place(int(self.rows[row]))
 
 
@@ -66,7 +66,7 @@ def check_ascending(series: Series) -> None:
 def steady_links(
     series: Series, control_step: float, tolerance: float
 ) -> tuple[Bool[np.ndarray, " links"], list[Finding]]:
-    """Whether each row is one control step after the one before it, and what is to be said of where it is not.
+    """Whether each row is one control step after the one before it, and a warning where it is not.
 
     Raises:
         MadocError: Most rows are not: the log has another rate, or its time another unit.
@@ -112,7 +112,7 @@ def _wrong_rate(series: Series, control_step: float, tolerance: float) -> MadocE
 
 
 def common_grid(parts: list[Series], control_step: float) -> Float[np.ndarray, " grid"]:
-    """Times a control step apart over the stretch in which all of them have rows.
+    """Times a control step apart, over the time in which all parts have rows.
 
     Raises:
         MadocError: There is no such stretch of two steps.
@@ -130,9 +130,9 @@ def common_grid(parts: list[Series], control_step: float) -> Float[np.ndarray, "
 def on_grid(
     series: Series, grid: Float[np.ndarray, " grid"], how: Resample
 ) -> tuple[Float[np.ndarray, "grid columns"], Bool[np.ndarray, " grid"]]:
-    """Values at the times of a grid, and whether each lies in no gap.
+    """Values at the times of a grid, and whether each time lies outside all gaps.
 
-    `hold` takes the last row before, `linear` the line between two.
+    `hold` takes the last row before a time, `linear` interpolates between two rows.
     """
     steps = np.diff(series.time)
     before = np.searchsorted(series.time, grid + _ROUNDING * (grid[1] - grid[0]), side="right") - 1

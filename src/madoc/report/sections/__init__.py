@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from madoc.report.reading import Run
-from madoc.report.sections.base import NOT_ENDED, TONES, Section
+from madoc.report.sections.base import NOT_ENDED, TONES, Section, Shown
 from madoc.report.sections.course import curves, trace
 from madoc.report.sections.estimates import correlations, estimates, grouping
 from madoc.report.sections.holdout import holdout, methods, residuals, signals
@@ -25,4 +25,4 @@ ALL: tuple[Callable[[Run], Section], ...] = (
 )
 """In the order of the page."""
 
-__all__ = ["ALL", "NOT_ENDED", "TONES", "Section"]
+__all__ = ["ALL", "NOT_ENDED", "TONES", "Section", "Shown"]

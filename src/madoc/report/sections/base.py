@@ -1,20 +1,23 @@
 """What a section of a page is, and what sections share."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from madoc.calibration import ParameterEstimate
 from madoc.report.reading import Run
 from madoc.report.words import number
 
-TONES = {
+TONES: Mapping[str, str] = {
     "CALIBRATED": "good",
     "NO_IMPROVEMENT": "doubtful",
     "NOT_IDENTIFIABLE": "doubtful",
     "MODEL_MISMATCH": "bad",
     "DATA_REJECTED": "bad",
 }
-"""How a verdict is coloured."""
+"""Class of the style sheet that colours each verdict."""
+
+Shown = dict[str, object]
+"""What a template shows, by name."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Section:
     id: str
     title: str
     lede: str
-    data: Any = None
+    data: Shown | None = None
     absent: str = ""
 
 
@@ -40,10 +43,27 @@ NOT_ENDED = "The run has not ended."
 """Why what comes with the result is not there."""
 
 
-def span_words(ends: Sequence[float]) -> str:
+def interval_words(ends: Sequence[float]) -> str:
     """An interval by its ends, or by its half-width where four digits do not tell them apart."""
     low, high = (number(end) for end in ends)
     return f"{low} to {high}" if low != high else f"± {number((ends[1] - ends[0]) / 2, 2)}"
+
+
+def spread_of(row: ParameterEstimate) -> tuple[float, float]:
+    """The ends of an estimate's 95 % interval; where that is not known, one standard deviation to either side."""
+    if row.interval:
+        return row.interval[0], row.interval[1]
+    return row.estimate - row.std, row.estimate + row.std
+
+
+def place(value: float, low: float, high: float) -> float:
+    """Where a value stands between two ends, in %; values beyond them stand at the ends."""
+    return round(min(max((value - low) / (high - low), 0.0), 1.0) * 100, 3)
+
+
+def unit_words(unit: str) -> str:
+    """A unit as a page shows it; that of a ratio is not shown."""
+    return "" if unit == "1" else unit
 
 
 def group_colour(run: Run, name: str) -> str:

@@ -1,14 +1,12 @@
 """How the run went: the trace of the estimates, the method's own curves."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from madoc.report.charts import Level, Line, line_chart, thinned
 from madoc.report.reading import MetricLog, Run
-from madoc.report.sections.base import Section, group_colour
+from madoc.report.sections.base import Section, Shown, group_colour
 from madoc.report.words import metric_title, parameter_title, short_count
 
 
@@ -42,47 +40,47 @@ _PANELS = (
 def trace(run: Run) -> Section:
     """The estimate of every parameter over the run."""
     title, lede = "The way there", "Each estimate over the run, its spread around it; the axis is the searched range."
-    log = run.log
-    names = [] if log is None else [name for name in _ranges(run) if f"estimate/{name}" in log.metrics]
+    log, ranges = run.log, _ranges(run)
+    names = [] if log is None else [name for name in ranges if f"estimate/{name}" in log.metrics]
     if log is None or not names:
         return Section("trace", title, lede, None, "This run wrote no estimates into its log while it went.")
-    charts = []
-    for name in names:
-        low, high, unit = _ranges(run)[name]
-        y = log.metrics[f"estimate/{name}"]
-        known = np.isfinite(y)
-        if known.sum() < 2:
-            continue
-        spent, x_title, words = _axis(log, known)
-        std = log.metrics.get(f"std/{name}", np.full(len(y), np.nan))[known]
-        x, mean, _, _ = thinned(spent, y[known])
-        spread = thinned(spent, std)[1]
-        level = [Level(run.truth[name], "truth")] if name in run.truth else []
-        line = Line(
-            "estimate", mean, group_colour(run, name), np.maximum(mean - spread, low), np.minimum(mean + spread, high)
-        )
-        chart = line_chart(
-            x,
-            [line],
-            label=f"{name} over the run",
-            x_title=x_title,
-            x_words=words,
-            y_range=(low, high),
-            levels=level,
-        )
-        charts.append({"title": parameter_title(name), "unit": unit, "chart": chart})
+    charts = [chart for name in names if (chart := _trace_chart(run, log, name, *ranges[name]))]
     if not charts:
         return Section("trace", title, lede, None, "The run had too few epochs to draw a trace of.")
     legend = [("truth", "truth")] if run.truth else []
     return Section("trace", title, lede, {"charts": charts, "legend": legend})
 
 
+def _trace_chart(run: Run, log: MetricLog, name: str, low: float, high: float, unit: str) -> Shown | None:
+    """One parameter's estimate and its standard deviation; None where it has fewer than two points."""
+    estimate = log.metrics[f"estimate/{name}"]
+    known = np.isfinite(estimate)
+    if known.sum() < 2:
+        return None
+    spent, x_title = _axis(log, known)
+    x, mean, _, _ = thinned(spent, estimate[known])
+    std = log.metrics.get(f"std/{name}", np.full(len(estimate), np.nan))[known]
+    spread = thinned(spent, std)[1]
+    line = Line(
+        "estimate", mean, group_colour(run, name), np.maximum(mean - spread, low), np.minimum(mean + spread, high)
+    )
+    chart = line_chart(
+        x,
+        [line],
+        label=f"{name} over the run",
+        x_title=x_title,
+        x_words=short_count,
+        y_range=(low, high),
+        levels=[Level(run.truth[name], "truth")] if name in run.truth else [],
+    )
+    return {"title": parameter_title(name), "unit": unit, "chart": chart}
+
+
 def _ranges(run: Run) -> dict[str, tuple[float, float, str]]:
     """Range and unit of each parameter; while there is no result, from what was asked."""
     if run.parameters:
-        return {name: (row["low"], row["high"], row["unit"]) for name, row in run.parameters.items()}
-    asked = run.spec.get("parameters") or {}
-    return {name: (span[0], span[1], "") for name, span in asked.items()} if isinstance(asked, dict) else {}
+        return {name: (row.low, row.high, row.unit) for name, row in run.parameters.items()}
+    return {name: (*span, "") for name, span in run.spec.parameters.items()}
 
 
 def curves(run: Run) -> Section:
@@ -109,7 +107,7 @@ def curves(run: Run) -> Section:
     return Section("curves", title, lede, {"charts": charts, "others": others})
 
 
-def _panel(log: MetricLog, panel: Panel) -> dict[str, Any] | None:
+def _panel(log: MetricLog, panel: Panel) -> Shown | None:
     """A chart of some metrics; None where the run has fewer than two points of each."""
     present = [name for name in panel.metrics if name in log.metrics]
     known = np.zeros(len(log), dtype=bool)
@@ -117,7 +115,7 @@ def _panel(log: MetricLog, panel: Panel) -> dict[str, Any] | None:
         known |= np.isfinite(log.metrics[name])
     if known.sum() < 2:
         return None
-    spent, x_title, words = _axis(log, known)
+    spent, x_title = _axis(log, known)
     values = np.concatenate([log.metrics[name][known] for name in present])
     values = values[np.isfinite(values)]
     log_scale = bool(panel.log or (panel.y_range is None and (values > 0).all() and values.max() > 300 * values.min()))
@@ -125,22 +123,24 @@ def _panel(log: MetricLog, panel: Panel) -> dict[str, Any] | None:
     for index, name in enumerate(present):
         x, y, low, high = thinned(spent, log.metrics[name][known])
         lines.append(Line(metric_title(name), y, f"g{index}", low, high))
-    levels = list(panel.levels)
     chart = line_chart(
-        x, lines, label=panel.title, x_title=x_title, x_words=words, y_range=panel.y_range, levels=levels, log=log_scale
+        x,
+        lines,
+        label=panel.title,
+        x_title=x_title,
+        x_words=short_count,
+        y_range=panel.y_range,
+        levels=panel.levels,
+        log=log_scale,
     )
     legend = [(line.colour, line.name) for line in lines] if len(lines) > 1 else []
-    legend += [(level.colour, level.name) for level in levels]
+    legend += [(level.colour, level.name) for level in panel.levels]
     return {"title": panel.title, "unit": "", "chart": chart, "legend": legend}
 
 
-def _axis(log: MetricLog, known: np.ndarray) -> tuple[np.ndarray, str, Callable[[float], str]]:
-    """What runs along under a curve: what was spent, or epochs where nothing was."""
+def _axis(log: MetricLog, known: np.ndarray) -> tuple[np.ndarray, str]:
+    """The horizontal axis of a curve and its title: what was spent, or epochs where nothing was."""
     spent = log.spent[known]
     if spent[-1] > spent[0]:
-        return spent, log.unit, short_count
-    return (
-        np.arange(1, len(spent) + 1, dtype=float),
-        f"epoch of {log.stage[int(np.flatnonzero(known)[0])]}",
-        short_count,
-    )
+        return spent, log.unit
+    return np.arange(1, len(spent) + 1, dtype=float), f"epoch of {log.stage[int(np.flatnonzero(known)[0])]}"

@@ -1,52 +1,49 @@
-"""What was found: estimates in their ranges, what acts alike, what makes up for what."""
-
-from typing import Any
+"""Estimates in their ranges, which parameters act alike, and which estimates are correlated."""
 
 import numpy as np
 
+from madoc.calibration import ParameterEstimate
 from madoc.report.charts import matrix_chart, scatter_chart
 from madoc.report.reading import Run
-from madoc.report.sections.base import Section, group_colour, span_words
+from madoc.report.sections.base import Section, Shown, group_colour, interval_words, place, spread_of, unit_words
 from madoc.report.words import number, parameter_title
 
 
 def estimates(run: Run) -> Section:
     """Every parameter in its range."""
     rows = [_estimate_row(run, name, row) for name, row in run.parameters.items()]
-    spread = "95 % interval" if any(row["interval"] for row in rows) else "one standard deviation to either side"
+    spread = (
+        "95 % interval"
+        if any(row.interval for row in run.parameters.values())
+        else "one standard deviation to either side"
+    )
     lede = f"Each bar is the range that was searched; shaded: {spread}."
-    data = {"rows": rows, "spread": spread, "truth": bool(run.truth), "groups": bool(run.groups)}
+    data: Shown = {"rows": rows, "spread": spread, "truth": bool(run.truth), "groups": bool(run.groups)}
     absent = "There is no estimate."
     return Section("estimates", "Estimates", lede, data if rows else None, absent)
 
 
-def _estimate_row(run: Run, name: str, row: dict[str, Any]) -> dict[str, Any]:
-    low, high, middle = row["low"], row["high"], row["estimate"]
-    interval = row.get("interval")
-    ends = interval or (middle - row["std"], middle + row["std"])
-
-    def place(value: float) -> float:
-        return round(min(max((value - low) / (high - low), 0.0), 1.0) * 100, 3)
-
-    truth = run.truth.get(name)
-    return {
+def _estimate_row(run: Run, name: str, row: ParameterEstimate) -> Shown:
+    ends, truth, span = spread_of(row), run.truth.get(name), (row.low, row.high)
+    shown: Shown = {
         "name": name,
         "title": parameter_title(name),
-        "unit": "" if row["unit"] == "1" else row["unit"],
+        "unit": unit_words(row.unit),
         "group": run.groups.get(name),
-        "low": number(low),
-        "high": number(high),
-        "estimate": number(middle, 4),
-        "interval": interval,
-        "spread": span_words(ends) if interval else f"± {number(row['std'], 2)}",
-        "at": place(middle),
-        "from": place(ends[0]),
-        "to": place(ends[1]),
-        "truth": None if truth is None else number(truth),
-        "truth_at": None if truth is None else place(truth),
-        "off": None if truth is None else number(abs(middle - truth), 2),
-        "off_percent": None if truth is None else number(100 * abs(middle - truth) / (high - low), 2),
+        "low": number(row.low),
+        "high": number(row.high),
+        "estimate": number(row.estimate, 4),
+        "spread": interval_words(ends) if row.interval else f"± {number(row.std, 2)}",
+        "at": place(row.estimate, *span),
+        "from": place(ends[0], *span),
+        "to": place(ends[1], *span),
+        "truth": None,
+        "truth_at": None,
     }
+    if truth is None:
+        return shown
+    off = 100 * abs(row.estimate - truth) / (row.high - row.low)
+    return shown | {"truth": number(truth), "truth_at": place(truth, *span), "off_percent": number(off, 2)}
 
 
 def grouping(run: Run) -> Section:
@@ -77,7 +74,7 @@ def grouping(run: Run) -> Section:
     )
     groups = [
         {"colour": f"g{index % 8}", "members": [parameter_title(name) for name in names]}
-        for index, names in enumerate(run.result.get("groups", []))
+        for index, names in enumerate(run.result.groups if run.result else [])
     ]
     return Section("grouping", title, lede, {"chart": chart, "groups": groups})
 
@@ -89,7 +86,7 @@ def correlations(run: Run) -> Section:
         "Correlation of the estimates. Near 1 or −1 the data can hardly tell the two apart: the simulator moves "
         "alike when both change together, the same way (blue) or opposite ways (orange)."
     )
-    rows = run.result.get("covariance")
+    rows = run.result.covariance if run.result else None
     names = list(run.parameters)
     if rows is None or len(names) < 2:
         absent = (
@@ -99,13 +96,11 @@ def correlations(run: Run) -> Section:
         )
         return Section("correlations", title, lede, None, absent)
     covariance = np.asarray(rows, dtype=float)
-    deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    kept = np.flatnonzero(deviation > 0)
+    kept = np.flatnonzero(np.diag(covariance) > 0)
     if len(kept) < 2:
         return Section("correlations", title, lede, None, "The estimates have no spread, so none hang together.")
-    matrix = (covariance / np.outer(np.where(deviation > 0, deviation, 1), np.where(deviation > 0, deviation, 1)))[
-        np.ix_(kept, kept)
-    ]
+    deviation = np.sqrt(np.diag(covariance)[kept])
+    matrix = covariance[np.ix_(kept, kept)] / np.outer(deviation, deviation)
     titles = [parameter_title(names[index]) for index in kept]
     pairs = [
         (abs(float(matrix[row, column])), titles[row], titles[column], float(matrix[row, column]))
@@ -114,9 +109,5 @@ def correlations(run: Run) -> Section:
     ]
     strongest = sorted(pairs, reverse=True)[:3]
     told = [f"{first} and {second}: {number(value, 2)}" for size, first, second, value in strongest if size > 0.5]
-    return Section(
-        "correlations",
-        title,
-        lede,
-        {"chart": matrix_chart(matrix, titles, label="correlation of the estimates"), "told": told},
-    )
+    chart = matrix_chart(matrix, titles, label="correlation of the estimates")
+    return Section("correlations", title, lede, {"chart": chart, "told": told})

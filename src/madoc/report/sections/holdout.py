@@ -1,13 +1,13 @@
 """What rows that no method has seen say: the verdict's numbers, replays, residuals, the methods compared."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
+from madoc.calibration.holdout import Fitted, NotRun, PredictionError, ToldApart
 from madoc.report.charts import Line, line_chart
 from madoc.report.reading import Run
-from madoc.report.sections.base import TONES, Section, span_words
+from madoc.report.sections.base import TONES, Section, Shown, interval_words
 from madoc.report.words import count, duration, number, parameter_title
 
 SIGNALS_SHOWN = 24
@@ -18,41 +18,41 @@ WINDOWS_SHOWN = 3
 
 def holdout(run: Run) -> Section:
     """How far ahead the simulator predicts rows that no method has seen."""
-    title = "On data it has not seen"
-    held = run.result.get("holdout")
-    if not held:
+    title, held = "On data it has not seen", run.holdout
+    if held is None:
         return Section("holdout", title, "", None, "Nothing was held out to judge the estimate by.")
-    lede = f"Held out: {held['split']}." if held.get("split") else ""
-    facts = [("rows held out", count(held["rows"])), ("episodes", count(held["episodes"]))]
-    areas = held.get("two_sample") or {}
-    if {"mid-range", "estimate"} <= set(areas):
-        told = " → ".join(number(areas[name]["area"], 2) for name in ("mid-range", "estimate"))
-        facts.append(("area under a classifier's curve, 0.5 is chance", told))
-    shares = held.get("interval_share_of_range") or {}
-    rows = [{"name": parameter_title(name), "at": round(100 * min(share, 1.0), 2)} for name, share in shares.items()]
-    data: dict[str, Any] = {"facts": facts, "chart": None, "legend": [], "shares": rows}
-    prediction = held.get("prediction") or {}
-    horizons = np.array(held.get("horizons") or [], dtype=float)
-    if prediction and len(horizons) > 1:
-        kinds = (("mid-range", "before"), ("noise", "chance"), ("nearby best", "g2"), ("estimate", "after"))
-        lines = [_errors(name, prediction[name], colour) for name, colour in kinds if name in prediction]
+    facts = [("rows held out", count(held.rows)), ("episodes", count(held.episodes))]
+    if not isinstance(held, Fitted):
+        areas = (held.area_at_mid_range.area, held.area_at_estimate.area)
+        facts.append(("area under a classifier's curve, 0.5 is chance", " → ".join(number(area, 2) for area in areas)))
+    rows = [
+        {"name": parameter_title(name), "at": round(100 * share, 2)} for name, share in held.interval_shares.items()
+    ]
+    data: Shown = {"facts": facts, "chart": None, "legend": [], "shares": rows}
+    if not isinstance(held, ToldApart) and len(held.errors.estimate) > 1:
+        errors = held.errors
+        lines = [
+            _error_line("mid-range", errors.mid_range, "before"),
+            _error_line("what noise alone leaves", errors.noise, "chance", dashed=True),
+            _error_line("the best parameters nearby", errors.nearby_best, "g2"),
+            _error_line("estimate", errors.estimate, "after"),
+        ]
         data["chart"] = line_chart(
-            horizons,
+            np.array([error.steps for error in errors.estimate], dtype=float),
             lines,
             label="prediction error by horizon",
-            x_title="control steps ahead",
+            x_title="control steps ahead" + (" of a fitted start" if isinstance(held, Fitted) else ""),
             x_words=number,
             log=True,
         )
         data["legend"] = [(line.colour, line.name) for line in lines]
-    return Section("holdout", title, lede, data)
+    return Section("holdout", title, f"{held.split[:1].upper()}{held.split[1:]}." if held.split else "", data)
 
 
-def _errors(name: str, rows: Sequence[dict[str, Any]], colour: str) -> Line:
+def _error_line(name: str, errors: Sequence[PredictionError], colour: str, *, dashed: bool = False) -> Line:
     """Prediction errors at each horizon, with their intervals."""
-    low, high = (np.array([row["interval"][end] for row in rows]) for end in (0, 1))
-    words = {"noise": "what noise alone leaves", "nearby best": "the best parameters nearby"}.get(name, name)
-    return Line(words, np.array([row["error"] for row in rows]), colour, low, high, dashed=name == "noise")
+    low, high = (np.array([error.interval[end] for error in errors]) for end in (0, 1))
+    return Line(name, np.array([error.mean for error in errors]), colour, low, high, dashed=dashed)
 
 
 def signals(run: Run) -> Section:
@@ -89,7 +89,7 @@ def signals(run: Run) -> Section:
             y_range=_fit(lines),
         )
         charts.append({"title": name, "unit": run.units.get(name, ""), "chart": chart})
-    data = {
+    data: Shown = {
         "charts": charts,
         "legend": [("measured", "measured"), ("before", "simulated at mid-range"), ("after", "simulated, calibrated")],
         "left_out": len(evidence.signals) - len(order),
@@ -138,7 +138,7 @@ def residuals(run: Run) -> Section:
         return Section("residuals", title, lede, None, absent)
     before, after = (_misses(each, evidence.scale) for each in (evidence.residual_before, evidence.residual_after))
     largest = float(max(before.max(), after.max())) or 1.0
-    rows = [
+    rows: list[Shown] = [
         {
             "name": evidence.signals[signal],
             "before": _percent(before[signal]),
@@ -153,7 +153,7 @@ def residuals(run: Run) -> Section:
 
 
 def _misses(residual: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Root mean square by signal, in units of its typical change; rows whose simulation failed count not."""
+    """Root mean square by signal, in units of its typical change; failed simulations are left out."""
     squares = residual.reshape(-1, residual.shape[-1]) ** 2
     rows = squares[np.isfinite(squares).all(-1)]
     mean = rows.mean(0) if len(rows) else np.zeros(residual.shape[-1])
@@ -178,23 +178,24 @@ def _factor(before: float, after: float) -> str:
 def methods(run: Run) -> Section:
     """What was tried before the best was kept."""
     title, lede = "Methods compared", "All that were tried, on the same hold-out by the same measure; less is better."
-    held = run.result.get("holdout") or {}
-    candidates = held.get("candidates")
-    if not candidates:
+    held = run.holdout
+    if held is None or not held.candidates:
         return Section("methods", title, lede, None, "One method was asked for, so none were compared.")
-    measure = "error, as a share of mid-range's" if held.get("measure") == "prediction" else "told apart, area less ½"
+    measure = "area of a classifier, less ½" if isinstance(held, ToldApart) else "error, as a share of mid-range's"
     rows = [
-        {
-            "name": row["method"],
-            "kept": row["method"] == held.get("chosen"),
-            "why": row.get("not_run", ""),
-            "score": number(row.get("score"), 3),
-            "interval": span_words(row["interval"]) if "interval" in row else "",
-            "verdict": row.get("verdict", "").replace("_", " "),
-            "tone": TONES.get(row.get("verdict", ""), "neutral"),
-            "steps": count(row["control_steps"]) if "control_steps" in row else "",
-            "time": duration(row["seconds"]) if "seconds" in row else "",
+        {"name": row.method, "kept": False, "why": row.not_run}
+        if isinstance(row, NotRun)
+        else {
+            "name": row.method,
+            "kept": row.method == held.chosen,
+            "why": "",
+            "score": number(row.score, 3),
+            "interval": interval_words(row.interval),
+            "verdict": row.verdict.replace("_", " "),
+            "tone": TONES[row.verdict],
+            "steps": count(row.control_steps),
+            "time": duration(row.seconds),
         }
-        for row in candidates
+        for row in held.candidates
     ]
     return Section("methods", title, lede, {"rows": rows, "measure": measure})

@@ -6,23 +6,16 @@ via proprioceptive distribution matching" (arXiv 2604.11090); its distance and i
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Literal
+from typing import Annotated, Literal
 
-import equinox as eqx
 import jax
 import numpy as np
-import optax
-from jaxtyping import Float, PRNGKeyArray, PyTree
+from jaxtyping import Float, PRNGKeyArray
+from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines import evolution
-from madoc.calibration.baselines.cma_es.mean_embedding import (
-    CosineFeatures,
-    adjusted,
-    cosine_features,
-    discrepancies,
-)
+from madoc.calibration.baselines.cma_es.mean_embedding import CosineFeatures, adjusted, cosine_features, discrepancies
 from madoc.calibration.baselines.population_search import (
     SearchState,
     draw_windows,
@@ -30,14 +23,11 @@ from madoc.calibration.baselines.population_search import (
     mean_with_failures,
     next_generation,
 )
-from madoc.errors import check_at_least
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import first_rows
-from madoc.learning.cloning import clone
-from madoc.learning.networks import scalars
-from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
 from madoc.simulation.rollout import Walkers, begin, reset_states, roll
-from madoc.types import Epoch
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 ROWS = {"one-step": 100, "distribution": 500, "policy": 50}
 """Logged rows, or walkers, under each candidate."""
@@ -68,10 +58,8 @@ class Clouds:
 class Actor:
     """A clone of the behaviour, and where its rollouts stand."""
 
-    policy: TanhGaussianPolicy
-    optimiser: PyTree
+    clone: Clone
     walkers: Walkers
-    epochs: int
 
 
 @jax.tree_util.register_dataclass
@@ -91,7 +79,8 @@ class CmaEs:
     Attributes:
         objective: `one-step`: the mean squared error of next observations, each channel in units of its typical
             change. `distribution`: the maximum mean discrepancy of clouds; see `starts`.
-        starts: Of `distribution`. `logged`: one control step from logged states under their actions; the cloud of
+        starts: Of `distribution`; None takes `logged` where states are exact, else `policy`.
+            `logged`: one control step from logged states under their actions; the cloud of
             next observations should differ from that of observations as it does in the log, whichever belongs to
             which. `policy`: a clone acts from resets on, and its observations and actions should be distributed as
             the logged ones; no state needs to be rebuilt. All candidates go on from where the last best one stood.
@@ -108,22 +97,20 @@ class CmaEs:
     """
 
     objective: Literal["one-step", "distribution"] = "one-step"
-    starts: Literal["logged", "policy"] = "logged"
-    rows: int | None = None
-    horizon: int = 10
-    features: int = 100
-    hidden: tuple[int, ...] = (128, 128)
-    cloning_epochs: int = 40
-    cloning_updates: int = 200
-    batch: int = 256
-    learning_rate: float = 1e-3
-    population: int | None = None
-    tolerance: float = 1e-5
+    starts: Literal["logged", "policy"] | None = None
+    rows: Count | None = None
+    horizon: Annotated[int, Field(ge=2)] = 10
+    features: Count = 100
+    hidden: Layers = (128, 128)
+    cloning_epochs: CountOrZero = 40
+    cloning_updates: Count = 200
+    batch: Count = 256
+    learning_rate: NotNegative = 1e-3
+    population: Annotated[int, Field(ge=4)] | None = None
+    tolerance: NotNegative = 1e-5
 
     def __post_init__(self) -> None:
-        counts = ("rows", "features", "hidden", "cloning_updates", "batch")
-        check_at_least(self, **dict.fromkeys(counts, 1), horizon=2, population=4, tolerance=0.0)
-        check_at_least(self, cloning_epochs=0, learning_rate=0.0)
+        check_hyperparameters(self)
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> CmaEsState:
         """The search about mid-range; features, clone and walkers where they are needed.
@@ -133,18 +120,19 @@ class CmaEs:
         """
         if self.objective == "one-step":
             problem.require_pairs()
-        if not self._acts:
-            first_rows(problem.dataset, problem.logged_rows, 1)
+        acts = self._acts(problem)
+        if not acts:
+            first_rows(problem.dataset, problem.states.exact()[1], 1)
         of_features, of_actor, key = jax.random.split(key, 3)
         search = evolution.begin(np.zeros(len(problem.simulator.parameters)))
         clouds = None if self.objective == "one-step" else self._begin_clouds(problem, of_features)
-        actor = self._begin_actor(problem, of_actor) if self._acts else None
+        actor = self._begin_actor(problem, of_actor) if acts else None
         return CmaEsState(SearchState(search, key, 0), clouds, actor)
 
     def step(self, problem: CalibrationProblem, state: CmaEsState) -> tuple[CmaEsState, Epoch]:
         """One generation; before the first, epochs of cloning and one of reading the log."""
         inner, clouds, actor = state.inner, state.clouds, state.actor
-        if actor is not None and actor.epochs < self.cloning_epochs:
+        if actor is not None and actor.clone.epochs < self.cloning_epochs:
             return self._clone(problem, state, actor)
         if clouds is not None and not clouds.read:
             return replace(state, clouds=self._read(problem, clouds)), Epoch(stage="reading")
@@ -161,20 +149,13 @@ class CmaEs:
         return CmaEsState(inner, clouds, actor), epoch
 
     def estimate(self, problem: CalibrationProblem, state: CmaEsState) -> Estimate:
-        """Centre and covariance of the search. The covariance says where it looks, not how sure it may be."""
+        """Centre and covariance of the search. The covariance is the search's, no measure of uncertainty."""
         return estimate_from_search(problem, state.inner)
 
-    @property
-    def _rows(self) -> int:
-        return self.rows or ROWS["policy" if self._acts else self.objective]
-
-    @property
-    def _acts(self) -> bool:
-        return self.objective == "distribution" and self.starts == "policy"
-
-    @cached_property
-    def _adam(self) -> optax.GradientTransformation:
-        return optax.adam(self.learning_rate)
+    def _acts(self, problem: CalibrationProblem) -> bool:
+        """Whether a clone acts from resets on."""
+        starts = self.starts or ("logged" if problem.states.kind == "exact" else "policy")
+        return self.objective == "distribution" and starts == "policy"
 
     def _begin_clouds(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Clouds:
         of_pairs, of_observations = jax.random.split(key)
@@ -189,41 +170,33 @@ class CmaEs:
 
     def _begin_actor(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Actor:
         of_policy, of_start = jax.random.split(key)
-        simulator, logged = problem.simulator, np.asarray(problem.dataset.transitions.observation)
-        policy = TanhGaussianPolicy(
-            simulator.task.observation_size,
-            simulator.action_size,
-            self.hidden,
-            key=of_policy,
-            offset=logged.mean(0),
-            scale=np.maximum(logged.std(0), 1e-3),
-        )
-        walkers = begin(reset_states(simulator), of_start, systems=1, rows=self._rows)
+        simulator, logged = problem.simulator, problem.dataset.transitions
+        clone = fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy)
+        rows = self.rows or ROWS["policy"]
+        walkers = begin(reset_states(simulator), of_start, systems=1, rows=rows)
         # Ages spread evenly: time limits that fell together would show one age of episodes at a time.
-        ages = np.arange(self._rows)[None] * simulator.task.max_episode_steps // self._rows
+        ages = np.arange(rows)[None] * simulator.task.max_episode_steps // rows
         walkers = replace(walkers, age=ages)
-        return Actor(policy, self._adam.init(eqx.filter(policy, eqx.is_array)), walkers, 0)
+        return Actor(clone, walkers)
 
     def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Epoch]:
         of_batches, key = jax.random.split(state.inner.key)
-        policy, optimiser, metrics = clone(
-            actor.policy,
-            actor.optimiser,
-            problem.pairs,
+        clone, metrics = continue_cloning(
+            actor.clone,
+            problem.features.pairs,
             of_batches,
-            optimiser=self._adam,
+            learning_rate=self.learning_rate,
             batch=self.batch,
-            count=self.cloning_updates,
+            updates=self.cloning_updates,
         )
-        actor = replace(actor, policy=policy, optimiser=optimiser, epochs=actor.epochs + 1)
-        following = replace(state, inner=replace(state.inner, key=key), actor=actor)
-        return following, Epoch(scalars(metrics), stage="cloning", fraction=actor.epochs / self.cloning_epochs)
+        following = replace(state, inner=replace(state.inner, key=key), actor=replace(actor, clone=clone))
+        return following, Epoch(metrics, stage="cloning", fraction=clone.epochs / self.cloning_epochs)
 
     def _standardised(
         self, problem: CalibrationProblem, rows: Float[np.ndarray, "*rows values"]
     ) -> Float[np.ndarray, "*rows values"]:
         """Observations, or observations and actions, in units of the log's spread."""
-        scaling, size = problem.scalings["standardised"], rows.shape[-1]
+        scaling, size = problem.features.standardised, rows.shape[-1]
         return (rows - scaling.pair_offset[:size]) / scaling.pair_scale[:size]
 
     def _read(self, problem: CalibrationProblem, clouds: Clouds) -> Clouds:
@@ -233,7 +206,7 @@ class CmaEs:
         the change is that of all rows.
         """
         whole = problem.dataset.transitions
-        rows = whole if self._acts else whole.take(problem.logged_rows)
+        rows = whole if self._acts(problem) else whole.take(problem.states.exact()[1])
         loose = problem.dataset.disturbance.shuffled == "next_observations"
         before, after = (
             clouds.of_observations.mean(self._standardised(problem, np.asarray(part)))
@@ -247,7 +220,7 @@ class CmaEs:
     def _one_step(
         self, problem: CalibrationProblem, candidates: Float[np.ndarray, "population d"], key: PRNGKeyArray
     ) -> tuple[Float[np.ndarray, " population"], int, int]:
-        windows = draw_windows(problem, 1, self._rows, key)
+        windows = draw_windows(problem, 1, self.rows or ROWS["one-step"], key)
         scale = problem.typical_change
         squared = (window_residuals(problem.simulator, windows, candidates, scale) ** 2).mean(-1)
         return mean_with_failures(squared), squared.size, int(np.isnan(squared).sum())
@@ -264,10 +237,11 @@ class CmaEs:
         So the draw of rows matters little; what of it still shows in the features of (s, a) is taken off as well.
         """
         simulator = problem.simulator
-        chosen = np.asarray(jax.random.randint(key, (self._rows,), 0, len(problem.logged_rows)))
+        states, logged = problem.states.exact()
+        chosen = np.asarray(jax.random.randint(key, (self.rows or ROWS["distribution"],), 0, len(logged)))
         state, action = (
-            np.ascontiguousarray(np.broadcast_to(part[chosen], (len(candidates), self._rows, part.shape[-1])))
-            for part in (problem.logged_states, problem.logged_actions)
+            np.ascontiguousarray(np.broadcast_to(part, (len(candidates), *part.shape)))
+            for part in (states[chosen], np.asarray(problem.dataset.transitions.action)[logged[chosen]])
         )
         system = simulator.bind(simulator.parameters.to_physical(candidates))
         state = system.unbiased(state)
@@ -294,7 +268,7 @@ class CmaEs:
         rollout, after = roll(
             simulator.bind(simulator.parameters.to_physical(candidates)),
             simulator.task,
-            actor.policy,
+            actor.clone.policy,
             jax.tree.map(lambda part: np.repeat(part, len(candidates), axis=0), actor.walkers),
             steps=self.horizon,
             starts=reset_states(simulator),

@@ -53,7 +53,7 @@ def discrepancies(
     """Squared distance of each cloud's mean feature m from the wanted w: n (m - w)ᵀ S⁻¹ (m - w), in standard errors.
 
     S is the covariance of rows about their cloud's mean, pooled over clouds, with a small ridge: features that hardly
-    vary from row to row tell most. Rows that failed (NaN) are left out; NaN for a cloud in which all did.
+    vary from row to row weigh most. Rows that failed (NaN) are left out; NaN for a cloud in which all did.
     """
     valid = np.isfinite(features).all(-1)
     count = valid.sum(1)
@@ -78,7 +78,7 @@ def adjusted(
     whole = np.isfinite(features).all((0, 2))
     if not whole.any():
         return features
-    known = np.concatenate([np.ones((whole.sum(), 1)), covariates[whole]], axis=1)
-    squares = known.T @ known / len(known)
-    slopes = np.linalg.solve(squares + _SLOPE_RIDGE * np.eye(len(squares)), known.T @ features[:, whole] / len(known))
+    design = np.concatenate([np.ones((whole.sum(), 1)), covariates[whole]], axis=1)
+    squares = design.T @ design / len(design)
+    slopes = np.linalg.solve(squares + _SLOPE_RIDGE * np.eye(len(squares)), design.T @ features[:, whole] / len(design))
     return features - covariates @ slopes[:, 1:]

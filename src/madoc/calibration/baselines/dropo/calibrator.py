@@ -4,10 +4,12 @@ Tiboni et al. 2023 (arXiv 2201.08434); with an entropy bonus it is E-DROPO (arXi
 """
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
+from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines import evolution
@@ -20,10 +22,9 @@ from madoc.calibration.baselines.dropo.likelihood import (
 )
 from madoc.calibration.baselines.population_search import SearchState, draw_windows, mean_with_failures, next_generation
 from madoc.calibration.cautions import at_end_of_range
-from madoc.errors import check_at_least
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import first_rows
-from madoc.types import Epoch
+from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
 
 DEVIATIONS = (1e-3, 0.5)
 """Smallest and largest σ in [-1, 1]. The largest is a quarter of a range, as the authors'."""
@@ -34,7 +35,7 @@ ENTROPY_WEIGHT = 0.1
 def distribution_of(
     candidate: Float[np.ndarray, "*candidates both"],
 ) -> tuple[Float[np.ndarray, "*candidates d"], Float[np.ndarray, "*candidates d"]]:
-    """μ and σ of candidates: the first half is μ, the second says where log σ lies between its ends."""
+    """μ and σ of candidates: the first half is μ, the second places log σ between its limits."""
     count = candidate.shape[-1] // 2
     low, high = np.log(DEVIATIONS)
     return candidate[..., :count], np.exp(low + (candidate[..., count:] + 1.0) / 2.0 * (high - low))
@@ -57,15 +58,15 @@ class Dropo:
         tolerance: Share of each range, of the mean's and of log σ's; it stops once the search is narrower. 0 never.
     """
 
-    draws: int = 10
-    transitions: int = 16
-    epsilon: float = 1e-4
-    entropy_weight: float = 0.0
-    population: int | None = None
-    tolerance: float = 1e-4
+    draws: Annotated[int, Field(ge=2)] = 10
+    transitions: Count = 16
+    epsilon: Annotated[float, Field(ge=1e-12)] = 1e-4
+    entropy_weight: NotNegative = 0.0
+    population: Annotated[int, Field(ge=4)] | None = None
+    tolerance: NotNegative = 1e-4
 
     def __post_init__(self) -> None:
-        check_at_least(self, draws=2, transitions=1, epsilon=1e-12, entropy_weight=0.0, population=4, tolerance=0.0)
+        check_hyperparameters(self)
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
         """The search about mid-range, σ half-way between its ends on a log scale.
@@ -74,7 +75,7 @@ class Dropo:
             MadocError: No state can be rebuilt, or the next observations are shuffled.
         """
         problem.require_pairs()
-        first_rows(problem.dataset, problem.logged_rows, 1)
+        first_rows(problem.dataset, problem.states.exact()[1], 1)
         return SearchState(evolution.begin(np.zeros(2 * len(problem.simulator.parameters))), key, 0)
 
     def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
@@ -104,7 +105,6 @@ class Dropo:
         return Estimate(
             mean=space.to_physical(mean),
             std=std,
-            groups=(tuple(range(len(space))),),
             failures=state.failures,
             warnings=at_end_of_range(mean, space.names),
             covariance=np.diag(std**2),

@@ -19,9 +19,7 @@ def truncated_noise(key: PRNGKeyArray, pairs: int, dimensions: int) -> Float[np.
 
 
 def parameter_draws(
-    mean: Float[np.ndarray, "candidates d"],
-    std: Float[np.ndarray, "candidates d"],
-    noise: Float[np.ndarray, "draws d"],
+    mean: Float[np.ndarray, "candidates d"], std: Float[np.ndarray, "candidates d"], noise: Float[np.ndarray, "draws d"]
 ) -> Float[np.ndarray, "candidates draws d"]:
     """ξ = μ + σ ε, put on the wall where it leaves the box [-1, 1]."""
     return np.clip(mean[:, None] + std[:, None] * noise, -1.0, 1.0)
@@ -55,8 +53,8 @@ def negative_log_likelihood(
     whole = np.where(failed[..., None, None], eye, covariance + epsilon * eye)
     centre = np.where(failed[..., None], 0.0, mean)
     distance = (centre * np.linalg.solve(whole, centre[..., None])[..., 0]).sum(-1)
-    found = 0.5 * (values * np.log(2.0 * np.pi) + np.linalg.slogdet(whole)[1] + distance)
-    return np.where(failed, np.nan, found)
+    negative = 0.5 * (values * np.log(2.0 * np.pi) + np.linalg.slogdet(whole)[1] + distance)
+    return np.where(failed, np.nan, negative)
 
 
 def entropy(std: Float[np.ndarray, "candidates d"]) -> Float[np.ndarray, " candidates"]:

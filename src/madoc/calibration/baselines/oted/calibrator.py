@@ -2,19 +2,18 @@
 
 Gur, Nachum and Faust 2021, "Offline tuning of simulators". Only its abstract and appendix D.2 of Jiang et al. 2024
 could be had: a distribution over simulator parameters, a divergence between the (s, a) of data and simulator, and a
-bandit's policy gradient. Everything else here is our choice, and said so where it is made.
+bandit's policy gradient. Everything else is our choice, and marked as such where it is made.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Literal
+from typing import Annotated, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Int, PRNGKeyArray, PyTree
+from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines.oted.bandit import (
@@ -26,13 +25,11 @@ from madoc.calibration.baselines.oted.bandit import (
 )
 from madoc.calibration.baselines.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
 from madoc.calibration.cautions import at_end_of_range
-from madoc.errors import check_at_least
 from madoc.learning import replay
-from madoc.learning.cloning import clone
-from madoc.learning.networks import Network, scalars
-from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
+from madoc.learning.networks import Network, adam, scalars
 from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll, unbiased_starts
-from madoc.types import Epoch
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -40,8 +37,7 @@ from madoc.types import Epoch
 class OtedState:
     """Everything OTED carries. `average` follows `distribution` slowly; the estimate is read from it."""
 
-    policy: TanhGaussianPolicy
-    policy_optimiser: PyTree
+    clone: Clone
     discriminator: Network
     discriminator_optimiser: PyTree
     rows: replay.Replay
@@ -49,7 +45,6 @@ class OtedState:
     distribution: Distribution
     average: Distribution
     key: PRNGKeyArray
-    cloned: int
     failures: int
 
 
@@ -59,6 +54,7 @@ class Oted:
 
     Attributes:
         starts: `logged` rolls out from logged states anew in every epoch; `policy` lets walkers run on from resets.
+            None takes `logged` where states are exact, else `policy`.
         draws: Parameter draws an epoch, in antithetic pairs.
         rows: Walkers under each draw.
         horizon: Control steps each walks under it.
@@ -76,27 +72,25 @@ class Oted:
         replay_capacity: Simulated rows kept for the discriminator.
     """
 
-    starts: Literal["logged", "policy"] = "logged"
-    draws: int = 50
-    rows: int = 4
-    horizon: int = 10
-    updates: int = 50
-    batch: int = 256
-    mean_rate: float = 0.3
-    std_rate: float = 0.1
-    first_std: float = 0.6
+    starts: Literal["logged", "policy"] | None = None
+    draws: Annotated[int, Field(ge=2)] = 50
+    rows: Count = 4
+    horizon: Annotated[int, Field(ge=2)] = 10
+    updates: Count = 50
+    batch: Count = 256
+    mean_rate: NotNegative = 0.3
+    std_rate: NotNegative = 0.1
+    first_std: NotNegative = 0.6
     smallest_std: float = 0.02
-    average_rate: float = 0.03
-    hidden: tuple[int, ...] = (128, 128)
-    cloning_epochs: int = 40
-    cloning_updates: int = 200
+    average_rate: NotNegative = 0.03
+    hidden: Layers = (128, 128)
+    cloning_epochs: CountOrZero = 40
+    cloning_updates: Count = 200
     learning_rate: float = 1e-3
-    replay_capacity: int = 20_000
+    replay_capacity: Count = 20_000
 
     def __post_init__(self) -> None:
-        counts = ("rows", "updates", "batch", "hidden", "cloning_updates", "replay_capacity")
-        check_at_least(self, **dict.fromkeys(counts, 1), draws=2, horizon=2, cloning_epochs=0)
-        check_at_least(self, **dict.fromkeys(("mean_rate", "std_rate", "first_std", "average_rate"), 0.0))
+        check_hyperparameters(self)
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> OtedState:
         """Fresh networks, the distribution around mid-range, walkers at their starts.
@@ -108,52 +102,37 @@ class Oted:
         task, simulator = problem.simulator.task, problem.simulator
         observation, action, count = task.observation_size, simulator.action_size, len(simulator.parameters)
         of_policy, of_discriminator, of_start, key = jax.random.split(key, 4)
-        logged = np.asarray(problem.dataset.transitions.observation)
-        policy = TanhGaussianPolicy(
-            observation,
-            action,
-            self.hidden,
-            key=of_policy,
-            offset=logged.mean(0),
-            scale=np.maximum(logged.std(0), 1e-3),
-        )
+        clone = fresh_clone(problem.dataset.transitions, self.hidden, learning_rate=self.learning_rate, key=of_policy)
         discriminator = Network(observation + action, 1, self.hidden, key=of_discriminator)
         distribution = Distribution(np.zeros(count), np.full(count, np.log(self.first_std)))
         return OtedState(
-            policy=policy,
-            policy_optimiser=self._adam.init(eqx.filter(policy, eqx.is_array)),
+            clone=clone,
             discriminator=discriminator,
-            discriminator_optimiser=self._adam.init(eqx.filter(discriminator, eqx.is_array)),
+            discriminator_optimiser=adam(self.learning_rate).init(eqx.filter(discriminator, eqx.is_array)),
             rows=replay.empty(self.replay_capacity, pair=(observation + action,)),
             walkers=begin(self._starts(problem)[0], of_start, systems=self._systems, rows=self.rows),
             distribution=distribution,
             average=distribution,
             key=key,
-            cloned=0,
             failures=0,
         )
 
     def step(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         """One epoch of whichever stage is due."""
-        return (self._clone if state.cloned < self.cloning_epochs else self._calibrate)(problem, state)
+        return (self._clone if state.clone.epochs < self.cloning_epochs else self._calibrate)(problem, state)
 
     def estimate(self, problem: CalibrationProblem, state: OtedState) -> Estimate:
         """The averaged distribution through tanh: its centre, and its deviation to first order."""
         space, average = problem.simulator.parameters, state.average
-        unit = np.tanh(average.mean)
-        std = (1.0 - unit**2) * np.exp(average.log_std) * (space.high - space.low) / 2.0
+        scaled = np.tanh(average.mean)
+        std = (1.0 - scaled**2) * np.exp(average.log_std) * (space.high - space.low) / 2.0
         return Estimate(
-            mean=space.to_physical(unit),
+            mean=space.to_physical(scaled),
             std=std,
-            groups=(tuple(range(len(space))),),
             failures=state.failures,
-            warnings=at_end_of_range(unit, space.names),
+            warnings=at_end_of_range(scaled, space.names),
             covariance=np.diag(std**2),
         )
-
-    @cached_property
-    def _adam(self) -> optax.GradientTransformation:
-        return optax.adam(self.learning_rate)
 
     @property
     def _systems(self) -> int:
@@ -161,25 +140,28 @@ class Oted:
 
     def _starts(self, problem: CalibrationProblem) -> tuple[Starts, Int[np.ndarray, " rows"]]:
         """Where rollouts start, and how often each logged row is visited by the true system from there."""
-        if self.starts == "policy":
+        if not self._anew(problem):
             return reset_states(problem.simulator), np.ones(len(problem.dataset), dtype=np.int64)
-        chosen = comparable_starts(problem.dataset, problem.logged_rows, self.horizon)
-        counts = visits(problem.dataset, problem.logged_rows[chosen], self.horizon)
-        return chosen_states(problem.logged_states[chosen]), counts
+        states, rows = problem.states.exact()
+        chosen = comparable_starts(problem.dataset, rows, self.horizon)
+        return chosen_states(states[chosen]), visits(problem.dataset, rows[chosen], self.horizon)
+
+    def _anew(self, problem: CalibrationProblem) -> bool:
+        """Whether every epoch starts anew at logged states."""
+        return (self.starts or ("logged" if problem.states.kind == "exact" else "policy")) == "logged"
 
     def _clone(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         of_batches, key = jax.random.split(state.key)
-        policy, optimiser_state, metrics = clone(
-            state.policy,
-            state.policy_optimiser,
-            problem.pairs,
+        clone, metrics = continue_cloning(
+            state.clone,
+            problem.features.pairs,
             of_batches,
-            optimiser=self._adam,
+            learning_rate=self.learning_rate,
             batch=self.batch,
-            count=self.cloning_updates,
+            updates=self.cloning_updates,
         )
-        following = replace(state, policy=policy, policy_optimiser=optimiser_state, key=key, cloned=state.cloned + 1)
-        return following, Epoch(scalars(metrics), stage="cloning", fraction=following.cloned / self.cloning_epochs)
+        epoch = Epoch(metrics, stage="cloning", fraction=clone.epochs / self.cloning_epochs)
+        return replace(state, clone=clone, key=key), epoch
 
     def _calibrate(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
@@ -188,14 +170,14 @@ class Oted:
         draws = np.tanh(distribution.mean + np.exp(distribution.log_std) * noise)
         starts, reached = self._starts(problem)
         fresh = begin(starts, of_start, systems=self._systems, rows=self.rows)
-        anew = self.starts == "logged"
+        anew = self._anew(problem)
         system = simulator.bind(simulator.parameters.to_physical(draws))
         if anew:
             starts, fresh = unbiased_starts(system, starts), replace(fresh, state=system.unbiased(fresh.state))
         rollout, walkers = roll(
             system,
             simulator.task,
-            state.policy,
+            state.clone.policy,
             fresh if anew else state.walkers,
             steps=self.horizon,
             starts=starts,
@@ -203,17 +185,17 @@ class Oted:
             restart_key=of_restart,
         )
         # The first pair of a row is where it was put: the draw had no part in it.
-        pairs = problem.scalings["standardised"].features(rollout.transitions)[0][1:]
+        pairs = problem.features.standardised.features(rollout.transitions)[0][1:]
         valid = (first_lives(rollout.transitions, rollout.valid) if anew else rollout.valid)[1:]
         rows = replay.add(state.rows, {"pair": replay.flatten_rows(pairs, 3)}, valid.reshape(-1))
         discriminator, optimiser_state, metrics = learn(
             state.discriminator,
             state.discriminator_optimiser,
-            problem.standardised_features[0],
+            problem.features.windows("standardised", 1)[1][0],
             jnp.asarray(np.cumsum(reached), jnp.int32),
             rows,
             of_updates,
-            optimiser=self._adam,
+            optimiser=adam(self.learning_rate),
             batch=self.batch,
             count=self.updates,
         )

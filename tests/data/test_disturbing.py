@@ -7,7 +7,7 @@ from layouts import make_dataset
 
 from madoc import data, tasks
 from madoc.data import Disturbance, disturb, hide_velocities, observed_task
-from madoc.data.disturbance import noise_of
+from madoc.data.disturbing import noise_of
 from madoc.errors import MadocError
 
 KEY = jax.random.key(0)

@@ -1,0 +1,230 @@
+"""One least-squares search: several damped Gauss-Newton searches on few windows, then the best of them on all.
+
+Windows' initial states are known (`known_starts`) or further unknowns (`unknown_starts`); all else is the same.
+"""
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
+
+from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.least_squares.known_starts import KnownStarts
+from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome, Plan
+from madoc.calibration.least_squares.unknown_starts import UnknownStarts
+from madoc.identification.information import SETTLED, sandwich
+from madoc.identification.losses import ALL_FAILED
+from madoc.types import Epoch
+
+DAMPING_RANGE = (1e-10, 1e10)
+"""Relative damping of the parameters' step, lowest and highest; it is clipped to them."""
+STATE_DAMPING_RANGE = (1e-9, 1e6)
+"""Relative damping of an initial state's step, lowest and highest; it is clipped to them."""
+LITTLE = 5e-3
+"""Share of the cost, from 0 to 1: a step that saves less has found unknown initial states too."""
+_SMALLEST = 1e-100
+"""Keeps a step over a tolerance of 0 finite."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SearchState:
+    """Everything a search carries. Once it refines, only the first of the searches goes on.
+
+    Attributes:
+        unit: Where each search stands, in [-1, 1].
+        states: Initial state of every window there; without windows where they are known.
+        damping: λ of each search's steps of the parameters.
+        state_damping: λ of each unknown initial state's step.
+        cost: Mean loss of a residual, `ALL_FAILED` before the first epoch. In squared typical changes of a step; in
+            squared standard deviations of the noise where initial states are unknown and the search refines.
+        moved: The largest component of each search's last step, over one that would matter; below 1 it has settled.
+        rows: First rows of the windows.
+        deviation: Noise of each channel in its typical changes; 1 where initial states are known.
+        bread: Curvature of the best search's cost where it last linearised.
+        meat: Scatter of the cost's gradient there.
+        explained: Number of windows that these two are of.
+        autocorrelation: Of residuals of consecutive readings in these windows; 0 where initial states are known.
+        refining: 0 while searching on few windows, 1 on all of them.
+        waiting: Epochs on all windows in which only initial states still move.
+        epochs: Done in this stage, those of waiting not counted.
+        failures: Windows whose simulation failed.
+    """
+
+    unit: Float[np.ndarray, "searches d"]
+    states: Float[np.ndarray, "searches unknown state"]
+    damping: Float[np.ndarray, " searches"]
+    state_damping: Float[np.ndarray, "searches unknown"]
+    cost: Float[np.ndarray, " searches"]
+    moved: Float[np.ndarray, " searches"]
+    rows: Int[np.ndarray, " windows"]
+    deviation: Float[np.ndarray, " channels"]
+    bread: Float[np.ndarray, "d d"]
+    meat: Float[np.ndarray, "d d"]
+    explained: int
+    autocorrelation: float
+    refining: int
+    waiting: int
+    epochs: int
+    failures: int
+
+
+_OF_EACH_SEARCH = ("unit", "states", "damping", "state_damping", "cost", "moved")
+
+
+@dataclass(frozen=True)
+class Search:
+    """The search's settings, as `LeastSquares` says.
+
+    Attributes:
+        starts: How windows begin, known or unknown.
+        horizon: Control steps of a window.
+        windows: Windows, at most.
+        searches: Searches on few windows.
+        search_windows: These windows, at most.
+        search_epochs: Epochs of searching, at most.
+        tolerance: Share of each range; a smaller step does not matter.
+    """
+
+    starts: KnownStarts | UnknownStarts
+    horizon: int
+    windows: int
+    searches: int
+    search_windows: int
+    search_epochs: int
+    tolerance: float
+
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
+        """Draw the windows, and put the first search at mid-range, the others at random places.
+
+        Raises:
+            MadocError: No state is known well enough, no episode is long enough, or there are too few values.
+        """
+        of_windows, of_starts = jax.random.split(key)
+        count = len(problem.simulator.parameters)
+        possible = self.starts.possible_rows(problem, self.horizon, self.windows)
+        drawn = min(self.windows, len(possible))
+        order = jax.random.choice(of_windows, len(possible), (drawn,), replace=False)
+        rows = possible[np.asarray(order)]
+        unit = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
+        unit[0] = 0.0
+        states = self.starts.guesses(problem, rows)
+        return SearchState(
+            unit=unit,
+            states=np.repeat(states[None], self.searches, axis=0),
+            damping=np.full(self.searches, FIRST_DAMPING),
+            state_damping=np.full((self.searches, len(states)), FIRST_DAMPING),
+            cost=np.full(self.searches, ALL_FAILED),
+            moved=np.full(self.searches, 1.0 / _SMALLEST),
+            rows=rows,
+            deviation=np.ones(problem.states.measured),
+            bread=np.zeros((count, count)),
+            meat=np.zeros((count, count)),
+            explained=0,
+            autocorrelation=0.0,
+            refining=0,
+            waiting=0,
+            epochs=0,
+            failures=0,
+        )
+
+    def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
+        """One damped step of every search under way: derivatives in one simulation, the steps tried in another."""
+        running, count = self._running(state), self.window_count(state)
+        windows = self.starts.windows(problem, state.rows[:count], self.horizon)
+        unit, states = state.unit[:running], state.states[:running, :count]
+        plans = windows.plans(
+            unit,
+            states,
+            state.damping[:running],
+            state.state_damping[:running, :count],
+            refining=bool(state.refining),
+        )
+        outcomes = windows.outcomes(plans, states)
+        new = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}
+        for index, (plan, outcome) in enumerate(zip(plans, outcomes, strict=True)):
+            trial, factor = chosen(outcome, waiting=state.waiting > 0)
+            followed = outcome.followed[trial]
+            new["unit"][index] = np.clip(unit[index] + plan.steps[trial], -1.0, 1.0)
+            change = followed[:, None] * plan.state_steps[trial]
+            new["states"][index, :count] += windows.in_state_units(change, states.shape[2])
+            new["damping"][index] = np.clip(state.damping[index] * factor, *DAMPING_RANGE)
+            state_factor = np.select([followed == 1.0, followed > 0.0], [0.1, 1.0], 10.0)
+            new["state_damping"][index, :count] = np.clip(
+                state.state_damping[index, :count] * state_factor, *STATE_DAMPING_RANGE
+            )
+            cost = float(outcome.totals[trial])
+            new["cost"][index] = cost if state.refining else plan.comparable(cost)
+            new["moved"][index] = self._moved(plan, outcome, trial, damping=float(state.damping[index]))
+        leader = int(np.argmin(new["cost"][:running]))
+        best = plans[leader]
+        following = replace(
+            state,
+            **new,
+            deviation=best.deviation,
+            bread=best.bread,
+            meat=best.meat,
+            explained=int(best.kept.sum()),
+            autocorrelation=best.autocorrelation,
+            waiting=max(0, state.waiting - 1),
+            epochs=state.epochs + (state.waiting == 0),
+            failures=state.failures + sum(each.failures for each in plans) + sum(each.failures for each in outcomes),
+        )
+        noise = float(np.median(best.deviation))
+        metrics = {
+            "residual": float(np.sqrt(new["cost"][leader])) * (noise if state.refining else 1.0),
+            "moved": float(new["moved"][leader]),
+        }
+        metrics |= {"noise": noise} if states.size else {}
+        if not state.refining and (new["moved"][leader] < 1.0 or following.epochs >= self.search_epochs):
+            following = self._refined(following, leader)
+        stage = "calibrating" if state.refining else "searching"
+        return following, Epoch(metrics, self._epoch_steps(problem, state), stage=stage)
+
+    def settled(self, state: SearchState) -> bool:
+        """Whether the next step would change nothing worth a simulation; not where every window fails."""
+        still = float(state.moved[0]) < 1.0 and float(state.cost[0]) < self.starts.failed_cost
+        return bool(state.refining) and state.epochs > 0 and still
+
+    def window_count(self, state: SearchState) -> int:
+        """Windows of the stage."""
+        return len(state.rows) if state.refining else min(self.search_windows, len(state.rows))
+
+    def whole_run(self, problem: CalibrationProblem, state: SearchState, refining_epochs: int) -> int:
+        """Control steps of the longest search, where it has yet to end, and of so many epochs on all windows."""
+        searching, refining = (self._epoch_steps(problem, replace(state, refining=stage)) for stage in (0, 1))
+        return searching * self.search_epochs * (1 - state.refining) + refining * refining_epochs
+
+    def _running(self, state: SearchState) -> int:
+        return 1 if state.refining else self.searches
+
+    def _epoch_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
+        return self._running(state) * self.window_count(state) * self.starts.columns(problem) * self.horizon
+
+    def _moved(self, plan: Plan, outcome: Outcome, trial: int, *, damping: float) -> float:
+        """The step over one that would matter: a tenth of a standard error, or the tolerance.
+
+        A step that did not help, or a short one, says that the end is near only where no longer one is tried any more.
+        """
+        tried = np.abs(plan.steps[0 if damping <= self.starts.stuck else min(trial, len(TRIALS) - 1)])
+        error = np.sqrt(np.maximum(np.diag(sandwich(plan.bread, plan.meat).covariance), 0.0))
+        worthwhile = np.maximum(2.0 * max(self.tolerance, _SMALLEST), SETTLED * error)
+        return max(float((tried / worthwhile).max()), 0.0 if plan.exact else outcome.saved(trial) / LITTLE)
+
+    def _refined(self, state: SearchState, leader: int) -> SearchState:
+        """The best search alone goes on, in the first place."""
+        order = np.argsort(np.arange(self.searches) != leader, kind="stable")
+        searches = {name: getattr(state, name)[order] for name in _OF_EACH_SEARCH}
+        if self.starts.waiting:
+            searches["damping"] = np.full(self.searches, FIRST_DAMPING)
+        return replace(state, **searches, refining=1, waiting=self.starts.waiting, epochs=0)
+
+
+def chosen(outcome: Outcome, *, waiting: bool) -> tuple[int, float]:
+    """The step of the parameters that helps most, the last one being none, and what multiplies the damping."""
+    last = len(outcome.totals) - 1
+    trial = last if waiting else int(np.argmin(outcome.totals))
+    if outcome.totals[trial] < outcome.totals[last]:
+        return trial, TRIALS[trial]
+    return last, 1.0 if waiting else 1e3

@@ -1,0 +1,13 @@
+from . import logs as logs
+from .dataset import Dataset as Dataset
+from .dataset import subsample as subsample
+from .dataset import typical_change as typical_change
+from .disturbance import Disturbance as Disturbance
+from .disturbing import disturb as disturb
+from .disturbing import hide_velocities as hide_velocities
+from .disturbing import observed_task as observed_task
+from .formats import FORMATS as FORMATS
+from .formats import Format as Format
+from .formats import load as load
+from .native import save as save
+from .validation import validate as validate

@@ -1,0 +1,238 @@
+"""What the stages can be asked: every option is declared here once, with its default and its help text.
+
+The command line reads these classes, and the stages carry them out. Nothing heavy is imported, so `--help` is quick.
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
+
+from madoc.data.disturbance import Disturbance, Velocities
+from madoc.errors import MadocError
+
+AUTO = "auto"
+"""The name under which several calibrators are tried and the best is kept."""
+
+Physics = Literal["legacy", "modern"]
+Place = Literal["calibrated", "distribution", "uniform", "midrange", "truth"]
+Settings = UseAppendAction[tuple[tuple[str, ...], ...]]
+"""Hyperparameters as texts: `--set a=1 b=2 --set c=3` is `(("a=1", "b=2"), ("c=3",))`."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How logged data is read."""
+
+    format: str | None = None
+    """Format of the log: d4rl, neorl, minari or madoc. Default: look at its content."""
+    clip_actions: bool = False
+    """Clip actions outside their ranges instead of refusing them."""
+    disturbance: OmitArgPrefixes[Disturbance] = field(default_factory=Disturbance)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where logged data is, and how it is read."""
+
+    paths: Annotated[tuple[str, ...], arg(name="data")]
+    """The log: a D4RL, NeoRL or Minari file, one of `madoc record`, or a Minari id; of a robot of your own, files or
+    folders of logs."""
+    max_transitions: int | None = 200_000
+    """Keep at most so many rows, drawn as whole episodes."""
+    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
+
+    def __post_init__(self) -> None:
+        if not self.paths:
+            raise MadocError("expected the log after --data, got nothing; name a file or a folder")
+
+    @property
+    def words(self) -> str:
+        """The paths as a sentence has them."""
+        return ", ".join(self.paths)
+
+    def absolute(self) -> "Source":
+        """The source that means the same from any working directory; the id of a Minari dataset stays what it is."""
+        files = {path: Path(path).expanduser() for path in self.paths}
+        return replace(self, paths=tuple(str(file.resolve()) if file.exists() else at for at, file in files.items()))
+
+
+@dataclass(frozen=True)
+class Search:
+    """Which parameters are calibrated, in which ranges, and by which method."""
+
+    physics: Physics | None = None
+    """Physics of the simulator. Default: the data's; legacy where it does not say."""
+    level: str = "normal"
+    """Ranges to search: easy, normal or hard."""
+    parameters: tuple[str, ...] = ()
+    """Calibrate only these. Default: all of the robot's."""
+    method: str | None = None
+    """A calibrator, as `madoc methods` lists it, or auto: what the data allows, compared on a hold-out. Default: auto
+    for a robot of your own, else madoc."""
+    starts: Literal["policy", "logged", "replay"] | None = None
+    """Where rollouts start: free running from resets, short ones from logged states, or one step of the log."""
+    set: Settings = ()
+    """Hyperparameters of the method as name=value; of a method that auto tries as madoc.name=value."""
+    budget: int | None = None
+    """Simulated control steps. Default: 600000 for auto, of which least squares may have two thirds and Madoc half;
+    else 300000."""
+    seed: int = 0
+    """Of all randomness."""
+
+    @property
+    def changes(self) -> dict[str, str]:
+        """Hyperparameters that differ from the method's own, by name.
+
+        Raises:
+            MadocError: One is not `name=value`, or is given twice.
+        """
+        return parse_settings(self.set, starts=self.starts)
+
+
+@dataclass(frozen=True)
+class CalibrationOrder:
+    """What a calibration is asked."""
+
+    task: Annotated[Positional[str], arg(metavar="TASK")]
+    """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
+    source: OmitArgPrefixes[Source]
+    search: OmitArgPrefixes[Search] = field(default_factory=Search)
+    holdout: float | None = None
+    """Share of the rows that no method sees, to judge the result by. Default: 0.2 for auto, else none."""
+    truth: Path | None = None
+    """JSON file {parameter: value} to judge the result by; no method ever sees it."""
+
+
+@dataclass(frozen=True)
+class SelftestOrder:
+    """What a selftest is asked."""
+
+    task: Annotated[Positional[str], arg(metavar="TASK")]
+    """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
+    source: OmitArgPrefixes[Source]
+    search: OmitArgPrefixes[Search] = field(default_factory=lambda: Search(method=AUTO, budget=400_000))
+    truths: int = 3
+    """How many truths to plant, one after another."""
+
+
+@dataclass(frozen=True)
+class CheckOrder:
+    """What a check of logs is asked."""
+
+    spec: Annotated[Positional[Path], arg(metavar="SPEC")]
+    """The spec file of the robot, as robot.yaml."""
+    paths: Annotated[tuple[Path, ...], arg(name="data")]
+    """Logs: files (CSV, npz, HDF5, Parquet, MCAP) or folders of them, Minari or LeRobot directories."""
+    clip_actions: bool = False
+    """Clip actions outside their ranges instead of refusing them."""
+    velocities: Velocities = "logged"
+    """differences puts velocities from positions where the logs have none, as `calibrate` does if told so."""
+    budget: int = 300_000
+    """Control steps to forecast the time of."""
+    forecast: bool = True
+    """Forecast how long methods would take: the longest part of a check."""
+    seed: int = 0
+    """Of the stretches of the log that are looked at."""
+
+
+@dataclass(frozen=True)
+class RecordOrder:
+    """What a recording is asked."""
+
+    name: Annotated[Positional[str], arg(metavar="TASK-QUALITY")]
+    """TASK-QUALITY: hopper-medium, halfcheetah-medium-replay, walker2d-neorl-high, ..."""
+    transitions: int = 200_000
+    """Rows to record."""
+    seed: int = 0
+    """Of all randomness."""
+    physics: Physics = "legacy"
+    """legacy is that of D4RL, NeoRL and the paper."""
+    friction: float = 1.0
+    """Friction of the target's contacts as a multiple of the model's: 1.2 is a gap that no parameter closes."""
+    disturbance: OmitArgPrefixes[Disturbance] = field(default_factory=Disturbance)
+
+
+@dataclass(frozen=True)
+class PolicyOrder:
+    """What a policy learner is asked."""
+
+    method: str = "sac"
+    """A policy learner, as `madoc methods` lists it; some need the run's data."""
+    at: Place = "calibrated"
+    """The parameters to learn at: the estimate; draws from the calibrated distribution, or from the whole box, anew
+    every epoch; or a yardstick: mid-range, or the truth, which only an evaluation knows."""
+    set: Settings = ()
+    """Hyperparameters of the method as name=value."""
+    budget: int = 300_000
+    """Simulated control steps, or updates of a learner that does not simulate, as `madoc methods` says."""
+    seed: int = 0
+    """Of all randomness."""
+    truth: Path | None = None
+    """JSON file {parameter: value}, for --at truth. Default: what the run remembers."""
+
+    @property
+    def changes(self) -> dict[str, str]:
+        """Hyperparameters that differ from the method's own, by name."""
+        return parse_settings(self.set)
+
+
+@dataclass(frozen=True)
+class EvaluationOrder:
+    """What an evaluation of policies is asked."""
+
+    episodes: int = 20
+    """Episodes for each policy, from the same starts."""
+    seed: int = 0
+    """Of the starts."""
+    truth: Path | None = None
+    """JSON file {parameter: value} that makes the target. Default: what the run remembers."""
+
+
+@dataclass(frozen=True)
+class RunOrder:
+    """What the whole job is asked: to record or load, calibrate, learn and evaluate."""
+
+    name: Annotated[Positional[str], arg(metavar="TASK-QUALITY")]
+    """TASK-QUALITY to record, as hopper-medium; with --data the name of the robot is enough."""
+    data: str | None = None
+    """Use this log instead of recording one."""
+    transitions: int = 200_000
+    """Rows to record, or to keep of the log."""
+    reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
+    search: OmitArgPrefixes[Search] = field(default_factory=lambda: Search(method="madoc", budget=300_000))
+    truth: Path | None = None
+    """JSON file {parameter: value} to judge by; no method ever sees it. Default: the data's, if it has any."""
+    learner: str = "sac"
+    """A policy learner, as `madoc methods` lists it."""
+    policy_set: Settings = ()
+    """Hyperparameters of the learner as name=value."""
+    policy_budget: int = 300_000
+    """Simulated control steps for each policy, or updates of a learner that does not simulate."""
+    yardsticks: bool = True
+    """Learn also a policy at mid-range and one at the truth."""
+    episodes: int = 20
+    """Episodes for the evaluation of each policy."""
+
+
+def parse_settings(settings: tuple[tuple[str, ...], ...], *, starts: str | None = None) -> dict[str, str]:
+    """`(("updates=2", "hidden=[64,64]"),)` as a dictionary of texts, with `starts` where it is an option of its own.
+
+    Raises:
+        MadocError: One is not `name=value`, or a name comes twice.
+    """
+    changes: dict[str, str] = {}
+    for setting in (text for group in settings for text in group):
+        name, equals, value = setting.partition("=")
+        name = name.strip().replace("-", "_")
+        if not equals or not name:
+            raise MadocError(f"expected hyperparameters as name=value, got {setting!r}")
+        if name in changes:
+            raise MadocError(f"hyperparameter {name} is given twice: {changes[name]!r} and {value!r}")
+        changes[name] = value
+    if starts is None:
+        return changes
+    if "starts" in changes:
+        raise MadocError(f"starts is given twice: --starts {starts} and --set starts={changes['starts']}")
+    return changes | {"starts": starts}

@@ -1,0 +1,176 @@
+"""From an order to what a calibration needs: the data, the robot, the problem, and what results are judged on."""
+
+import warnings
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from madoc import robots, simulation
+from madoc.calibration import CalibrationProblem
+from madoc.data import Dataset, observed_task
+from madoc.data.split import hold_out
+from madoc.diagnosis import check, refuse_fatal
+from madoc.errors import MadocError, unknown_name
+from madoc.pipeline.data_stage import Machine, fingerprint, load_source, read_truth
+from madoc.pipeline.folders import stored_path
+from madoc.pipeline.keys import seed_key, stage_key
+from madoc.pipeline.orders import AUTO, CalibrationOrder
+from madoc.pipeline.records import DataRecord
+from madoc.simulation import Simulator
+from madoc.tasks import Task
+from madoc.verdict import Bench
+
+HOLDOUT = 0.2
+"""Share of the rows that `auto` holds out unless told otherwise, as cross-validation in five folds does."""
+BUDGET = 300_000
+"""Control steps of one method, unless told otherwise."""
+AUTO_BUDGET = 600_000
+"""Control steps of all of `auto`'s candidates together, unless told otherwise."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What an order comes to.
+
+    Attributes:
+        order: What was asked.
+        method: Name of the calibrator, or `auto`.
+        budget: Simulated control steps.
+        holdout: Share of the rows that no method sees; None where nothing is judged.
+        machine: The robot before any choice of the order.
+        dataset: All rows.
+        simulator: Of the robot as the order wants it.
+        truth: The target's physical values by name, as the order or the data has them.
+    """
+
+    order: CalibrationOrder
+    method: str
+    budget: int
+    holdout: float | None
+    machine: Machine
+    dataset: Dataset
+    simulator: Simulator
+    truth: dict[str, float] | None
+
+    @property
+    def seed(self) -> int:
+        """The seed of all randomness."""
+        return self.order.search.seed
+
+    @cached_property
+    def bench(self) -> Bench:
+        """What results are judged on."""
+        split = hold_out(self.dataset, self.holdout or HOLDOUT, stage_key(self.seed, "hold-out"))
+        problem = CalibrationProblem(split.kept, self.simulator)
+        return Bench(problem, split.held, stage_key(self.seed, "verdict"), split.sentence)
+
+    @cached_property
+    def problem(self) -> CalibrationProblem:
+        """What methods are given: all rows but those that are held out."""
+        return CalibrationProblem(self.dataset, self.simulator) if self.holdout is None else self.bench.problem
+
+    @property
+    def calibrated_truth(self) -> dict[str, float] | None:
+        """The true values of the calibrated parameters."""
+        names = self.simulator.parameters.names
+        return None if self.truth is None else {name: self.truth[name] for name in names}
+
+    def spec(self, out: Path) -> dict[str, object]:
+        """What the `spec.json` of the run folder `out` keeps; `records.SpecRecord` reads it."""
+        search, source, task = self.order.search, self.order.source, self.simulator.task
+        files = {path: Path(path).expanduser() for path in source.paths}
+        stored = DataRecord(
+            paths=tuple(stored_path(file, out) if file.exists() else path for path, file in files.items()),
+            format=source.reading.format,
+            clip_actions=source.reading.clip_actions,
+            max_transitions=source.max_transitions,
+            disturbance=source.reading.disturbance,
+            rows=len(self.dataset),
+            fingerprint=fingerprint(self.dataset),
+        )
+        held = {} if self.holdout is None else {"holdout": self.holdout}
+        asked = {
+            "command": "calibrate",
+            "task": task.name,
+            "physics": task.physics,
+            "level": search.level,
+            "parameters": {row.name: [row.low, row.high] for row in task.parameters.parameters},
+            "method": self.method,
+            "data": asdict(stored),
+            "seed": self.seed,
+            "budget": self.budget,
+            "truth": self.truth,
+        }
+        return asked | held | self.machine.stored()
+
+
+def method_of(order: CalibrationOrder) -> str:
+    """The calibrator that an order means: `auto` for a robot of one's own, else `madoc`, unless it names one."""
+    return order.search.method or (AUTO if robots.is_spec_path(order.task) else "madoc")
+
+
+def check_order(order: CalibrationOrder, out: Path | None = None) -> None:
+    """Refuse what can be refused without looking at the data.
+
+    Args:
+        order: What is asked.
+        out: The run folder; a run's files must not come to lie among the logs, which they would hide.
+
+    Raises:
+        MadocError: The seed, the budget or the share held out is impossible, or the folder holds the logs.
+    """
+    seed_key(order.search.seed)
+    if order.search.budget is not None and order.search.budget < 1:
+        raise MadocError(f"expected a budget of at least 1 control step, got {order.search.budget}")
+    if order.holdout is not None and not 0.0 < order.holdout < 1.0:
+        raise MadocError(f"expected a share of the rows to hold out between 0 and 1, got {order.holdout}")
+    if out is None:
+        return
+    folder = out.expanduser().resolve()
+    for path in order.source.paths:
+        log = Path(path).expanduser().resolve()
+        if log == folder or (log.exists() and log.is_relative_to(folder) and not (folder / "spec.json").exists()):
+            raise MadocError(f"the run folder {out} holds the log {path}; choose another --out")
+
+
+def prepare(order: CalibrationOrder) -> Prepared:
+    """Read the data and the robot of an order, and check the logs of a robot of one's own.
+
+    Raises:
+        MadocError: The robot, the data or the truth is refused, or the check finds the data to be useless.
+    """
+    method = method_of(order)
+    budget = order.search.budget if order.search.budget is not None else AUTO_BUDGET if method == AUTO else BUDGET
+    holdout = HOLDOUT if method == AUTO and order.holdout is None else order.holdout
+    truth = read_truth(order.truth)
+    machine, dataset, task = _read(order)
+    truth = dataset.true_parameters if truth is None else truth
+    if truth is not None:
+        machine.check_truth(truth, task)
+    simulator = simulation.make(task)
+    if machine.robot is not None:
+        diagnosis = check(dataset, simulator, robot=machine.robot)
+        refuse_fatal(diagnosis.findings)
+        dataset = replace(dataset, findings=diagnosis.findings)
+    return Prepared(order, method, budget, holdout, machine, dataset, simulator, truth)
+
+
+def _read(order: CalibrationOrder) -> tuple[Machine, Dataset, Task]:
+    """The robot, its data, and the task as the order wants it searched."""
+    search = order.search
+    machine = Machine.named(order.task, search.physics)
+    for name in search.parameters:
+        if name not in machine.task.parameters.names:
+            raise unknown_name(f"parameter of {order.task}", name, machine.task.parameters.names)
+    machine.task.with_level(search.level)
+    dataset = load_source(order.source, machine, seed=search.seed)
+    recorded = dataset.physics if dataset.physics != "unknown" else None
+    machine = machine.in_physics(search.physics or recorded or "legacy")
+    task = observed_task(machine.task.with_level(search.level), dataset)
+    if recorded is not None and recorded != task.physics:
+        warnings.warn(
+            f"{order.source.words} was recorded in {recorded} physics and is calibrated in {task.physics}: "
+            "the estimate will make up for the difference; leave out --physics to take the data's",
+            stacklevel=2,
+        )
+    return machine, dataset, task.with_parameters(list(search.parameters)) if search.parameters else task

@@ -1,0 +1,143 @@
+"""The parts that the paper's walking robots share. The root's x (and y) position never enters their dynamics."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from madoc.parameters import Parameter, ParameterSpace
+from madoc.tasks.base import Batch, Task
+from madoc.tasks.physics import load_robot
+
+VELOCITY_CLIP = 10.0
+"""Bound of an observed velocity of Hopper and Walker2d in m/s or rad/s; larger ones are clipped to it."""
+
+Span = tuple[float, float]
+"""Lower and upper end of a range."""
+Ranges = tuple[Span, Sequence[Span], Sequence[Span]]
+"""Ranges of gravity (m/s²), of each mass (kg) and of each damping (N·m·s/rad)."""
+
+
+def walking_task(
+    name: str,
+    file: str,
+    physics: str,
+    *,
+    bodies: Sequence[str],
+    joints: Sequence[str],
+    ranges: Mapping[str, Ranges],
+    positions: int,
+    velocities: int,
+    root: int,
+    clipped: bool,
+    frame_skip: int,
+    reward: Callable[[Batch, Batch, Batch], Batch],
+    terminated: Callable[[Batch], Batch],
+    reset_noise: Callable[[PRNGKeyArray, int], jax.Array],
+    groups: int,
+    reference_returns: tuple[float, float],
+    total_mass: float | None = None,
+) -> Task:
+    """A robot of the paper, from Gymnasium's model file.
+
+    Args as the attributes of `Task`, and:
+        file: A file of Gymnasium's MuJoCo assets.
+        bodies: Bodies whose mass is calibrated.
+        joints: Joints whose damping is calibrated.
+        ranges: The box by level; `normal` is the task's own.
+        positions: Number of positions in a state.
+        velocities: Number of velocities in a state.
+        root: Number of leading positions that an observation leaves out.
+        clipped: Whether observed velocities are clipped.
+        total_mass: The model's masses are scaled to this sum in kg.
+    """
+    spaces = {level: _space(bodies, joints, spans) for level, spans in ranges.items()}
+    seen = positions - root
+    return Task(
+        name=name,
+        physics=physics,
+        spec=partial(load_robot, file, physics, total_mass),
+        frame_skip=frame_skip,
+        observation_size=seen + velocities,
+        observe=partial(_observe_clipped if clipped else _observe, root=root, positions=positions),
+        reward=reward,
+        terminated=terminated,
+        reset_noise=reset_noise,
+        parameters=spaces["normal"],
+        ranges=spaces,
+        groups=groups,
+        max_episode_steps=1000,
+        reference_returns=reference_returns,
+        state_from_observation=partial(_with_root, root=root),
+        rebuildable=partial(_unclipped, positions=seen) if clipped else _always,
+        velocities=velocities,
+    )
+
+
+def forward_reward(state: Batch, action: Batch, next_state: Batch, *, dt: float, cost: float) -> Batch:
+    """Velocity along the first coordinate (m/s), less `cost` times the squared action."""
+    return (next_state[..., 0] - state[..., 0]) / dt - cost * (action**2).sum(-1)
+
+
+def healthy_reward(
+    state: Batch, action: Batch, next_state: Batch, *, terminated: Callable[[Batch], Batch], dt: float, cost: float
+) -> Batch:
+    """Velocity along the first coordinate (m/s), plus 1 where healthy, less `cost` times the squared action."""
+    speed = (next_state[..., 0] - state[..., 0]) / dt
+    return speed + ~terminated(next_state) - cost * (action**2).sum(-1)
+
+
+def uniform_noise(key: PRNGKeyArray, count: int, *, size: int, scale: float) -> jax.Array:
+    """Offsets of an initial state, uniform in ±scale, shape (count, size)."""
+    return jax.random.uniform(key, (count, size), minval=-scale, maxval=scale)
+
+
+def uniform_and_normal_noise(
+    key: PRNGKeyArray, count: int, *, positions: int, velocities: int, scale: float
+) -> jax.Array:
+    """Offsets of an initial state: positions uniform in ±scale, velocities normal with deviation `scale`."""
+    of_position, of_velocity = jax.random.split(key)
+    normal = scale * jax.random.normal(of_velocity, (count, velocities))
+    return jax.numpy.concatenate([uniform_noise(of_position, count, size=positions, scale=scale), normal], axis=-1)
+
+
+def _space(bodies: Sequence[str], joints: Sequence[str], ranges: Ranges) -> ParameterSpace:
+    """The paper's box: gravity, masses of bodies, damping of joints, in this order."""
+    gravity, masses, dampings = ranges
+    return ParameterSpace(
+        (
+            Parameter("gravity", "", *gravity),
+            *(Parameter("body_mass", body, *span) for body, span in zip(bodies, masses, strict=True)),
+            *(Parameter("dof_damping", joint, *span) for joint, span in zip(joints, dampings, strict=True)),
+        )
+    )
+
+
+def _observe(state: Batch, *, root: int, positions: int) -> Batch:
+    """Every position but the root's, then the velocities."""
+    return state[..., root:]
+
+
+def _observe_clipped(state: Batch, *, root: int, positions: int) -> Batch:
+    """Every position but the root's, then the velocities, clipped."""
+    namespace = state.__array_namespace__()
+    velocity = namespace.clip(state[..., positions:], -VELOCITY_CLIP, VELOCITY_CLIP)
+    return namespace.concat([state[..., root:positions], velocity], axis=-1)
+
+
+def _with_root(observation: Batch, *, root: int) -> Batch:
+    """The state whose root is at 0."""
+    namespace = observation.__array_namespace__()
+    return namespace.concat([namespace.zeros_like(observation[..., :root]), observation], axis=-1)
+
+
+def _unclipped(observation: Batch, *, positions: int) -> Batch:
+    """Whether no velocity of a row is at the clip: only then can its state be rebuilt."""
+    return (abs(observation[..., positions:]) < VELOCITY_CLIP).all(-1)
+
+
+def _always(observation: Batch) -> Batch:
+    """Every row determines its state."""
+    return np.ones(observation.shape[:-1], dtype=bool)

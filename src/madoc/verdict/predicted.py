@@ -1,0 +1,127 @@
+"""The hold-out predicted from logged states: where states can be rebuilt from what was logged."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from madoc.calibration.holdout import Predicted
+from madoc.diagnosis.channels import signal_names
+from madoc.identification import noise as sensors
+from madoc.identification.states import logged_states
+from madoc.verdict.bench import Bench, common_fields
+from madoc.verdict.prediction import nearby_best
+from madoc.verdict.statistics import best_of, prediction_errors, relative_to_first
+from madoc.verdict.systematic import autocorrelation, explained, explained_at_end
+from madoc.verdict.two_sample import replayed, tell_apart
+
+
+def predicted(bench: Bench, unit: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
+    """Prediction errors at mid-range, at the estimate, at the best parameters nearby, and of noise alone.
+
+    Args:
+        bench: The hold-out.
+        unit: The estimate in [-1, 1].
+        interval: Its 95 % intervals in physical units, if known.
+    """
+    replays, mid_range = bench.replays, np.zeros(len(unit))
+    nearby, searching = nearby_best(replays, unit)
+    points = np.concatenate([mid_range[None], unit[None], nearby])
+    residuals = replays.residuals(points)
+    sizes = replays.magnitudes(residuals)
+    best = best_of(sizes)
+    single = _single_steps(bench, points[best])
+    noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
+    systems = {"the simulator at mid-range": mid_range, "the simulator at the best parameters nearby": points[best]}
+    common = common_fields(
+        bench,
+        unit,
+        interval,
+        at=points[best],
+        residual=single.size,
+        by_model=tuple(bench.against_chance(name, _simulated(bench, point)) for name, point in systems.items()),
+        noise=single.noise,
+        control_steps=searching + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps,
+    )
+    area_at_mid_range, area_at_estimate = (
+        tell_apart(*replayed(replays, bench.scaling, part, noisy[0]), overlap=False) for part in residuals[:2]
+    )
+    actions = replays.windows.actions.reshape(len(replays.windows), -1)
+    return Predicted(
+        **common,
+        errors=prediction_errors(
+            sizes,
+            replays.magnitudes(noisy)[:, 0],
+            best,
+            episodes=replays.episodes,
+            horizons=replays.horizons,
+            signals=signal_names(bench.simulator.task),
+            failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
+        ),
+        explained=max(
+            single.explained,
+            explained_at_end(np.concatenate([replays.observation, actions], axis=1), residuals[best]),
+        ),
+        autocorrelation=single.autocorrelation,
+        area_at_mid_range=area_at_mid_range,
+        area_at_estimate=area_at_estimate,
+    )
+
+
+def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
+    """Standard deviation of the sensors' noise in their units, without an estimate.
+
+    Where states can be rebuilt, it is what the best parameters near mid-range leave over.
+    """
+    if not bench.states_known:
+        return sensors.difference_noise(bench.problem.dataset)
+    mid_range = np.zeros((1, len(bench.simulator.parameters)))
+    points = np.concatenate([mid_range, nearby_best(bench.replays, mid_range[0])[0]])
+    sizes = bench.replays.magnitudes(bench.replays.residuals(points)).mean((0, -1))
+    best = points[int(np.argmin(relative_to_first(sizes)))]
+    return _single_steps(bench, best).noise * bench.change
+
+
+@dataclass(frozen=True)
+class _SingleSteps:
+    """Residuals of single steps, in typical changes of a step.
+
+    Attributes:
+        size: Root mean square of each signal.
+        explained: Share of their squares that state and action explain.
+        autocorrelation: From step to step.
+        noise: Standard deviation of the sensors' noise.
+        control_steps: Simulated.
+    """
+
+    size: Float[np.ndarray, " observation"]
+    explained: float
+    autocorrelation: float
+    noise: Float[np.ndarray, " observation"]
+    control_steps: int
+
+
+def _single_steps(bench: Bench, unit: Float[np.ndarray, " d"]) -> _SingleSteps:
+    held, rows, scale = bench.held_out, bench.judged_rows, bench.change
+    followed = np.asarray(held.transitions.next_observation)[rows]
+    residuals = sensors.clipped((_simulated(bench, unit) - followed) / scale)
+    first = np.flatnonzero((np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts))
+    share, explanation = explained(bench.scaling.features(held.transitions.take(rows))[0], residuals)
+    noise, spent = np.zeros(len(scale)), len(rows)
+    if len(first):
+        slopes = sensors.own_slopes(bench.simulator, held, unit, rows[first], scale)
+        unexplained = residuals - explanation
+        noise = sensors.consecutive_noise(unexplained[first], unexplained[first + 1], slopes)
+        spent += len(first) * (1 + len(scale))
+    together = autocorrelation(residuals[first], residuals[first + 1])
+    return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise, spent)
+
+
+def _simulated(bench: Bench, unit: Float[np.ndarray, " d"]) -> Float[np.ndarray, "rows observation"]:
+    """Next observations of the judged rows in the simulator."""
+    held, simulator = bench.held_out, bench.simulator
+    states, rows = logged_states(held, simulator.task)
+    states = states[np.searchsorted(rows, bench.judged_rows)]
+    system = simulator.bind(simulator.parameters.to_physical(unit)[None])
+    action = np.asarray(held.transitions.action)[bench.judged_rows]
+    return np.asarray(system.observe(system.step(system.unbiased(states[None]), action[None]))[0])

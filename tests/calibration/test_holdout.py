@@ -1,0 +1,65 @@
+"""Reports on a hold-out, as a result's file keeps them."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from madoc.calibration.holdout import (
+    AgainstChance,
+    Area,
+    Fitted,
+    NotRun,
+    Predicted,
+    PredictionError,
+    PredictionErrors,
+    ToldApart,
+    Tried,
+    holdout_from_json,
+    holdout_to_json,
+)
+from madoc.errors import MadocError
+
+COMMON = {
+    "split": "1 of 5 episodes is held out",
+    "rows": 400,
+    "episodes": 1,
+    "estimate": {"mass": 0.2},
+    "interval_shares": {"mass": 0.01},
+    "against_chance": (AgainstChance("the simulator", 0.9, 0.02), AgainstChance("staying in place", 0.2, 0.002)),
+    "noise": {"q": 0.1},
+    "control_steps": 7,
+}
+ROW = (PredictionError(1, 0.1, (0.05, 0.2), {"q": 0.1}),)
+ERRORS = PredictionErrors(ROW, ROW, ROW, ROW, 0.1, (0.08, 0.12), 0.09, 400, 0)
+AREA = Area(0.7, (0.6, 0.8), 400)
+REPORTS = [
+    Predicted(
+        **COMMON, errors=ERRORS, explained=0.0, autocorrelation=0.0, area_at_mid_range=AREA, area_at_estimate=AREA
+    ),
+    Fitted(**COMMON, errors=ERRORS, explained=0.0, fitted_steps=10),
+    ToldApart(**COMMON, area_at_mid_range=AREA, area_at_estimate=AREA),
+]
+
+
+@pytest.mark.parametrize("report", REPORTS)
+def test_a_report_comes_back_as_it_was(report):
+    compared = (Tried("madoc", 0.1, (0.0, 0.2), "CALIBRATED", 10, 1.5), NotRun("oted", "the budget is spent"))
+    for written in (report, replace(report, candidates=compared, chosen="madoc")):
+        assert holdout_from_json(json.loads(json.dumps(holdout_to_json(written)))) == written
+    assert "candidates" not in holdout_to_json(report)
+
+
+def test_the_clearest_prediction_pays_for_the_others_that_were_tried():
+    assert (REPORTS[0].clearest.prediction, REPORTS[0].chance) == ("staying in place", 0.004)
+
+
+@pytest.mark.parametrize(("report", "score"), [*zip(REPORTS, (0.1, 0.1, pytest.approx(0.2)), strict=True)])
+def test_less_is_better_by_every_measure(report, score):
+    assert report.score == score
+    assert report.score_interval[0] < report.score < report.score_interval[1]
+
+
+def test_a_report_of_another_version_is_refused_in_a_sentence():
+    with pytest.raises(MadocError, match=r"not written by this version .*calibrate again, or delete its entry"):
+        holdout_from_json({"measure": "prediction", "relative": 0.1})

@@ -1,0 +1,84 @@
+"""One step of a search by hand: which trial is taken, when it has settled, and that known states are no unknowns."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from madoc import simulation
+from madoc.calibration import CalibrationProblem
+from madoc.calibration.least_squares.known_starts import KnownStarts
+from madoc.calibration.least_squares.plan import Outcome, Plan
+from madoc.calibration.least_squares.search import Search, chosen
+from madoc.calibration.least_squares.unknown_starts import UnknownStarts
+from madoc.identification.losses import ALL_FAILED
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import windows_at
+from robots import SPRING_TRUTH, recorded, spring
+
+SPRING = spring(max_episode_steps=100)
+
+
+def outcome(*totals, before=4.0):
+    return Outcome(before, np.array(totals), np.zeros((len(totals), 0)), 0)
+
+
+def test_the_step_that_helps_most_is_taken_and_its_damping_kept():
+    assert chosen(outcome(3.0, 1.0, 2.0, 4.0), waiting=False) == (1, 1.0)
+    assert chosen(outcome(1.0, 3.0, 2.0, 4.0), waiting=False) == (0, 1e-2)
+
+
+def test_where_no_step_helps_none_is_taken_and_damping_grows():
+    assert chosen(outcome(5.0, 4.0, 6.0, 4.0), waiting=False) == (3, 1e3)
+    assert chosen(outcome(1.0, 1.0, 1.0, 4.0), waiting=True) == (3, 1.0)
+
+
+def test_the_share_that_a_step_saves():
+    assert outcome(3.0, 1.0, 2.0, 4.0).saved(1) == pytest.approx(0.75)
+
+
+def test_windows_left_out_make_a_search_worse_than_its_cost_says():
+    nothing = np.zeros(0)
+    rest = {"unit": nothing, "residuals": nothing, "kept": nothing, "steps": nothing, "state_steps": nothing}
+    rest |= {"bread": nothing, "meat": nothing}
+    plan = Plan(
+        **rest, scale=1.0, deviation=np.array([0.5]), autocorrelation=0.0, exact=False, left_out=0.25, failures=0
+    )
+    assert plan.comparable(2.0) == pytest.approx(2.0 * 0.25 + 0.25)
+    assert replace(plan, left_out=1.0).comparable(2.0) == ALL_FAILED
+
+
+@pytest.mark.parametrize("starts", [KnownStarts("cauchy"), UnknownStarts("cauchy")])
+def test_one_search_finds_a_clean_spring_from_known_and_unknown_states(starts):
+    problem = CalibrationProblem(
+        recorded(SPRING, SPRING_TRUTH, 400, jax.random.key(0)), simulation.make(SPRING, threads=1)
+    )
+    search = Search(starts, horizon=5, windows=40, searches=2, search_windows=10, search_epochs=6, tolerance=1e-7)
+    state, spent = search.init(problem, jax.random.key(1)), 0
+    assert state.states.shape[1:] == ((0, 0) if isinstance(starts, KnownStarts) else (40, 2))
+    for _ in range(25):
+        state, epoch = search.step(problem, state)
+        spent += epoch.control_steps
+        if search.settled(state):
+            break
+    assert search.settled(state)
+    truth = SPRING.parameters.to_unit(SPRING.parameters.vector(SPRING_TRUTH))
+    np.testing.assert_allclose(state.unit[0], truth, atol=1e-5)
+    longest = search.init(problem, jax.random.key(1))
+    assert spent <= search.whole_run(problem, longest, refining_epochs=25)
+
+
+def test_known_windows_leave_the_residuals_of_a_replay():
+    log = recorded(SPRING, SPRING_TRUTH, 50, jax.random.key(0))
+    problem, rows = CalibrationProblem(log, simulation.make(SPRING, threads=1)), np.array([3, 30])
+    unit = np.zeros((1, len(SPRING.parameters)))
+    (plan,) = (
+        KnownStarts("linear")
+        .windows(problem, rows, 4)
+        .plans(unit, np.zeros((1, 0, 0)), np.ones(1), np.ones((1, 0)), refining=True)
+    )
+    windows = windows_at(log, log.transitions.observation[rows], rows, 4)
+    expected = window_residuals(problem.simulator, windows, unit, problem.typical_change)[0]
+    np.testing.assert_array_equal(plan.residuals, expected)
+    assert (plan.steps[-1] == 0.0).all()

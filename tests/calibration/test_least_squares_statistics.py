@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+
+from madoc.calibration.least_squares.statistics import alternation, autocorrelation, clipped_change, outlier_limits
+from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE
+
+LIMITS = {"least": LIKE_NOISE, "failed": FAILED_WINDOW}
+
+
+def test_noise_takes_turns_and_a_wrong_model_does_not():
+    noise = np.random.default_rng(0).normal(size=(3, 20_000, 1))
+    before, after = noise[1] - noise[0], noise[2] - noise[1]
+    assert alternation(before, after) == pytest.approx(0.5, abs=0.03)
+    assert alternation(before + 3.0, after + 3.0) < -0.5
+    assert alternation(noise[0], noise[1]) == pytest.approx(0.0, abs=0.03)
+    assert alternation(before[:0], after[:0]) == 0.0
+
+
+def test_half_of_the_channels_tell_of_noise():
+    noise = np.random.default_rng(0).normal(size=(3, 20_000, 2))
+    before, after = noise[1] - noise[0], noise[2] - noise[1]
+    before[:, 1], after[:, 1] = noise[0, :, 1], noise[1, :, 1]
+    assert alternation(before, after) == pytest.approx(0.5, abs=0.03)
+
+
+def test_what_is_unlike_the_others_is_measured_in_their_deviations():
+    middle, reach = outlier_limits(np.array([[1.0, 2.0, 3.0, 4.0, 100.0]]), np.ones(5))
+    np.testing.assert_allclose(middle, [[3.0]])
+    np.testing.assert_allclose(reach, [[5.0 * 1.4826 * 1.0]])
+
+
+def test_windows_in_which_nothing_happens_do_not_say_what_is_usual():
+    cost = np.array([[0.0, 0.0, 0.0, 0.0, 5.0, 6.0, 7.0]])
+    middle, reach = outlier_limits(cost, np.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
+    np.testing.assert_allclose(middle, [[6.0]])
+    assert (cost[:, 4:] < middle + reach).all()
+
+
+def test_a_window_thrown_across_a_contact_does_not_forbid_what_helps_the_others():
+    # From their middle, 2, the changes are 1, 0, 1 and 98 away, so 5 · 1.4826 · 1 is how far is like the others.
+    before, after = np.zeros(4), np.array([[1.0, 2.0, 3.0, 100.0]])
+    change = clipped_change(before, after, np.ones(4), **LIMITS)
+    np.testing.assert_allclose(change, [[1.0, 2.0, 3.0, 2.0 + 5.0 * 1.4826]])
+
+
+def test_a_step_that_makes_simulations_fail_pays_for_it():
+    before, after = np.ones(5), np.array([[0.9, 0.9, 0.9, 0.9, FAILED_WINDOW]])
+    assert clipped_change(before, after, np.ones(5), **LIMITS).sum() > 0.0
+
+
+def test_costs_never_fall_below_nothing():
+    before, after = np.array([10.0, 10.0, 10.0, 0.1]), np.array([[1.0, 1.0, 1.0, 0.05]])
+    np.testing.assert_allclose(clipped_change(before, after, np.ones(4), **LIMITS), after - before)
+
+
+def test_where_most_windows_rest_the_others_are_not_done_without():
+    change = clipped_change(np.ones(5), np.array([[1.0, 1.0, 1.0, 2.0, 2.0]]), np.ones(5), **LIMITS)
+    np.testing.assert_allclose(change, [[0.0, 0.0, 0.0, 1.0, 1.0]])
+
+
+def test_what_is_left_of_consecutive_readings_is_correlated_where_it_is_not_noise():
+    # One window, two channels: products 2 and -1 + -1 over squares 3 and 3.
+    residuals = np.array([[[1.0, 1.0], [1.0, -1.0], [1.0, 1.0]]])
+    assert autocorrelation(residuals) == pytest.approx(2.0 / 3.0)
+    assert autocorrelation(residuals[..., 1:]) == pytest.approx(-2.0 / 3.0)
+    assert autocorrelation(0.1 * residuals) == pytest.approx(0.02 / 3.0)  # less than the noise says nothing
+    assert autocorrelation(100.0 * residuals) == pytest.approx(2.0 / 3.0)  # 3 deviations at most
