@@ -21,7 +21,7 @@ def test_a_budget_is_a_count_or_a_time(written, budget):
     assert read_budget(written) == budget
 
 
-@pytest.mark.parametrize("written", ["soon", "3 days", "1.5", "0s", "1.2.3s", Seconds(-1.0)])
+@pytest.mark.parametrize("written", ["soon", "3 days", "1.5", "0s", 0, "1.2.3s", Seconds(-1.0)])
 def test_what_is_no_budget_is_refused(written):
     with pytest.raises(MadocError, match="expected a budget"):
         read_budget(written)

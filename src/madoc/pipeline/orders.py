@@ -165,8 +165,9 @@ class PolicyOrder:
     every epoch; or a yardstick: mid-range, or the truth, which only an evaluation knows."""
     set: Settings = ()
     """Hyperparameters of the method as name=value."""
-    budget: int = 300_000
-    """Simulated control steps, or updates of a learner that does not simulate, as `madoc methods` says."""
+    budget: int | str = 300_000
+    """Simulated control steps, or updates of a learner that does not simulate, as `madoc methods` says; or a time, as
+    300s or 15min."""
     seed: int = 0
     """Of all randomness."""
     truth: Path | None = None
@@ -208,8 +209,8 @@ class RunOrder:
     """A policy learner, as `madoc methods` lists it."""
     policy_set: Settings = ()
     """Hyperparameters of the learner as name=value."""
-    policy_budget: int = 300_000
-    """Simulated control steps for each policy, or updates of a learner that does not simulate."""
+    policy_budget: int | str = 300_000
+    """Simulated control steps for each policy, or updates of a learner that does not simulate; or a time, as 300s."""
     yardsticks: bool = True
     """Learn also a policy at mid-range and one at the truth."""
     episodes: int = 20

@@ -8,7 +8,7 @@ from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
 from madoc.policies.files import save_policy
 from madoc.policies.registry import LEARNERS
 from madoc.runs import loop
-from madoc.runs.budget import Budget, read_budget
+from madoc.runs.budget import Budget
 from madoc.runs.run_folder import RunFolder
 from madoc.types import Policy, State, Unit, entry_of
 
@@ -66,7 +66,7 @@ def learn_policy(
         method,
         problem,
         key=key,
-        budget=read_budget(budget),
+        budget=budget,
         folder=folder,
         resume=resume,
         quiet=quiet,

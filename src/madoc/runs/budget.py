@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass
 
 from madoc.errors import MadocError
+from madoc.types import Unit
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,12 @@ Budget = int | Seconds
 _TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
-def read_budget(given: Budget | str) -> Budget:
+def read_budget(given: Budget | str, unit: Unit = "control steps") -> Budget:
     """A budget as written: `300000` is a count, `300s`, `15min` and `2h` are times.
+
+    Args:
+        given: The budget, read already or not.
+        unit: What it counts where it is a count.
 
     Raises:
         MadocError: It is neither, or not positive.
@@ -36,10 +41,12 @@ def read_budget(given: Budget | str) -> Budget:
     else:
         words = re.fullmatch(r"([\d_.]+) ?(s|min|h)?", str(given).strip())
         try:
-            number, unit = (words[1], words[2]) if words else ("", None)
-            budget = Seconds(float(number) * _TIME_UNITS[unit]) if unit else int(number)
+            number, time = (words[1], words[2]) if words else ("", None)
+            budget = Seconds(float(number) * _TIME_UNITS[time]) if time else int(number)
         except ValueError:
             raise MadocError(f"expected a budget such as 300000, 300s, 15min or 2h, got {given!r}") from None
     if isinstance(budget, Seconds) and not budget.seconds > 0:
         raise MadocError(f"expected a budget of more than 0 s, got {given}")
+    if isinstance(budget, int) and budget < 1:
+        raise MadocError(f"expected a budget of at least 1 {unit.removesuffix('s')}, got {budget}")
     return budget

@@ -12,7 +12,7 @@ from jaxtyping import PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.runs import checkpoint
-from madoc.runs.budget import Budget, Seconds
+from madoc.runs.budget import Budget, Seconds, read_budget
 from madoc.runs.interruption import interruptible
 from madoc.runs.progress import Moment, display
 from madoc.runs.run_folder import RunFolder, RunLog
@@ -93,7 +93,7 @@ def run(
     problem: Problem,
     *,
     key: PRNGKeyArray,
-    budget: Budget,
+    budget: Budget | str,
     folder: RunFolder | None = None,
     resume: bool = False,
     quiet: bool = False,
@@ -112,8 +112,9 @@ def run(
         method: What to run.
         problem: What to run it on.
         key: The only source of randomness; on resume, the same key again.
-        budget: A count in `unit`, or a time; the step that reaches it is the last. A run under a time budget that is
-            killed and resumed has what was left of it at the checkpoint, and its result depends on the machine's speed.
+        budget: A count in `unit`, or a time as `Seconds(300)` or "300s"; the step that reaches it is the last. A run
+            under a time budget that is killed and resumed has what was left of it at the checkpoint, and its result
+            depends on the machine's speed.
         folder: Where to write logs, checkpoints and `result.json`; None to write nothing.
         resume: Go on from the folder's checkpoint, or from the start if it was killed before the first one.
             A run that had ended comes back as it is, unless `budget` grew.
@@ -128,8 +129,7 @@ def run(
         MadocError: The budget is not positive, there is no folder to resume, the folder holds a run and
             `resume` is false, the checkpoint is damaged or another method's, or the state cannot be saved.
     """
-    if isinstance(budget, int) and budget < 1:
-        raise MadocError(f"expected a budget of at least 1 {unit.removesuffix('s')}, got {budget}")
+    budget = read_budget(budget, unit)
     _check_folder(folder, resume)
     with ExitStack() as stack:
         interruption = stack.enter_context(interruptible())
