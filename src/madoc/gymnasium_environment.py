@@ -6,7 +6,7 @@ for `gymnasium.make_vec`; where nobody imports it, the id can: `gymnasium.make("
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import gymnasium
 import jax
@@ -26,6 +26,7 @@ Information = dict[str, object]
 """The `info` of Gymnasium."""
 
 
+@runtime_checkable
 class Distribution(Protocol):
     """A distribution of parameters, as `madoc.policies.NormalParameters`."""
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, is_dataclass
 from functools import cache
-from typing import Annotated, Any, Generic, Literal, Protocol, TypeVar, get_type_hints
+from typing import Annotated, Any, Generic, Literal, Protocol, TypeVar, get_type_hints, runtime_checkable
 
 import jax
 import numpy as np
@@ -55,6 +55,7 @@ class Transitions:
         return jax.tree.map(lambda column: column[rows], self)
 
 
+@runtime_checkable
 class Policy(Protocol):
     """Acts. With a key it samples, without one it returns its deterministic action."""
 
@@ -88,6 +89,7 @@ class Epoch:
     converged: str | None = None
 
 
+@runtime_checkable
 class Method(Protocol[Problem, State]):
     """What calibrators and policy learners have in common: hyperparameters, and functions of a state.
 

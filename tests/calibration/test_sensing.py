@@ -85,8 +85,8 @@ def test_initial_states_are_estimated_where_the_data_asks_for_it(log):
         "starting": {"noise": 0.1},
         "estimated": {"hidden_velocities": True},
     }
-    for phase, disturbance in phases.items():
-        assert LeastSquares().init(problem_of(log, **disturbance), KEY).phase == phase
+    for stage, disturbance in stages.items():
+        assert LeastSquares().init(problem_of(log, **disturbance), KEY).stage == stage
     assert LeastSquares(initial_states="logged").init(problem_of(log, noise=0.1), KEY).phase == "logged"
     with pytest.raises(MadocError, match="does not determine its state"):
         LeastSquares(initial_states="logged").init(problem_of(log, hidden_velocities=True), KEY)

@@ -124,6 +124,7 @@ class EmbedsParameters(Protocol):
         ...
 
 
+@runtime_checkable
 class Calibrator(Method[CalibrationProblem, State], Protocol[State]):
     """A method that estimates parameters."""
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from rich.console import RenderableType
 from rich.table import Table
@@ -63,6 +63,7 @@ class Output:
     """Print exactly one JSON object on standard output."""
 
 
+@runtime_checkable
 class Command(Protocol):
     """A command with its options."""
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -135,6 +135,7 @@ def require_reward(task: Task) -> None:
         raise MadocError(f"{task.name} has no reward, so no policy can be learnt for it; give its spec a reward:")
 
 
+@runtime_checkable
 class PolicyLearner(Method[PolicyProblem, State], Protocol[State]):
     """A method that learns a policy."""
 

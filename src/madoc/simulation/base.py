@@ -1,7 +1,7 @@
 """What a simulator backend provides: a simulator binds parameters, and the systems it returns step states."""
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
@@ -11,6 +11,7 @@ from madoc.parameters import ParameterSpace
 from madoc.tasks.base import Task
 
 
+@runtime_checkable
 class System(Protocol):
     """Dynamics at fixed parameters: `count` systems, each with any number of rows."""
 
@@ -38,6 +39,7 @@ class System(Protocol):
         ...
 
 
+@runtime_checkable
 class Simulator(Protocol):
     """The source domain: a robot whose parameters can be chosen. A backend is this class and its `System`."""
 

@@ -1,0 +1,37 @@
+"""The type checker that the suite runs under: shapes and types of annotations are checked at every call."""
+
+import functools
+
+import jax
+import numpy as np
+from beartype import BeartypeConf, beartype
+
+_check = beartype(conf=BeartypeConf(is_pep484_tower=True))
+"""An int passes for a float, as in static type checking."""
+
+
+def checked(function):
+    """The function with its arguments and its result checked; used by jaxtyping's import hook.
+
+    JAX rebuilds registered dataclasses from leaves of any type, as from booleans of a mask or from placeholders. Such
+    a call of `__init__` is let through; every other one is checked.
+    """
+    strict = _check(function)
+    if function.__name__ != "__init__":
+        return strict
+    arrays = {name for name, kind in function.__annotations__.items() if "Array" in str(kind) or "ndarray" in str(kind)}
+    names = function.__code__.co_varnames[1 : function.__code__.co_argcount]
+
+    @functools.wraps(function)
+    def initialise(self, *args, **kwargs):
+        given = dict(zip(names, args, strict=False)) | kwargs
+        rebuilt = any(type(given.get(name)) in (bool, object) or _is_placeholder(given.get(name)) for name in arrays)
+        return (function if rebuilt else strict)(self, *args, **kwargs)
+
+    return initialise
+
+
+def _is_placeholder(value) -> bool:
+    """Whether a leaf stands for an array without being one."""
+    array = isinstance(value, jax.Array | np.ndarray | np.generic | int | float | tuple | list)
+    return value is not None and not array
