@@ -41,7 +41,7 @@ METHODS = {
     "sac-bc": LEARNERS["sac-bc"].make(**ACTING),
     "dr-bc": LEARNERS["dr-bc"].make(**ACTING),
     "fast-sac": LEARNERS["fast-sac"].make(**FAST),
-    "fast-sac-logged": LEARNERS["fast-sac-logged"].make(**FAST),
+    "rlpd": LEARNERS["rlpd"].make(**FAST),
     "h2o": LEARNERS["h2o"].make(**ACTING),
     "bc": LEARNERS["bc"].make(**OFFLINE),
     "cql": LEARNERS["cql"].make(**OFFLINE, critic_hidden=(8, 8), samples=2, cloning_updates=EPOCH),
@@ -62,7 +62,7 @@ METHODS = {
 }
 SIMULATING = [name for name, entry in LEARNERS.items() if entry.simulates]
 FED = [name for name, entry in LEARNERS.items() if entry.needs_data]
-REWARDED = ["fast-sac-logged", "h2o", "cql", "morec"]
+REWARDED = ["rlpd", "h2o", "cql", "morec"]
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ import pytest
 
 from madoc.errors import MadocError
 from madoc.runs import checkpoint
+from madoc.runs.budget import Seconds
 from madoc.runs.loop import Tally, run
 from madoc.runs.run_folder import RunFolder
 from madoc.types import Epoch

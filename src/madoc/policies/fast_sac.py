@@ -11,7 +11,8 @@ What differs from `sac`, which is the paper's (arXiv 1812.05905), and where it c
   arXiv 1802.09477).
 - Networks see observations standardised by the mean and deviation of all that were seen (SimBa, Lee et al. 2024,
   arXiv 2410.09754), so a robot's units do not matter.
-- Where there is data, a share of every batch may come from it (RLPD, Ball et al. 2023, arXiv 2302.02948).
+- Where there is data, a share of every batch may come from it: with half, the entry `rlpd` (RLPD, Ball et al. 2023,
+  arXiv 2302.02948; without its layer norms and its ensemble of critics).
 """
 
 from concurrent.futures import ThreadPoolExecutor
