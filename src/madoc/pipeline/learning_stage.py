@@ -16,7 +16,7 @@ from madoc.pipeline.data_stage import load_source, read_truth
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
-from madoc.pipeline.orders import Place, PolicyOrder
+from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
@@ -53,7 +53,7 @@ def learn_in(
     """
     method = make_method(LEARNERS, order.method, order.changes)
     entry = entry_of(method, LEARNERS)
-    budget = read_budget(order.budget, entry.unit)
+    budget = read_budget(entry.usual_budget if order.budget is None else order.budget, entry.unit)
     if not entry.needs_parameters and order.at != PLACES[0]:
         raise MadocError(
             f"{order.method} does not learn at given parameters, so --at {order.at} would change nothing; leave it out"
@@ -83,10 +83,10 @@ def learn_in(
 
 
 def policy_folder_name(at: str, method: str) -> str:
-    """`policy-calibrated`, with the method behind it unless that is SAC; `policy-cql` where the place is no matter."""
+    """`policy-calibrated`, with the method behind it unless it is the default; `policy-cql` where places are alike."""
     if not LEARNERS[method].needs_parameters:
         return f"policy-{method}"
-    return f"policy-{at}" if method == "sac" else f"policy-{at}-{method}"
+    return f"policy-{at}" if method == DEFAULT_LEARNER else f"policy-{at}-{method}"
 
 
 def _logged(calibrated: Calibrated, method: str) -> Dataset:

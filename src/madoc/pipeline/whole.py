@@ -94,7 +94,8 @@ def _spec(order: RunOrder, machine: Machine) -> dict[str, object]:
     seed_key(order.search.seed)
     calibrator = make_method(CALIBRATORS, order.search.method or "madoc", order.search.changes)
     learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
-    read_budget(order.policy_budget, entry_of(learner, LEARNERS).unit)
+    if order.policy_budget is not None:
+        read_budget(order.policy_budget, entry_of(learner, LEARNERS).unit)
     resolved = {
         "command": "run",
         "truth": read_truth(order.truth),

@@ -17,6 +17,7 @@ CLONING = {"cloning": 2.5}
 SAC_SHOWN = ("return_in_simulator", "temperature")
 
 _sac = partial(MethodEntry[PolicyLearner], kind=SAC, shown=SAC_SHOWN)
+_fast_sac = partial(MethodEntry[PolicyLearner], kind=FastSAC, shown=SAC_SHOWN, usual_budget=2_400_000)
 _offline = partial(MethodEntry[PolicyLearner], unit="updates", simulates=False, needs_parameters=False)
 
 _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
@@ -27,23 +28,19 @@ _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
         year=2018,
         needs_data=False,
     ),
-    MethodEntry(
-        "fast-sac",
-        FastSAC,
-        "SAC for cheap simulation",
-        "Li et al., PQL",
-        2023,
-        shown=SAC_SHOWN,
+    _fast_sac(
+        name="fast-sac",
+        summary="SAC for cheap simulation",
+        paper="Li et al., PQL",
+        year=2023,
         needs_data=False,
     ),
-    MethodEntry(
-        "rlpd",
-        FastSAC,
-        "fast-sac, half of each batch logged",
-        "Ball et al., RLPD",
-        2023,
-        {"logged_share": 0.5},
-        shown=SAC_SHOWN,
+    _fast_sac(
+        name="rlpd",
+        summary="fast-sac, half of each batch logged",
+        paper="Ball et al., RLPD",
+        year=2023,
+        settings={"logged_share": 0.5},
     ),
     _sac(
         name="sac-bc",
