@@ -6,10 +6,8 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Annotated
 
 import tyro
-from tyro.conf import subcommand
 
 from madoc.commands.answer import EXIT_CODES, Answer, Command
 from madoc.commands.calibrate import Calibrate
@@ -30,19 +28,7 @@ WIDTH = 110
 """Width of a table in characters where standard output is no terminal."""
 
 Commands = (
-    Annotated[Run, subcommand("run")]
-    | Annotated[Record, subcommand("record")]
-    | Annotated[Calibrate, subcommand("calibrate")]
-    | Annotated[Selftest, subcommand("selftest")]
-    | Annotated[Learn, subcommand("learn")]
-    | Annotated[Evaluate, subcommand("evaluate")]
-    | Annotated[Init, subcommand("init")]
-    | Annotated[Spec, subcommand("spec")]
-    | Annotated[Check, subcommand("check")]
-    | Annotated[Report, subcommand("report")]
-    | Annotated[Export, subcommand("export")]
-    | Annotated[Tasks, subcommand("tasks")]
-    | Annotated[Methods, subcommand("methods")]
+    Run | Record | Calibrate | Selftest | Learn | Evaluate | Init | Spec | Check | Report | Export | Tasks | Methods
 )
 
 

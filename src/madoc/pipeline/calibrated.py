@@ -41,11 +41,6 @@ class Calibrated:
         reading = Reading(data.format, data.clip_actions, data.disturbance)
         return Source(tuple(restored_path(path, self.folder) for path in data.paths), data.max_transitions, reading)
 
-    @property
-    def seed(self) -> int:
-        """The seed of the calibration."""
-        return self.result.seed if self.spec.seed is None else self.spec.seed
-
 
 def read_calibration(path: str | Path, *, physics: str | None = None) -> Calibrated:
     """A finished calibration: a run folder of `madoc calibrate` or `madoc run`, or a `result.json` alone.

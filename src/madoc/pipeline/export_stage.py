@@ -65,7 +65,7 @@ def provenance_of(calibrated: Calibrated) -> Provenance:
     return Provenance(
         run=whole.parent.name if whole.name == "calibration" else whole.name,
         method=calibrated.result.method,
-        seed=calibrated.seed,
+        seed=calibrated.result.seed,
         data=data,
         versions=calibrated.spec.versions,
         verdict=None if verdict is None else verdict.to_json(),
@@ -74,17 +74,11 @@ def provenance_of(calibrated: Calibrated) -> Provenance:
 
 
 def _stepping(simulator: Simulator) -> dict[str, object]:
-    """How the model must be stepped to move as it was calibrated to."""
+    """How the model must be stepped to move as in calibration."""
     task, steps = simulator.task, simulator.task.frame_skip
     channels = [
-        {
-            "name": channel.name,
-            "actuator": channel.actuator,
-            "low": channel.low,
-            "high": channel.high,
-            "unit": channel.unit,
-            "control_per_unit": channel.scale,
-        }
+        {name: getattr(channel, name) for name in ("name", "actuator", "low", "high", "unit")}
+        | {"control_per_unit": channel.scale}
         for channel in task.actions
     ]
     held = "held for a control step; the solver starts cold (qacc_warmstart = 0) at each"

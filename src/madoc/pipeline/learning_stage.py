@@ -90,7 +90,7 @@ def _logged(calibrated: Calibrated, method: str) -> Dataset:
             f"{method} learns from logged data, and a bare result names no data; "
             "give it the run folder of the calibration"
         )
-    dataset = load_source(calibrated.source, calibrated.machine, seed=calibrated.seed)
+    dataset = load_source(calibrated.source, calibrated.machine, seed=calibrated.result.seed)
     if dataset.disturbance.hidden_velocities:
         raise MadocError(
             f"{method} learns from whole observations, and {dataset.origin} hides velocities; "

@@ -87,35 +87,27 @@ def headline(run: Run) -> Headline:
     return Headline("NO VERDICT", "neutral", sentence, run.sentence)
 
 
-@dataclass(frozen=True)
-class Fact:
-    """A number for the top of the page."""
-
-    title: str
-    value: str
-    note: str
-
-
-def _facts(run: Run) -> list[Fact]:
+def _facts(run: Run) -> list[tuple[str, str, str]]:
+    """Numbers for the top of the page: the title, value and note of each."""
     facts = [_on_holdout(run.holdout)] if run.holdout else []
     if run.error_percent is not None:
-        facts.append(Fact("off the truth", f"{number(run.error_percent, 3)} %", "of the range, on average"))
+        facts.append(("off the truth", f"{number(run.error_percent, 3)} %", "of the range, on average"))
     if run.result is not None:
-        facts.append(Fact("control steps", count(run.result.control_steps), "simulated"))
-        facts.append(Fact("time", duration(run.result.seconds), "wall clock"))
+        facts.append(("control steps", count(run.result.control_steps), "simulated"))
+        facts.append(("time", duration(run.result.seconds), "wall clock"))
     if run.spec.data is not None:
-        facts.append(Fact("log", count(run.spec.data.rows), f"rows · {run.spec.data.fingerprint}"))
+        facts.append(("log", count(run.spec.data.rows), f"rows · {run.spec.data.fingerprint}"))
     return facts
 
 
-def _on_holdout(held: HoldOut) -> Fact:
-    """The hold-out's measure in one number."""
+def _on_holdout(held: HoldOut) -> tuple[str, str, str]:
+    """The measure of the hold-out in one number."""
     if isinstance(held, ToldApart):
         low, high = (number(end, 2) for end in held.area_at_estimate.interval)
         note = f"area of a classifier, {low} to {high}; 0.5 is chance"
-        return Fact("told from the log", number(held.area_at_estimate.area, 2), note)
+        return "told from the log", number(held.area_at_estimate.area, 2), note
     value, low, high = map(percent, (held.score, *held.score_interval))
-    return Fact("error on the hold-out", value, f"of mid-range's; {low} to {high}")
+    return "error on the hold-out", value, f"of mid-range's; {low} to {high}"
 
 
 def _ended(run: Run) -> str:
