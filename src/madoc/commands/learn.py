@@ -7,7 +7,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import PLACE_NAMES, Answer, Output
-from madoc.pipeline.orders import Physics, PolicyOrder
+from madoc.pipeline.orders import Physics, PolicyOrder, parse_settings
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Learn:
         from madoc.policies import LEARNERS
         from madoc.types import entry_of
 
-        entry = entry_of(make_method(LEARNERS, self.order.method, self.order.changes), LEARNERS)
+        entry = entry_of(make_method(LEARNERS, self.order.method, parse_settings(self.order.set)), LEARNERS)
         if entry.needs_parameters:
             return PLACE_NAMES[self.order.at]
         return PLACE_NAMES["uniform"] if entry.unit == "control steps" else "from the data alone"

@@ -1,4 +1,4 @@
-"""`madoc init` and `madoc spec`: a robot of one's own."""
+"""`madoc init` and `madoc spec`, for a user's own robot."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -100,7 +100,7 @@ def describe(robot: "Robot") -> dict[str, object]:
 
 
 def _sentences(robot: "Robot") -> list[str]:
-    """What a user should know of the robot, one sentence each."""
+    """What a user should know about the robot, one sentence each."""
     task = robot.task
     sentences = [
         f"one action every {robot.spec.control_step:g} s, {task.frame_skip} physics steps each; "

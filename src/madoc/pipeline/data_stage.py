@@ -150,7 +150,9 @@ def load_source(source: Source, machine: Machine, *, seed: int) -> Dataset:
             dataset = data.subsample(dataset, source.max_transitions, key)
     else:
         if len(source.paths) != 1:
-            raise MadocError(f"expected one file or dataset of {task.name}, got {len(source.paths)}: {source.words}")
+            raise MadocError(
+                f"expected one file or dataset of {task.name}, got {len(source.paths)}: {', '.join(source.paths)}"
+            )
         dataset = data.load(
             source.paths[0],
             task,

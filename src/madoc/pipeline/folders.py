@@ -17,7 +17,7 @@ ENDED = ("finished", "converged")
 def working_folder(
     path: Path, spec: dict[str, object], *, resume: bool, keep: str = "checkpoint.npz"
 ) -> Iterator[RunFolder]:
-    """The locked folder of a run, new or, with `resume`, as it was left.
+    """The locked folder of a run: a new one, or with `resume` that of an earlier run.
 
     Args:
         path: The folder.
@@ -47,7 +47,7 @@ def holds_run(path: Path) -> bool:
 
 
 def ended(path: Path, also: str | None = None) -> bool:
-    """Whether the run in a folder has ended, and left the file `also` as well."""
+    """Whether the run in a folder has ended, and the file `also` is there as well."""
     if not (path / "result.json").exists() or (also is not None and not (path / also).exists()):
         return False
     return read_json(path / "result.json").get("status") in ENDED

@@ -16,7 +16,7 @@ from madoc.pipeline.data_stage import load_source, read_truth
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
-from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder
+from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder, parse_settings
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
@@ -45,7 +45,7 @@ def learn_in(
     Raises:
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
-    method = make_method(LEARNERS, order.method, order.changes)
+    method = make_method(LEARNERS, order.method, parse_settings(order.set))
     entry = entry_of(method, LEARNERS)
     budget = read_budget(entry.usual_budget if order.budget is None else order.budget, entry.unit)
     if not entry.needs_parameters and order.at != PLACES[0]:
@@ -70,7 +70,7 @@ def learn_in(
         "truth": truth,
     } | calibrated.machine.stored()
     with working_folder(out, spec, resume=resume) as folder:
-        # One that an interrupted run left would be taken for the finished policy after a kill.
+        # The policy of an interrupted run would look finished if this run were killed.
         (out / "policy.npz").unlink(missing_ok=True)
         problem = PolicyProblem(simulator, parameters, dataset)
         return learn_policy(method, problem, key=key, budget=budget, folder=folder, resume=resume, quiet=quiet)

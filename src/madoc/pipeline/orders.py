@@ -21,7 +21,7 @@ Settings = UseAppendAction[tuple[tuple[str, ...], ...]]
 """Hyperparameters as texts: `--set a=1 b=2 --set c=3` is `(("a=1", "b=2"), ("c=3",))`."""
 
 DEFAULT_LEARNER = "fast-sac"
-"""What learns a policy where no other learner is asked for."""
+"""Name of the policy learner that is used by default."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,6 @@ class Source:
     def __post_init__(self) -> None:
         if not self.paths:
             raise MadocError("expected the log after --data, got nothing; name a file or a folder")
-
-    @property
-    def words(self) -> str:
-        """The paths for a sentence."""
-        return ", ".join(self.paths)
 
     def absolute(self) -> "Source":
         """The source that means the same from any working directory; the id of a Minari dataset stays what it is."""
@@ -92,7 +87,7 @@ class Search:
 
 @dataclass(frozen=True)
 class CalibrationOrder:
-    """What a calibration is asked."""
+    """Options of a calibration."""
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
@@ -106,7 +101,7 @@ class CalibrationOrder:
 
 @dataclass(frozen=True)
 class SelftestOrder:
-    """What a selftest is asked."""
+    """Options of a selftest."""
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
@@ -118,7 +113,7 @@ class SelftestOrder:
 
 @dataclass(frozen=True)
 class CheckOrder:
-    """What a check of logs is asked."""
+    """Options of a check of logs."""
 
     spec: Annotated[Positional[Path], arg(metavar="SPEC")]
     """The spec file of the robot, as robot.yaml."""
@@ -138,7 +133,7 @@ class CheckOrder:
 
 @dataclass(frozen=True)
 class RecordOrder:
-    """What a recording is asked."""
+    """Options of a recording."""
 
     name: Annotated[Positional[str], arg(metavar="TASK-QUALITY")]
     """TASK-QUALITY: hopper-medium, halfcheetah-medium-replay, walker2d-neorl-high, ..."""
@@ -155,7 +150,7 @@ class RecordOrder:
 
 @dataclass(frozen=True)
 class PolicyOrder:
-    """What a policy learner is asked."""
+    """Options of a policy learner."""
 
     method: str = DEFAULT_LEARNER
     """A policy learner, as `madoc methods` lists it; some need the run's data."""
@@ -172,15 +167,10 @@ class PolicyOrder:
     truth: Path | None = None
     """JSON file {parameter: value}, for --at truth. Default: what the run remembers."""
 
-    @property
-    def changes(self) -> dict[str, str]:
-        """Hyperparameters that differ from the method's own, by name."""
-        return parse_settings(self.set)
-
 
 @dataclass(frozen=True)
 class EvaluationOrder:
-    """What an evaluation of policies is asked."""
+    """Options of an evaluation of policies."""
 
     episodes: int = 20
     """Episodes for each policy, from the same starts."""
@@ -192,7 +182,7 @@ class EvaluationOrder:
 
 @dataclass(frozen=True)
 class RunOrder:
-    """What the whole job is asked: to record or load, calibrate, learn and evaluate."""
+    """Options of a whole run: to record or load, calibrate, learn and evaluate."""
 
     name: Annotated[Positional[str], arg(metavar="TASK-QUALITY")]
     """TASK-QUALITY to record, as hopper-medium; with --data the name of the robot is enough."""

@@ -164,7 +164,7 @@ def _read(order: CalibrationOrder) -> tuple[Machine, Dataset, Task]:
     task = observed_task(machine.task.with_level(search.level), dataset)
     if recorded is not None and recorded != task.physics:
         warnings.warn(
-            f"{order.source.words} was recorded in {recorded} physics and is calibrated in {task.physics}: "
+            f"{', '.join(order.source.paths)} was recorded in {recorded} physics and is calibrated in {task.physics}: "
             "the estimate will make up for the difference; leave out --physics to take the data's",
             stacklevel=2,
         )
