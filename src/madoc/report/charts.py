@@ -222,7 +222,7 @@ def _band(across: np.ndarray, line: Line, to_y: Scale) -> str:
 
 _PLACES = ((1, 12, 4), (-1, 12, 4), (0, 0, -13), (0, 0, 22), *((side, 10, dy) for side in (1, -1) for dy in (-10, 18)))
 _PLACES += tuple((side, 12, dy) for side in (1, -1) for dy in (-26, 34))
-"""Places of a name beside its point, the best first: the side (1 is right, 0 centred) and the offsets across and down."""
+"""Places of a name beside its point, the best first: the side (1 right, 0 centred), and offsets across and down."""
 Box = tuple[float, float, float, float]
 
 
