@@ -212,7 +212,7 @@ def test_a_rounding_writer_is_refused(tmp_path, monkeypatch):
 
 
 def test_a_change_that_cannot_be_written_is_refused(monkeypatch, tmp_path):
-    monkeypatch.setattr(mjcf, "_GROUPS", {})
+    monkeypatch.setattr(mjcf, "_ROWS", ())
     task = spring(Parameter("dof_damping", "slide", 0.0, 2.0))
     with pytest.raises(MadocError, match=r"written into its spec differs from the bound one in dof_damping by 0\.75"):
         save_mjcf(simulation.make(task, threads=1), np.array([1.25]), tmp_path / "model.xml")

@@ -20,12 +20,7 @@ def insensitive(
 
     All other parameters stay at mid-range. A row counts only where both simulations succeeded.
 
-    Args:
-        simulator: The simulator.
-        states: States to step from, typically logged ones.
-        actions: The actions taken there.
-        key: Randomness of the rows.
-        rows: Number of rows drawn without repetition; all where there are fewer.
+    At most `rows` logged rows are drawn without repetition.
 
     Returns:
         The names, in the order of the parameters, and the control steps spent: rows · (2 d + 1).
@@ -33,17 +28,14 @@ def insensitive(
     Raises:
         MadocError: There are no rows, or every one fails at mid-range.
     """
-    if not len(states) or len(states) != len(actions):
-        raise MadocError(f"expected as many states as actions, at least one, got {len(states)} and {len(actions)}")
+    if not len(states):
+        raise MadocError("expected at least one logged state to test the parameters at, got none")
     count = min(rows, len(states))
     chosen = np.asarray(jax.random.choice(key, len(states), (count,), replace=False))
     ends = _ends(simulator)
-    shape = (len(ends), count, -1)
+    state, action = (np.repeat(logged[chosen][None], len(ends), axis=0) for logged in (states, actions))
     system = simulator.bind(ends)
-    next_states = system.step(
-        system.unbiased(np.broadcast_to(states[chosen], (len(ends), *states[chosen].shape)).reshape(shape)),
-        np.broadcast_to(actions[chosen], (len(ends), *actions[chosen].shape)).reshape(shape),
-    )
+    next_states = system.step(system.unbiased(state), action)
     following = np.concatenate([next_states, system.observe(next_states)], axis=-1)
     middle, moved = following[0], following[1:]
     if not np.isfinite(middle).all(-1).any():

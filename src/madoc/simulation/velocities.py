@@ -14,14 +14,7 @@ def velocities_between(
     after: Float[np.ndarray, "rows state"],
     steps: Float[np.ndarray, " rows"],
 ) -> Float[np.ndarray, "rows velocity"]:
-    """The constant velocities that lead from the positions of one state to those of another.
-
-    Args:
-        task: The robot.
-        before: Earlier states, of which only the positions are used.
-        after: Later states, of which only the positions are used.
-        steps: Control steps between them, at least 1.
-    """
+    """The constant velocities that lead from the positions of `before` to those of `after`, `steps` >= 1 later."""
     model = task.model
     seconds = steps * task.frame_skip * model.opt.timestep
     start, end = before[:, : model.nq], after[:, : model.nq]
@@ -66,11 +59,7 @@ def unseen_positions(task: Task) -> tuple[str, ...]:
 
 
 def refuse_unseen_positions(task: Task) -> None:
-    """Refuse velocities from positions where some positions are not observed.
-
-    Raises:
-        MadocError: Names the joints.
-    """
+    """Raise a `MadocError` that names the joints whose position, and so whose velocity, is not observed."""
     joints = unseen_positions(task)
     if joints:
         raise MadocError(

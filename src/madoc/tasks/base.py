@@ -36,6 +36,11 @@ def scaled_friction(spec: Callable[[], mujoco.MjSpec], factor: float) -> mujoco.
     return changed
 
 
+def never_terminated(next_state: Batch) -> Batch:
+    """False for every row."""
+    return next_state.__array_namespace__().zeros(next_state.shape[:-1], dtype=bool)
+
+
 @dataclass(frozen=True)
 class ActionChannel:
     """One value of an action: its actuator, and the values that -1 and 1 stand for.

@@ -17,13 +17,10 @@ def load_robot(file: str, physics: str, total_mass: float | None = None) -> mujo
     cylinder of length 2h + r. In both physics the floor's margin is 0: since MuJoCo 3.5.0 margins add, before
     the larger counted, and the robots' geoms carry theirs already.
 
-    Args:
-        file: A file of Gymnasium's MuJoCo assets.
-        physics: `legacy` or `modern`.
-        total_mass: Masses and inertias are scaled to this sum, in kg.
+    Masses and inertias are scaled so that the masses sum to `total_mass` in kg, where it is given.
 
     Raises:
-        MadocError: `physics` is neither.
+        MadocError: `physics` is neither `legacy` nor `modern`.
     """
     if physics not in PHYSICS:
         raise MadocError(f"unknown physics {physics!r}; expected one of {', '.join(PHYSICS)}")
@@ -58,7 +55,8 @@ def _use_legacy_inertia(spec: mujoco.MjSpec) -> None:
     densities = [geom.density for body in spec.bodies for geom in body.geoms]
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     for body in spec.bodies[1:]:
-        parts = [_geom_inertia(model, geom, densities[geom]) for geom in _geoms_of(model, body.id)]
+        geoms = model.body_geomadr[body.id] + np.arange(model.body_geomnum[body.id])
+        parts = [_geom_inertia(model, geom, densities[geom]) for geom in geoms.tolist()]
         if not parts:
             body.mass = 0.0
             continue
@@ -70,11 +68,6 @@ def _use_legacy_inertia(spec: mujoco.MjSpec) -> None:
         body.ipos = centre
         body.iquat = [1.0, 0.0, 0.0, 0.0]
         body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-
-
-def _geoms_of(model: mujoco.MjModel, body: int) -> range:
-    start = model.body_geomadr[body]
-    return range(start, start + model.body_geomnum[body])
 
 
 def _geom_inertia(model: mujoco.MjModel, geom: int, density: float) -> tuple[float, np.ndarray, np.ndarray]:

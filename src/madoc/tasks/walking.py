@@ -61,7 +61,7 @@ def walking_task(
         spec=partial(load_robot, file, physics, total_mass),
         frame_skip=frame_skip,
         observation_size=seen + velocities,
-        observe=partial(_observe_clipped if clipped else _observe, root=root, positions=positions),
+        observe=partial(_observe, root=root, positions=positions, clipped=clipped),
         reward=reward,
         terminated=terminated,
         reset_noise=reset_noise,
@@ -115,13 +115,10 @@ def _space(bodies: Sequence[str], joints: Sequence[str], ranges: Ranges) -> Para
     )
 
 
-def _observe(state: Batch, *, root: int, positions: int) -> Batch:
-    """Every position but the root's, then the velocities."""
-    return state[..., root:]
-
-
-def _observe_clipped(state: Batch, *, root: int, positions: int) -> Batch:
-    """Every position but the root's, then the velocities, clipped."""
+def _observe(state: Batch, *, root: int, positions: int, clipped: bool) -> Batch:
+    """Every position but the root's, then the velocities, clipped or not."""
+    if not clipped:
+        return state[..., root:]
     namespace = state.__array_namespace__()
     velocity = namespace.clip(state[..., positions:], -VELOCITY_CLIP, VELOCITY_CLIP)
     return namespace.concat([state[..., root:positions], velocity], axis=-1)
