@@ -111,7 +111,7 @@ def lift(tmp_path):
         (tmp_path / "own" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "own" / name).write_bytes(content)
     task = robots.load(tmp_path / "own" / "lift.yaml").task
-    restored = robots.restore(json.loads(json.dumps(dict(task.source))))
+    restored = robots.restore(json.loads(json.dumps(dict(task.source)))).task
     (tmp_path / "own").rename(tmp_path / "moved")
     return simulation.make(restored, threads=1)
 

@@ -35,23 +35,12 @@ def load(path: str | Path) -> Robot:
     except OSError as error:
         raise MadocError(f"could not read {file}: {error.strerror or error}") from error
     spec, document = read_spec(content, file.name)
-    try:
+    with document.at("model"):
         model = ModelFiles.read(file.parent / spec.model)
-    except MadocError as error:
-        raise document.error(("model",), str(error)) from error
     return replace(make_robot(content, file.name, model), path=file)
 
 
-def restore(source: Mapping[str, object]) -> Task:
-    """The task that `Task.source` describes, without reading any file.
-
-    Raises:
-        MadocError: The source is damaged.
-    """
-    return restore_robot(source).task
-
-
-def restore_robot(source: Mapping[str, object]) -> Robot:
+def restore(source: Mapping[str, object]) -> Robot:
     """The robot that `Task.source` describes, without reading any file.
 
     Raises:
@@ -94,26 +83,10 @@ def is_spec_path(name: str | Path) -> bool:
     return str(name) not in TASKS and (Path(name).suffix.lower() in SUFFIXES or Path(name).expanduser().exists())
 
 
-def remake(task: Task, physics: str | None = None) -> Task:
-    """The same robot with all of its parameters in their normal ranges."""
-    return tasks.make(task.name, physics or task.physics) if task.source is None else restore(task.source)
-
-
 def schema() -> dict[str, object]:
     """JSON schema of the spec file."""
     made = RobotSpec.model_json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **made, "title": "Madoc robot spec"}
 
 
-__all__ = [
-    "Robot",
-    "RobotSpec",
-    "Signal",
-    "is_spec_path",
-    "load",
-    "remake",
-    "resolve",
-    "restore",
-    "restore_robot",
-    "schema",
-]
+__all__ = ["Robot", "RobotSpec", "Signal", "is_spec_path", "load", "resolve", "restore", "schema"]

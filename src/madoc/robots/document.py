@@ -1,7 +1,8 @@
 """YAML with the line of everything in it, so that a mistake is reported where it was made; and YAML written."""
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from ruamel.yaml import YAML
@@ -47,6 +48,14 @@ class Document:
     def error(self, place: Place, sentence: str) -> MadocError:
         """An error about the value at a place, with the file and the line in front."""
         return MadocError(f"{self.file}, line {self.line(place)}: {sentence}")
+
+    @contextmanager
+    def at(self, *place: str | int) -> Iterator[None]:
+        """Put the file and the line of a value in front of an error that is raised inside."""
+        try:
+            yield
+        except MadocError as error:
+            raise self.error(place, str(error)) from error
 
     def unknown(self, place: Place, what: str, name: str, known: Iterable[str]) -> MadocError:
         """An error about a name that is not among the known ones; it lists the nearest of them."""

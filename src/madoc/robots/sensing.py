@@ -1,15 +1,14 @@
 """Signals as functions: of a state, of the model's sensors, and back to a state where they determine it."""
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
-from madoc.errors import nearest_hint
-from madoc.robots.expressions import Expression, ExpressionError, Read
+from madoc.errors import MadocError, nearest_hint
+from madoc.robots.expressions import Expression, Read
 from madoc.simulation.write import element_names
 from madoc.tasks.base import Batch
 
@@ -54,21 +53,17 @@ class Layout:
         )
 
     def address(self, read: Read) -> int:
-        """Address of a value in the state or in sensordata.
-
-        Raises:
-            ExpressionError: The model has no such joint or sensor, or not so many values.
-        """
+        """Address of a value in the state or in sensordata; what the model does not have is refused."""
         known: dict[str, Span] = getattr(self, read.kind)
         what = "sensor" if read.kind == "sensor" else "joint"
         if read.name not in known:
             hint = nearest_hint(read.name, known, none=f"it names no {what}")
-            raise ExpressionError(f"the model has no {what} {read.name!r}; {hint}")
+            raise MadocError(f"the model has no {what} {read.name!r}; {hint}")
         start, count = known[read.name]
         if read.index is None and count > 1:
-            raise ExpressionError(f"{read} has {count} values; pick one, as {read}[0]")
+            raise MadocError(f"{read} has {count} values; pick one, as {read}[0]")
         if not 0 <= (read.index or 0) < count:
-            raise ExpressionError(f"{read} does not exist: it has {count} value{'s' * (count > 1)}, counted from 0")
+            raise MadocError(f"{read} does not exist: it has {count} value{'s' * (count > 1)}, counted from 0")
         return start + (read.index or 0)
 
 
@@ -111,13 +106,14 @@ class Signals:
         )
 
     def _stacked(self, expressions: Sequence[Expression], state: Batch, sensordata: Batch | None) -> Batch:
+        """Values of expressions; where one has none it is NaN or infinite, without a warning of NumPy."""
         namespace = state.__array_namespace__()
 
         def look_up(read: Read) -> Batch:
             source: Batch = sensordata if read.kind == "sensor" else state
             return source[..., self.layout.address(read)]
 
-        with quiet_arithmetic():
+        with np.errstate(all="ignore"):
             return namespace.stack([expression.value(look_up, namespace) for expression in expressions], axis=-1)
 
     def rebuild(self) -> Callable[[Batch], Batch] | None:
@@ -179,8 +175,3 @@ def _scaled_rows(forward: Float[np.ndarray, "signals state"]) -> tuple[np.ndarra
     scale = np.abs(forward).max(1, initial=0.0, keepdims=True)
     even = np.divide(forward, scale, out=np.zeros_like(forward), where=scale > 0)
     return even, np.where(scale > 0, scale, 1.0)
-
-
-def quiet_arithmetic() -> AbstractContextManager[None]:
-    """No warnings of NumPy where an expression has no value: it is then NaN or infinite, and checked as such."""
-    return np.errstate(all="ignore")

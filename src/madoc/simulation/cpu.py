@@ -92,7 +92,7 @@ class CpuSimulator:
     def _summed(
         self, values: Float[np.ndarray, "systems parameters"], field: str
     ) -> Float[np.ndarray, "systems signals"]:
-        """The values of a field by signal, 0 where none is calibrated; those of a field without elements in column 0."""
+        """The values of a field by signal, 0 where none is calibrated; column 0 if the field has no elements."""
         signals = self.task.signals
         sums = np.zeros((len(values), max(1, len(signals))))
         for parameter, column in zip(self.parameters.parameters, values.T, strict=True):

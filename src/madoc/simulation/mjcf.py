@@ -14,6 +14,7 @@ from jaxtyping import Float
 from madoc.errors import MadocError
 from madoc.runs.files import replacing
 from madoc.simulation.base import Simulator
+from madoc.tasks.physics import write_inertia
 
 DIGITS = 17
 """Number of significant digits that determine a float64; MuJoCo by itself writes 6."""
@@ -194,17 +195,10 @@ def _write_inertia(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.M
         if (new := _row(bound, name, index)) != _row(nominal, name, index)
     ]
     if changes:
-        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
         spec.compiler.settotalmass = -1.0
         spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
         spec.compiler.balanceinertia = False
-        for body in spec.bodies[1:]:
-            body.explicitinertial = bool(bound.body_mass[body.id] > 0.0)
-            body.mass = bound.body_mass[body.id]
-            body.ipos = bound.body_ipos[body.id]
-            body.iquat = bound.body_iquat[body.id]
-            body.inertia = bound.body_inertia[body.id]
-            body.fullinertia = np.full(6, np.nan)
+        write_inertia(spec, bound)
     return changes
 
 

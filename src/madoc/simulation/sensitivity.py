@@ -32,7 +32,9 @@ def insensitive(
         raise MadocError("expected at least one logged state to test the parameters at, got none")
     count = min(rows, len(states))
     chosen = np.asarray(jax.random.choice(key, len(states), (count,), replace=False))
-    ends = _ends(simulator)
+    # Mid-range, then each parameter in turn at its low and at its high end.
+    space = simulator.parameters
+    ends = space.to_physical(np.vstack([np.zeros(len(space)), np.kron(np.eye(len(space)), [[-1.0], [1.0]])]))
     state, action = (np.repeat(logged[chosen][None], len(ends), axis=0) for logged in (states, actions))
     system = simulator.bind(ends)
     next_states = system.step(system.unbiased(state), action)
@@ -45,7 +47,7 @@ def insensitive(
         )
     comparable = np.isfinite(moved).all(-1) & np.isfinite(middle).all(-1)
     changed = ((moved != middle).any(-1) & comparable).any(-1).reshape(-1, 2).any(-1)
-    names = [name for name, felt in zip(simulator.parameters.names, changed, strict=True) if not felt]
+    names = [name for name, felt in zip(space.names, changed, strict=True) if not felt]
     return names, len(ends) * count
 
 
@@ -68,12 +70,3 @@ def refuse_insensitive(
         remedy = "remove it or widen its range" if len(names) == 1 else "remove them or widen their ranges"
         raise MadocError(f"{what} no next state in {min(rows, len(states))} logged rows; {remedy}")
     return control_steps
-
-
-def _ends(simulator: Simulator) -> Float[np.ndarray, "systems parameters"]:
-    """Mid-range, then each parameter in turn at its low and at its high end."""
-    space = simulator.parameters
-    unit = np.zeros((1 + 2 * len(space), len(space)))
-    for column in range(len(space)):
-        unit[1 + 2 * column : 3 + 2 * column, column] = -1.0, 1.0
-    return space.to_physical(unit)

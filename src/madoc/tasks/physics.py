@@ -95,11 +95,18 @@ def _scale_mass(spec: mujoco.MjSpec, total_mass: float) -> None:
     """Make the inertia of every body explicit, scaled so that the masses sum to `total_mass`."""
     model = spec.compile()
     factor = total_mass / model.body_mass.sum()
+    model.body_mass *= factor
+    model.body_inertia *= factor
+    write_inertia(spec, model)
+
+
+def write_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Give every body of a spec the inertia that it has in a model, instead of one inferred from its geoms."""
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     for body in spec.bodies[1:]:
-        body.explicitinertial = True
-        body.mass = model.body_mass[body.id] * factor
+        body.explicitinertial = bool(model.body_mass[body.id] > 0.0)
+        body.mass = model.body_mass[body.id]
         body.ipos = model.body_ipos[body.id]
         body.iquat = model.body_iquat[body.id]
-        body.inertia = model.body_inertia[body.id] * factor
+        body.inertia = model.body_inertia[body.id]
         body.fullinertia = np.full(6, np.nan)
