@@ -19,6 +19,7 @@ def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
         if action.actuator not in actuators:
             place = ("actions", index, "actuator")
             raise document.unknown(place, "the name of an actuator", str(action.actuator), actuators)
+        _check_free(draft, index)
         return None
     place, joint = ("actions", index, "joint"), draft.base.joint(action.joint)
     if joint is None:
@@ -59,12 +60,6 @@ def action_channel(draft: Draft, model: mujoco.MjModel, index: int) -> ActionCha
                 ("actions", index), f"expected low: and high:, as the actuator {name!r} has no ctrlrange in the model"
             )
         low, high = (float(end) for end in model.actuator_ctrlrange[actuator])
-    first = [row.actuator for row in draft.spec.actions[:index]]
-    if action.actuator is not None and action.actuator in first:
-        line = draft.document.line(("actions", first.index(action.actuator), "actuator"))
-        raise draft.document.error(
-            ("actions", index, "actuator"), f"the actuator {name!r} is driven by line {line} already"
-        )
     unit = action.unit or _action_unit(action, model, actuator)
     if unit and unit not in KNOWN_UNITS:
         raise draft.document.unknown(("actions", index, "unit"), "a unit that is known", unit, KNOWN_UNITS)
@@ -94,17 +89,18 @@ def idle_actuators(model: mujoco.MjModel, actions: tuple[ActionChannel, ...]) ->
 
 
 def _check_free(draft: Draft, index: int) -> None:
-    """Refuse a joint that another actuator drives already."""
-    action, place = draft.spec.actions[index], ("actions", index, "joint")
+    """Refuse a joint or an actuator that another action or, for a joint, an actuator of the model drives already."""
+    action = draft.spec.actions[index]
+    key, driven = ("actuator", action.actuator) if action.joint is None else ("joint", action.joint)
     for actuator in draft.base.actuators:
         if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == action.joint:
             name = actuator.name or "without a name"
             raise draft.document.error(
-                place,
-                f"the joint {action.joint!r} has an actuator {name!r} in the model; drive that with actuator: {name}, "
+                ("actions", index, key),
+                f"the joint {driven!r} has an actuator {name!r} in the model; drive that with actuator: {name}, "
                 "or take it out of the model",
             )
-    others = [row.joint for row in draft.spec.actions[:index]]
-    if action.joint in others:
-        first = draft.document.line(("actions", others.index(action.joint), "joint"))
-        raise draft.document.error(place, f"the joint {action.joint!r} is driven by line {first} already")
+    others = [getattr(row, key) for row in draft.spec.actions[:index]]
+    if driven in others:
+        line = draft.document.line(("actions", others.index(driven), key))
+        raise draft.document.error(("actions", index, key), f"the {key} {driven!r} is driven by line {line} already")

@@ -25,12 +25,7 @@ DEEPEST = 20
 
 @dataclass(frozen=True)
 class Document:
-    """The content of a YAML file.
-
-    Attributes:
-        file: The name of the file, for error sentences.
-        data: Mappings and lists that know their lines, text, numbers, booleans or None.
-    """
+    """The name of a YAML file and its content: mappings and lists that know their lines, and plain values."""
 
     file: str
     data: object
@@ -63,11 +58,7 @@ class Document:
 
 
 def read_document(content: bytes, file: str) -> Document:
-    """Read YAML 1.2 that has no tags, no anchors and no key twice.
-
-    Raises:
-        MadocError: The content is not such YAML; the sentence names the line.
-    """
+    """Read YAML 1.2 that has no tags, no anchors and no key twice; anything else is refused with its line."""
     if len(content) > LARGEST:
         raise MadocError(
             f"{file} has {len(content):,} bytes, a robot's spec at most {LARGEST:,}; is it the right file?"

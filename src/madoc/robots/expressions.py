@@ -7,7 +7,7 @@
 import ast
 import math
 import operator
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -160,12 +160,10 @@ def _name_in(argument: ast.expr, kind: str) -> str:
     )
 
 
-def _reads(node: Node) -> Iterator[Read]:
+def _reads(node: Node) -> list[Read]:
     if isinstance(node, Operation):
-        for argument in node.arguments:
-            yield from _reads(argument)
-    elif isinstance(node, Read):
-        yield node
+        return [read for argument in node.arguments for read in _reads(argument)]
+    return [node] if isinstance(node, Read) else []
 
 
 def _value(node: Node, look_up: Callable[[Read], Batch], namespace: ModuleType) -> Batch:

@@ -115,14 +115,12 @@ def _signals(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[str, st
         for joint in joints:
             index = model.joint(joint).id
             speed, reads = kind == "velocity", str(Read(kind, joint))
-            parts = _PARTS.get(int(model.jnt_type[index]))
-            if parts is None:
+            if is_single(model, index):
                 unit = "m" if is_slide(model, index) else "rad"
                 yield (f"{joint}_speed", reads, f"{unit}/s") if speed else (joint, reads, unit)
                 continue
-            for at, part in enumerate(parts[speed]):
-                unit = "1" if part[0] == "q" else {"v": "m/s", "w": "rad/s"}.get(part[0], "m")
-                yield f"{joint}_{part}", f"{reads}[{at}]", unit
+            for at, part in enumerate(_PARTS[int(model.jnt_type[index])][speed]):
+                yield f"{joint}_{part}", f"{reads}[{at}]", {"q": "1", "v": "m/s", "w": "rad/s"}.get(part[0], "m")
 
 
 def _sensors(model: mujoco.MjModel) -> Iterator[str]:

@@ -20,11 +20,9 @@ _MESH = re.compile(r"""<mesh[^>]*\bfilename\s*=\s*["']([^"']+)["']""")
 
 @dataclass(frozen=True)
 class ModelFiles:
-    """A model file and all files that it refers to.
+    """The name of a model file, and the contents of it and of all files that it refers to.
 
-    Attributes:
-        main: Name of the model file.
-        files: Path from the model file's folder, or the name that the model uses, and content of each file.
+    A file is named by its path from the model file's folder, or as the model names it.
     """
 
     main: str
@@ -179,6 +177,11 @@ def _read(path: Path, owner: str = "") -> bytes:
     if not path.is_file():
         refers = f"{owner} refers to {path}, which is" if owner else f"there is no model file {path}: it is"
         raise MadocError(f"{refers} {'a directory' if path.is_dir() else 'missing'}; check the path")
+    return read_bytes(path)
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file; one that cannot be read is refused."""
     try:
         return path.read_bytes()
     except OSError as error:

@@ -45,9 +45,9 @@ def _check_unit(draft: Draft, model: mujoco.MjModel, index: int, expression: Exp
     """Refuse `position(JOINT)` in deg: the unit converts nothing, the expression has to."""
     plain, given = _plain_unit(model, expression), draft.spec.signals[index].unit
     if plain and given in SCALES:
-        angle = plain.startswith("rad")
-        hint = " * 180 / pi" if angle else f" * {1.0 / SCALES[given]:g}"
+        factor = "180 / pi" if plain.startswith("rad") else f"{1.0 / SCALES[given]:g}"
         raise draft.document.error(
             ("signals", index, "unit"),
-            f"{expression.text} is in {plain}, not in {given}; write reads: {expression.text}{hint}, or unit: {plain}",
+            f"{expression.text} is in {plain}, not in {given}; "
+            f"write reads: {expression.text} * {factor}, or unit: {plain}",
         )

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
-from madoc.errors import MadocError, nearest_hint
+from madoc.errors import nearest_hint
 from madoc.parameters import FIELDS, Parameter
 from madoc.robots.document import Document, Place, read_document
 from madoc.tasks import TASKS
@@ -66,16 +66,16 @@ class ActionSpec(Part):
         neither_or_both = (self.joint is None) == (self.actuator is None)
         _refuse(neither_or_both, "expected either joint: or actuator:, got both or neither")
         given = [key for key in ("means", "kp", "kd", "limit") if getattr(self, key) is not None]
-        for key in given if self.actuator is not None else ():
-            _refuse(True, f"{key}: belongs to joint:, the actuator {self.actuator!r} has its own in the model")
+        if self.actuator is not None and given:
+            raise ValueError(f"{given[0]}: belongs to joint:, the actuator {self.actuator!r} has its own in the model")
         if self.joint is not None:
             _refuse(self.means is None, "expected means: torque, force, position or velocity beside joint:")
             _refuse(self.low is None or self.high is None, "expected low: and high: beside joint:")
             _refuse(self.means == "position" and self.kp is None, "expected kp: of a position servo")
             _refuse(self.means == "velocity" and not self.kd, "expected kd: above 0 of a velocity servo")
             _refuse(self.means == "velocity" and self.kp is not None, "kp: means nothing beside means: velocity")
-            for key in given[1:] if self.means in ("torque", "force") else ():
-                _refuse(True, f"{key}: means nothing beside means: {self.means}")
+            if self.means in ("torque", "force") and len(given) > 1:
+                raise ValueError(f"{given[1]}: means nothing beside means: {self.means}")
         _refuse((self.low is None) != (self.high is None), "expected both low: and high:, got one of them")
         if self.low is not None and self.high is not None:
             _refuse(self.low >= self.high, f"expected low below high, got {self.low:g} and {self.high:g}")
@@ -102,10 +102,7 @@ class ParameterSpec(Part):
     @model_validator(mode="after")
     def _consistent(self) -> "ParameterSpec":
         _refuse(self.element is not None and self.elements is not None, "expected element: or elements:, got both")
-        try:
-            self.parameter()
-        except MadocError as error:
-            raise ValueError(str(error)) from error
+        self.parameter()  # pydantic reports what it refuses, as a MadocError is a ValueError
         return self
 
     def parameter(self, unit: str = "") -> Parameter:
@@ -166,11 +163,7 @@ _PARTS: dict[str | int, type[Part]] = {
 
 @lru_cache(maxsize=32)
 def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
-    """A spec and the lines of its parts; the same content is parsed once.
-
-    Raises:
-        MadocError: One sentence about the first mistake, with its line.
-    """
+    """A spec and the lines of its parts, parsed once; the first mistake is refused with its line."""
     document = read_document(content, file)
     if not isinstance(document.data, dict):
         raise document.error((), "expected keys and values, as `name: my_robot`; write one with: madoc init MODEL")
@@ -187,7 +180,7 @@ def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
 
 
 def _refuse(wrong: bool, sentence: str) -> None:
-    """Pydantic reports the ValueErrors of validators."""
+    """Raise a ValueError, which pydantic reports, where something is wrong."""
     if wrong:
         raise ValueError(sentence)
 

@@ -59,11 +59,7 @@ class Robot:
 
 @lru_cache(maxsize=32)
 def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
-    """The robot that a spec describes; of the same content, the same robot.
-
-    Raises:
-        MadocError: Spec and model do not fit; the sentence names the line of the spec.
-    """
+    """The robot that a spec describes; of the same content, the same robot. A mistake is refused with its line."""
     spec, document = read_spec(content, file)
     with document.at("model"):
         draft = Draft(spec, document, files.spec())
@@ -117,7 +113,7 @@ def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
 
 def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco.MjModel]:
     """The function that builds the MuJoCo spec with the added actuators, and its model."""
-    actuators = (added_actuator(draft, index) for index in range(len(draft.spec.actions)))
+    actuators = [added_actuator(draft, index) for index in range(len(draft.spec.actions))]
     added = tuple(actuator for actuator in actuators if actuator is not None)
     factory = partial(make_model, draft.base, added, draft.spec.timestep)
     with draft.document.at("actions"):

@@ -152,8 +152,7 @@ class CpuSystem:
     def step(self, state: Float[np.ndarray, "..."], action: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """One control step of `frame_skip` physics steps; a row whose simulation diverges comes back as NaN.
 
-        Raises:
-            MadocError: States or actions are not of shape (systems, rows, values).
+        States and actions that are not of shape (systems, rows, values) are refused.
         """
         self._check_shapes(state.shape, action.shape)
         history = np.concatenate([action[..., None, :], self._pending(state)], axis=-2)

@@ -30,13 +30,9 @@ _LONG_NUMBER = re.compile(r'(?<=["\s])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?=["\s])'
 
 @dataclass(frozen=True)
 class Change:
-    """One attribute in which a bound model differs from the robot's own.
+    """One attribute of MJCF in which a bound model (`new`) differs from the robot's own (`old`).
 
-    Attributes:
-        element: Kind and name, as `joint foot_joint`; `option` for the options of the model.
-        attribute: The attribute's name in MJCF.
-        old: Its value or values in the robot's own model.
-        new: Its value or values in the bound model.
+    The element is its kind and name, as `joint foot_joint`; `option` for the options of the model.
     """
 
     element: str
@@ -144,38 +140,38 @@ def _precision(digits: int) -> Iterator[None]:
 
 def _gather_assets(spec: mujoco.MjSpec, folder: Path) -> None:
     """Copy the files that a model refers to into the folder beside it, and refer to the copies."""
-    files: dict[str, str] = {}
+    copies: dict[str, str] = {}
     owners = [*spec.meshes, *spec.hfields, *spec.textures, *spec.skins]
     for owner in owners:
         own_folder = owner.compiler.texturedir if isinstance(owner, mujoco.MjsTexture) else owner.compiler.meshdir
         if owner.file:
-            owner.file = _gathered(spec, owner.file, own_folder, folder, files)
+            owner.file = _copied(spec, owner.file, own_folder, folder / ASSETS, copies)
         for side, file in enumerate(getattr(owner, "cubefiles", ())):
             if file:
-                owner.cubefiles[side] = _gathered(spec, file, own_folder, folder, files)
-    if files:
-        for owner in owners:
-            owner.compiler.meshdir = owner.compiler.texturedir = ASSETS
-        spec.compiler.meshdir = spec.compiler.texturedir = ASSETS
+                owner.cubefiles[side] = _copied(spec, file, own_folder, folder / ASSETS, copies)
+    if copies:
+        for compiler in (spec.compiler, *(owner.compiler for owner in owners)):
+            compiler.meshdir = compiler.texturedir = ASSETS
         spec.modelfiledir = str(folder)
 
 
-def _gathered(spec: mujoco.MjSpec, file: str, own_folder: str, folder: Path, files: dict[str, str]) -> str:
-    """Name of the copy of a file in the folder of assets; copied at the first call."""
-    wanted, target = str(Path(own_folder) / file), folder / ASSETS / Path(file).name
-    if wanted not in files:
-        while target.name in files.values():
-            target = target.with_name(f"_{target.name}")
-        target.parent.mkdir(exist_ok=True)
-        inside = spec.assets.get(wanted, spec.assets.get(file, spec.assets.get(Path(file).name)))
+def _copied(spec: mujoco.MjSpec, file: str, own_folder: str, folder: Path, copies: dict[str, str]) -> str:
+    """Name of the copy of a file in a folder; `copies` has those made so far, by the path of the original."""
+    wanted = str(Path(own_folder) / file)
+    if wanted not in copies:
+        name = Path(file).name
+        inside = spec.assets.get(wanted, spec.assets.get(file, spec.assets.get(name)))
+        while name in copies.values():
+            name = f"_{name}"
         source = Path(spec.modelfiledir or ".") / wanted
+        folder.mkdir(exist_ok=True)
         try:
             content = source.read_bytes() if inside is None else inside
         except OSError as error:
             raise MadocError(f"could not copy {source}, which the model needs: {error.strerror}") from error
-        target.write_bytes(content if isinstance(content, bytes) else content.encode())
-        files[wanted] = target.name
-    return files[wanted]
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        copies[wanted] = name
+    return copies[wanted]
 
 
 def _write_gravity(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:

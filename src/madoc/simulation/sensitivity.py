@@ -18,15 +18,11 @@ def insensitive(
 ) -> tuple[list[str], int]:
     """Parameters that change no bit of any next state or observation at either end of their range.
 
-    All other parameters stay at mid-range. A row counts only where both simulations succeeded.
-
-    At most `rows` logged rows are drawn without repetition.
+    All other parameters stay at mid-range. At most `rows` logged rows are drawn without repetition, and a row counts
+    only where both simulations succeeded. No rows, or rows that all fail at mid-range, are refused.
 
     Returns:
         The names, in the order of the parameters, and the control steps spent: rows · (2 d + 1).
-
-    Raises:
-        MadocError: There are no rows, or every one fails at mid-range.
     """
     if not len(states):
         raise MadocError("expected at least one logged state to test the parameters at, got none")

@@ -53,9 +53,8 @@ def unseen_positions(task: Task) -> tuple[str, ...]:
         state = np.concatenate([model.qpos0, np.zeros(model.nv)])
         moved = state + 1e-3 * np.eye(len(state))[: model.nq]
         blind |= (np.asarray(task.observe(moved)) == np.asarray(task.observe(state))).all(-1)
-    starts = [*model.jnt_qposadr, model.nq]
-    names = [model.joint(index).name or f"joint {index}" for index in range(model.njnt)]
-    return tuple(name for name, *span in zip(names, starts, starts[1:], strict=False) if blind[slice(*span)].any())
+    joints = np.add.reduceat(blind.astype(int), model.jnt_qposadr).nonzero()[0]
+    return tuple(model.joint(index).name or f"joint {index}" for index in joints.tolist())
 
 
 def refuse_unseen_positions(task: Task) -> None:

@@ -31,8 +31,7 @@ def write_parameters(
 ) -> None:
     """Write physical values (d,) into a model in place, then recompute the constants derived from them (`mj_setConst`).
 
-    Raises:
-        MadocError: A parameter names an element that the model does not have, or scales a mass of 0.
+    A parameter that names an element the model does not have, or that scales a mass of 0, is refused.
     """
     for parameter, value in zip(parameters, values, strict=True):
         if FIELDS[parameter.field].in_model:
@@ -45,11 +44,7 @@ def write_parameters(
 
 
 def nominal_values(model: mujoco.MjModel, parameter: Parameter) -> tuple[float, ...]:
-    """The values in a model that a parameter would replace, one for each element; 0 for a delay and for biases.
-
-    Raises:
-        MadocError: The model has no such element.
-    """
+    """The values in a model that a parameter would replace, one for each element; 0 for a delay and for biases."""
     if not FIELDS[parameter.field].in_model:
         return tuple(0.0 for _ in parameter.elements or (0,))
     return tuple(
@@ -58,11 +53,7 @@ def nominal_values(model: mujoco.MjModel, parameter: Parameter) -> tuple[float, 
 
 
 def find_elements(model: mujoco.MjModel, parameter: Parameter) -> list[int]:
-    """Indices of a parameter's elements in the model; one -1 for gravity. A body may be named by a joint of its own.
-
-    Raises:
-        MadocError: The model has no such element; the message lists the nearest names.
-    """
+    """Indices of a parameter's elements in the model; one -1 for gravity. A body may be named by a joint of its own."""
     kind = FIELDS[parameter.field].element
     return [-1] if kind is None else [_find_element(model, parameter.name, kind, one) for one in parameter.elements]
 

@@ -139,11 +139,7 @@ class Task:
         return copy.copy(self.model)
 
     def with_level(self, level: str) -> "Task":
-        """The same task searched in its `easy`, `normal` or `hard` ranges (the paper's appendix D).
-
-        Raises:
-            MadocError: No such level.
-        """
+        """The same task searched in its `easy`, `normal` or `hard` ranges (appendix D, Jiang et al. 2024)."""
         if level not in self.ranges:
             raise MadocError(f"no range level {level!r} for {self.name}; there are: {', '.join(self.ranges)}")
         return replace(self, parameters=self.ranges[level])

@@ -18,9 +18,6 @@ def load_robot(file: str, physics: str, total_mass: float | None = None) -> mujo
     the larger counted, and the robots' geoms carry theirs already.
 
     Masses and inertias are scaled so that the masses sum to `total_mass` in kg, where it is given.
-
-    Raises:
-        MadocError: `physics` is neither `legacy` nor `modern`.
     """
     if physics not in PHYSICS:
         raise MadocError(f"unknown physics {physics!r}; expected one of {', '.join(PHYSICS)}")
