@@ -123,7 +123,7 @@ def _precision(digits: int) -> Iterator[None]:
     check after every writing refuses them.
     """
     folder = Path(mujoco.__file__).parent
-    files = [*folder.glob(f"*mujoco*{mujoco.__version__}*"), *folder.glob("mujoco*.dll")]
+    files = sorted([*folder.glob(f"*mujoco*{mujoco.__version__}*"), *folder.glob("mujoco*.dll")])
     library = ctypes.CDLL(str(files[0])) if files else None
     setter = getattr(library, "_mjPRIVATE__set_xml_precision", None)
     getter = getattr(library, "_mjPRIVATE__get_xml_precision", None)
