@@ -30,6 +30,10 @@ _PARTS = {
 """Names of the values of a joint's position and velocity, where it has several."""
 
 
+_REMARKS = {"actuator_gain": "", "geom_friction": "sliding, in contacts; "}
+"""What stands in a comment instead of the unit of a field."""
+
+
 def write_spec(model: Path, out: Path) -> None:
     """Write a first spec for a model to a new file.
 
@@ -149,16 +153,13 @@ def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Itera
         low, high = model.actuator_ctrlrange[index] if limited else (-1.0, 1.0)
         comment = "" if limited else "  # the model has no ctrlrange: write its limits"
         yield {"name": name, "actuator": actuator, "low": float(low), "high": float(high)}, comment
-    if model.nu:
-        return
-    for joint in joints:
+    for joint in joints if not model.nu else ():
         index = model.joint(joint).id
         if not is_single(model, index):
             continue
-        slide = is_slide(model, index)
         limited = bool(model.jnt_actfrclimited[index])
         low, high = model.jnt_actfrcrange[index] if limited else (-1.0, 1.0)
-        means, unit = ("force", "N") if slide else ("torque", "N·m")
+        means, unit = ("force", "N") if is_slide(model, index) else ("torque", "N·m")
         comment = "" if limited else f"  # the model has no limit: write the motor's largest {means}"
         fields = {"name": f"{joint}_{means}", "joint": joint, "means": means}
         yield {**fields, "low": float(low), "high": float(high), "unit": unit}, comment
@@ -203,9 +204,7 @@ def _scaled(
     for name in names:
         (value,) = nominal_values(model, Parameter(field, name, 0.0, 1.0))
         if value > 0:
-            unit = {"actuator_gain": "", "geom_friction": "sliding, in contacts; "}.get(
-                field, f"{_unit(model, field, name)}; "
-            )
+            unit = _REMARKS[field] if field in _REMARKS else f"{_unit(model, field, name)}; "
             fields: Fields = {"field": field, "element": name, "low": _round(value / 2), "high": _round(value * 2)}
             yield fields, f"{unit}the model has {value:.4g}", wanted
 
