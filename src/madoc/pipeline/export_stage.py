@@ -1,5 +1,6 @@
 """Export as a stage: a finished calibration as files for other tools."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 from madoc import simulation
@@ -71,7 +72,7 @@ def provenance_of(calibrated: Calibrated) -> Provenance:
         seed=calibrated.seed,
         data=data,
         versions=calibrated.spec.versions,
-        verdict=None if verdict is None else verdict.to_json(),
+        verdict=None if verdict is None else asdict(verdict),
         warnings=calibrated.result.warnings,
     )
 

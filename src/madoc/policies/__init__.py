@@ -9,7 +9,7 @@ from madoc.policies.learn import LearnedPolicy, learn_policy
 from madoc.policies.morec import MOREC
 from madoc.policies.registry import LEARNERS
 from madoc.policies.sac import SAC
-from madoc.policies.systems import NormalParameters, ParameterDistribution, UniformParameters
+from madoc.policies.systems import NormalParameters, UniformParameters
 
 __all__ = [
     "BC",
@@ -20,7 +20,6 @@ __all__ = [
     "SAC",
     "LearnedPolicy",
     "NormalParameters",
-    "ParameterDistribution",
     "PolicyLearner",
     "PolicyProblem",
     "UniformParameters",
