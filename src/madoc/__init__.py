@@ -1,7 +1,7 @@
 """Madoc: calibrate a simulator to logged robot data, learn a policy there, and show that it works in the target.
 
-The public names are those of `__init__.pyi`. Each is imported when it is first used, so `import madoc` loads neither JAX
-nor MuJoCo. It registers the robots as Gymnasium environments: `gymnasium.make("madoc/Hopper")`.
+The public names are those of `__init__.pyi`. Each is imported when it is first used, so that `import madoc` loads no
+JAX and no MuJoCo. It registers the robots as Gymnasium environments: `gymnasium.make("madoc/Hopper")`.
 """
 
 import ast

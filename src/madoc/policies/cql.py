@@ -18,7 +18,7 @@ from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hy
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CQLState:
-    """Everything CQL carries."""
+    """The state of CQL."""
 
     learner: ActorCritic
     key: PRNGKeyArray
@@ -87,9 +87,8 @@ class CQL:
         of_update, key = jax.random.split(state.key)
         clones = state.updates < self.cloning_updates
         learner, metrics = self._update(state.learner, problem.logged, of_update, clones, self.epoch_updates)
-        stage = "cloning" if clones else "learning"
-        following = CQLState(learner, key, state.updates + self.epoch_updates)
-        return following, Epoch(scalars(metrics), updates=self.epoch_updates, stage=stage)
+        epoch = Epoch(scalars(metrics), updates=self.epoch_updates, stage="cloning" if clones else "learning")
+        return CQLState(learner, key, state.updates + epoch.updates), epoch
 
     @eqx.filter_jit
     def _update(

@@ -26,7 +26,7 @@ from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hy
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Learning:
-    """What gradient updates change."""
+    """The part of the state that gradient updates change."""
 
     learner: ActorCritic
     discriminators: Discriminators
@@ -36,7 +36,7 @@ class Learning:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class H2OState:
-    """Everything H2O carries."""
+    """The state of H2O."""
 
     learning: Learning
     interaction: Interaction

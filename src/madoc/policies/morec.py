@@ -16,27 +16,23 @@ from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step,
 from madoc.learning.dynamics_ensemble import Ensemble, fit, holdout_error
 from madoc.learning.dynamics_reward import Opposition, oppose, opposition
 from madoc.learning.features import Features
-from madoc.learning.networks import adam, scalars, scan_updates
+from madoc.learning.networks import Network, adam, scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.imagination import Filter, Imagination, ImaginedRows, imagine, start_imagining
+from madoc.policies.imagination import ImaginedRows, imagine, start_imagining
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MORECState:
-    """Everything MOREC carries.
+    """The state of MOREC.
 
     Attributes:
-        ensemble: The dynamics models.
-        ensemble_optimiser: State of their optimiser.
-        elites: Those of the smallest error on held-out rows.
-        opposition: What becomes the dynamics reward.
-        learner: SAC.
-        replay: Imagined rows.
-        under_way: Imagined rows and where they stand.
-        key: The random key.
+        elites: Indices of the models of the smallest error on held-out rows.
+        opposition: Generator and discriminators; the past discriminators make up the dynamics reward.
+        replay: Imagined transitions.
+        under_way: Imagined rows in progress.
         preparing: Updates of models and discriminators so far.
     """
 
@@ -74,8 +70,8 @@ class MOREC:
         discriminator_hidden: Units per layer of a discriminator.
         discriminators: Past discriminators that make up the dynamics reward; one is kept every `epoch_updates`.
         discriminator_updates: Updates of generator and discriminator, after the models'. Chosen, not the authors'.
-        noise: On next states that discriminators see while they learn, in units of a step's change. Chosen.
-        samples: Candidates from each elite.
+        noise: Standard deviation of the noise on the discriminators' inputs, in units of a step's change. Chosen.
+        samples: Next states drawn from each elite.
         threshold: An imagined row whose best dynamics reward is below ends there.
         horizon: Longest imagined rollout, in control steps.
         penalty: λ of MOPO, on rewards and state changes in their units. The authors chose it by dataset: 15 for Hopper
@@ -84,7 +80,7 @@ class MOREC:
         imagined_per_update: Imagined transitions for each update of the policy.
         imagined_rows: Rows imagined at a time.
         epoch_updates: Gradient updates per `step`.
-        holdout_every: Every so-manieth logged row is kept from the models, to choose the elites by.
+        holdout_every: The elites are chosen on every `holdout_every`-th logged row, which the models do not see.
         batch: Rows per update.
         discount: γ.
         target_rate: τ of the target critics.
@@ -164,7 +160,7 @@ class MOREC:
         )
 
     def step(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, Epoch]:
-        """`epoch_updates` updates of the models, of the discriminators, or of the policy."""
+        """One epoch: `epoch_updates` updates of the models, of the discriminators, or of the policy."""
         key, following = jax.random.split(state.key)
         stages = {"fitting": self._fit, "opposing": self._oppose, "learning": self._learn}
         stage = self._stage(state)
@@ -176,13 +172,13 @@ class MOREC:
         return state, Epoch(scalars(metrics), stage=stage, fraction=prepared)
 
     def _stage(self, state: MORECState) -> str:
-        """What the next epoch does."""
-        if state.preparing < self.model_updates:
-            return "fitting"
-        return "opposing" if state.preparing < self.model_updates + self.discriminator_updates else "learning"
+        """The stage of the next epoch."""
+        if state.preparing >= self.model_updates + self.discriminator_updates:
+            return "learning"
+        return "fitting" if state.preparing < self.model_updates else "opposing"
 
     def _fit(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
-        """Fit the models, and rank them."""
+        """Fit the models, and choose the elites."""
         ensemble, optimiser, elites, metrics = self._update_models(
             state.ensemble, state.ensemble_optimiser, problem.logged, problem.features, state.key
         )
@@ -238,11 +234,10 @@ class MOREC:
         of_imagination, of_updates = jax.random.split(state.key)
         task = problem.simulator.task
         assert task.state_from_observation is not None
-        believed = Filter(state.elites, state.opposition.past)
         under_way, rows, imagined = self._imagine(
             (task.terminated, task.state_from_observation),
             state.ensemble,
-            believed,
+            (state.elites, state.opposition.past),
             problem.features,
             state.learner.policy,
             state.under_way,
@@ -258,7 +253,7 @@ class MOREC:
         self,
         ends: tuple[Callable, Callable],
         ensemble: Ensemble,
-        believed: Filter,
+        selection: tuple[Int[Array, " elites"], Network],
         features: Features,
         policy: TanhGaussianPolicy,
         under_way: ImaginedRows,
@@ -268,13 +263,16 @@ class MOREC:
         terminated, to_state = ends
         return imagine(
             ensemble,
-            believed,
+            *selection,
             features,
             policy,
             under_way,
             logged=logged,
             terminated=lambda observation: terminated(to_state(observation)),
-            settings=Imagination(self.samples, self.threshold, self.horizon, self.penalty),
+            samples=self.samples,
+            threshold=self.threshold,
+            horizon=self.horizon,
+            penalty=self.penalty,
             steps=-(-self.epoch_updates * self.imagined_per_update // self.imagined_rows),
             key=key,
         )

@@ -22,12 +22,12 @@ from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hy
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SACState:
-    """Everything SAC carries.
+    """The state of SAC.
 
     Attributes:
-        best: The policy that did best when judged.
-        best_return: Its mean return then.
-        judged: Control steps of learning at the last judgement; 0 before the first.
+        best: The policy with the highest mean return so far.
+        best_return: Its mean return.
+        judged: Control steps of learning at the last evaluation; 0 before the first.
     """
 
     learner: ActorCritic

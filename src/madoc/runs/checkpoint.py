@@ -2,7 +2,7 @@
 
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +19,12 @@ State = TypeVar("State")
 FORMAT = 2
 """Version of the file's layout: one `.npy` member for each array, and `checkpoint.json` for everything else."""
 
-_READERS = {"bool": lambda text: text == "True", "int": int, "float": float, "str": str}
+_READERS: dict[str, Callable[[str], object]] = {
+    "bool": lambda text: text == "True",
+    "int": int,
+    "float": float,
+    "str": str,
+}
 """Types of the Python values that a state may hold, and how to read them back, exactly, from `str(value)`."""
 _ARRAYS = ("jax", "numpy", "scalar")
 

@@ -25,16 +25,7 @@ PREPARATION = 0.1
 
 @dataclass(frozen=True)
 class Tally:
-    """What the epochs of a run add up to; part of every checkpoint.
-
-    Attributes:
-        control_steps: Simulated control steps.
-        unbudgeted: Those of them that the budget does not count.
-        updates: Gradient updates.
-        stage: Of the last epoch.
-        prepared: Share of the preparation that is done; None where there was none.
-        converged: Why the method stopped by itself.
-    """
+    """The sums over the epochs of a run, and the stage, share of preparation and convergence of the last one."""
 
     control_steps: int = 0
     unbudgeted: int = 0
@@ -44,7 +35,7 @@ class Tally:
     converged: str | None = None
 
     def plus(self, epoch: Epoch) -> "Tally":
-        """With one more epoch."""
+        """The tally after one more epoch."""
         return Tally(
             self.control_steps + epoch.control_steps,
             self.unbudgeted + epoch.unbudgeted,
@@ -55,7 +46,7 @@ class Tally:
         )
 
     def spent(self, unit: Unit) -> int:
-        """What the budget counts."""
+        """The count that is compared with the budget."""
         return self.updates if unit == "updates" else self.control_steps - self.unbudgeted
 
     def fraction(self, spent_share: float) -> float:
@@ -69,12 +60,12 @@ class Finished(Generic[State]):
     """How a run ended.
 
     Attributes:
-        state: The last state; the bad one if the run diverged.
-        status: "finished" (budget spent), "converged", "interrupted" (by the user) or "diverged" (NaN).
+        state: The last state, even if the run diverged.
+        status: `finished` (the budget is spent), `converged`, `interrupted` (by the user) or `diverged` (a NaN).
         sentence: The status in words.
-        control_steps: Simulated control steps spent.
-        spent: What the budget counts.
-        seconds: Wall-clock time, that before a resume included.
+        control_steps: Simulated control steps.
+        spent: How much of the budget was spent, in its unit.
+        seconds: Wall-clock time, including that before a resume.
     """
 
     state: State
@@ -106,19 +97,19 @@ def run(
     ends the run after the current step, with a checkpoint; a second one abandons the step.
 
     Args:
-        method: What to run.
-        problem: What to run it on.
-        key: The only source of randomness; on resume, the same key again.
+        method: The method.
+        problem: The problem that its functions are given.
+        key: The only source of randomness; a resumed run needs the same key.
         budget: In `unit`; the step that reaches it is the last.
-        folder: Where to write logs, checkpoints and `result.json`; None to write nothing.
-        resume: Go on from the folder's checkpoint, or from the start if it was killed before the first one.
-            A run that had ended comes back as it is, unless `budget` grew.
+        folder: The folder for logs, checkpoints and `result.json`; None to write nothing.
+        resume: Continue from the folder's checkpoint, or from the start if there is none yet. A run that had ended
+            is returned as it is, unless `budget` grew.
         quiet: Show no progress.
-        description: What the progress bar is called.
-        shown: Metrics shown beside the bar, at most three; the first three if none is named.
+        description: Title of the progress bar.
+        shown: Metrics to show beside the bar, at most three; if empty, the first three.
         checkpoint_every: Seconds between two checkpoints.
-        unit: What the budget counts.
-        trace: More finite scalars of a state, for the log alone.
+        unit: The unit of the budget.
+        trace: A function of the state that gives more finite scalars for the log.
 
     Raises:
         MadocError: The budget is not positive, there is no folder to resume, the folder holds a run and
@@ -152,7 +143,7 @@ def run(
 
 
 class _Session(Generic[State]):
-    """A run under way: its state, what its epochs add up to, and what of it is on the disk."""
+    """A run in progress: its state, its tally, and its files."""
 
     def __init__(
         self,
@@ -189,7 +180,7 @@ class _Session(Generic[State]):
         return self._tally.spent(self._unit)
 
     def begin(self, stack: ExitStack) -> None:
-        """Open the logs; write the first checkpoint, which refuses a bad state before any budget is spent."""
+        """Open the logs, and write the first checkpoint, so that a bad state is refused before any budget is spent."""
         self._started = time.monotonic()
         if self._folder:
             self._folder.result.unlink(missing_ok=True)
@@ -199,7 +190,7 @@ class _Session(Generic[State]):
             self.save()
 
     def ended(self, interrupted: bool) -> bool:
-        """Whether there is a reason to stop; the first one found stays the reason."""
+        """Whether there is a reason to stop; the first reason is kept."""
         if self.outcome is None:
             spent = self.spent
             if self._tally.converged is not None:
@@ -211,11 +202,11 @@ class _Session(Generic[State]):
         return self.outcome is not None
 
     def moment(self, metrics: Metrics) -> Moment:
-        """Where the run stands, for the progress bar."""
+        """The progress of the run, for the bar."""
         return Moment(self._tally.fraction(self.spent / self._budget), self.spent, self._tally.stage, metrics)
 
     def take(self, state: State, epoch: Epoch) -> Metrics:
-        """Accept the result of a step, log it, and look at its metrics."""
+        """Accept the result of a step, log it, and check that its metrics are finite."""
         self.state, self._tally = state, self._tally.plus(epoch)
         metrics = {name: float(value) for name, value in epoch.metrics.items()}
         if self._log:
@@ -228,7 +219,7 @@ class _Session(Generic[State]):
         return metrics
 
     def save(self) -> None:
-        """Write a checkpoint; never a bad one."""
+        """Write a checkpoint, unless the state holds a NaN or an infinity."""
         if self.outcome is None or self.outcome[0] != "diverged":
             bad = checkpoint.first_non_finite(self.state)
             if bad:
@@ -240,12 +231,12 @@ class _Session(Generic[State]):
                 self._write_state(self._folder.checkpoint, self._log.sync())
 
     def abandon(self) -> None:
-        """Stop inside a step. What it may have left half-changed is not saved: the last checkpoint stays."""
+        """Stop inside a step. Its unfinished state is not saved: the last checkpoint stays."""
         sentence = f"interrupted inside a step, at {self.spent:,} of {self._budget:,} {self._unit}"
         self.outcome = "interrupted", sentence
 
     def finish(self) -> Finished[State]:
-        """The result, also as `result.json`; one of a run that had ended before is left as it is."""
+        """The result; also written as `result.json`, unless an earlier run has written it."""
         if self.outcome is None:
             raise RuntimeError("finish() before the run has ended")
         status, sentence = self.outcome

@@ -74,8 +74,8 @@ class _Pace:
         self._started = time.monotonic()
         self._seen: deque[tuple[float, Moment]] = deque()
 
-    def words(self, moment: Moment) -> dict[str, str]:
-        """What to show at a moment: `rate`, `elapsed`, and the time `left`."""
+    def words(self, moment: Moment) -> tuple[str, str, str]:
+        """The rate, the time elapsed, and the time left, at a moment."""
         now = time.monotonic()
         self._seen.append((now, moment))
         while len(self._seen) > 2 and self._seen[1][0] < now - _WINDOW_SECONDS:
@@ -85,7 +85,7 @@ class _Pace:
         rate = f"{done / seconds:,.0f}" if seconds > 0 and done > 0 else "-"
         left = _clock((1.0 - moment.fraction) * seconds / fraction) if fraction > 0 else "-:--"
         elapsed = _clock(now - self._started)
-        return {"rate": f"{rate} {self._unit}/s", "elapsed": f"{elapsed} elapsed", "left": f"{left} left"}
+        return f"{rate} {self._unit}/s", f"{elapsed} elapsed", f"{left} left"
 
 
 @contextmanager
@@ -100,7 +100,7 @@ def _lines(description: str, unit: str) -> Iterator[Show]:
         nonlocal stage, printed, line
         head = " ".join(word for word in (description, moment.stage) if word)
         done = [f"{100 * moment.fraction:.0f}%", f"{moment.done:,} {unit}"]
-        parts = ", ".join([*done, *pace.words(moment).values(), *_metrics(moment)])
+        parts = ", ".join([*done, *pace.words(moment), *_metrics(moment)])
         line = f"{head}: {parts}" if head else parts
         if moment.stage != stage or time.monotonic() - printed >= LINE_SECONDS:
             stage, printed = moment.stage, time.monotonic()
@@ -136,8 +136,8 @@ def _bar(description: str, unit: str) -> Iterator[Show]:
 
         def show(moment: Moment) -> None:
             metrics = "  ".join(_metrics(moment))
-            shown = {"stage": moment.stage, "metrics": metrics} | pace.words(moment)
-            progress.update(task, completed=moment.fraction, **shown)
+            rate, _, left = pace.words(moment)
+            progress.update(task, completed=moment.fraction, stage=moment.stage, rate=rate, left=left, metrics=metrics)
 
         yield show
 
