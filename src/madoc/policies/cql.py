@@ -40,7 +40,7 @@ class CQL:
         cloning_updates: In the first updates the policy clones instead of climbing values that mean nothing yet. The
             authors' 40 000 are of 3 million updates; these of 300 000, in which the temperature has not fallen yet:
             their entropy term is left out here, it would pull the clone from the data.
-        epoch_updates: Gradient updates per `step`. With the default networks one costs about as much as 20 of SAC's.
+        epoch_updates: Gradient updates per epoch. With the default networks one costs about as much as 20 of SAC's.
         batch: Rows per update.
         discount: γ.
         target_rate: τ of the target critics.

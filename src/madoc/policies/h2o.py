@@ -53,9 +53,9 @@ class H2O:
     of the spread.
 
     Attributes:
-        hidden: Units per layer of policy, critics and discriminators.
-        environments: Rows acting at a time, spread evenly over the systems.
-        epoch_steps: Control steps per `step`.
+        hidden: Numbers of units of the hidden layers of policy, critics and discriminators.
+        environments: Number of episodes simulated at a time, spread evenly over the systems.
+        epoch_steps: Control steps per epoch.
         updates_per_step: Gradient updates per control step.
         warmup_steps: Control steps with uniform random actions before the first update.
         batch: Rows per update, logged and simulated in equal numbers.

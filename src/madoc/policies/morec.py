@@ -62,7 +62,7 @@ class MOREC:
     policy and critics see standardised observations.
 
     Attributes:
-        hidden: Units per layer of policy and critics.
+        hidden: Numbers of units of the hidden layers of policy and critics.
         model_hidden: Units per layer of a dynamics model.
         models: Dynamics models.
         elites: How many of them are sampled from.
@@ -79,7 +79,7 @@ class MOREC:
         real: Share of logged rows in a batch.
         imagined_per_update: Imagined transitions for each update of the policy.
         imagined_rows: Rows imagined at a time.
-        epoch_updates: Gradient updates per `step`.
+        epoch_updates: Gradient updates per epoch.
         holdout_every: The elites are chosen on every `holdout_every`-th logged row, which the models do not see.
         batch: Rows per update.
         discount: γ.

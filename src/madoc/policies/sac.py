@@ -43,9 +43,9 @@ class SAC:
     """Soft actor-critic with twin critics and a learnt temperature, in many environments at a time.
 
     Attributes:
-        hidden: Units per layer of policy and critics.
-        environments: Rows acting at a time, spread evenly over the systems.
-        epoch_steps: Control steps per `step`.
+        hidden: Numbers of units of the hidden layers of policy and critics.
+        environments: Number of episodes simulated at a time, spread evenly over the systems.
+        epoch_steps: Control steps per epoch.
         updates_per_step: Gradient updates per control step.
         warmup_steps: Control steps with uniform random actions before the first update.
         batch: Rows per update.

@@ -120,7 +120,7 @@ def run(
     _check_folder(folder, resume)
     with ExitStack() as stack:
         interruption = stack.enter_context(interruptible())
-        session = _Session(method, method.init(problem, key), budget, unit, folder, resume, trace)
+        session = _Session(method.init(problem, key), budget, unit, folder, resume, trace)
         if session.ended(interruption.asked) and session.resumed:
             return session.finish()
         session.begin(stack)
@@ -147,7 +147,6 @@ class _Session(Generic[State]):
 
     def __init__(
         self,
-        method: object,
         state: State,
         budget: int,
         unit: Unit,
@@ -160,7 +159,6 @@ class _Session(Generic[State]):
         self.outcome: tuple[Status, str] | None = None
         self._tally = Tally()
         self._trace = trace
-        self._method_name = type(method).__name__
         self._budget, self._unit = budget, unit
         self._folder = folder
         self._layout = checkpoint.layout(state) if folder else {}
@@ -227,7 +225,7 @@ class _Session(Generic[State]):
             elif self._folder and self._log:
                 problem = checkpoint.difference(checkpoint.layout(self.state), self._layout)
                 if problem:
-                    raise MadocError(f"{self._method_name} changed the layout of its state: {problem}")
+                    raise MadocError(f"the method changed the layout of its state: {problem}")
                 self._write_state(self._folder.checkpoint, self._log.sync())
 
     def abandon(self) -> None:
