@@ -13,7 +13,7 @@ from madoc.learning import sac_losses
 from madoc.learning.features import Features
 from madoc.learning.networks import adam, descend, moving_average
 from madoc.learning.sac_losses import TwinCritic
-from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
+from madoc.learning.tanh_gaussian import Noise, TanhGaussianPolicy, sample
 
 Batch = dict[str, Array]
 """Rows as `replay.sample` gives them: observation, action, reward, next_observation, terminated."""
@@ -98,12 +98,24 @@ def fresh(
     )
 
 
+def standardising(
+    learner: ActorCritic, offset: Float[Array, " observation"], scale: Float[Array, " observation"]
+) -> ActorCritic:
+    """The same weights, for observations that are standardised with this offset and scale."""
+    networks = learner.policy, learner.critic, learner.target_critic
+    changed = [eqx.tree_at(lambda net: (net.offset, net.scale), network, (offset, scale)) for network in networks]
+    return eqx.tree_at(lambda parts: (parts.policy, parts.critic, parts.target_critic), learner, tuple(changed))
+
+
 def bellman_target(
-    learner: ActorCritic, batch: Batch, key: PRNGKeyArray, *, discount: float, entropy: bool = True
+    learner: ActorCritic, batch: Batch, noise: Noise, *, discount: float | Array, entropy: bool = True
 ) -> Float[Array, " rows"]:
-    """Where the critics of a batch should go; without `entropy`, the backup leaves out -α log π."""
+    """What the critics should say of a batch; without `entropy`, the backup leaves out -α log π.
+
+    `discount` is one number, or one a row where rows span several control steps.
+    """
     following = batch["next_observation"]
-    action, density = sample(*learner.policy.distribution(following), key)
+    action, density = sample(*learner.policy.distribution(following), noise)
     return sac_losses.soft_target(
         batch["reward"],
         batch["terminated"],
@@ -141,7 +153,7 @@ def critic_step(
 def actor_step(
     learner: ActorCritic,
     observation: Float[Array, "rows observation"],
-    key: PRNGKeyArray,
+    noise: Noise,
     descent: Descent,
     combine: Callable[[TanhGaussianPolicy, Array, Array], Array] = lambda policy, loss, value: loss,
 ) -> tuple[ActorCritic, dict[str, Array]]:
@@ -150,14 +162,14 @@ def actor_step(
     Args:
         learner: What to improve.
         observation: Where to improve it.
-        key: Of the sampled actions.
+        noise: Of the sampled actions.
         descent: How.
         combine: (policy, SAC's loss, value of each row) -> what the policy descends. SAC's loss alone by default.
     """
 
     def loss_of(policy: TanhGaussianPolicy) -> tuple[Array, tuple[Array, Array]]:
         loss, (value, density) = sac_losses.actor_loss(
-            policy, learner.critic, observation, temperature=jnp.exp(learner.log_temperature), key=key
+            policy, learner.critic, observation, temperature=jnp.exp(learner.log_temperature), noise=noise
         )
         return combine(policy, loss, value), (loss, density)
 
@@ -177,10 +189,10 @@ def actor_step(
 
 
 def soft_critic_step(
-    learner: ActorCritic, batch: Batch, key: PRNGKeyArray, descent: Descent, *, discount: float
+    learner: ActorCritic, batch: Batch, noise: Noise, descent: Descent, *, discount: float | Array
 ) -> tuple[ActorCritic, dict[str, Array]]:
     """SAC's own step of the critics."""
-    target = bellman_target(learner, batch, key, discount=discount)
+    target = bellman_target(learner, batch, noise, discount=discount)
 
     def loss_of(critic: TwinCritic) -> tuple[Array, Array]:
         loss = sac_losses.critic_loss(critic, batch["observation"], batch["action"], target)

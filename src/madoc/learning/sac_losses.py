@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.learning.networks import Network, standardise
-from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
+from madoc.learning.tanh_gaussian import Noise, TanhGaussianPolicy, sample
 
 
 class TwinCritic(eqx.Module):
@@ -48,7 +48,7 @@ def soft_target(
     next_log_density: Float[Array, " rows"],
     *,
     temperature: Float[Array, ""],
-    discount: float,
+    discount: float | Float[Array, " rows"],
 ) -> Float[Array, " rows"]:
     """Eq. (2) and (3): r + γ (1 - terminated) (min Q(s', a') - α log π(a'|s'))."""
     return reward + discount * (1.0 - terminated) * (next_value - temperature * next_log_density)
@@ -68,10 +68,10 @@ def actor_loss(
     observation: Array,
     *,
     temperature: Float[Array, ""],
-    key: PRNGKeyArray,
+    noise: Noise,
 ) -> tuple[Float[Array, ""], tuple[Float[Array, " rows"], Float[Array, " rows"]]]:
     """Eq. (7): mean of α log π(a|s) - min Q(s, a). Also returns the values and log densities, per row."""
-    action, density = sample(*policy.distribution(observation), key)
+    action, density = sample(*policy.distribution(observation), noise)
     value = jnp.minimum(*critic(observation, action))
     return jnp.mean(temperature * density - value), (value, density)
 

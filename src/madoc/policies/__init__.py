@@ -5,6 +5,7 @@ from madoc.policies.base import PolicyProblem as PolicyProblem
 from madoc.policies.base import require_reward as require_reward
 from madoc.policies.bc import BC as BC
 from madoc.policies.cql import CQL as CQL
+from madoc.policies.fast_sac import FastSAC as FastSAC
 from madoc.policies.files import load_policy as load_policy
 from madoc.policies.files import save_policy as save_policy
 from madoc.policies.h2o import H2O as H2O

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.learning import replay
+from madoc.learning.moments import Moments
 from madoc.policies.base import PolicyProblem
 from madoc.simulation.rollout import Rollout, Walkers, begin, reset_states, roll
 from madoc.types import Epoch, Policy
@@ -24,6 +25,7 @@ class Interaction:
     """The replay buffer, the present state and return of every row, and the control steps and failures so far."""
 
     replay: replay.Replay
+    observed: Moments
     walkers: Walkers
     episode_return: Float[np.ndarray, "systems rows"]
     control_steps: int
@@ -42,8 +44,51 @@ def start_acting(problem: PolicyProblem, key: PRNGKeyArray, *, environments: int
         raise MadocError(f"expected a multiple of {systems} environments for {systems} systems, got {environments}")
     observation, action = (simulator.task.observation_size,), (simulator.action_size,)
     columns = dict(zip(COLUMNS, (observation, action, (), observation, ()), strict=True))
+    ring = replay.empty(capacity, **columns)
     walkers = begin(reset_states(simulator), key, systems=systems, rows=environments // systems)
-    return Interaction(replay.empty(capacity, **columns), walkers, np.zeros(walkers.age.shape), 0, 0)
+    return Interaction(ring, Moments.none(simulator.task.observation_size), walkers, np.zeros(walkers.age.shape), 0, 0)
+
+
+def roll_on(
+    problem: PolicyProblem, state: Interaction, policy: Policy, key: PRNGKeyArray, *, control_steps: int
+) -> tuple[Rollout, Walkers]:
+    """Act for `control_steps` in all. Where parameters are distributed, all systems are drawn anew first.
+
+    A row goes on in its new system from where it stood in the old one, as the paper's own rollouts do when
+    parameters change inside an episode. The state does not change.
+    """
+    of_systems, of_action, of_restart = jax.random.split(key, 3)
+    simulator = problem.simulator
+    return roll(
+        simulator.bind(problem.systems(of_systems, state.walkers.age.size)),
+        simulator.task,
+        policy,
+        state.walkers,
+        steps=control_steps // state.walkers.age.size,
+        starts=reset_states(simulator),
+        key=of_action,
+        restart_key=of_restart,
+    )
+
+
+def remember(state: Interaction, rollout: Rollout, walkers: Walkers) -> tuple[Interaction, dict[str, float]]:
+    """Add the transitions of a rollout to the replay buffer, whose old arrays are consumed.
+
+    Returns:
+        The interaction, and as metrics the failures and the mean return of the episodes that ended, if any did.
+    """
+    rows = {name: replay.flatten_rows(getattr(rollout.transitions, name), 3) for name in COLUMNS}
+    finished, episode_return = _episode_returns(rollout, state.episode_return)
+    following = Interaction(
+        replay.add(state.replay, rows, rollout.valid.reshape(-1)),
+        state.observed.including(rows["observation"].astype(np.float64)),
+        walkers,
+        episode_return,
+        state.control_steps + rollout.valid.size,
+        state.failures + rollout.failures,
+    )
+    metrics = {"failures": float(following.failures)}
+    return following, metrics | ({"return_in_simulator": float(finished.mean())} if len(finished) else {})
 
 
 def explore_or_act(
@@ -56,38 +101,19 @@ def explore_or_act(
     warmup_steps: int,
     updates_per_step: float,
 ) -> tuple[Interaction, Epoch, int]:
-    """Act for `control_steps` in all, with uniform random actions until `warmup_steps` control steps have been taken.
-
-    Where parameters are distributed, all systems are drawn anew first. A row goes on in its new system from where it
-    stood in the old one, as the paper's own rollouts do when parameters change inside an episode.
+    """Act for `control_steps` in all, and store the transitions; random actions until `warmup_steps` have been taken.
 
     Returns:
-        The interaction, the epoch so far, and how many updates are due. The metrics of the epoch hold the mean return
-        of the episodes that ended, if any did.
+        The interaction, the epoch so far, and how many updates are due.
     """
-    of_systems, of_action, of_restart = jax.random.split(key, 3)
-    simulator = problem.simulator
     explores = state.control_steps < warmup_steps
-    rollout, walkers = roll(
-        simulator.bind(problem.systems(of_systems, state.walkers.age.size)),
-        simulator.task,
-        UniformPolicy(simulator.action_size) if explores else policy,
-        state.walkers,
-        steps=control_steps // state.walkers.age.size,
-        starts=reset_states(simulator),
-        key=of_action,
-        restart_key=of_restart,
-    )
-    rows = {name: replay.flatten_rows(getattr(rollout.transitions, name), 3) for name in COLUMNS}
-    finished, episode_return = _episode_returns(rollout, state.episode_return)
-    taken, failures = rollout.valid.size, state.failures + rollout.failures
-    seen = replay.add(state.replay, rows, rollout.valid.reshape(-1))
-    following = Interaction(seen, walkers, episode_return, state.control_steps + taken, failures)
-    metrics = {"failures": float(failures)}
-    if len(finished):
-        metrics["return_in_simulator"] = float(finished.mean())
+    acting = UniformPolicy(problem.simulator.action_size) if explores else policy
+    rolled = roll_on(problem, state, acting, key, control_steps=control_steps)
+    following, metrics = remember(state, *rolled)
+    taken = following.control_steps - state.control_steps
     due = round(updates_per_step * taken) if following.control_steps >= warmup_steps else 0
-    return following, Epoch(metrics, control_steps=taken, stage="exploring" if explores else "learning"), due
+    stage = "exploring" if explores else "learning"
+    return following, Epoch(metrics, control_steps=taken, updates=due, stage=stage), due
 
 
 class UniformPolicy(eqx.Module):

@@ -8,6 +8,7 @@ from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
 from madoc.policies.files import save_policy
 from madoc.policies.registry import LEARNERS
 from madoc.runs import loop
+from madoc.runs.budget import Budget
 from madoc.runs.run_folder import RunFolder
 from madoc.types import Policy, State, Unit, entry_of
 
@@ -20,6 +21,7 @@ class LearnedPolicy:
     status: str
     sentence: str
     control_steps: int
+    updates: int
     spent: int
     unit: Unit
     seconds: float
@@ -30,7 +32,7 @@ def learn_policy(
     problem: PolicyProblem,
     *,
     key: PRNGKeyArray,
-    budget: int,
+    budget: Budget | str,
     folder: RunFolder | None = None,
     resume: bool = False,
     quiet: bool = False,
@@ -40,6 +42,7 @@ def learn_policy(
 
     The budget counts simulated control steps for a learner that simulates and gradient updates for one that does not;
     its entry in `LEARNERS` says which. At one update per control step, the number of updates is the same for both.
+    Or it is a time: `Seconds(300)`, or `300s` or `5min` as text.
 
     With a folder, the policy is saved there as `policy.npz`, which `madoc.numpy_policy` reads without JAX.
 
@@ -65,5 +68,5 @@ def learn_policy(
     if folder is not None:
         save_policy(policy, folder.path / "policy.npz", task_name=problem.simulator.task.name)
     seconds = round(finished.seconds, 3)
-    counts = finished.control_steps, finished.spent, entry.unit, seconds
+    counts = finished.control_steps, finished.updates, finished.spent, entry.unit, seconds
     return LearnedPolicy(policy, finished.status, finished.sentence, *counts)
