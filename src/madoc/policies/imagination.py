@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -41,6 +42,7 @@ def best_candidate(
     return candidates[best, rows], rewards[best, rows]
 
 
+@eqx.filter_jit
 def imagine(
     ensemble: Ensemble,
     elites: Int[Array, " elites"],
@@ -51,6 +53,7 @@ def imagine(
     *,
     logged: Float[Array, "logged observation"],
     terminated: Callable[[Array], Bool[Array, " rows"]],
+    state_of: Callable[[Array], Array],
     samples: int,
     threshold: float,
     horizon: int,
@@ -71,7 +74,8 @@ def imagine(
         policy: The policy that acts.
         under_way: The rows.
         logged: Observations to restart at.
-        terminated: Whether the task ends at an observation.
+        terminated: Whether the task ends at a state.
+        state_of: The state at an observation.
         samples: Number of next states drawn from each elite.
         threshold: A row whose best dynamics reward is below ends there, as if it had fallen.
         horizon: Number of steps after which a row restarts.
@@ -106,7 +110,7 @@ def imagine(
         uncertainty = uncertainty_penalty(std, features)
         reward = features.reward_offset + features.reward_scale * outcome[:, -1]
         unreal = reality < threshold
-        ends = terminated(following) | unreal
+        ends = terminated(state_of(following)) | unreal
         row = {
             "observation": observation,
             "action": action,

@@ -1,6 +1,5 @@
 """MOREC: SAC in a learnt model, of whose transitions only those that look real are kept (arXiv 2310.05422)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -16,7 +15,7 @@ from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step,
 from madoc.learning.dynamics_ensemble import Ensemble, fit, holdout_error
 from madoc.learning.dynamics_reward import Opposition, oppose, opposition
 from madoc.learning.features import Features
-from madoc.learning.networks import Network, adam, scalars, scan_updates
+from madoc.learning.networks import adam, scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.imagination import ImaginedRows, imagine, start_imagining
@@ -234,48 +233,26 @@ class MOREC:
         of_imagination, of_updates = jax.random.split(state.key)
         task = problem.simulator.task
         assert task.state_from_observation is not None
-        under_way, rows, imagined = self._imagine(
-            (task.terminated, task.state_from_observation),
+        under_way, rows, imagined = imagine(
             state.ensemble,
-            (state.elites, state.opposition.past),
+            state.elites,
+            state.opposition.past,
             problem.features,
             state.learner.policy,
             state.under_way,
-            problem.logged["observation"],
-            of_imagination,
-        )
-        seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
-        learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
-        return replace(state, learner=learner, replay=seen, under_way=under_way), imagined | metrics
-
-    @eqx.filter_jit
-    def _imagine(
-        self,
-        ends: tuple[Callable, Callable],
-        ensemble: Ensemble,
-        selection: tuple[Int[Array, " elites"], Network],
-        features: Features,
-        policy: TanhGaussianPolicy,
-        under_way: ImaginedRows,
-        logged: Array,
-        key: PRNGKeyArray,
-    ) -> tuple[ImaginedRows, Batch, dict[str, Array]]:
-        terminated, to_state = ends
-        return imagine(
-            ensemble,
-            *selection,
-            features,
-            policy,
-            under_way,
-            logged=logged,
-            terminated=lambda observation: terminated(to_state(observation)),
+            logged=problem.logged["observation"],
+            terminated=task.terminated,
+            state_of=task.state_from_observation,
             samples=self.samples,
             threshold=self.threshold,
             horizon=self.horizon,
             penalty=self.penalty,
             steps=-(-self.epoch_updates * self.imagined_per_update // self.imagined_rows),
-            key=key,
+            key=of_imagination,
         )
+        seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
+        learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
+        return replace(state, learner=learner, replay=seen, under_way=under_way), imagined | metrics
 
     @eqx.filter_jit
     def _update_policy(
