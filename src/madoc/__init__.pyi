@@ -40,6 +40,7 @@ from .policies import CQL as CQL
 from .policies import H2O as H2O
 from .policies import MOREC as MOREC
 from .policies import SAC as SAC
+from .policies import FastSAC as FastSAC
 from .policies import NormalParameters as NormalParameters
 from .policies import PolicyProblem as PolicyProblem
 from .policies import UniformParameters as UniformParameters

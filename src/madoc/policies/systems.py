@@ -34,7 +34,7 @@ class NormalParameters:
 
     space: ParameterSpace
     mean: Float[np.ndarray, " parameters"]
-    covariance: Float[np.ndarray, "parameters parameters"]
+    covariance: Float[np.ndarray, "rows columns"]
 
     def __post_init__(self) -> None:
         size = len(self.space)
