@@ -51,6 +51,6 @@ from .runs.run_folder import RunFolder as RunFolder
 from .verdict import assess as assess
 
 ENVIRONMENTS: dict[str, str]
+EPISODE_STEPS: int
 
 def lazily(package: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]: ...
-def register_environments() -> None: ...

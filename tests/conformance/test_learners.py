@@ -40,6 +40,7 @@ METHODS = {
     "sac": LEARNERS["sac"].make(**ACTING, judge_every=2 * EPOCH, judge_episodes=2),
     "sac-bc": LEARNERS["sac-bc"].make(**ACTING),
     "dr-bc": LEARNERS["dr-bc"].make(**ACTING),
+    "dr": LEARNERS["dr"].make(**ACTING),
     "fast-sac": LEARNERS["fast-sac"].make(**FAST),
     "rlpd": LEARNERS["rlpd"].make(**FAST),
     "h2o": LEARNERS["h2o"].make(**ACTING),
@@ -279,7 +280,7 @@ def test_data_without_rewards_is_refused_where_they_are_learnt_from(name, datase
 @pytest.mark.parametrize("name", REWARDED)
 def test_next_observations_of_other_rows_are_refused_where_they_are_learnt_from(name, dataset, problem):
     torn = replace(dataset, disturbance=Disturbance(shuffled="next_observations"))
-    with pytest.raises(MadocError, match="learns from what followed on each action"):
+    with pytest.raises(MadocError, match="learns from the outcomes of actions"):
         learn_policy(METHODS[name], replace(problem, dataset=torn), key=KEY, budget=BUDGET)
 
 

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from madoc.calibration.holdout import (
     AgainstChance,
@@ -12,7 +13,6 @@ from madoc.calibration.holdout import (
     PredictionError,
     PredictionErrors,
     Tried,
-    holdout_to_json,
 )
 
 PARAMETERS = {
@@ -89,7 +89,7 @@ def result(**changes):
         "error": {"mean_absolute": 0.1, "mean_percent_of_range": 4.5, "per_parameter": {}},
         "covariance": (correlation * np.outer(deviation, deviation)).tolist(),
         "verdict": {"word": "CALIBRATED", "sentence": "the hold-out is predicted", "parameters": []},
-        "holdout": holdout_to_json(holdout),
+        "holdout": TypeAdapter(Predicted).dump_python(holdout, mode="json"),
     } | changes
 
 

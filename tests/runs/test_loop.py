@@ -275,7 +275,7 @@ class Grows(Wander):
 
 
 def test_a_state_that_changes_shape_is_refused_before_it_is_saved(tmp_path):
-    with pytest.raises(MadocError, match=r"Grows changed the layout of its state: expected state\.sum to be"):
+    with pytest.raises(MadocError, match=r"the method changed the layout of its state: expected state\.sum to be"):
         in_folder(tmp_path / "run", method=Grows(), checkpoint_every=0.0)
 
 

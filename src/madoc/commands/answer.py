@@ -93,7 +93,7 @@ def evaluation_text(evaluation: "EvaluationRecord") -> tuple[RenderableType, ...
 
 def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
     """The verdict, the table of estimates, the comparison of methods, and a summary."""
-    verdict = (result.verdict_line(),) if result.verdict else ()
+    verdict = (str(result.verdict),) if result.verdict else ()
     compared = (candidates_table(result.holdout),) if result.holdout and result.holdout.candidates else ()
     return (*verdict, result.table(), *compared, result.summary())
 
@@ -108,7 +108,7 @@ def candidates_table(holdout: "HoldOut") -> Table:
     for heading in (measure, "95 %", "control steps", "s"):
         table.add_column(heading, justify="right")
     table.add_column("verdict")
-    for row in holdout.candidates:
+    for row in holdout.candidates or ():
         if isinstance(row, NotRun):
             table.add_row(row.method, "", "", "", "", row.not_run)
             continue

@@ -1,5 +1,6 @@
 """Export as a stage: a finished calibration as files for other tools."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 from madoc import simulation
@@ -63,7 +64,7 @@ def provenance_of(calibrated: Calibrated) -> dict[str, object]:
         "run": whole.parent.name if whole.name == "calibration" else whole.name,
         "method": result.method,
         "seed": result.seed,
-        "verdict": None if verdict is None else verdict.to_json(),
+        "verdict": None if verdict is None else asdict(verdict),
         "data": stored and {"paths": list(stored.paths), "rows": stored.rows, "fingerprint": stored.fingerprint},
         "versions": dict(calibrated.spec.versions),
         "warnings": list(result.warnings),

@@ -10,7 +10,7 @@ from madoc import simulation
 from madoc.calibration import CalibrationResult
 from madoc.data import Dataset
 from madoc.errors import MadocError, unknown_name
-from madoc.parameters import ParameterSpace
+from madoc.parameters import ParameterDistribution, ParameterSpace
 from madoc.pipeline.calibrated import Calibrated
 from madoc.pipeline.data_stage import load_source, read_truth
 from madoc.pipeline.folders import working_folder
@@ -21,7 +21,6 @@ from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
     NormalParameters,
-    ParameterDistribution,
     PolicyProblem,
     UniformParameters,
     learn_policy,

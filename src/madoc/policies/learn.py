@@ -1,4 +1,4 @@
-"""Run a policy learner on a problem and hand back its policy."""
+"""Run a policy learner on a problem."""
 
 from dataclasses import dataclass
 
@@ -15,18 +15,7 @@ from madoc.types import Policy, State, Unit, entry_of
 
 @dataclass(frozen=True)
 class LearnedPolicy:
-    """A policy and how its learning ended.
-
-    Attributes:
-        policy: Acts; deterministic without a key.
-        status: As `loop.Finished` has it.
-        sentence: The status in words.
-        control_steps: Simulated control steps spent.
-        updates: Gradient updates spent.
-        spent: How much of the budget, in `unit`.
-        unit: What the budget counted: control steps of a learner that simulates, updates of one that does not.
-        seconds: Wall-clock time.
-    """
+    """A policy, and how its learning ended: see `madoc.runs.loop.Finished`; `spent` is counted in `unit`."""
 
     policy: Policy
     status: str
@@ -51,11 +40,11 @@ def learn_policy(
 ) -> LearnedPolicy:
     """Learn until the budget is spent.
 
-    The budget is simulated control steps for a learner that simulates and gradient updates for one that does not:
-    the entry in `LEARNERS` says which. With one update per control step, a budget means as many updates for either.
+    The budget counts simulated control steps for a learner that simulates and gradient updates for one that does not;
+    its entry in `LEARNERS` says which. At one update per control step, the number of updates is the same for both.
     Or it is a time: `Seconds(300)`, or `300s` or `5min` as text.
 
-    With a folder, `policy.npz` is left there: `madoc.numpy_policy` acts from it without JAX.
+    With a folder, the policy is saved there as `policy.npz`, which `madoc.numpy_policy` reads without JAX.
 
     Raises:
         MadocError: The robot has no reward, the method refuses the problem, or `loop.run` refuses.
@@ -78,13 +67,6 @@ def learn_policy(
     policy = method.policy(finished.state)
     if folder is not None:
         save_policy(policy, folder.path / "policy.npz", task_name=problem.simulator.task.name)
-    return LearnedPolicy(
-        policy,
-        finished.status,
-        finished.sentence,
-        finished.control_steps,
-        finished.updates,
-        finished.spent,
-        entry.unit,
-        round(finished.seconds, 3),
-    )
+    seconds = round(finished.seconds, 3)
+    counts = finished.control_steps, finished.updates, finished.spent, entry.unit, seconds
+    return LearnedPolicy(policy, finished.status, finished.sentence, *counts)

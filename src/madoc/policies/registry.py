@@ -50,6 +50,15 @@ _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
         settings=CLONING,
     ),
     _sac(
+        name="dr",
+        summary="SAC over the whole box",
+        paper="Tobin et al., randomization",
+        year=2017,
+        settings={"randomize": True},
+        needs_data=False,
+        needs_parameters=False,
+    ),
+    _sac(
         name="dr-bc",
         summary="SAC over the whole box, cloning the data",
         paper="Tobin et al., randomization",

@@ -22,7 +22,13 @@ from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hy
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SACState:
-    """Everything SAC carries; `judged` counts in control steps of learning."""
+    """The state of SAC.
+
+    Attributes:
+        best: The policy with the highest mean return so far.
+        best_return: Its mean return.
+        judged: Control steps of learning at the last evaluation; 0 before the first.
+    """
 
     learner: ActorCritic
     interaction: Interaction
@@ -35,9 +41,9 @@ class SAC:
     """Soft actor-critic with twin critics and a learnt temperature, in many environments at a time.
 
     Attributes:
-        hidden: Units per layer of policy and critics.
-        environments: Rows acting at a time, spread evenly over the systems.
-        epoch_steps: Control steps per `step`.
+        hidden: Numbers of units of the hidden layers of policy and critics.
+        environments: Number of episodes simulated at a time, spread evenly over the systems.
+        epoch_steps: Control steps per epoch.
         updates_per_step: Gradient updates per control step.
         warmup_steps: Control steps with uniform random actions before the first update.
         batch: Rows per update.

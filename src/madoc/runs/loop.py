@@ -26,16 +26,7 @@ PREPARATION = 0.1
 
 @dataclass(frozen=True)
 class Tally:
-    """What the epochs of a run add up to; part of every checkpoint.
-
-    Attributes:
-        control_steps: Simulated control steps.
-        unbudgeted: Those of them that the budget does not count.
-        updates: Gradient updates.
-        stage: Of the last epoch.
-        prepared: Share of the preparation that is done; None where there was none.
-        converged: Why the method stopped by itself.
-    """
+    """The sums over the epochs of a run, and the stage, share of preparation and convergence of the last one."""
 
     control_steps: int = 0
     unbudgeted: int = 0
@@ -45,7 +36,7 @@ class Tally:
     converged: str | None = None
 
     def plus(self, epoch: Epoch) -> "Tally":
-        """With one more epoch."""
+        """The tally after one more epoch."""
         return Tally(
             self.control_steps + epoch.control_steps,
             self.unbudgeted + epoch.unbudgeted,
@@ -56,7 +47,7 @@ class Tally:
         )
 
     def spent(self, unit: Unit) -> int:
-        """What the budget counts."""
+        """The count that is compared with the budget."""
         return self.updates if unit == "updates" else self.control_steps - self.unbudgeted
 
     def fraction(self, spent_share: float) -> float:
@@ -70,13 +61,13 @@ class Finished(Generic[State]):
     """How a run ended.
 
     Attributes:
-        state: The last state; the bad one if the run diverged.
-        status: "finished" (budget spent), "converged", "interrupted" (by the user) or "diverged" (NaN).
+        state: The last state, even if the run diverged.
+        status: `finished` (the budget is spent), `converged`, `interrupted` (by the user) or `diverged` (a NaN).
         sentence: The status in words.
-        control_steps: Simulated control steps spent.
+        control_steps: Simulated control steps.
         updates: Gradient updates of the result.
-        spent: What the budget counts, where it is no time.
-        seconds: Wall-clock time, that before a resume included.
+        spent: How much of the budget was spent, in its unit; in the method's unit where the budget is a time.
+        seconds: Wall-clock time, including that before a resume.
     """
 
     state: State
@@ -109,21 +100,21 @@ def run(
     ends the run after the current step, with a checkpoint; a second one abandons the step.
 
     Args:
-        method: What to run.
-        problem: What to run it on.
-        key: The only source of randomness; on resume, the same key again.
+        method: The method.
+        problem: The problem that its functions are given.
+        key: The only source of randomness; a resumed run needs the same key.
         budget: A count in `unit`, or a time as `Seconds(300)` or "300s"; the step that reaches it is the last. A run
-            under a time budget that is killed and resumed has what was left of it at the checkpoint, and its result
+            under a time budget that is killed and resumed has the time that was left at the checkpoint, and its result
             depends on the machine's speed.
-        folder: Where to write logs, checkpoints and `result.json`; None to write nothing.
-        resume: Go on from the folder's checkpoint, or from the start if it was killed before the first one.
-            A run that had ended comes back as it is, unless `budget` grew.
+        folder: The folder for logs, checkpoints and `result.json`; None to write nothing.
+        resume: Continue from the folder's checkpoint, or from the start if there is none yet. A run that had ended
+            is returned as it is, unless `budget` grew.
         quiet: Show no progress.
-        description: What the progress bar is called.
-        shown: Metrics shown beside the bar, at most three; the first three if none is named.
+        description: Title of the progress bar.
+        shown: Metrics to show beside the bar, at most three; if empty, the first three.
         checkpoint_every: Seconds between two checkpoints.
-        unit: What the budget counts.
-        trace: More finite scalars of a state, for the log alone.
+        unit: The unit of the budget.
+        trace: A function of the state that gives more finite scalars for the log.
 
     Raises:
         MadocError: The budget is not positive, there is no folder to resume, the folder holds a run and
@@ -133,7 +124,7 @@ def run(
     _check_folder(folder, resume)
     with ExitStack() as stack:
         interruption = stack.enter_context(interruptible())
-        session = _Session(method, method.init(problem, key), budget, unit, folder, resume, trace)
+        session = _Session(method.init(problem, key), budget, unit, folder, resume, trace)
         if session.ended(interruption.asked) and session.resumed:
             return session.finish()
         session.begin(stack)
@@ -156,11 +147,10 @@ def run(
 
 
 class _Session(Generic[State]):
-    """A run under way: its state, what its epochs add up to, and what of it is on the disk."""
+    """A run in progress: its state, its tally, and its files."""
 
     def __init__(
         self,
-        method: object,
         state: State,
         budget: Budget,
         unit: Unit,
@@ -173,7 +163,6 @@ class _Session(Generic[State]):
         self.outcome: tuple[Status, str] | None = None
         self._tally = Tally()
         self._trace = trace
-        self._method_name = type(method).__name__
         self._budget, self._unit = budget, unit
         self._folder = folder
         self._layout = checkpoint.layout(state) if folder else {}
@@ -210,7 +199,7 @@ class _Session(Generic[State]):
         return f"{self._seconds():.0f}" if isinstance(self._budget, Seconds) else f"{self.spent:,}"
 
     def begin(self, stack: ExitStack) -> None:
-        """Open the logs; write the first checkpoint, which refuses a bad state before any budget is spent."""
+        """Open the logs, and write the first checkpoint, so that a bad state is refused before any budget is spent."""
         self._started = time.monotonic()
         if self._folder:
             self._folder.result.unlink(missing_ok=True)
@@ -220,7 +209,7 @@ class _Session(Generic[State]):
             self.save()
 
     def ended(self, interrupted: bool) -> bool:
-        """Whether there is a reason to stop; the first one found stays the reason."""
+        """Whether there is a reason to stop; the first reason is kept."""
         if self.outcome is None:
             if self._tally.converged is not None:
                 self.outcome = "converged", self._tally.converged
@@ -231,11 +220,11 @@ class _Session(Generic[State]):
         return self.outcome is not None
 
     def moment(self, metrics: Metrics) -> Moment:
-        """Where the run stands, for the progress bar."""
+        """The progress of the run, for the bar."""
         return Moment(self._tally.fraction(self._share), self.spent, self._tally.stage, metrics)
 
     def take(self, state: State, epoch: Epoch) -> Metrics:
-        """Accept the result of a step, log it, and look at its metrics."""
+        """Accept the result of a step, log it, and check that its metrics are finite."""
         self.state, self._tally = state, self._tally.plus(epoch)
         metrics = {name: float(value) for name, value in epoch.metrics.items()}
         if self._log:
@@ -248,7 +237,7 @@ class _Session(Generic[State]):
         return metrics
 
     def save(self) -> None:
-        """Write a checkpoint; never a bad one."""
+        """Write a checkpoint, unless the state holds a NaN or an infinity."""
         if self.outcome is None or self.outcome[0] != "diverged":
             bad = checkpoint.first_non_finite(self.state)
             if bad:
@@ -256,16 +245,16 @@ class _Session(Generic[State]):
             elif self._folder and self._log:
                 problem = checkpoint.difference(checkpoint.layout(self.state), self._layout)
                 if problem:
-                    raise MadocError(f"{self._method_name} changed the layout of its state: {problem}")
+                    raise MadocError(f"the method changed the layout of its state: {problem}")
                 self._write_state(self._folder.checkpoint, self._log.sync())
 
     def abandon(self) -> None:
-        """Stop inside a step. What it may have left half-changed is not saved: the last checkpoint stays."""
+        """Stop inside a step. Its unfinished state is not saved: the last checkpoint stays."""
         sentence = f"interrupted inside a step, at {self._used} of {self._allowed}"
         self.outcome = "interrupted", sentence
 
     def finish(self) -> Finished[State]:
-        """The result, also as `result.json`; one of a run that had ended before is left as it is."""
+        """The result; also written as `result.json`, unless an earlier run has written it."""
         if self.outcome is None:
             raise RuntimeError("finish() before the run has ended")
         status, sentence = self.outcome
