@@ -50,7 +50,7 @@ class Transitions:
     def __len__(self) -> int:
         return len(self.reward)
 
-    def take(self, rows: np.ndarray) -> "Transitions":
+    def take(self, rows: np.ndarray | slice) -> "Transitions":
         """The given rows (indices or mask over the first axis)."""
         return jax.tree.map(lambda column: column[rows], self)
 
@@ -188,7 +188,7 @@ def check_hyperparameters(method: object) -> None:
 
 
 @cache
-def _adapters(kind: type) -> dict[str, TypeAdapter[object]]:
+def _adapters(kind: type) -> dict[str, TypeAdapter]:
     """What checks each field of a dataclass."""
     hints = get_type_hints(kind, include_extras=True)
     checked = {name: hint for name, hint in hints.items() if not is_dataclass(hint)}
