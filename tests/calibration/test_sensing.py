@@ -80,14 +80,14 @@ def test_horizons_follow_how_fast_a_robot_moves(log):
 
 
 def test_initial_states_are_estimated_where_the_data_asks_for_it(log):
-    phases = {
+    stages = {
         "undecided": {},
         "starting": {"noise": 0.1},
         "estimated": {"hidden_velocities": True},
     }
     for stage, disturbance in stages.items():
         assert LeastSquares().init(problem_of(log, **disturbance), KEY).stage == stage
-    assert LeastSquares(initial_states="logged").init(problem_of(log, noise=0.1), KEY).phase == "logged"
+    assert LeastSquares(initial_states="logged").init(problem_of(log, noise=0.1), KEY).stage == "logged"
     with pytest.raises(MadocError, match="does not determine its state"):
         LeastSquares(initial_states="logged").init(problem_of(log, hidden_velocities=True), KEY)
 
