@@ -186,7 +186,7 @@ def check_hyperparameters(method: object) -> None:
 
 
 @cache
-def _adapters(kind: type) -> dict[str, TypeAdapter[object]]:
+def _adapters(kind: type) -> dict[str, TypeAdapter]:
     """What checks each field of a dataclass."""
     hints = get_type_hints(kind, include_extras=True)
     checked = {name: hint for name, hint in hints.items() if not is_dataclass(hint)}

@@ -263,7 +263,7 @@ HoldOut: TypeAlias = Predicted | Fitted | ToldApart
 
 
 @functools.cache
-def _adapter() -> TypeAdapter[HoldOut]:
+def _adapter() -> TypeAdapter:
     return TypeAdapter(Annotated[HoldOut, Field(discriminator="measure")])
 
 

@@ -1,4 +1,4 @@
-"""Baselines that simulate nothing: the middle of every range, and a uniform distribution over the ranges."""
+"""Baselines without simulation: the middle of every range, and a uniform distribution over the ranges."""
 
 from dataclasses import dataclass
 
@@ -13,28 +13,28 @@ from madoc.types import Epoch
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class UncalibratedState:
-    """Nothing but the random key that every state carries."""
+    """The random key, which every state has."""
 
     key: PRNGKeyArray
 
 
 @dataclass(frozen=True)
 class Uncalibrated:
-    """The estimate without any data. It simulates nothing and converges in its first epoch.
+    """An estimate that uses no data and converges in its first epoch.
 
     Attributes:
-        randomised: False is `nominal`: mid-range without a spread, the simulator as it comes. True is `uniform`:
-            mid-range with the deviation of a uniform distribution over each range, (high - low) / √12.
+        randomised: False is `nominal`: the middle of every range with standard deviation 0. True is `uniform`: the
+            same with the standard deviation of a uniform distribution over each range, (high - low) / √12.
     """
 
     randomised: bool = False
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> UncalibratedState:
-        """Nothing to begin with."""
+        """The state, which never changes."""
         return UncalibratedState(key)
 
     def step(self, problem: CalibrationProblem, state: UncalibratedState) -> tuple[UncalibratedState, Epoch]:
-        """It has converged, as there is nothing to do."""
+        """An epoch that has converged."""
         return state, Epoch(converged="there is nothing to simulate")
 
     def estimate(self, problem: CalibrationProblem, state: UncalibratedState) -> Estimate:

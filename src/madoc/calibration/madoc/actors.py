@@ -1,6 +1,6 @@
-"""Calibration actors: one tanh-Gaussian a group, over its own parameters.
+"""Calibration actors: a tanh-Gaussian for each group, over the parameters of that group.
 
-Groups are disjoint and every Gaussian is diagonal, so all actors together are one mean and one log std a parameter.
+Groups are disjoint and every Gaussian is diagonal, so all actors together are a mean and a log std of each parameter.
 """
 
 from dataclasses import dataclass
