@@ -25,7 +25,8 @@ def checked(function):
     @functools.wraps(function)
     def initialise(self, *args, **kwargs):
         given = dict(zip(names, args, strict=False)) | kwargs
-        rebuilt = any(type(given.get(name)) in (bool, object) or _is_placeholder(given.get(name)) for name in arrays)
+        leaves = [given[name] for name in arrays & given.keys()]
+        rebuilt = any(type(leaf) in (bool, object) or _is_placeholder(leaf) for leaf in leaves)
         return (function if rebuilt else strict)(self, *args, **kwargs)
 
     return initialise
@@ -33,5 +34,4 @@ def checked(function):
 
 def _is_placeholder(value) -> bool:
     """Whether a leaf stands for an array without being one."""
-    array = isinstance(value, jax.Array | np.ndarray | np.generic | int | float | tuple | list)
-    return value is not None and not array
+    return not isinstance(value, jax.Array | np.ndarray | np.generic | int | float | tuple | list)

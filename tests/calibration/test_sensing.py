@@ -60,7 +60,8 @@ def test_simulated_readings_carry_the_noise_that_the_data_says_it_has(log):
 
 def test_a_reading_that_ends_a_row_begins_the_next():
     places = np.zeros((4, 2, 3, 1))
-    rows = Transitions(places, places, places[..., 0], places, places[..., 0], places[..., 0])
+    never = np.zeros((4, 2, 3), dtype=bool)
+    rows = Transitions(places, places, places[..., 0], places, never, never)
     rollout = Rollout(rows, np.ones((4, 2, 3), dtype=bool))
     seen = with_sensor_noise(rollout, np.array([2.0]), KEY).transitions
     np.testing.assert_array_equal(seen.next_observation[:-1], seen.observation[1:])

@@ -34,8 +34,8 @@ class TwinCritic(eqx.Module):
         self.scale = jnp.ones(observation_size) if scale is None else scale
 
     def __call__(
-        self, observation: Float[Array, "rows observation"], action: Float[Array, "rows action"]
-    ) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
+        self, observation: Float[Array, "*rows observation"], action: Float[Array, "*rows action"]
+    ) -> tuple[Float[Array, "*rows"], Float[Array, "*rows"]]:
         """Both values of every row."""
         pair = jnp.concatenate([standardise(observation, self.offset, self.scale), action], axis=-1)
         return self.first(pair)[..., 0], self.second(pair)[..., 0]

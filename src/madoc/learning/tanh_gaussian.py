@@ -22,7 +22,7 @@ def sample(
 
 
 def log_density(
-    value: Float[Array, "*rows n"], mean: Float[Array, "*rows n"], log_std: Float[Array, "*rows n"]
+    value: Float[Array | np.ndarray, "*rows n"], mean: Float[Array, "*rows n"], log_std: Float[Array, "*rows n"]
 ) -> Float[Array, "*rows"]:
     """Log density of values in [-1, 1]."""
     return _log_density(jnp.arctanh(jnp.clip(value, -_EDGE, _EDGE)), mean, log_std)
@@ -66,7 +66,7 @@ class TanhGaussianPolicy(eqx.Module):
         return mean, jnp.clip(log_std, *LOG_STD_RANGE)
 
     def __call__(
-        self, observation: Float[Array, "*rows observation"], key: PRNGKeyArray | None = None
+        self, observation: Float[Array | np.ndarray, "*rows observation"], key: PRNGKeyArray | None = None
     ) -> Float[Array, "*rows action"]:
         """A sampled action with a key, tanh of the mean without."""
         mean, log_std = self.distribution(jnp.asarray(observation, jnp.float32))

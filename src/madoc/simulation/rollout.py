@@ -145,7 +145,7 @@ def act(
     policy: Policy,
     observation: Float[Array | np.ndarray, "*rows observation"],
     key: PRNGKeyArray | None,
-    step: np.int32,
+    step: Int[Array | np.ndarray, ""] | np.int32,
 ) -> Array:
     """Actions of a policy, jitted: sampled with the key of this step, deterministic without a key."""
     return policy(jnp.asarray(observation), None if key is None else jax.random.fold_in(key, step))

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from madoc.learning.tanh_gaussian import sample
 
@@ -17,8 +18,8 @@ from madoc.learning.tanh_gaussian import sample
 class Actors:
     """Means and log stds before squashing, both of shape (d,)."""
 
-    mean: Float[Array, " d"]
-    log_std: Float[Array, " d"]
+    mean: Float[Array | np.ndarray, " d"]
+    log_std: Float[Array | np.ndarray, " d"]
 
 
 def initial_actors(count: int) -> Actors:
@@ -42,7 +43,7 @@ def divergence(actors: Actors, prior: Actors) -> Float[Array, " d"]:
     return 0.5 * (variance_ratio + shift - 1.0) - actors.log_std + prior.log_std
 
 
-def prior_weight(updates: Float[Array, ""], *, time_constant: float, largest: float) -> Float[Array, ""]:
+def prior_weight(updates: Int[Array, ""], *, time_constant: float, largest: float) -> Float[Array, ""]:
     """λ_t = min(largest, exp(t / time_constant)) (appendix C: 10 and 2e5)."""
     return jnp.minimum(largest, jnp.exp(updates / time_constant))
 
@@ -53,7 +54,7 @@ def actor_loss(
     kl: Float[Array, ""],
     *,
     entropy_weight: float,
-    prior_weight: Float[Array, ""],
+    prior_weight: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
     """Eq. (13) summed over groups: α log q - v + λ KL(q || p), averaged over draws.
 

@@ -80,7 +80,7 @@ def one_at_a_time(key: PRNGKeyArray, count: int) -> Float[np.ndarray, "d d"]:
     return np.diag(np.asarray(values, dtype=np.float64))
 
 
-def cluster(embeddings: Float[Array, "d latent"], groups: int, seed: int) -> Int[np.ndarray, " d"]:
+def cluster(embeddings: Float[Array | np.ndarray, "d latent"], groups: int, seed: int) -> Int[np.ndarray, " d"]:
     """Group labels of parameters, in order of first appearance: k-means of the first three principal components."""
     if groups == 1:
         return np.zeros(len(embeddings), dtype=np.int64)
