@@ -50,7 +50,7 @@ class Transitions:
     def __len__(self) -> int:
         return len(self.reward)
 
-    def take(self, rows: np.ndarray) -> "Transitions":
+    def take(self, rows: np.ndarray | slice) -> "Transitions":
         """The given rows (indices or mask over the first axis)."""
         return jax.tree.map(lambda column: column[rows], self)
 

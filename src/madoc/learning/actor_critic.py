@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from madoc.learning import sac_losses
 from madoc.learning.features import Features
-from madoc.learning.networks import adam, descend, moving_average
+from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend, moving_average
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
 
@@ -31,7 +31,7 @@ class ActorCritic:
     policy: TanhGaussianPolicy
     critic: TwinCritic
     target_critic: TwinCritic
-    log_temperature: Float[Array, ""]
+    log_temperature: Scalar
     policy_optimiser: PyTree
     critic_optimiser: PyTree
     temperature_optimiser: PyTree
@@ -94,7 +94,7 @@ def fresh(
 
 def bellman_target(
     learner: ActorCritic, batch: Batch, key: PRNGKeyArray, *, discount: float, entropy: bool = True
-) -> Float[Array, " rows"]:
+) -> PerRow:
     """Target of the critics for each row of a batch; without `entropy`, it leaves out the term -α log π."""
     following = batch["next_observation"]
     action, density = sample(*learner.policy.distribution(following), key)
@@ -110,7 +110,7 @@ def bellman_target(
 
 def critic_step(
     learner: ActorCritic, loss_of: Callable[[TwinCritic], tuple[Array, Array]], descent: Descent
-) -> tuple[ActorCritic, tuple[Float[Array, ""], Float[Array, ""]]]:
+) -> tuple[ActorCritic, tuple[Scalar, Scalar]]:
     """One gradient step of the critics; the target critics then move towards them.
 
     `loss_of` gives the loss of a critic and a part of it to report. Both are returned as they were before the step.
@@ -123,7 +123,7 @@ def critic_step(
 
 def actor_step(
     learner: ActorCritic,
-    observation: Float[Array, "rows observation"],
+    observation: Observations,
     key: PRNGKeyArray,
     descent: Descent,
     combine: Callable[[TanhGaussianPolicy, Array, Array], Array] = lambda policy, loss, value: loss,

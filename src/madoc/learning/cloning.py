@@ -6,13 +6,13 @@ import equinox as eqx
 import jax
 import numpy as np
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Float, PRNGKeyArray, PyTree
 
-from madoc.learning.networks import adam, minimise
+from madoc.learning.networks import Actions, Observations, Scalar, adam, minimise
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy, log_density
 from madoc.types import Metrics, Transitions
 
-Pairs = tuple[Float[Array, "rows observation"], Float[Array, "rows action"]]
+Pairs = tuple[Observations, Actions]
 """Logged observations and actions on the device, float32."""
 
 
@@ -50,9 +50,7 @@ def fresh_clone(
     return Clone(policy, adam(learning_rate).init(eqx.filter(policy, eqx.is_array)), 0)
 
 
-def cloning_loss(
-    policy: TanhGaussianPolicy, observation: Float[Array, "rows observation"], action: Float[Array, "rows action"]
-) -> Float[Array, ""]:
+def cloning_loss(policy: TanhGaussianPolicy, observation: Observations, action: Actions) -> Scalar:
     """Mean negative log-likelihood of the data's actions under the policy."""
     return -log_density(action, *policy.distribution(observation)).mean()
 
@@ -75,8 +73,8 @@ def _train(
     optimiser: optax.GradientTransformation,
     batch: int,
     updates: int,
-) -> tuple[TanhGaussianPolicy, PyTree, Float[Array, ""]]:
-    def loss_of(policy: TanhGaussianPolicy, key: PRNGKeyArray) -> Float[Array, ""]:
+) -> tuple[TanhGaussianPolicy, PyTree, Scalar]:
+    def loss_of(policy: TanhGaussianPolicy, key: PRNGKeyArray) -> Scalar:
         rows = jax.random.randint(key, (batch,), 0, len(logged[0]))
         return cloning_loss(policy, logged[0][rows], logged[1][rows])
 

@@ -8,7 +8,7 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from madoc.learning.features import Features
-from madoc.learning.networks import Network, map_stack, minimise, stack
+from madoc.learning.networks import Network, PerRow, Scalar, map_stack, minimise, stack
 
 BOUNDS_WEIGHT = 0.01
 """Weight in the loss of the distance between the learnt bounds of the log variance (Chua et al., appendix A.1)."""
@@ -70,7 +70,7 @@ class Ensemble(eqx.Module):
 
 def likelihood_loss(
     ensemble: Ensemble, pair: Float[Array, "models rows pair"], target: Float[Array, "models rows outputs"]
-) -> Float[Array, ""]:
+) -> Scalar:
     """Eq. (1), Chua et al. 2018: squared error over variance plus log variance, averaged over rows and outputs.
 
     Summed over the models, with the learnt bounds of the variance pulled together.
@@ -80,7 +80,7 @@ def likelihood_loss(
     return error.mean((1, 2)).sum() + BOUNDS_WEIGHT * (ensemble.largest - ensemble.smallest).sum()
 
 
-def weight_decay(ensemble: Ensemble) -> Float[Array, ""]:
+def weight_decay(ensemble: Ensemble) -> Scalar:
     """Half the squared norm of the weights of each layer, times its `DECAY`, summed over layers and models."""
     layers = ensemble.networks.layers
     decays = np.linspace(*DECAY, len(layers))
@@ -96,7 +96,7 @@ def holdout_error(
     return ((mean - jnp.broadcast_to(target, mean.shape)) ** 2).mean((1, 2))
 
 
-def uncertainty_penalty(std: Float[Array, "models rows outputs"], features: Features) -> Float[Array, " rows"]:
+def uncertainty_penalty(std: Float[Array, "models rows outputs"], features: Features) -> PerRow:
     """u(s, a) of MOPO, Yu et al. 2020: the largest norm over the models of the std, in physical units."""
     scale = jnp.append(features.change_scale, features.reward_scale)
     return jnp.linalg.norm(std * jnp.broadcast_to(scale, std.shape), axis=-1).max(0)
@@ -121,7 +121,7 @@ def fit(
     """`count` updates. Every model draws its own batches, so that the models differ."""
     size = len(rows[0]) - len(rows[0]) // holdout_every
 
-    def loss_of(ensemble: Ensemble, key: PRNGKeyArray) -> Float[Array, ""]:
+    def loss_of(ensemble: Ensemble, key: PRNGKeyArray) -> Scalar:
         drawn = training_rows(jax.random.randint(key, (ensemble.count, batch), 0, size), holdout_every)
         return likelihood_loss(ensemble, rows[0][drawn], rows[1][drawn]) + weight_decay(ensemble)
 

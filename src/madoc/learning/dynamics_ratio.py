@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from madoc.learning.networks import Network
+from madoc.learning.networks import Network, Observations, PerRow, Scalar
 
 TARGET, SOURCE = 0, 1
 """Indices of the two logits: the target domain (logged rows) and the source domain (simulated rows)."""
@@ -67,7 +67,7 @@ def discriminator_loss(
     logged: tuple[Array, Array],
     simulated: tuple[Array, Array],
     key: PRNGKeyArray | None = None,
-) -> tuple[Float[Array, ""], dict[str, Array]]:
+) -> tuple[Scalar, dict[str, Array]]:
     """Eq. (6), Jiang et al. 2024: the sum of both cross-entropies; also each of them, and each accuracy.
 
     `logged` and `simulated` are features (pair, following) of as many rows. The key is that of dropout.
@@ -92,7 +92,7 @@ def discriminator_loss(
     return metrics["discriminator_loss_sa"] + metrics["discriminator_loss_sas"], metrics
 
 
-def log_dynamics_ratio(discriminators: Discriminators, pair: Array, following: Array) -> Float[Array, " rows"]:
+def log_dynamics_ratio(discriminators: Discriminators, pair: Array, following: Array) -> PerRow:
     """The reward below Eq. (5): log D_sas(target) - log D_sas(source) - log D_sa(target) + log D_sa(source).
 
     As f_sa enters both softmaxes, this is f_sas(target) - f_sas(source): within ±2 `bound`.
@@ -101,7 +101,7 @@ def log_dynamics_ratio(discriminators: Discriminators, pair: Array, following: A
     return log_triple[:, TARGET] - log_triple[:, SOURCE] - log_pair[:, TARGET] + log_pair[:, SOURCE]
 
 
-def overlap(discriminators: Discriminators, pair: Array) -> Float[Array, " rows"]:
+def overlap(discriminators: Discriminators, pair: Array) -> PerRow:
     """4 p (1 - p) of D_sa's probability p: 1 where (s, a) is as likely in either domain, near 0 where in one only.
 
     Not in the paper. f_sas learns only where both domains have rows; elsewhere its ratio is an extrapolation. Rows are
@@ -112,9 +112,7 @@ def overlap(discriminators: Discriminators, pair: Array) -> Float[Array, " rows"
     return 4.0 * jax.nn.sigmoid(log_odds) * jax.nn.sigmoid(-log_odds)
 
 
-def blur(
-    following: tuple[Array, Array], scale: Float[Array, ""] | float, key: PRNGKeyArray
-) -> tuple[Float[Array, "rows observation"], Float[Array, "rows observation"]]:
+def blur(following: tuple[Array, Array], scale: Scalar | float, key: PRNGKeyArray) -> tuple[Observations, Observations]:
     """Add independent normal noise of deviation `scale` to the s' features of logged and of simulated rows.
 
     Not in the paper. Under different parameters a simulator without noise never gives the same s', so that

@@ -16,7 +16,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from madoc.learning.dynamics_ensemble import Ensemble
-from madoc.learning.networks import Network, descend, map_stack, scan_updates, stack
+from madoc.learning.networks import Network, PerRow, Scalar, descend, map_stack, scan_updates, stack
 
 SURE = 0.999
 """Largest mean probability that counts; the authors'."""
@@ -69,12 +69,12 @@ def logit(
     return discriminator(jnp.concatenate([pair, change], axis=-1))[..., 0]
 
 
-def telling_loss(real: Float[Array, " rows"], generated: Float[Array, " rows"]) -> Float[Array, ""]:
+def telling_loss(real: PerRow, generated: PerRow) -> Scalar:
     """The discriminator's: mean of -log D on real transitions and of -log(1 - D) on generated ones, from logits."""
     return jax.nn.softplus(-real).mean() + jax.nn.softplus(generated).mean()
 
 
-def deceiving_loss(generated: Float[Array, " rows"]) -> Float[Array, ""]:
+def deceiving_loss(generated: PerRow) -> Scalar:
     """The generator's: minus the mean reward -log(1 - D), from logits."""
     return -jax.nn.softplus(generated).mean()
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.learning.dynamics_ratio import Discriminators, log_dynamics_ratio
+from madoc.learning.networks import Observations, PerRow, Scalar
 from madoc.learning.sac_losses import TwinCritic
 
 RATIO_RANGE = (1e-5, 1.0)
@@ -14,7 +15,7 @@ GAP_RANGE = (1e-30, 10.0)
 """Bounds of the dynamics gap. The authors' lower one, 1e-45, is 0 in float32 on most machines, and has no logarithm."""
 
 
-def dynamics_ratio(log_ratio: Float[Array, " rows"]) -> Float[Array, " rows"]:
+def dynamics_ratio(log_ratio: PerRow) -> PerRow:
     """P_real(s'|s, a) / P_simulated(s'|s, a), the weight of a simulated row's Bellman error in Eq. (10), clipped."""
     return jnp.clip(jnp.exp(log_ratio), *RATIO_RANGE)
 
@@ -22,12 +23,12 @@ def dynamics_ratio(log_ratio: Float[Array, " rows"]) -> Float[Array, " rows"]:
 def dynamics_gap(
     discriminators: Discriminators,
     pair: Float[Array, "rows pair"],
-    following: Float[Array, "rows observation"],
+    following: Observations,
     *,
     spread: float,
     samples: int,
     key: PRNGKeyArray,
-) -> Float[Array, " rows"]:
+) -> PerRow:
     """u(s, a) = KL(P_simulated || P_real), Eq. (7): the mean of -log ratio over s' drawn about the simulated one.
 
     A simulator that is deterministic has no distribution to draw from: like the authors' code, s' is blurred by
@@ -40,20 +41,20 @@ def dynamics_gap(
     return jnp.clip(-log_ratio.mean(0), *GAP_RANGE)
 
 
-def gap_weighted_value(value: Float[Array, " rows"], gap: Float[Array, " rows"]) -> Float[Array, ""]:
+def gap_weighted_value(value: PerRow, gap: PerRow) -> Scalar:
     """Log Σ ω exp Q over simulated rows, ω = u / Σ u: the closed form of Eq. (9), what H2O pushes down."""
     return jax.nn.logsumexp(value + jnp.log(gap) - jnp.log(gap.sum()))
 
 
 def h2o_loss(
     critic: TwinCritic,
-    logged: tuple[Array, Array, Float[Array, " rows"]],
-    simulated: tuple[Array, Array, Float[Array, " rows"]],
+    logged: tuple[Array, Array, PerRow],
+    simulated: tuple[Array, Array, PerRow],
     *,
-    ratio: Float[Array, " rows"],
-    gap: Float[Array, " rows"],
+    ratio: PerRow,
+    gap: PerRow,
     weight: float,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Scalar, Scalar]:
     """Eq. (9) and (10), summed over the twins.
 
     The Bellman error of logged rows, that of simulated rows weighed by the dynamics ratio, and `weight` times the

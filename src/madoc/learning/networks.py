@@ -15,6 +15,12 @@ from madoc.types import Metrics
 
 Carry = TypeVar("Carry")
 
+Scalar = Float[Array, ""]
+PerRow = Float[Array, " rows"]
+Observations = Float[Array, "rows observation"]
+Actions = Float[Array, "rows action"]
+"""Arrays of a batch on the device: one number, a number for each row, an observation and an action of each row."""
+
 
 class Network(eqx.Module):
     """A multilayer perceptron on a batch, with optional dropout between layers."""
@@ -98,14 +104,14 @@ def scan_updates(
 
 
 def minimise(
-    loss_of: Callable[[Carry, PRNGKeyArray], Float[Array, ""]],
+    loss_of: Callable[[Carry, PRNGKeyArray], Scalar],
     parameters: Carry,
     optimiser_state: PyTree,
     key: PRNGKeyArray,
     *,
     optimiser: optax.GradientTransformation,
     count: int,
-) -> tuple[Carry, PyTree, Float[Array, ""]]:
+) -> tuple[Carry, PyTree, Scalar]:
     """`count` steps down a loss that draws its own batch with the key given to it; also its mean over the steps."""
 
     def update(carry: tuple[Carry, PyTree], key: PRNGKeyArray) -> tuple[tuple[Carry, PyTree], dict[str, Array]]:

@@ -9,21 +9,19 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from madoc.learning.networks import Network, standardise
 
 LOG_STD_RANGE = (-5.0, 2.0)
+"""Range of the log standard deviation before squashing; values beyond it are clipped."""
 _EDGE = 1.0 - 1e-5
-"""Actions recorded at ±1 are read as this: the density of a squashed Gaussian ends there."""
+"""Largest absolute action that has a density; recorded actions beyond it, such as ±1, are replaced by it."""
+Values = Float[Array | np.ndarray, "*rows n"]
 
 
-def sample(
-    mean: Float[Array, "*rows n"], log_std: Float[Array, "*rows n"], key: PRNGKeyArray
-) -> tuple[Float[Array, "*rows n"], Float[Array, "*rows"]]:
+def sample(mean: Values, log_std: Values, key: PRNGKeyArray) -> tuple[Float[Array, "*rows n"], Float[Array, "*rows"]]:
     """A reparameterised draw in (-1, 1) and its log density."""
     raw = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
     return jnp.tanh(raw), _log_density(raw, mean, log_std)
 
 
-def log_density(
-    value: Float[Array | np.ndarray, "*rows n"], mean: Float[Array, "*rows n"], log_std: Float[Array, "*rows n"]
-) -> Float[Array, "*rows"]:
+def log_density(value: Values, mean: Values, log_std: Values) -> Float[Array, "*rows"]:
     """Log density of values in [-1, 1]."""
     return _log_density(jnp.arctanh(jnp.clip(value, -_EDGE, _EDGE)), mean, log_std)
 

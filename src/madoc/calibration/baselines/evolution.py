@@ -17,6 +17,11 @@ LARGEST_DEVIATION = 2.0
 """Largest deviation of a candidate, the width of the box. The step size of a flat cost grows without limit; beyond this
 candidates would only be put on the walls."""
 
+Candidates = Float[np.ndarray, "population d"]
+"""Parameters of each candidate of a generation, in [-1, 1]."""
+Costs = Float[np.ndarray, " population"]
+"""Cost of each candidate of a generation."""
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ def begin(mean: Float[np.ndarray, " d"], deviation: float = FIRST_DEVIATION) -> 
     return Evolution(np.array(mean, np.float64), deviation, np.eye(len(mean)), nothing, nothing, 0)
 
 
-def ask(evolution: Evolution, key: PRNGKeyArray, population: int | None = None) -> Float[np.ndarray, "population d"]:
+def ask(evolution: Evolution, key: PRNGKeyArray, population: int | None = None) -> Candidates:
     """The candidates of a generation, by default 4 + ⌊3 ln d⌋ of them (Eq. 48 of the tutorial).
 
     A candidate outside the box is drawn again, a hundred times at most; then it is put on the wall.
@@ -56,9 +61,7 @@ def ask(evolution: Evolution, key: PRNGKeyArray, population: int | None = None) 
     return np.stack([optimiser.ask() for _ in range(population)])
 
 
-def tell(
-    evolution: Evolution, candidates: Float[np.ndarray, "population d"], costs: Float[np.ndarray, " population"]
-) -> Evolution:
+def tell(evolution: Evolution, candidates: Candidates, costs: Costs) -> Evolution:
     """The distribution after a generation. Only the order of the costs matters, and the lowest is the best."""
     optimiser = _optimiser(evolution, len(candidates))
     optimiser.tell(list(zip(candidates, costs.tolist(), strict=True)))

@@ -8,7 +8,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines import evolution
-from madoc.calibration.baselines.evolution import Evolution
+from madoc.calibration.baselines.evolution import Candidates, Costs, Evolution
 from madoc.calibration.cautions import at_end_of_range
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import Windows, first_rows, windows_at
@@ -80,8 +80,8 @@ def mean_with_failures(costs: Float[np.ndarray, "candidates windows"]) -> Float[
 
 def next_generation(
     state: SearchState,
-    candidates: Float[np.ndarray, "population d"],
-    costs: Float[np.ndarray, " population"],
+    candidates: Candidates,
+    costs: Costs,
     key: PRNGKeyArray,
     *,
     control_steps: int,

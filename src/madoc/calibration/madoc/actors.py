@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from madoc.learning.networks import PerRow, Scalar
 from madoc.learning.tanh_gaussian import sample
 
 
@@ -43,19 +44,14 @@ def divergence(actors: Actors, prior: Actors) -> Float[Array, " d"]:
     return 0.5 * (variance_ratio + shift - 1.0) - actors.log_std + prior.log_std
 
 
-def prior_weight(updates: Int[Array, ""], *, time_constant: float, largest: float) -> Float[Array, ""]:
+def prior_weight(updates: Int[Array, ""], *, time_constant: float, largest: float) -> Scalar:
     """λ_t = min(largest, exp(t / time_constant)) (appendix C: 10 and 2e5)."""
     return jnp.minimum(largest, jnp.exp(updates / time_constant))
 
 
 def actor_loss(
-    value: Float[Array, " rows"],
-    log_density: Float[Array, " rows"],
-    kl: Float[Array, ""],
-    *,
-    entropy_weight: float,
-    prior_weight: Float[Array, ""] | float,
-) -> Float[Array, ""]:
+    value: PerRow, log_density: PerRow, kl: Scalar, *, entropy_weight: float, prior_weight: Scalar | float
+) -> Scalar:
     """Eq. (13) summed over groups: α log q - v + λ KL(q || p), averaged over draws.
 
     Args:

@@ -12,7 +12,7 @@ from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_
 from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
-from madoc.learning.networks import adam, descend, moving_average, scan_updates
+from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend, moving_average, scan_updates
 from madoc.types import Count, Layers, NotNegative, check_hyperparameters
 
 AT_BOUND = 0.95
@@ -44,7 +44,7 @@ class Agents:
     actors: Actors
     prior: Actors
     average: Actors
-    log_blur: Float[Array, ""]
+    log_blur: Scalar
     updates: Int[Array, ""]
     discriminator_optimiser: PyTree
     critic_optimiser: PyTree
@@ -129,7 +129,7 @@ class AgentSettings:
         self,
         agents: Agents,
         simulated: replay.Replay,
-        logged: tuple[Float[Array, "rows pair"], Float[Array, "rows observation"]],
+        logged: tuple[Float[Array, "rows pair"], Observations],
         members: Bool[Array, "groups d"],
         key: PRNGKeyArray,
         *,
@@ -181,9 +181,7 @@ class AgentSettings:
         judges = moving_average(agents.judges, discriminators, self.judge_rate)
         return replace(agents, discriminators=discriminators, judges=judges, discriminator_optimiser=optimiser), metrics
 
-    def _steer_blur(
-        self, agents: Agents, reward: Float[Array, " rows"], share: Float[Array, " rows"]
-    ) -> tuple[Agents, dict[str, Array]]:
+    def _steer_blur(self, agents: Agents, reward: PerRow, share: PerRow) -> tuple[Agents, dict[str, Array]]:
         """Widen the blur where the mean |reward| is above `reward_size`, and narrow it where it is below."""
         size = (share * jnp.abs(reward)).mean()
         surplus = jnp.clip(size - self.reward_size, -1.0, 1.0)

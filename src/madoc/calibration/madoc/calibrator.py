@@ -16,14 +16,7 @@ from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.madoc import grouping, watch
 from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.agents import BLUR_RANGE, Agents, AgentSettings
-from madoc.calibration.madoc.collection import (
-    GEOMETRY,
-    HIDDEN_WINDOW,
-    Collection,
-    Features,
-    StartMode,
-    noise_deviation,
-)
+from madoc.calibration.madoc.collection import GEOMETRY, HIDDEN_WINDOW, Collection, Features, StartMode, noise_deviation
 from madoc.calibration.madoc.grouping import GroupingVAE
 from madoc.calibration.madoc.value_decomposition import Mixing
 from madoc.calibration.madoc.watch import Watch

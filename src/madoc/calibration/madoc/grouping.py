@@ -10,7 +10,7 @@ from sklearn.cluster import KMeans
 from sklearn.decomposition import PCA
 
 from madoc.learning import replay
-from madoc.learning.networks import Network, minimise
+from madoc.learning.networks import Network, Observations, Scalar, minimise
 
 LATENT = 16
 """Width of the embedding, and number of repetitions of the parameter's value beside it (appendix C)."""
@@ -39,7 +39,7 @@ class GroupingVAE(eqx.Module):
         """The embedding of each parameter."""
         return self.encoder(jnp.eye(int(self.encoder.layers[0].in_features)))
 
-    def __call__(self, pair: Array, value: Array, identity: Array) -> Float[Array, "rows observation"]:
+    def __call__(self, pair: Array, value: Array, identity: Array) -> Observations:
         """The predicted features of s', given the value (in [-1, 1]) of the varied parameter, and its index."""
         repeated = jnp.repeat(value[:, None], LATENT, axis=1)
         return self.decoder(jnp.concatenate([pair, repeated, self.embeddings()[identity]], axis=-1))
@@ -47,7 +47,7 @@ class GroupingVAE(eqx.Module):
 
 def reconstruction_loss(
     vae: GroupingVAE, pair: Array, following: Array, value: Array, identity: Int[Array, " rows"]
-) -> Float[Array, ""]:
+) -> Scalar:
     """The first term of Eq. (10) with a unit-variance decoder: mean squared error of s'."""
     return jnp.mean((vae(pair, value, identity) - following) ** 2)
 
@@ -62,10 +62,10 @@ def train(
     optimiser: optax.GradientTransformation,
     batch: int,
     count: int,
-) -> tuple[GroupingVAE, PyTree, Float[Array, ""]]:
+) -> tuple[GroupingVAE, PyTree, Scalar]:
     """`count` updates on simulated rows; also the mean loss."""
 
-    def loss_of(vae: GroupingVAE, key: PRNGKeyArray) -> Float[Array, ""]:
+    def loss_of(vae: GroupingVAE, key: PRNGKeyArray) -> Scalar:
         drawn = replay.sample(rows, key, batch)
         identity = drawn["identity"].astype(jnp.int32)
         value = jnp.take_along_axis(drawn["parameters"], identity[:, None], axis=1)[:, 0]

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from madoc.learning.networks import Network, stack
+from madoc.learning.networks import Network, PerRow, Scalar, stack
 
 Mixing = Literal["dop", "sum", "independent"]
 
@@ -22,7 +22,7 @@ class GroupCritics(eqx.Module):
 
     networks: Network
     weight: Float[Array, " groups"]
-    bias: Float[Array, ""]
+    bias: Scalar
 
     def __init__(self, groups: int, parameters: int, hidden: tuple[int, ...], *, key: PRNGKeyArray) -> None:
         self.networks = stack(groups, lambda key: Network(parameters, 1, hidden, key=key), key)
@@ -37,9 +37,7 @@ class GroupCritics(eqx.Module):
         return eqx.filter_vmap(lambda network, rows: network(rows)[:, 0])(self.networks, own).T
 
 
-def total_value(
-    values: Float[Array, "rows groups"], weight: Float[Array, " groups"], bias: Float[Array, ""]
-) -> Float[Array, " rows"]:
+def total_value(values: Float[Array, "rows groups"], weight: Float[Array, " groups"], bias: Scalar) -> PerRow:
     """Eq. (11): V_tot = Σ_g |k_g| v_g + b."""
     return values @ jnp.abs(weight) + bias
 
@@ -47,11 +45,11 @@ def total_value(
 def value_loss(
     values: Float[Array, "rows groups"],
     weight: Float[Array, " groups"],
-    bias: Float[Array, ""],
-    reward: Float[Array, " rows"],
-    share: Float[Array, " rows"],
+    bias: Scalar,
+    reward: PerRow,
+    share: PerRow,
     mixing: Mixing,
-) -> Float[Array, ""]:
+) -> Scalar:
     """Eq. (12): half the mean of (V_tot - R)². A bandit: there is no next value.
 
     Rows are weighted by `share`, whose mean is 1; in the paper every share is 1.

@@ -16,6 +16,7 @@ from pydantic import Field
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines import evolution
 from madoc.calibration.baselines.cma_es.mean_embedding import CosineFeatures, adjusted, cosine_features, discrepancies
+from madoc.calibration.baselines.evolution import Candidates, Costs
 from madoc.calibration.baselines.population_search import (
     SearchState,
     estimate_from_search,
@@ -28,7 +29,7 @@ from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
 from madoc.simulation.rollout import Walkers, begin, out_of_step, reset_states, roll
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
-Evaluation = tuple[Float[np.ndarray, " population"], int, int]
+Evaluation = tuple[Costs, int, int]
 """Cost of each candidate, control steps spent, and number of simulations that failed."""
 ROWS = {"one-step": 100, "distribution": 500, "policy": 50}
 """Default number under each candidate of logged rows (`one-step`, `distribution`) or of walkers (`policy`)."""
@@ -216,19 +217,13 @@ class CmaEs:
             clouds, pair=clouds.of_pairs.mean(self._standardised(problem, pairs)), change=after - before, read=1
         )
 
-    def _one_step(
-        self, problem: CalibrationProblem, candidates: Float[np.ndarray, "population d"], key: PRNGKeyArray
-    ) -> Evaluation:
+    def _one_step(self, problem: CalibrationProblem, candidates: Candidates, key: PRNGKeyArray) -> Evaluation:
         residuals = replay_residuals(problem, candidates, key, steps=1, windows=self.rows or ROWS["one-step"])
         squared = (residuals**2).mean(-1)
         return mean_with_failures(squared), squared.size, int(np.isnan(squared).sum())
 
     def _replay(
-        self,
-        problem: CalibrationProblem,
-        clouds: Clouds,
-        candidates: Float[np.ndarray, "population d"],
-        key: PRNGKeyArray,
+        self, problem: CalibrationProblem, clouds: Clouds, candidates: Candidates, key: PRNGKeyArray
     ) -> Evaluation:
         """Clouds one step after drawn logged rows, compared by the change of their features from those rows.
 
@@ -253,12 +248,7 @@ class CmaEs:
         return mean_with_failures(costs[:, None]), failed.size, int(failed.sum())
 
     def _act(
-        self,
-        problem: CalibrationProblem,
-        clouds: Clouds,
-        actor: Actor,
-        candidates: Float[np.ndarray, "population d"],
-        key: PRNGKeyArray,
+        self, problem: CalibrationProblem, clouds: Clouds, actor: Actor, candidates: Candidates, key: PRNGKeyArray
     ) -> tuple[Evaluation, Actor]:
         """Clouds that the clone visits under each candidate, from where the best one of the last generation stopped."""
         simulator = problem.simulator
