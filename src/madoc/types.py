@@ -121,6 +121,7 @@ class MethodEntry(Generic[Made]):
         recognised_by: Those of them that tell it from other entries of its class; None: all of them.
         shown: Metrics worth a place beside the progress bar.
         unit: What its budget counts.
+        usual_budget: A policy learner's budget where none is given.
         simulates: Whether it spends control steps.
         needs_data: Whether it uses logged data.
         needs_parameters: Whether the parameters of a policy problem make a difference to it.
@@ -135,6 +136,7 @@ class MethodEntry(Generic[Made]):
     recognised_by: tuple[str, ...] | None = None
     shown: tuple[str, ...] = ()
     unit: Unit = "control steps"
+    usual_budget: int = 300_000
     simulates: bool = True
     needs_data: bool = True
     needs_parameters: bool = True

@@ -43,6 +43,7 @@ class Learn:
             "status": learnt.status,
             "sentence": learnt.sentence,
             "control_steps": learnt.control_steps,
+            "updates": learnt.updates,
             "budget_unit": learnt.unit,
             "spent": learnt.spent,
             "seconds": learnt.seconds,

@@ -7,13 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from madoc.learning import sac_losses
 from madoc.learning.features import Features
 from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend, moving_average
 from madoc.learning.sac_losses import TwinCritic
-from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
+from madoc.learning.tanh_gaussian import Noise, TanhGaussianPolicy, sample
 
 Batch = dict[str, Array]
 """Rows as `replay.sample` gives them: observation, action, reward, next_observation, terminated."""
@@ -92,12 +92,24 @@ def fresh(
     )
 
 
+def standardising(
+    learner: ActorCritic, offset: Float[Array, " observation"], scale: Float[Array, " observation"]
+) -> ActorCritic:
+    """The same weights, for observations that are standardised with this offset and scale."""
+    networks = learner.policy, learner.critic, learner.target_critic
+    changed = (eqx.tree_at(lambda net: (net.offset, net.scale), network, (offset, scale)) for network in networks)
+    return replace(learner, **dict(zip(("policy", "critic", "target_critic"), changed, strict=True)))
+
+
 def bellman_target(
-    learner: ActorCritic, batch: Batch, key: PRNGKeyArray, *, discount: float, entropy: bool = True
+    learner: ActorCritic, batch: Batch, noise: Noise, *, discount: float | Array, entropy: bool = True
 ) -> PerRow:
-    """Target of the critics for each row of a batch; without `entropy`, it leaves out the term -α log π."""
+    """Target of the critics for each row of a batch; without `entropy`, it leaves out the term -α log π.
+
+    `discount` is one number, or one for each row where rows span several control steps.
+    """
     following = batch["next_observation"]
-    action, density = sample(*learner.policy.distribution(following), key)
+    action, density = sample(*learner.policy.distribution(following), noise)
     return sac_losses.soft_target(
         batch["reward"],
         batch["terminated"],
@@ -124,18 +136,18 @@ def critic_step(
 def actor_step(
     learner: ActorCritic,
     observation: Observations,
-    key: PRNGKeyArray,
+    noise: Noise,
     descent: Descent,
     combine: Callable[[TanhGaussianPolicy, Array, Array], Array] = lambda policy, loss, value: loss,
 ) -> tuple[ActorCritic, dict[str, Array]]:
-    """One gradient step of the policy and of the temperature, on actions sampled with the key.
+    """One gradient step of the policy and of the temperature, on actions sampled with the noise.
 
     `combine` makes the policy's loss of (policy, SAC's loss, value of each row); by default it is SAC's loss.
     """
 
     def loss_of(policy: TanhGaussianPolicy) -> tuple[Array, tuple[Array, Array]]:
         loss, (value, density) = sac_losses.actor_loss(
-            policy, learner.critic, observation, temperature=jnp.exp(learner.log_temperature), key=key
+            policy, learner.critic, observation, temperature=jnp.exp(learner.log_temperature), noise=noise
         )
         return combine(policy, loss, value), (loss, density)
 
@@ -157,10 +169,10 @@ def actor_step(
 
 
 def soft_critic_step(
-    learner: ActorCritic, batch: Batch, key: PRNGKeyArray, descent: Descent, *, discount: float
+    learner: ActorCritic, batch: Batch, noise: Noise, descent: Descent, *, discount: float | Array
 ) -> tuple[ActorCritic, dict[str, Array]]:
     """One gradient step of the critics down SAC's loss."""
-    target = bellman_target(learner, batch, key, discount=discount)
+    target = bellman_target(learner, batch, noise, discount=discount)
 
     def loss_of(critic: TwinCritic) -> tuple[Array, Array]:
         return sac_losses.critic_loss(critic, batch["observation"], batch["action"], target), target.mean()

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from madoc.types import Metrics
 
 Carry = TypeVar("Carry")
+Input = TypeVar("Input")
 
 Scalar = Float[Array, ""]
 PerRow = Float[Array, " rows"]
@@ -93,13 +94,20 @@ def scan_updates(
     update: Callable[[Carry, PRNGKeyArray], tuple[Carry, dict[str, Array]]], carry: Carry, key: PRNGKeyArray, count: int
 ) -> tuple[Carry, dict[str, Array]]:
     """Run `count` updates in one `lax.scan`. Returns the last carry and the mean of each metric over the updates."""
+    return scan_inputs(update, carry, jax.random.split(key, count))
+
+
+def scan_inputs(
+    update: Callable[[Carry, Input], tuple[Carry, dict[str, Array]]], carry: Carry, inputs: Input
+) -> tuple[Carry, dict[str, Array]]:
+    """One update for each leading index of `inputs`, in one `lax.scan`; the last carry and the mean of each metric."""
     arrays, static = eqx.partition(carry, eqx.is_array)
 
-    def body(arrays: PyTree, key: PRNGKeyArray) -> tuple[PyTree, dict[str, Array]]:
-        following, metrics = update(eqx.combine(arrays, static), key)
+    def body(arrays: PyTree, given: Input) -> tuple[PyTree, dict[str, Array]]:
+        following, metrics = update(eqx.combine(arrays, static), given)
         return eqx.filter(following, eqx.is_array), metrics
 
-    arrays, metrics = jax.lax.scan(body, arrays, jax.random.split(key, count))
+    arrays, metrics = jax.lax.scan(body, arrays, inputs)
     return eqx.combine(arrays, static), jax.tree.map(jnp.mean, metrics)
 
 

@@ -52,10 +52,10 @@ def clear(replay: Replay) -> Replay:
     return Replay(replay.rows, jnp.zeros((), jnp.int32))
 
 
-def sample(replay: Replay, key: PRNGKeyArray, batch: int) -> dict[str, Array]:
-    """`batch` rows drawn uniformly with replacement."""
+def sample(replay: Replay, key: PRNGKeyArray, *shape: int) -> dict[str, Array]:
+    """Rows drawn uniformly with replacement, with leading axes of this shape."""
     size = jnp.minimum(replay.written, replay.capacity)
-    index = jax.random.randint(key, (batch,), 0, size)
+    index = jax.random.randint(key, shape, 0, size)
     return jax.tree.map(lambda ring: ring[index], replay.rows)
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.learning.networks import Actions, Network, PerRow, Scalar, standardise
-from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
+from madoc.learning.tanh_gaussian import Noise, TanhGaussianPolicy, sample
 
 
 class TwinCritic(eqx.Module):
@@ -48,7 +48,7 @@ def soft_target(
     next_log_density: PerRow,
     *,
     temperature: Scalar,
-    discount: float,
+    discount: float | PerRow,
 ) -> PerRow:
     """Eq. (2) and (3): r + γ (1 - terminated) (min Q(s', a') - α log π(a'|s'))."""
     return reward + discount * (1.0 - terminated) * (next_value - temperature * next_log_density)
@@ -61,10 +61,10 @@ def critic_loss(critic: TwinCritic, observation: Array, action: Array, target: P
 
 
 def actor_loss(
-    policy: TanhGaussianPolicy, critic: TwinCritic, observation: Array, *, temperature: Scalar, key: PRNGKeyArray
+    policy: TanhGaussianPolicy, critic: TwinCritic, observation: Array, *, temperature: Scalar, noise: Noise
 ) -> tuple[Scalar, tuple[PerRow, PerRow]]:
     """Eq. (7): mean of α log π(a|s) - min Q(s, a). Also returns the values and log densities, per row."""
-    action, density = sample(*policy.distribution(observation), key)
+    action, density = sample(*policy.distribution(observation), noise)
     value = jnp.minimum(*critic(observation, action))
     return jnp.mean(temperature * density - value), (value, density)
 

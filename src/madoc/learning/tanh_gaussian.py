@@ -15,9 +15,15 @@ _EDGE = 1.0 - 1e-5
 Values = Float[Array | np.ndarray, "*rows n"]
 
 
-def sample(mean: Values, log_std: Values, key: PRNGKeyArray) -> tuple[Float[Array, "*rows n"], Float[Array, "*rows"]]:
+Noise = PRNGKeyArray | Float[Array, "*rows n"]
+"""A random key, or standard normal numbers drawn beforehand: drawing those of many updates together is faster."""
+
+
+def sample(mean: Values, log_std: Values, noise: Noise) -> tuple[Float[Array, "*rows n"], Float[Array, "*rows"]]:
     """A reparameterised draw in (-1, 1) and its log density."""
-    raw = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+    if jnp.issubdtype(noise.dtype, jax.dtypes.prng_key):
+        noise = jax.random.normal(noise, mean.shape)
+    raw = mean + jnp.exp(log_std) * noise
     return jnp.tanh(raw), _log_density(raw, mean, log_std)
 
 
@@ -26,7 +32,7 @@ def log_density(value: Values, mean: Values, log_std: Values) -> Float[Array, "*
     return _log_density(jnp.arctanh(jnp.clip(value, -_EDGE, _EDGE)), mean, log_std)
 
 
-def _log_density(raw: Array, mean: Array, log_std: Array) -> Array:
+def _log_density(raw: Values, mean: Values, log_std: Values) -> Array:
     """Log N(raw; mean, std) - log |d tanh(raw) / d raw|, summed over the last axis (SAC, appendix C)."""
     standard = (raw - mean) * jnp.exp(-log_std)
     normal = -0.5 * standard**2 - log_std - 0.5 * np.log(2 * np.pi)

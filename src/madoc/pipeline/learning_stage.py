@@ -16,7 +16,7 @@ from madoc.pipeline.data_stage import load_source, read_truth
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
-from madoc.pipeline.orders import Place, PolicyOrder
+from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
@@ -27,6 +27,7 @@ from madoc.policies import (
     learn_policy,
     require_reward,
 )
+from madoc.runs.budget import read_budget
 from madoc.simulation import Simulator
 from madoc.types import entry_of
 
@@ -52,8 +53,7 @@ def learn_in(
     """
     method = make_method(LEARNERS, order.method, order.changes)
     entry = entry_of(method, LEARNERS)
-    if order.budget < 1:
-        raise MadocError(f"expected a budget of at least 1 {entry.unit.removesuffix('s')}, got {order.budget}")
+    budget = read_budget(entry.usual_budget if order.budget is None else order.budget, entry.unit)
     if not entry.needs_parameters and order.at != PLACES[0]:
         raise MadocError(
             f"{order.method} does not learn at given parameters, so --at {order.at} would change nothing; leave it out"
@@ -72,21 +72,21 @@ def learn_in(
         "method": order.method,
         "hyperparameters": hyperparameters(method),
         "seed": order.seed,
-        "budget": order.budget,
+        "budget": budget if isinstance(budget, int) else str(budget),
         "truth": truth,
     } | calibrated.machine.stored()
     with working_folder(out, spec, resume=resume) as folder:
         # One that an interrupted run left would be taken for the finished policy after a kill.
         (out / "policy.npz").unlink(missing_ok=True)
         problem = PolicyProblem(simulator, parameters, dataset)
-        return learn_policy(method, problem, key=key, budget=order.budget, folder=folder, resume=resume, quiet=quiet)
+        return learn_policy(method, problem, key=key, budget=budget, folder=folder, resume=resume, quiet=quiet)
 
 
 def policy_folder_name(at: str, method: str) -> str:
-    """`policy-calibrated`, with the method behind it unless that is SAC; `policy-cql` where the place is no matter."""
+    """`policy-calibrated`, with the method behind it unless it is the default; `policy-cql` where places are alike."""
     if not LEARNERS[method].needs_parameters:
         return f"policy-{method}"
-    return f"policy-{at}" if method == "sac" else f"policy-{at}-{method}"
+    return f"policy-{at}" if method == DEFAULT_LEARNER else f"policy-{at}-{method}"
 
 
 def _logged(calibrated: Calibrated, method: str) -> Dataset:

@@ -20,6 +20,9 @@ Place = Literal["calibrated", "distribution", "uniform", "midrange", "truth"]
 Settings = UseAppendAction[tuple[tuple[str, ...], ...]]
 """Hyperparameters as texts: `--set a=1 b=2 --set c=3` is `(("a=1", "b=2"), ("c=3",))`."""
 
+DEFAULT_LEARNER = "fast-sac"
+"""What learns a policy where no other learner is asked for."""
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -158,15 +161,16 @@ class RecordOrder:
 class PolicyOrder:
     """What a policy learner is asked."""
 
-    method: str = "sac"
+    method: str = DEFAULT_LEARNER
     """A policy learner, as `madoc methods` lists it; some need the run's data."""
     at: Place = "calibrated"
     """The parameters to learn at: the estimate; draws from the calibrated distribution, or from the whole box, anew
     every epoch; or a yardstick: mid-range, or the truth, which only an evaluation knows."""
     set: Settings = ()
     """Hyperparameters of the method as name=value."""
-    budget: int = 300_000
-    """Simulated control steps, or updates of a learner that does not simulate, as `madoc methods` says."""
+    budget: int | str | None = None
+    """Simulated control steps, or updates of a learner that does not simulate, as `madoc methods` says; or a time, as
+    300s or 15min. Default: 2400000 for fast-sac and rlpd, else 300000."""
     seed: int = 0
     """Of all randomness."""
     truth: Path | None = None
@@ -204,12 +208,13 @@ class RunOrder:
     search: OmitArgPrefixes[Search] = field(default_factory=lambda: Search(method="madoc", budget=300_000))
     truth: Path | None = None
     """JSON file {parameter: value} to judge by; no method ever sees it. Default: the data's, if it has any."""
-    learner: str = "sac"
+    learner: str = DEFAULT_LEARNER
     """A policy learner, as `madoc methods` lists it."""
     policy_set: Settings = ()
     """Hyperparameters of the learner as name=value."""
-    policy_budget: int = 300_000
-    """Simulated control steps for each policy, or updates of a learner that does not simulate."""
+    policy_budget: int | str | None = None
+    """Simulated control steps for each policy, or updates of a learner that does not simulate; or a time, as 300s.
+    Default: 2400000 for fast-sac and rlpd, else 300000."""
     yardsticks: bool = True
     """Learn also a policy at mid-range and one at the truth."""
     episodes: int = 20

@@ -25,7 +25,9 @@ from madoc.pipeline.orders import (
 )
 from madoc.pipeline.records import Summary, read_record
 from madoc.policies import LEARNERS, require_reward
+from madoc.runs.budget import read_budget
 from madoc.runs.files import read_json
+from madoc.types import entry_of
 
 
 def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = False) -> Summary:
@@ -85,7 +87,6 @@ def _spec(order: RunOrder, machine: Machine) -> dict[str, object]:
     for what, value in {
         "transition": order.transitions,
         "control step of budget": order.search.budget,
-        "control step of policy budget": order.policy_budget,
         "episode": order.episodes,
     }.items():
         if value is not None and value < 1:
@@ -93,6 +94,8 @@ def _spec(order: RunOrder, machine: Machine) -> dict[str, object]:
     seed_key(order.search.seed)
     calibrator = make_method(CALIBRATORS, order.search.method or "madoc", order.search.changes)
     learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
+    if order.policy_budget is not None:
+        read_budget(order.policy_budget, entry_of(learner, LEARNERS).unit)
     resolved = {
         "command": "run",
         "truth": read_truth(order.truth),

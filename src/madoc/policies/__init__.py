@@ -3,6 +3,7 @@
 from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
 from madoc.policies.bc import BC
 from madoc.policies.cql import CQL
+from madoc.policies.fast_sac import FastSAC
 from madoc.policies.files import load_policy, save_policy
 from madoc.policies.h2o import H2O
 from madoc.policies.learn import LearnedPolicy, learn_policy
@@ -18,6 +19,7 @@ __all__ = [
     "LEARNERS",
     "MOREC",
     "SAC",
+    "FastSAC",
     "LearnedPolicy",
     "NormalParameters",
     "ParameterDistribution",

@@ -119,9 +119,9 @@ def require_data(problem: PolicyProblem, *, rows: int, outcomes: bool = True) ->
     return problem.dataset
 
 
-def draw_rows(logged: dict[str, Array], key: PRNGKeyArray, batch: int) -> dict[str, Array]:
-    """`batch` logged rows, uniformly with replacement."""
-    rows = jax.random.randint(key, (batch,), 0, len(logged["reward"]))
+def draw_rows(logged: dict[str, Array], key: PRNGKeyArray, *shape: int) -> dict[str, Array]:
+    """Logged rows, drawn uniformly with replacement, with leading axes of this shape."""
+    rows = jax.random.randint(key, shape, 0, len(logged["reward"]))
     return {name: column[rows] for name, column in logged.items()}
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.learning import replay
+from madoc.learning.moments import Moments
 from madoc.policies.base import PolicyProblem
 from madoc.simulation.rollout import Rollout, Walkers, begin, reset_states, roll
 from madoc.types import Epoch, Policy
@@ -24,6 +25,7 @@ class Interaction:
     """What acting carries: what was seen, where the rows stand, and what it has cost."""
 
     replay: replay.Replay
+    observed: Moments
     walkers: Walkers
     episode_return: Float[np.ndarray, "systems rows"]
     control_steps: int
@@ -45,23 +47,27 @@ def start_acting(problem: PolicyProblem, key: PRNGKeyArray, *, environments: int
         capacity, observation=observation, action=action, reward=(), next_observation=observation, terminated=()
     )
     walkers = begin(reset_states(simulator), key, systems=systems, rows=environments // systems)
-    return Interaction(ring, walkers, np.zeros(walkers.age.shape), 0, 0)
+    return Interaction(ring, Moments.none(simulator.task.observation_size), walkers, np.zeros(walkers.age.shape), 0, 0)
 
 
 def act_on(
     problem: PolicyProblem, state: Interaction, policy: Policy, key: PRNGKeyArray, *, control_steps: int
 ) -> tuple[Interaction, dict[str, float]]:
+    """Act for so many control steps in all, and remember them: `roll_on`, then `remember`."""
+    return remember(state, *roll_on(problem, state, policy, key, control_steps=control_steps))
+
+
+def roll_on(
+    problem: PolicyProblem, state: Interaction, policy: Policy, key: PRNGKeyArray, *, control_steps: int
+) -> tuple[Rollout, Walkers]:
     """Act for so many control steps in all. Where parameters are distributed, all systems are drawn anew first.
 
     A row goes on in its new system from where it stood in the old one, as the paper's own rollouts do when
-    parameters change inside an episode.
-
-    Returns:
-        What is carried now, and the mean return of the episodes that ended, if any did.
+    parameters change inside an episode. The state is left as it is.
     """
     of_systems, of_action, of_restart = jax.random.split(key, 3)
     simulator = problem.simulator
-    rollout, walkers = roll(
+    return roll(
         simulator.bind(problem.systems(of_systems, state.walkers.age.size)),
         simulator.task,
         policy,
@@ -71,10 +77,19 @@ def act_on(
         key=of_action,
         restart_key=of_restart,
     )
+
+
+def remember(state: Interaction, rollout: Rollout, walkers: Walkers) -> tuple[Interaction, dict[str, float]]:
+    """Add what a rollout saw to the replay. The replay of the state given is consumed.
+
+    Returns:
+        What is carried now, and the mean return of the episodes that ended, if any did.
+    """
     rows = {name: replay.flatten_rows(getattr(rollout.transitions, name), 3) for name in COLUMNS}
     finished, episode_return = _episode_returns(rollout, state.episode_return)
     following = Interaction(
         replay.add(state.replay, rows, rollout.valid.reshape(-1)),
+        state.observed.including(rows["observation"].astype(np.float64)),
         walkers,
         episode_return,
         state.control_steps + rollout.valid.size,
@@ -104,7 +119,8 @@ def explore_or_act(
     following, metrics = act_on(problem, state, acting, key, control_steps=control_steps)
     taken = following.control_steps - state.control_steps
     due = round(updates_per_step * taken) if following.control_steps >= warmup_steps else 0
-    return following, Epoch(metrics, control_steps=taken, stage="exploring" if explores else "learning"), due
+    stage = "exploring" if explores else "learning"
+    return following, Epoch(metrics, control_steps=taken, updates=due, stage=stage), due
 
 
 class UniformPolicy(eqx.Module):

@@ -8,6 +8,7 @@ from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
 from madoc.policies.files import save_policy
 from madoc.policies.registry import LEARNERS
 from madoc.runs import loop
+from madoc.runs.budget import Budget
 from madoc.runs.run_folder import RunFolder
 from madoc.types import Policy, State, Unit, entry_of
 
@@ -21,6 +22,7 @@ class LearnedPolicy:
         status: As `loop.Finished` has it.
         sentence: The status in words.
         control_steps: Simulated control steps spent.
+        updates: Gradient updates spent.
         spent: How much of the budget, in `unit`.
         unit: What the budget counted: control steps of a learner that simulates, updates of one that does not.
         seconds: Wall-clock time.
@@ -30,6 +32,7 @@ class LearnedPolicy:
     status: str
     sentence: str
     control_steps: int
+    updates: int
     spent: int
     unit: Unit
     seconds: float
@@ -40,7 +43,7 @@ def learn_policy(
     problem: PolicyProblem,
     *,
     key: PRNGKeyArray,
-    budget: int,
+    budget: Budget | str,
     folder: RunFolder | None = None,
     resume: bool = False,
     quiet: bool = False,
@@ -50,6 +53,7 @@ def learn_policy(
 
     The budget is simulated control steps for a learner that simulates and gradient updates for one that does not:
     the entry in `LEARNERS` says which. With one update per control step, a budget means as many updates for either.
+    Or it is a time: `Seconds(300)`, or `300s` or `5min` as text.
 
     With a folder, `policy.npz` is left there: `madoc.numpy_policy` acts from it without JAX.
 
@@ -79,6 +83,7 @@ def learn_policy(
         finished.status,
         finished.sentence,
         finished.control_steps,
+        finished.updates,
         finished.spent,
         entry.unit,
         round(finished.seconds, 3),

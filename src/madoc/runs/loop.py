@@ -12,9 +12,10 @@ from jaxtyping import PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.runs import checkpoint
+from madoc.runs.budget import Budget, Seconds, read_budget
 from madoc.runs.interruption import interruptible
 from madoc.runs.progress import Moment, display
-from madoc.runs.run_folder import RunFolder, RunLog, count_name
+from madoc.runs.run_folder import RunFolder, RunLog
 from madoc.types import Epoch, Method, Metrics, Problem, State, Unit
 
 Status = Literal["finished", "converged", "interrupted", "diverged"]
@@ -73,7 +74,8 @@ class Finished(Generic[State]):
         status: "finished" (budget spent), "converged", "interrupted" (by the user) or "diverged" (NaN).
         sentence: The status in words.
         control_steps: Simulated control steps spent.
-        spent: What the budget counts.
+        updates: Gradient updates of the result.
+        spent: What the budget counts, where it is no time.
         seconds: Wall-clock time, that before a resume included.
     """
 
@@ -81,6 +83,7 @@ class Finished(Generic[State]):
     status: Status
     sentence: str
     control_steps: int
+    updates: int
     spent: int
     seconds: float
 
@@ -90,7 +93,7 @@ def run(
     problem: Problem,
     *,
     key: PRNGKeyArray,
-    budget: int,
+    budget: Budget | str,
     folder: RunFolder | None = None,
     resume: bool = False,
     quiet: bool = False,
@@ -109,7 +112,9 @@ def run(
         method: What to run.
         problem: What to run it on.
         key: The only source of randomness; on resume, the same key again.
-        budget: In `unit`; the step that reaches it is the last.
+        budget: A count in `unit`, or a time as `Seconds(300)` or "300s"; the step that reaches it is the last. A run
+            under a time budget that is killed and resumed has what was left of it at the checkpoint, and its result
+            depends on the machine's speed.
         folder: Where to write logs, checkpoints and `result.json`; None to write nothing.
         resume: Go on from the folder's checkpoint, or from the start if it was killed before the first one.
             A run that had ended comes back as it is, unless `budget` grew.
@@ -124,8 +129,7 @@ def run(
         MadocError: The budget is not positive, there is no folder to resume, the folder holds a run and
             `resume` is false, the checkpoint is damaged or another method's, or the state cannot be saved.
     """
-    if budget < 1:
-        raise MadocError(f"expected a budget of at least 1 {unit.removesuffix('s')}, got {budget}")
+    budget = read_budget(budget, unit)
     _check_folder(folder, resume)
     with ExitStack() as stack:
         interruption = stack.enter_context(interruptible())
@@ -158,7 +162,7 @@ class _Session(Generic[State]):
         self,
         method: object,
         state: State,
-        budget: int,
+        budget: Budget,
         unit: Unit,
         folder: RunFolder | None,
         resume: bool,
@@ -188,6 +192,23 @@ class _Session(Generic[State]):
     def spent(self) -> int:
         return self._tally.spent(self._unit)
 
+    @property
+    def _share(self) -> float:
+        """Share of the budget spent."""
+        if isinstance(self._budget, Seconds):
+            return self._seconds() / self._budget.seconds
+        return self.spent / self._budget
+
+    @property
+    def _allowed(self) -> str:
+        """The budget in words."""
+        return str(self._budget) if isinstance(self._budget, Seconds) else f"{self._budget:,} {self._unit}"
+
+    @property
+    def _used(self) -> str:
+        """What of the budget is spent, as a number in words."""
+        return f"{self._seconds():.0f}" if isinstance(self._budget, Seconds) else f"{self.spent:,}"
+
     def begin(self, stack: ExitStack) -> None:
         """Open the logs; write the first checkpoint, which refuses a bad state before any budget is spent."""
         self._started = time.monotonic()
@@ -201,18 +222,17 @@ class _Session(Generic[State]):
     def ended(self, interrupted: bool) -> bool:
         """Whether there is a reason to stop; the first one found stays the reason."""
         if self.outcome is None:
-            spent = self.spent
             if self._tally.converged is not None:
                 self.outcome = "converged", self._tally.converged
-            elif spent >= self._budget:
-                self.outcome = "finished", f"the budget of {self._budget:,} {self._unit} is spent"
+            elif self._share >= 1.0:
+                self.outcome = "finished", f"the budget of {self._allowed} is spent"
             elif interrupted:
-                self.outcome = "interrupted", f"interrupted at {spent:,} of {self._budget:,} {self._unit}"
+                self.outcome = "interrupted", f"interrupted at {self._used} of {self._allowed}"
         return self.outcome is not None
 
     def moment(self, metrics: Metrics) -> Moment:
         """Where the run stands, for the progress bar."""
-        return Moment(self._tally.fraction(self.spent / self._budget), self.spent, self._tally.stage, metrics)
+        return Moment(self._tally.fraction(self._share), self.spent, self._tally.stage, metrics)
 
     def take(self, state: State, epoch: Epoch) -> Metrics:
         """Accept the result of a step, log it, and look at its metrics."""
@@ -241,7 +261,7 @@ class _Session(Generic[State]):
 
     def abandon(self) -> None:
         """Stop inside a step. What it may have left half-changed is not saved: the last checkpoint stays."""
-        sentence = f"interrupted inside a step, at {self.spent:,} of {self._budget:,} {self._unit}"
+        sentence = f"interrupted inside a step, at {self._used} of {self._allowed}"
         self.outcome = "interrupted", sentence
 
     def finish(self) -> Finished[State]:
@@ -249,11 +269,11 @@ class _Session(Generic[State]):
         if self.outcome is None:
             raise RuntimeError("finish() before the run has ended")
         status, sentence = self.outcome
-        control_steps, seconds = self._tally.control_steps, self._seconds()
+        tally, seconds = self._tally, self._seconds()
         if self._folder and not self._folder.result.exists():
-            counts = {count_name(self._unit): self.spent, "control_steps": control_steps, "seconds": seconds}
+            counts = {"control_steps": tally.control_steps, "updates": tally.updates, "seconds": seconds}
             self._folder.write_json("result.json", {"status": status, "sentence": sentence} | counts)
-        return Finished(self.state, status, sentence, control_steps, self.spent, seconds)
+        return Finished(self.state, status, sentence, tally.control_steps, tally.updates, self.spent, seconds)
 
     def _diverge(self, what: str) -> None:
         where = ""
