@@ -61,17 +61,10 @@ def fresh(
     features: Features | None = None,
     key: PRNGKeyArray,
 ) -> ActorCritic:
-    """New networks, temperature 1.
+    """New networks for so many values of an observation and of an action, temperature 1.
 
-    Args:
-        observation: Number of values of an observation.
-        action: Number of values of an action.
-        hidden: Units per layer of the policy.
-        critic_hidden: Units per layer of the critics; None takes `hidden`.
-        descent: The optimisers.
-        features: Standardisation of the data's observations, as in TD3+BC (Fujimoto & Gu 2021, section 5); with None,
-            for learning without data, the networks see observations as they are.
-        key: Randomness of the weights.
+    Without `critic_hidden`, critics have the layers of the policy. With `features`, networks see observations
+    standardised as those of the data, as in TD3+BC (Fujimoto & Gu 2021, section 5).
     """
     of_policy, of_critic = jax.random.split(key)
     seen = {}

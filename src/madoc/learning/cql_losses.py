@@ -47,7 +47,7 @@ def conservative_gap(
     action: Actions,
     proposed: tuple[Float[Array, "proposals rows action"], Float[Array, "proposals rows"]],
 ) -> Scalar:
-    """Eq. (4), the term α weighs: mean of log ∫ exp Q(s, a) da - Q(s, a of the data), summed over the twins."""
+    """Eq. (4), the term with weight α: mean of log ∫ exp Q(s, a) da - Q(s, a of the data), summed over the twins."""
     actions, log_density = proposed
     repeated = jnp.broadcast_to(observation, (*actions.shape[:2], observation.shape[-1]))
     pairs = zip(critic(repeated, actions), critic(observation, action), strict=True)
@@ -66,8 +66,8 @@ def cql_loss(
 ) -> tuple[Scalar, Scalar]:
     """Eq. (4): Bellman error plus `weight` times the gap; also the gap.
 
-    The squared error counts whole, not half as the paper prints it: the authors' code does so, and their weights of 5
-    and 10 belong to that.
+    The squared error is not halved as it is in the paper: it is not in the authors' code, to which their weights of 5
+    and 10 belong.
     """
     first, second = critic(observation, action)
     bellman = jnp.mean((first - target) ** 2) + jnp.mean((second - target) ** 2)

@@ -18,7 +18,7 @@ class Moments:
 
     @classmethod
     def none(cls, size: int) -> "Moments":
-        """Of no rows of this many values."""
+        """The moments before the first row, for rows of `size` values."""
         return cls(0, np.zeros(size), np.zeros(size))
 
     @property
@@ -27,7 +27,7 @@ class Moments:
         return np.sqrt(self.squares / self.count) if self.count else np.ones_like(self.squares)
 
     def including(self, rows: Float[np.ndarray, "rows n"]) -> "Moments":
-        """With more rows (Chan et al. 1979, pairwise update of mean and variance)."""
+        """The moments once more rows have come in (Chan et al. 1979, pairwise update of mean and variance)."""
         if not len(rows):
             return self
         count, mean = self.count + len(rows), rows.mean(0)

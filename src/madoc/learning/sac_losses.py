@@ -10,7 +10,7 @@ from madoc.learning.tanh_gaussian import Noise, TanhGaussianPolicy, sample
 
 
 class TwinCritic(eqx.Module):
-    """Two independent action values of standardised observations."""
+    """Two independently initialised action values of standardised observations."""
 
     first: Network
     second: Network

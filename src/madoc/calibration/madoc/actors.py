@@ -24,7 +24,7 @@ class Actors:
 
 
 def initial_actors(count: int) -> Actors:
-    """N(0, 1) before squashing: also the prior's start (appendix C)."""
+    """Actors at N(0, 1) before squashing, where the prior starts too (appendix C)."""
     return Actors(jnp.zeros(count), jnp.zeros(count))
 
 
@@ -52,13 +52,5 @@ def prior_weight(updates: Int[Array, ""], *, time_constant: float, largest: floa
 def actor_loss(
     value: PerRow, log_density: PerRow, kl: Scalar, *, entropy_weight: float, prior_weight: Scalar | float
 ) -> Scalar:
-    """Eq. (13) summed over groups: α log q - v + λ KL(q || p), averaged over draws.
-
-    Args:
-        value: Σ_g v_g(ξ^g) of each draw.
-        log_density: Σ_g log q_g(ξ^g) of each draw.
-        kl: Σ_g KL(q_g || p_g).
-        entropy_weight: α.
-        prior_weight: λ.
-    """
+    """Eq. (13): α log q - v + λ KL(q || p), averaged over draws; values, densities and KL are sums over groups."""
     return (entropy_weight * log_density - value).mean() + prior_weight * kl

@@ -139,15 +139,7 @@ class AgentSettings:
         """`count` updates, Algorithm 1, lines 13 to 19, and the mean of each metric.
 
         The discriminators learn from blurred s'; the reward is computed at s' without blur, where it is least noisy.
-
-        Args:
-            agents: The agents.
-            simulated: Rows with `pair`, `following` and `parameters` (in [-1, 1]).
-            logged: Features (pair, following) of the logged rows.
-            members: Which parameters belong to which group.
-            key: Randomness.
-            mixing: How the critics of the groups make up the value of a draw.
-            count: Number of updates.
+        Simulated rows are columns `pair`, `following` and `parameters` (in [-1, 1]), logged rows are (pair, following).
         """
 
         def update(agents: Agents, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
