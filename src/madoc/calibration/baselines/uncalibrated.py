@@ -2,20 +2,11 @@
 
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.types import Epoch
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class UncalibratedState:
-    """The random key, which every state has."""
-
-    key: PRNGKeyArray
 
 
 @dataclass(frozen=True)
@@ -29,15 +20,15 @@ class Uncalibrated:
 
     randomised: bool = False
 
-    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> UncalibratedState:
-        """The state, which never changes."""
-        return UncalibratedState(key)
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> PRNGKeyArray:
+        """The random key, which never changes."""
+        return key
 
-    def step(self, problem: CalibrationProblem, state: UncalibratedState) -> tuple[UncalibratedState, Epoch]:
+    def step(self, problem: CalibrationProblem, state: PRNGKeyArray) -> tuple[PRNGKeyArray, Epoch]:
         """An epoch that has converged."""
         return state, Epoch(converged="there is nothing to simulate")
 
-    def estimate(self, problem: CalibrationProblem, state: UncalibratedState) -> Estimate:
+    def estimate(self, problem: CalibrationProblem, state: PRNGKeyArray) -> Estimate:
         """The middle of every range, whatever the data says."""
         space = problem.simulator.parameters
         std = (space.high - space.low) / np.sqrt(12.0) if self.randomised else np.zeros(len(space))
