@@ -55,7 +55,7 @@ class Machine:
             MadocError: The spec names no robot, or keeps one that cannot be made.
         """
         if spec.robot is not None:
-            robot = robots.restore_robot(spec.robot)
+            robot = robots.restore(spec.robot)
             return cls(robot.task, robot)
         return cls(tasks.make(spec.task, spec.physics or "legacy"))
 

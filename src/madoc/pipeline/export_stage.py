@@ -4,7 +4,7 @@ from pathlib import Path
 
 from madoc import simulation
 from madoc.errors import MadocError
-from madoc.export import Exported, Provenance, save_onnx, save_patch, save_randomization, save_sysid_parameters
+from madoc.export import Exported, save_onnx, save_patch, save_randomization, save_sysid_parameters
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibration_stage import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
@@ -58,22 +58,19 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dic
     return files
 
 
-def provenance_of(calibrated: Calibrated) -> Provenance:
-    """Where an estimate comes from, as its run folder remembers it."""
-    verdict = calibrated.result.verdict
+def provenance_of(calibrated: Calibrated) -> dict[str, object]:
+    """Where an estimate comes from, as its run folder says; None or empty where it does not."""
+    result, verdict = calibrated.result, calibrated.result.verdict
     stored, whole = calibrated.spec.data, calibrated.folder.resolve()
-    data = (
-        {} if stored is None else {"paths": list(stored.paths), "rows": stored.rows, "fingerprint": stored.fingerprint}
-    )
-    return Provenance(
-        run=whole.parent.name if whole.name == "calibration" else whole.name,
-        method=calibrated.result.method,
-        seed=calibrated.seed,
-        data=data,
-        versions=calibrated.spec.versions,
-        verdict=None if verdict is None else verdict.to_json(),
-        warnings=calibrated.result.warnings,
-    )
+    return {
+        "run": whole.parent.name if whole.name == "calibration" else whole.name,
+        "method": result.method,
+        "seed": calibrated.seed,
+        "verdict": None if verdict is None else verdict.to_json(),
+        "data": stored and {"paths": list(stored.paths), "rows": stored.rows, "fingerprint": stored.fingerprint},
+        "versions": dict(calibrated.spec.versions),
+        "warnings": list(result.warnings),
+    }
 
 
 def _stepping(simulator: Simulator) -> dict[str, object]:

@@ -94,17 +94,8 @@ def roll(
 ) -> tuple[Rollout, Walkers]:
     """Act for `steps` control steps in every row.
 
-    A row that terminates, fails, or reaches the task's time limit starts again at a state from `starts`.
-
-    Args:
-        system: The systems to act in.
-        task: The robot's functions of state.
-        policy: The policy; sampled with `key`, deterministic where `key` is None.
-        walkers: The states of the rows.
-        steps: Control steps per row.
-        starts: The states at which ended rows start again.
-        key: Randomness of the actions.
-        restart_key: Randomness of the restarts.
+    A row that terminates, fails, or reaches the task's time limit starts again at a state from `starts`. Actions are
+    sampled with `key`, or deterministic where it is None.
 
     Returns:
         Transitions with axes (steps, systems, rows), and the states of the rows afterwards.
@@ -120,15 +111,8 @@ def roll(
         terminated = task.terminated(safe) & valid
         truncated = (age + 1 >= task.max_episode_steps) & ~terminated & valid
         following = system.observe(safe)
-        frame = (
-            observation,
-            action,
-            task.reward(state, action, safe),
-            following,
-            terminated,
-            truncated,
-        )
-        frames.append((*frame, valid))
+        reward = task.reward(state, action, safe)
+        frames.append((observation, action, reward, following, terminated, truncated, valid))
         state, age, observation = safe, age + 1, following
         ended = terminated | truncated | ~valid
         if ended.any():
@@ -172,12 +156,6 @@ def replay_actions(
     valid = np.isfinite(next_state).all(-1)
     safe = np.where(valid[..., None], next_state, state)
     terminated = task.terminated(safe) & valid
-    seen = Transitions(
-        system.observe(state),
-        action,
-        task.reward(state, action, safe),
-        system.observe(safe),
-        terminated,
-        np.zeros_like(terminated),
-    )
+    reward, ended = task.reward(state, action, safe), np.zeros_like(terminated)
+    seen = Transitions(system.observe(state), action, reward, system.observe(safe), terminated, ended)
     return Rollout(jax.tree.map(lambda column: column[None], seen), valid[None])

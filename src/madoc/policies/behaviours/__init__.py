@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.data import Dataset
-from madoc.data.record import join, record
+from madoc.data.dataset import join
+from madoc.data.record import record
 from madoc.data.targets import paper_truth
 from madoc.errors import MadocError, unknown_name
 from madoc.numpy_policy import NumpyPolicy
