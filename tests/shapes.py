@@ -28,7 +28,8 @@ def checked(function):
         given = dict(zip(names, args, strict=False)) | kwargs
         if "check_hyperparameters" in _names_in(getattr(self, "__post_init__", None)):
             return function(self, *args, **kwargs)  # it refuses wrong types itself, in its own words
-        rebuilt = any(type(given.get(name)) in (bool, object) or _is_placeholder(given.get(name)) for name in arrays)
+        leaves = [given[name] for name in arrays & given.keys()]
+        rebuilt = any(type(leaf) in (bool, object) or _is_placeholder(leaf) for leaf in leaves)
         return (function if rebuilt else strict)(self, *args, **kwargs)
 
     return initialise
@@ -41,5 +42,4 @@ def _names_in(method) -> tuple[str, ...]:
 
 def _is_placeholder(value) -> bool:
     """Whether a leaf stands for an array without being one."""
-    array = isinstance(value, jax.Array | np.ndarray | np.generic | int | float | tuple | list)
-    return value is not None and not array
+    return not isinstance(value, jax.Array | np.ndarray | np.generic | int | float | tuple | list)

@@ -11,7 +11,7 @@ from madoc.data import Dataset, typical_change
 from madoc.errors import MadocError
 from madoc.identification.noise import regression_noise
 from madoc.identification.states import LoggedStates, probing_rows, states_of
-from madoc.learning.window_features import LoggedFeatures
+from madoc.learning.features import LoggedFeatures
 from madoc.simulation.base import Simulator
 from madoc.types import Method, State
 

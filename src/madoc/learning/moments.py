@@ -1,4 +1,4 @@
-"""Mean and spread of all rows seen so far, kept up as batches of them come in."""
+"""Running mean and standard deviation of rows that arrive in batches."""
 
 from dataclasses import dataclass
 
@@ -10,13 +10,7 @@ from jaxtyping import Float
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Moments:
-    """What is kept of the rows seen so far.
-
-    Attributes:
-        count: How many rows.
-        mean: Their mean.
-        squares: Sum of their squared distances to the mean.
-    """
+    """Number of rows so far, their mean, and the sum of their squared distances to the mean."""
 
     count: int
     mean: Float[np.ndarray, " n"]
@@ -24,7 +18,7 @@ class Moments:
 
     @classmethod
     def none(cls, size: int) -> "Moments":
-        """Of no rows of this many values."""
+        """The moments before the first row, for rows of `size` values."""
         return cls(0, np.zeros(size), np.zeros(size))
 
     @property
@@ -33,7 +27,7 @@ class Moments:
         return np.sqrt(self.squares / self.count) if self.count else np.ones_like(self.squares)
 
     def including(self, rows: Float[np.ndarray, "rows n"]) -> "Moments":
-        """With more rows (Chan et al. 1979, pairwise update of mean and variance)."""
+        """The moments once more rows have come in (Chan et al. 1979, pairwise update of mean and variance)."""
         if not len(rows):
             return self
         count, mean = self.count + len(rows), rows.mean(0)

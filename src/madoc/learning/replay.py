@@ -1,4 +1,4 @@
-"""A ring of rows on the device, filled by jitted writes and sampled inside jitted updates."""
+"""A ring buffer of rows on the device, written by jitted calls and sampled inside jitted updates."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ def add(replay: Replay, rows: Mapping[str, Array | np.ndarray], valid: Bool[Arra
 
 
 def clear(replay: Replay) -> Replay:
-    """The same ring with nothing in it."""
+    """The same buffer without rows."""
     return Replay(replay.rows, jnp.zeros((), jnp.int32))
 
 

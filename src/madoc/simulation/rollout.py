@@ -1,7 +1,7 @@
 """Closed-loop rollouts: a policy acts in systems, rows that end start again, failed rows are counted."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import equinox as eqx
@@ -73,6 +73,12 @@ def begin(starts: Starts, key: PRNGKeyArray, *, systems: int, rows: int) -> Walk
     """Rows at fresh starts."""
     state = starts(key, systems * rows).reshape(systems, rows, -1)
     return Walkers(state, np.zeros((systems, rows), dtype=np.int64))
+
+
+def out_of_step(walkers: Walkers, time_limit: int) -> Walkers:
+    """The same rows with evenly spread ages, so that they do not all reach the time limit together."""
+    count = walkers.age.size
+    return replace(walkers, age=(np.arange(count) * time_limit // count).reshape(walkers.age.shape))
 
 
 def roll(

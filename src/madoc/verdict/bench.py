@@ -19,7 +19,7 @@ from madoc.identification.excitation import expected_half_widths
 from madoc.identification.noise import difference_noise
 from madoc.identification.states import logged_states
 from madoc.identification.windows import consecutive_rows, evenly
-from madoc.learning.dynamics_ratio import Scaling
+from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of

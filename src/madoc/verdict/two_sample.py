@@ -17,9 +17,8 @@ from madoc.data import Dataset
 from madoc.data.dataset import spread_of, starts_after
 from madoc.identification.windows import evenly
 from madoc.learning.cloning import continue_cloning, fresh_clone
-from madoc.learning.dynamics_ratio import Scaling
+from madoc.learning.features import LoggedFeatures, Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
-from madoc.learning.window_features import LoggedFeatures
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import begin, reset_states, roll
 from madoc.types import Transitions
