@@ -11,8 +11,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 demo: $(RUNS)  ## the main job on Hopper, small: record, calibrate, learn, evaluate
 	rm -rf runs/demo
-	$(BIN)/madoc run hopper-medium --out runs/demo --transitions 50000 --budget 80000 --policy-budget 20000 \
-	  --policy-set "hidden=[128, 128]" --episodes 10
+	$(BIN)/madoc run hopper-medium --out runs/demo --transitions 50000 --budget 80000 --policy-budget 60s --episodes 10
 
 test: $(TESTS)  ## every test that takes seconds
 	$(BIN)/python -m pytest -n 2 -rs

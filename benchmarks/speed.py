@@ -27,7 +27,7 @@ from madoc.calibration.madoc.agents import AgentSettings
 from madoc.data.targets import paper_truth
 from madoc.learning import replay
 from madoc.learning.cloning import continue_cloning
-from madoc.policies import LEARNERS, PolicyProblem
+from madoc.policies import LEARNERS, FastSAC, PolicyProblem
 from madoc.policies.behaviours import record_quality
 from madoc.simulation.cpu import CpuSimulator
 
@@ -100,6 +100,12 @@ def sac_flops(width: int, observation: int, action: int, batch: int = 256) -> fl
     return batch * (2 * (1 + 3 + 2) * critic + 4 * policy)
 
 
+def fast_sac_flops(width: int, observation: int, action: int, batch: int = 256) -> float:
+    """SAC's, with the policy's part in every `policy_delay`-th update only."""
+    critic, policy = mlp(observation + action, width, 1), mlp(observation, width, 2 * action)
+    return batch * (2 * (1 + 3) * critic + policy + (2 * 2 * critic + 3 * policy) / FastSAC().policy_delay)
+
+
 def mlp(inputs: int, width: int, outputs: int, layers: int = 2) -> float:
     """Operations of one pass of a network over one row."""
     return 2.0 * (inputs * width + (layers - 1) * width * width + width * outputs)
@@ -124,7 +130,15 @@ def cql_flops(width: int, observation: int, action: int, batch: int = 256) -> fl
     return batch * (2 * (1 + 3 + 2 + 30 * 3) * critic + (4 + 2) * policy)
 
 
-FLOPS = {"bc": bc_flops, "sac": sac_flops, "sac-bc": sac_flops, "h2o": h2o_flops, "cql": cql_flops, "morec": sac_flops}
+FLOPS = {
+    "bc": bc_flops,
+    "sac": sac_flops,
+    "fast-sac": fast_sac_flops,
+    "sac-bc": sac_flops,
+    "h2o": h2o_flops,
+    "cql": cql_flops,
+    "morec": sac_flops,
+}
 """Of one update of a learner. Those of SAC+BC's cloning and of MOREC's imagined steps are left out."""
 
 
@@ -145,7 +159,9 @@ def learner_update(name: str, problem: PolicyProblem, width: int) -> float:
     hidden = {"hidden": (width, width)}
     if name == "cql":
         hidden = {"hidden": (width,) * 3, "critic_hidden": (width,) * 3, "cloning_updates": 0}
-    if name in ("sac", "sac-bc", "h2o"):
+    if name == "fast-sac":
+        count = 256
+    if name in ("sac", "fast-sac", "sac-bc", "h2o"):
         method = LEARNERS[name].make(**hidden, replay_capacity=50_000)
     else:
         method = LEARNERS[name].make(**hidden, epoch_updates=count)
@@ -167,6 +183,8 @@ def learner_update(name: str, problem: PolicyProblem, width: int) -> float:
             run = lambda: method._update(  # noqa: E731
                 state.learning, seen, problem.logged, problem.features, key, count
             )
+        elif name == "fast-sac":
+            run = lambda: method._descend(state.learner, seen, None, key)  # noqa: E731
         else:
             logged = problem.logged if method.cloning is not None else None
             run = lambda: method._update(state.learner, seen, logged, key, count)  # noqa: E731

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import madoc.tasks
-from madoc import ENVIRONMENTS, register_environments
+from madoc import ENVIRONMENTS
 from madoc.errors import MadocError
 from madoc.gymnasium_environment import CalibratedEnvironment
 from madoc.simulation.cpu import CpuSimulator
@@ -64,12 +64,6 @@ def test_the_import_of_madoc_registers_in_either_order_and_the_id_can_import_it(
 
 def test_a_registered_episode_is_as_long_as_the_tasks():
     assert {madoc.tasks.make(task).max_episode_steps for task in ENVIRONMENTS.values()} == {madoc.EPISODE_STEPS}
-
-
-def test_registering_again_is_harmless():
-    before = dict(gymnasium.registry)
-    register_environments()
-    assert dict(gymnasium.registry) == before
 
 
 def test_same_seed_same_episode_and_the_stream_goes_on(hopper):

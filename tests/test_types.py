@@ -28,8 +28,14 @@ def test_a_calibrator_is_recognised_by_the_settings_of_its_entry(method, name):
 
 
 def test_a_learner_is_recognised_by_the_settings_of_its_entry():
-    learners = (SAC(), SAC(cloning=1.0), SAC(cloning=0.0), SAC(cloning=1.0, randomize=True))
-    assert [entry_of(learner, LEARNERS).name for learner in learners] == ["sac", "sac-bc", "sac-bc", "dr-bc"]
+    learners = (SAC(), SAC(cloning=1.0), SAC(cloning=0.0), SAC(cloning=1.0, randomize=True), SAC(randomize=True))
+    assert [entry_of(learner, LEARNERS).name for learner in learners] == ["sac", "sac-bc", "sac-bc", "dr-bc", "dr"]
+
+
+def test_a_learner_that_draws_from_the_whole_box_needs_no_parameters():
+    entry = entry_of(SAC(randomize=True), LEARNERS)
+    assert not entry.needs_parameters
+    assert not entry.needs_data
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ from .policies import CQL as CQL
 from .policies import H2O as H2O
 from .policies import MOREC as MOREC
 from .policies import SAC as SAC
+from .policies import FastSAC as FastSAC
 from .policies import NormalParameters as NormalParameters
 from .policies import PolicyProblem as PolicyProblem
 from .policies import UniformParameters as UniformParameters
@@ -50,6 +51,6 @@ from .runs.run_folder import RunFolder as RunFolder
 from .verdict import assess as assess
 
 ENVIRONMENTS: dict[str, str]
+EPISODE_STEPS: int
 
 def lazily(package: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]: ...
-def register_environments() -> None: ...

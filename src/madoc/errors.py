@@ -1,4 +1,4 @@
-"""The one exception a user's mistake raises: a sentence saying what, where and what to do."""
+"""The exception for a user's mistakes, and sentences that its messages have in common."""
 
 import difflib
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ class MadocError(ValueError):
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> MadocError:
-    """The refusal of a name that is not among the known ones; it points at the nearest."""
+    """The error for a name that is not among the known ones; it suggests the nearest."""
     names = list(known)
     ending = [candidate for candidate in names if candidate.endswith(f".{name}")]
     near = ending or difflib.get_close_matches(name, names, n=1)

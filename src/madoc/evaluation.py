@@ -1,4 +1,4 @@
-"""Evaluation: returns in a system, the normalized score, the calibration error. No other module reads the truth."""
+"""Returns of a policy in a system, the normalized score, and the error of an estimate. Only here is the truth read."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,18 +10,14 @@ from jaxtyping import Float, PRNGKeyArray
 from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import act, reset_states
-from madoc.tasks.base import Task
 from madoc.types import Policy
 
 
 @dataclass(frozen=True)
 class Returns:
-    """Undiscounted returns of episodes, and D4RL's normalized scores.
+    """Undiscounted returns, and D4RL's normalized scores 100 (return - random) / (expert - random) (Fu et al. 2020).
 
-    Attributes:
-        returns: Return of each episode.
-        lengths: Control steps of each episode.
-        normalized: 100 (return - random) / (expert - random) of each episode.
+    Each array has one value for each episode; `lengths` are in control steps.
     """
 
     returns: Float[np.ndarray, " episodes"]
@@ -51,9 +47,9 @@ def evaluate(
 ) -> Returns:
     """Returns of whole episodes, simulated at the same time; an episode whose simulation fails ends there.
 
-    The parameters are physical values of one system, by name or as a vector, or of several, one in each row. Each of
-    several systems gets the same number of episodes, at least one and together at least `episodes`. `advance` is called
-    with the number of control steps, of the task's `max_episode_steps`, that have passed.
+    The parameters are physical values of one system, by name or as a vector, or of several, one in each row. Every
+    system gets the same number of episodes, in sum at least `episodes`. `advance` is called with the number of further
+    control steps, of the task's `max_episode_steps`, that are done.
     """
     task = simulator.task
     of_start, of_action = jax.random.split(key)
@@ -77,23 +73,18 @@ def evaluate(
             break
         advance(1)
     returns = total.reshape(-1)
-    return Returns(returns, length.reshape(-1), normalized_score(returns, task))
-
-
-def normalized_score(returns: Float[np.ndarray, " episodes"], task: Task) -> Float[np.ndarray, " episodes"]:
-    """100 (return - random) / (expert - random), D4RL (Fu et al. 2020)."""
     random, expert = task.reference_returns
-    return 100.0 * (returns - random) / (expert - random)
+    return Returns(returns, length.reshape(-1), 100.0 * (returns - random) / (expert - random))
 
 
 def calibration_error(
     estimate: Float[np.ndarray, " parameters"], truth: Float[np.ndarray, " parameters"], space: ParameterSpace
 ) -> dict[str, object]:
-    """How far an estimate is from the truth.
+    """The error of an estimate.
 
     Returns:
-        `mean_absolute` in raw units, as the paper's Table 10 has it (gravity dominates), `mean_percent_of_range`,
-        and `per_parameter`: the absolute error of each, in its unit.
+        `mean_absolute` over values in different units, as in the paper's Table 10 (gravity dominates),
+        `mean_percent_of_range`, and `per_parameter`: the absolute error of each, in its unit.
     """
     absolute = np.abs(np.asarray(estimate) - np.asarray(truth))
     return {

@@ -1,12 +1,11 @@
 """A calibrated simulator as a Gymnasium environment, single and vectorised, to train with other libraries.
 
 `import madoc` registers `madoc/Hopper`, `madoc/HalfCheetah`, `madoc/Walker2d` and `madoc/Ant`, for `gymnasium.make` and
-for `gymnasium.make_vec`; where nobody imports it, the id can: `gymnasium.make("madoc:madoc/Hopper", parameters={...})`.
+for `gymnasium.make_vec`. `gymnasium.make("madoc:madoc/Hopper", parameters={...})` needs no import.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import gymnasium
 import jax
@@ -15,10 +14,11 @@ from gymnasium.spaces import Box
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import Bool, Float
 
 from madoc import ENVIRONMENTS, robots, simulation
 from madoc.errors import MadocError
+from madoc.parameters import ParameterDistribution
 from madoc.simulation.base import System
 from madoc.tasks.base import Task
 
@@ -26,30 +26,21 @@ Information = dict[str, object]
 """The `info` of Gymnasium."""
 
 
-@runtime_checkable
-class Distribution(Protocol):
-    """A distribution of parameters, as `madoc.policies.NormalParameters`."""
-
-    def draw(self, key: PRNGKeyArray, count: int) -> Float[np.ndarray, "count parameters"]:
-        """Physical values of `count` systems."""
-        ...
-
-
-Parameters = Mapping[str, float] | Float[np.ndarray, " parameters"] | Distribution | None
-"""Physical values by name or in the task's order; a distribution, from which every episode draws its own; None is
-mid-range, the uncalibrated robot."""
+Parameters = Mapping[str, float] | Float[np.ndarray, " parameters"] | ParameterDistribution | None
+"""Physical values by name or in the task's order; or a distribution, from which every episode draws new values; or None
+for the middle of every range."""
 
 
 class Episodes:
-    """Episodes of one robot, a row each, stepped together: what both environments share.
+    """Episodes of one robot, one in each row, that are stepped together; both environments use it.
 
-    A step depends on state, action and parameters alone: unlike in Gymnasium's own MuJoCo environments the solver never
-    starts from the last step's solution.
+    A step depends on state, action and parameters alone: unlike in Gymnasium's own MuJoCo environments, the solver
+    never starts from the last step's solution.
 
     Attributes:
         task: The robot.
-        parameters: Physical values by row.
-        state: States by row, float64.
+        parameters: Physical values of each row.
+        state: State of each row, float64.
 
     Raises:
         MadocError: No such task or physics; a parameter is unknown, missing, not finite or below its bound.
@@ -60,14 +51,15 @@ class Episodes:
     ) -> None:
         self.task = task if isinstance(task, Task) else robots.resolve(task, physics)
         self._simulator = simulation.make(self.task, threads=threads)
-        drawn = parameters is not None and hasattr(parameters, "draw")
-        self._distribution: Distribution | None = parameters if drawn else None  # type: ignore[assignment]
-        space = self.task.parameters
-        values = space.middle if drawn or parameters is None else space.vector(parameters)  # type: ignore[arg-type]
+        space, values, self._distribution = self.task.parameters, self.task.parameters.middle, None
+        if isinstance(parameters, ParameterDistribution):
+            self._distribution = parameters
+        elif parameters is not None:
+            values = space.vector(parameters)
         self.parameters = np.tile(values, (rows, 1))
         self.state = np.tile(self._simulator.initial_state, (rows, 1))
         # One system with many rows where all have the same parameters, else one system a row.
-        self._axes = (rows, 1) if drawn else (1, rows)
+        self._axes = (rows, 1) if self._distribution else (1, rows)
         self._system: System = self._simulator.bind(self.parameters[: self._axes[0]])
         noise = self.task.reset_noise
         self._noise = jax.jit(jax.vmap(lambda seed: noise(jax.random.key(seed), 1)[0]))
@@ -75,14 +67,14 @@ class Episodes:
         self.action_space = Box(-1.0, 1.0, (self.task.action_size,), np.float32)
 
     def reset(self, chosen: Bool[np.ndarray, " rows"], generators: Sequence[np.random.Generator]) -> None:
-        """Start the chosen rows at the task's own noise, and at new parameters where a distribution was given.
+        """Start the chosen rows with the task's noise of the start and, given a distribution, with new parameters.
 
         Each row draws from its own generator, so that an episode does not depend on the other rows.
         """
         rows: list[int] = np.flatnonzero(chosen).tolist()
         seeds = np.zeros(len(chosen), dtype=np.uint32)
         seeds[rows] = [generators[row].integers(2**31) for row in rows]
-        # The noise of all rows: a shape that never changes is compiled once.
+        # Noise is computed for all rows, because a shape that never changes is compiled once.
         fresh = self._simulator.initial_state + np.asarray(self._noise(seeds), dtype=np.float64)
         self.state = np.where(chosen[:, None], fresh, self.state)
         if self._distribution is None:
@@ -98,8 +90,8 @@ class Episodes:
         """One control step of all rows; a row whose simulation diverges stays at its last state.
 
         Returns:
-            Rewards, whether the task has ended, and an info by row: `failed`, and for the project's robots `x_position`
-            (m) and `x_velocity` (m/s, the mean over the step).
+            Rewards, whether the task has ended, and an info: `failed`, and for Madoc's own robots `x_position` (m) and
+            `x_velocity` (m/s, the mean over the step).
 
         Raises:
             MadocError: The actions have the wrong shape or are not finite.
@@ -122,27 +114,27 @@ class Episodes:
         return np.asarray(self.task.reward(state, control, self.state)), terminated, {**info, "failed": failed}
 
     def observe(self) -> Float[np.ndarray, "rows observation"]:
-        """Observations of all rows, in an array of the caller's own."""
+        """Observations of all rows, in a new array."""
         return np.array(self._system.observe(self.state.reshape(*self._axes, -1))).reshape(len(self.state), -1)
 
     def position(self) -> dict[str, np.ndarray]:
-        """`x_position` of the project's robots, m; empty for others."""
+        """`x_position` in m for Madoc's own robots; empty for others."""
         return {"x_position": self.state[:, 0].copy()} if self.task.name in ENVIRONMENTS.values() else {}
 
 
 class CalibratedEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     """One robot at given parameters; `gymnasium.make` adds its time limit.
 
-    Where the simulation diverges, the episode is truncated at its last state and `info["failed"]` is true. Nothing is
+    If the simulation diverges, the episode is truncated at its last state and `info["failed"]` is true. Nothing is
     rendered.
 
     Args:
-        task: A task, the name of one, or the path of a robot's spec file.
-        parameters: Physical values by name, as a vector in the task's order, a distribution of them, or None.
+        task: A task, its name, or the path of a robot's spec file.
+        parameters: See `Parameters`.
         physics: `legacy` or `modern`, for a task given by name; None is `legacy`.
 
     Raises:
-        MadocError: No such task or physics; a parameter is unknown, missing, not finite or below its bound.
+        MadocError: The task or physics does not exist; a parameter is unknown, missing, not finite or below its bound.
     """
 
     def __init__(self, task: Task | str | Path, *, parameters: Parameters = None, physics: str | None = None) -> None:
@@ -152,13 +144,13 @@ class CalibratedEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @property
     def parameters(self) -> Float[np.ndarray, " parameters"]:
-        """Physical values of this episode."""
+        """Physical values in this episode."""
         return self._episodes.parameters[0].copy()
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, object] | None = None
     ) -> tuple[np.ndarray, Information]:
-        """Start an episode at the task's own noise; a seed starts the stream anew. There are no options."""
+        """Start an episode; a seed restarts the random numbers. There are no options."""
         super().reset(seed=seed)
         self._episodes.reset(np.ones(1, dtype=bool), [self.np_random])
         return self._episodes.observe()[0], _of_row(self._episodes.position())
@@ -175,18 +167,17 @@ class CalibratedEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class CalibratedVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Many copies of a robot, stepped in one batch; copy i of seed s acts as the single environment of seed s + i.
+    """Many copies of a robot, stepped in one batch; copy i with seed s equals the single environment with seed s + i.
 
     Args:
         num_envs: Number of copies.
-        task: A task, the name of one, or the path of a robot's spec file.
-        parameters: Physical values by name, as a vector in the task's order, or None; a distribution gives each copy a
-            new system at every reset.
+        task: A task, its name, or the path of a robot's spec file.
+        parameters: See `Parameters`; a distribution gives each copy a new system at every reset.
         physics: `legacy` or `modern`, for a task given by name; None is `legacy`.
-        max_episode_steps: Time limit in control steps; reaching it truncates. None takes the task's.
-        autoreset_mode: When a copy whose episode has ended starts the next one: by default in the step that follows,
-            whose action is then ignored; `SAME_STEP` puts the last observation into `info["final_obs"]`.
-        threads: Number of cores; by default all that this process may use.
+        max_episode_steps: Time limit in control steps, at which an episode is truncated. None takes the task's.
+        autoreset_mode: When a copy whose episode has ended starts the next one: by default in the following step, whose
+            action is then ignored; `SAME_STEP` puts the last observation into `info["final_obs"]`.
+        threads: Number of threads; by default one for each core that this process may use.
 
     Raises:
         MadocError: As `CalibratedEnvironment`, or fewer than one copy.
@@ -231,11 +222,11 @@ class CalibratedVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         """Start an episode in all copies, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: The first copy's, the others count up from it; or one for each copy.
-            options: `reset_mask`, an array of booleans; the other copies stay as they are.
+            seed: The seed of the first copy, from which the others count up; or one for each copy.
+            options: `reset_mask`, an array of booleans; copies outside it stay as they are.
 
         Raises:
-            MadocError: Not as many seeds, or not as large a mask, as copies.
+            MadocError: The number of seeds or the size of the mask is not the number of copies.
         """
         if seed is None or isinstance(seed, int):
             seed = [None if seed is None else seed + row for row in range(self.num_envs)]
@@ -257,8 +248,8 @@ class CalibratedVectorEnvironment(VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         """One control step of all copies: observations, rewards, terminations, truncations, info (`Episodes.step`).
 
         Raises:
-            MadocError: The actions have the wrong shape or are not finite, or with autoreset disabled an ended copy was
-                not reset.
+            MadocError: The actions have the wrong shape or are not finite, or an ended copy was not reset although
+                autoreset is disabled.
         """
         fresh = self._ended
         if self.autoreset_mode == AutoresetMode.DISABLED and fresh.any():
@@ -293,6 +284,6 @@ def _of_row(info: Mapping[str, np.ndarray]) -> Information:
 
 
 def _masked(info: Mapping[str, np.ndarray], of: Bool[np.ndarray, " num_envs"]) -> Information:
-    """The info of a vectorised environment: each array, 0 outside the copies it is of, beside their mask."""
+    """The info of a vectorised environment: each array, zero outside a mask of copies, and that mask."""
     values = {name: np.where(of, array, np.zeros((), array.dtype)) for name, array in info.items()}
     return {**values, **{f"_{name}": of.copy() for name in info}}

@@ -1,9 +1,11 @@
-"""Calibratable parameters: their names, units, ranges, and the one map between [-1, 1] and physical values."""
+"""Parameters that can be calibrated: their names, units and ranges, and their scaling to [-1, 1]."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float, PRNGKeyArray
 from numpy.typing import ArrayLike
 
 from madoc.errors import MadocError
@@ -11,13 +13,13 @@ from madoc.errors import MadocError
 
 @dataclass(frozen=True)
 class Field:
-    """A kind of parameter: the elements it belongs to, its unit and its physical bound.
+    """A kind of parameter.
 
     Attributes:
-        element: `body`, `joint`, `geom`, `actuator` or `signal`; None where it belongs to the whole robot.
-        unit: Of a hinge; a slide joint reads N for N·m and m for rad.
-        minimum: No physical value is below it.
-        in_model: It is written into the model. Otherwise the bound system applies it around the model.
+        element: `body`, `joint`, `geom`, `actuator` or `signal`; None for a parameter of the whole robot.
+        unit: The unit for a hinge joint; for a slide joint N takes the place of N·m, and m that of rad.
+        minimum: Smallest value that is physically possible.
+        in_model: Whether the value is written into the MuJoCo model; if not, the simulator applies it around the model.
     """
 
     element: str | None
@@ -58,12 +60,12 @@ class Parameter:
 
     Attributes:
         field: A key of `FIELDS`.
-        element: Name of the body, joint, geom, actuator or signal (a body without a name may be named by its joint);
-            several that share one value as a tuple; empty for what belongs to the whole robot, as gravity.
+        element: Name of the body, joint, geom, actuator or signal (a body without a name may be named by its joint).
+            A tuple of names shares one value; a parameter of the whole robot, such as gravity, has an empty name.
         low: Lower end of the range, in `unit`.
         high: Upper end of the range, in `unit`.
-        label: Its own name; empty takes `field.element`.
-        measured_in: Its unit where that is not the field's, as of a slide joint or a signal; empty takes the field's.
+        label: The parameter's name; if empty, it is `field.element`.
+        measured_in: The unit of a slide joint or of a signal; if empty, it is the field's.
     """
 
     field: str
@@ -91,14 +93,14 @@ class Parameter:
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """The elements that share the value; none of what belongs to the whole robot."""
+        """The elements that share the value; empty for a parameter of the whole robot."""
         if isinstance(self.element, tuple):
             return self.element
         return (self.element,) if self.element else ()
 
     @property
     def name(self) -> str:
-        """Its own name, or `field.element`, as `dof_damping.foot_joint`; plain `gravity`. Elements join with `+`."""
+        """The label, or `field.element` such as `dof_damping.foot_joint`; several elements are joined with `+`."""
         return self.label or ".".join([self.field, *(["+".join(self.elements)] if self.elements else [])])
 
     @property
@@ -109,7 +111,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class ParameterSpace:
-    """An ordered box of parameters. The only place that maps the unit cube [-1, 1]^d to physical values."""
+    """The parameters to calibrate, in order, each within its range; scaled, they fill the cube [-1, 1]^d."""
 
     parameters: tuple[Parameter, ...]
 
@@ -127,17 +129,17 @@ class ParameterSpace:
 
     @property
     def low(self) -> np.ndarray:
-        """Lower ends, shape (d,), physical units."""
-        return np.array([parameter.low for parameter in self.parameters])
+        """Lower ends of the ranges, shape (d,), physical units."""
+        return np.array([parameter.low for parameter in self.parameters], dtype=np.float64)
 
     @property
     def high(self) -> np.ndarray:
-        """Upper ends, shape (d,), physical units."""
-        return np.array([parameter.high for parameter in self.parameters])
+        """Upper ends of the ranges, shape (d,), physical units."""
+        return np.array([parameter.high for parameter in self.parameters], dtype=np.float64)
 
     @property
     def middle(self) -> np.ndarray:
-        """Mid-range values, shape (d,): the uncalibrated simulator."""
+        """Middles of the ranges, shape (d,), physical units: the uncalibrated simulator."""
         return self.to_physical(np.zeros(len(self)))
 
     def __len__(self) -> int:
@@ -148,11 +150,11 @@ class ParameterSpace:
         return self.low + (np.asarray(unit, dtype=np.float64) + 1.0) * 0.5 * (self.high - self.low)
 
     def to_unit(self, physical: ArrayLike) -> np.ndarray:
-        """Map physical units to [-1, 1]; shape (..., d), float64. The inverse of `to_physical`."""
+        """Map physical units to [-1, 1]; shape (..., d), float64."""
         return 2.0 * (np.asarray(physical, dtype=np.float64) - self.low) / (self.high - self.low) - 1.0
 
     def select(self, names: Sequence[str]) -> "ParameterSpace":
-        """The same space with only the named parameters, in the order given.
+        """The space of the named parameters, in the order given.
 
         Raises:
             MadocError: A name is not in the space.
@@ -167,7 +169,7 @@ class ParameterSpace:
         """Physical values, by name or in the space's order, as an array of shape (..., d), float64.
 
         Raises:
-            MadocError: A parameter has no value, a name is no parameter, or the last axis has another length.
+            MadocError: A parameter is missing or unknown, or the last axis has another length.
         """
         if isinstance(values, Mapping):
             missing = [name for name in self.names if name not in values]
@@ -182,3 +184,11 @@ class ParameterSpace:
                 f"expected {len(self)} parameter values ({', '.join(self.names)}), got an array of shape {vector.shape}"
             )
         return vector
+
+
+@runtime_checkable
+class ParameterDistribution(Protocol):
+    """A distribution of the parameters, from which a learner draws new systems in every epoch or episode."""
+
+    def draw(self, key: PRNGKeyArray, count: int) -> Float[np.ndarray, "count parameters"]:
+        """Physical values of `count` systems, within the ranges."""

@@ -1,6 +1,6 @@
-"""What every room exchanges: transitions, policies, metrics, and the protocol of methods."""
+"""The types that all packages share: transitions, policies, metrics, and the protocol of methods."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Generic, Literal, Protocol, TypeVar, get_type_hints, runtime_checkable
@@ -20,16 +20,16 @@ Unit = Literal["control steps", "updates"]
 """What a budget counts: simulated control steps, or gradient updates where a method does not simulate."""
 
 Count = Annotated[int, Field(ge=1)]
-"""A hyperparameter that counts something there must be one of."""
+"""A hyperparameter that is a number of things, at least one."""
 CountOrZero = Annotated[int, Field(ge=0)]
-"""A hyperparameter that counts something there may be none of."""
+"""A hyperparameter that is a number of things, possibly none."""
 Layers = tuple[Count, ...]
-"""Units of a network's hidden layers."""
+"""Number of units in each hidden layer of a network."""
 NotNegative = Annotated[float, Field(ge=0.0)]
-"""A hyperparameter such as a rate or a weight."""
+"""A hyperparameter that is a number of at least 0, such as a rate or a weight."""
 
 Metrics = dict[str, float]
-"""Scalars worth looking at, by name. Never needed by the next step."""
+"""Scalars for the log, by name; no step depends on them."""
 
 
 @jax.tree_util.register_dataclass
@@ -50,34 +50,33 @@ class Transitions:
     def __len__(self) -> int:
         return len(self.reward)
 
-    def take(self, rows: np.ndarray) -> "Transitions":
+    def take(self, rows: np.ndarray | slice) -> "Transitions":
         """The given rows (indices or mask over the first axis)."""
         return jax.tree.map(lambda column: column[rows], self)
 
 
 @runtime_checkable
 class Policy(Protocol):
-    """Acts. With a key it samples, without one it returns its deterministic action."""
+    """A map from observations to actions in [-1, 1]: sampled with a key, deterministic without one."""
 
     def __call__(
         self, observation: Float[Array, "*rows observation"], key: PRNGKeyArray | None = None
     ) -> Float[Array, "*rows action"]:
-        """Actions in [-1, 1] for a batch of observations."""
-        ...
+        """Actions for a batch of observations."""
 
 
 @dataclass(frozen=True)
 class Epoch:
-    """What one call of a method's `step` did; the loop adds these up.
+    """The metrics and the cost of one call of a method's `step`; the loop adds the costs up.
 
     Attributes:
         metrics: Finite scalars for the log and the progress bar.
-        control_steps: Simulated control steps, of any kind.
-        unbudgeted: Those of them that the budget does not count, because nothing is learnt from them.
+        control_steps: Simulated control steps of any kind.
+        unbudgeted: How many of them do not count against the budget, because nothing is learnt from them.
         updates: Gradient updates of the result.
-        stage: A word for what the epoch did, such as `cloning`.
-        fraction: Share of the preparation that is done, where the epoch prepares and spends none of the budget.
-        converged: A sentence once the method has stopped by itself.
+        stage: The kind of the epoch in a word, such as `cloning`.
+        fraction: Share of the preparation that is done, if the epoch prepares and spends none of the budget.
+        converged: The reason in a sentence, once the method has stopped by itself.
     """
 
     metrics: Metrics = field(default_factory=dict)
@@ -91,36 +90,35 @@ class Epoch:
 
 @runtime_checkable
 class Method(Protocol[Problem, State]):
-    """What calibrators and policy learners have in common: hyperparameters, and functions of a state.
+    """The interface that calibrators and policy learners share: hyperparameters, and functions of a state.
 
     A state is a pytree of JAX arrays, NumPy arrays, typed random keys, Python numbers, strings and functions.
-    It carries everything the method needs to go on. Its structure, shapes and dtypes stay those of `init`,
-    and a healthy state holds no NaN and no infinity, not even as a marker.
+    It holds everything that the method needs to continue. Its structure, shapes and dtypes stay those of `init`, and a
+    NaN or an infinity in it means that the method has diverged.
     """
 
     def init(self, problem: Problem, key: PRNGKeyArray) -> State:
-        """The state before the first epoch. Cheap, as a resumed run calls it too, for the structure."""
-        ...
+        """The state before the first epoch. It must be cheap: a resumed run calls it too, for the structure."""
 
     def step(self, problem: Problem, state: State) -> tuple[State, Epoch]:
-        """One epoch, 0.1 to 2 seconds long: the new state, and what was done."""
-        ...
+        """One epoch of 0.1 to 2 seconds: the new state, and the epoch's metrics and cost."""
 
 
 @dataclass(frozen=True)
 class MethodEntry(Generic[Made]):
-    """A line of `madoc methods`: what never changes about a method.
+    """The constant facts about a method; `madoc methods` lists them.
 
     Attributes:
-        name: As `madoc methods` lists it.
+        name: The name of the method on the command line.
         kind: The method's class.
-        summary: What it does, in half a line.
-        paper: Where it comes from.
-        year: When that was published.
-        settings: Hyperparameters in which it differs from the defaults of its class.
-        recognised_by: Those of them that tell it from other entries of its class; None: all of them.
-        shown: Metrics worth a place beside the progress bar.
+        summary: What the method does, in half a line.
+        paper: Its source.
+        year: Year of publication.
+        settings: Hyperparameters that differ from the defaults of the class.
+        recognised_by: Names of the settings that distinguish it from other entries of its class; None means all.
+        shown: Metrics to show beside the progress bar.
         unit: What its budget counts.
+        usual_budget: A policy learner's budget where none is given.
         simulates: Whether it spends control steps.
         needs_data: Whether it uses logged data.
         needs_parameters: Whether the parameters of a policy problem make a difference to it.
@@ -135,6 +133,7 @@ class MethodEntry(Generic[Made]):
     recognised_by: tuple[str, ...] | None = None
     shown: tuple[str, ...] = ()
     unit: Unit = "control steps"
+    usual_budget: int = 300_000
     simulates: bool = True
     needs_data: bool = True
     needs_parameters: bool = True
@@ -145,16 +144,16 @@ class MethodEntry(Generic[Made]):
 
     @property
     def identity(self) -> dict[str, object]:
-        """The hyperparameters by which a method is recognised as this one."""
+        """The hyperparameters by which `entry_of` recognises the method."""
         names = self.settings if self.recognised_by is None else self.recognised_by
         return {name: self.settings[name] for name in names}
 
 
 def entry_of(method: Made, registry: Mapping[str, MethodEntry[Any]]) -> MethodEntry[Made]:
-    """The entry of a registry that describes a method: its class, and as many recognised settings as possible.
+    """The entry of a registry that describes a method: of its class, and with the most settings in common.
 
-    A number such as a weight is recognised at any value but the default, everything else at the entry's own value.
-    A method of another class is named after its class, and has the defaults of an entry.
+    A setting of type float, such as a weight, matches every value but the default; all others must be equal. A method
+    of a class that is not in the registry gets an entry with the name of the class and the defaults.
     """
 
     def fits(entry: MethodEntry[Any]) -> bool:
@@ -169,15 +168,15 @@ def entry_of(method: Made, registry: Mapping[str, MethodEntry[Any]]) -> MethodEn
 
 
 def check_hyperparameters(method: object) -> None:
-    """Refuse fields of a dataclass of hyperparameters that are not what their annotations say.
+    """Refuse a dataclass of hyperparameters with a field that is not what its annotation says.
 
     Raises:
-        MadocError: Names the first such field, what is expected of it, and what it was.
+        MadocError: Names the first such field, what is expected of it, and its value.
     """
     kind: type = type(method)
-    for name, adapter in _adapters(kind).items():
+    for name, validate in _validators(kind).items():
         try:
-            adapter.validate_python(getattr(method, name))
+            validate(getattr(method, name))
         except ValidationError as error:
             problem = error.errors()[0]
             expected = problem["msg"].removeprefix("Input should be ")
@@ -186,8 +185,8 @@ def check_hyperparameters(method: object) -> None:
 
 
 @cache
-def _adapters(kind: type) -> dict[str, TypeAdapter[object]]:
-    """What checks each field of a dataclass."""
+def _validators(kind: type) -> dict[str, Callable[[object], object]]:
+    """A function for each field of a dataclass that raises where a value is not as annotated."""
     hints = get_type_hints(kind, include_extras=True)
     checked = {name: hint for name, hint in hints.items() if not is_dataclass(hint)}
-    return {name: TypeAdapter(hint, config=ConfigDict(strict=True)) for name, hint in checked.items()}
+    return {name: TypeAdapter(hint, config=ConfigDict(strict=True)).validate_python for name, hint in checked.items()}

@@ -77,4 +77,4 @@ def test_a_candidate_is_a_mean_and_a_log_deviation():
 
 def test_droids_cost_weighs_both_distances():
     assert trajectory_cost(np.array([[1.0, -3.0]]), absolute=2.0, squared=0.5) == pytest.approx([2.0 * 2.0 + 0.5 * 5.0])
-    assert np.isnan(trajectory_cost(np.array([1.0, np.nan]), absolute=1.0, squared=1.0))
+    assert np.isnan(trajectory_cost(np.array([[1.0, np.nan]]), absolute=1.0, squared=1.0)).all()

@@ -54,7 +54,7 @@ def test_training_lowers_the_loss_and_traces_once(traced):
     for key in keys[1:]:
         vae, state, last = grouping.train(vae, state, rows, key, **settings)
     assert traced() == before
-    assert last["grouping_loss"] < 0.8 * first["grouping_loss"]
+    assert last < 0.8 * first
     assert state[0].count == 220
 
 
@@ -78,7 +78,6 @@ def test_reconstruction_loss_by_hand(compiled):
 
 def test_embeddings_are_one_a_parameter():
     vae, _ = untrained()
-    assert vae.parameters == 4
     assert vae.embeddings().shape == (4, LATENT)
     np.testing.assert_allclose(hand_made().embeddings()[:, 0], [0.5, -1.0])
 
@@ -138,13 +137,6 @@ def test_permuting_parameters_permutes_groups():
 def test_as_many_groups_as_parameters_is_each_its_own():
     np.testing.assert_array_equal(grouping.cluster(islands((0, 1, 2, 3)), 4, seed=0), [0, 1, 2, 3])
     np.testing.assert_array_equal(grouping.cluster(islands((0, 1, 2, 3)), 1, seed=0), [0, 0, 0, 0])
-
-
-@pytest.mark.parametrize(("count", "width"), [(2, 2), (3, 3), (8, 3)])
-def test_project_keeps_three_components_at_most(count, width):
-    projected = grouping.project(islands(range(count)))
-    assert projected.shape == (count, width)
-    np.testing.assert_allclose(projected.mean(0), 0, atol=1e-9)
 
 
 def test_vote_takes_the_most_frequent_scheme():

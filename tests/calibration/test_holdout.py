@@ -1,7 +1,4 @@
-"""Reports on a hold-out, as a result's file keeps them."""
-
-import json
-from dataclasses import replace
+"""The records of what a hold-out shows of an estimate."""
 
 import pytest
 
@@ -9,16 +6,11 @@ from madoc.calibration.holdout import (
     AgainstChance,
     Area,
     Fitted,
-    NotRun,
     Predicted,
     PredictionError,
     PredictionErrors,
     ToldApart,
-    Tried,
-    holdout_from_json,
-    holdout_to_json,
 )
-from madoc.errors import MadocError
 
 COMMON = {
     "split": "1 of 5 episodes is held out",
@@ -42,14 +34,6 @@ REPORTS = [
 ]
 
 
-@pytest.mark.parametrize("report", REPORTS)
-def test_a_report_comes_back_as_it_was(report):
-    compared = (Tried("madoc", 0.1, (0.0, 0.2), "CALIBRATED", 10, 1.5), NotRun("oted", "the budget is spent"))
-    for written in (report, replace(report, candidates=compared, chosen="madoc")):
-        assert holdout_from_json(json.loads(json.dumps(holdout_to_json(written)))) == written
-    assert "candidates" not in holdout_to_json(report)
-
-
 def test_the_clearest_prediction_pays_for_the_others_that_were_tried():
     assert (REPORTS[0].clearest.prediction, REPORTS[0].chance) == ("staying in place", 0.004)
 
@@ -58,8 +42,3 @@ def test_the_clearest_prediction_pays_for_the_others_that_were_tried():
 def test_less_is_better_by_every_measure(report, score):
     assert report.score == score
     assert report.score_interval[0] < report.score < report.score_interval[1]
-
-
-def test_a_report_of_another_version_is_refused_in_a_sentence():
-    with pytest.raises(MadocError, match=r"not written by this version .*calibrate again, or delete its entry"):
-        holdout_from_json({"measure": "prediction", "relative": 0.1})

@@ -39,24 +39,35 @@ def test_the_share_that_a_step_saves():
 
 
 def test_windows_left_out_make_a_search_worse_than_its_cost_says():
-    nothing = np.zeros(0)
-    rest = {"unit": nothing, "residuals": nothing, "kept": nothing, "steps": nothing, "state_steps": nothing}
-    rest |= {"bread": nothing, "meat": nothing}
     plan = Plan(
-        **rest, scale=1.0, deviation=np.array([0.5]), autocorrelation=0.0, exact=False, left_out=0.25, failures=0
+        point=np.zeros(0),
+        residuals=np.zeros((0, 0)),
+        kept=np.zeros(0, bool),
+        steps=np.zeros((0, 0)),
+        state_steps=np.zeros((0, 0, 0)),
+        spread=np.zeros(0),
+        scale=1.0,
+        deviation=np.array([0.5]),
+        bread=np.zeros((0, 0)),
+        meat=np.zeros((0, 0)),
+        failures=0,
+        exact=False,
+        left_out=0.25,
     )
     assert plan.comparable(2.0) == pytest.approx(2.0 * 0.25 + 0.25)
     assert replace(plan, left_out=1.0).comparable(2.0) == ALL_FAILED
 
 
-@pytest.mark.parametrize("starts", [KnownStarts("cauchy"), UnknownStarts("cauchy")])
+@pytest.mark.parametrize("starts", [KnownStarts, UnknownStarts])
 def test_one_search_finds_a_clean_spring_from_known_and_unknown_states(starts):
     problem = CalibrationProblem(
         recorded(SPRING, SPRING_TRUTH, 400, jax.random.key(0)), simulation.make(SPRING, threads=1)
     )
-    search = Search(starts, horizon=5, windows=40, searches=2, search_windows=10, search_epochs=6, tolerance=1e-7)
+    search = Search(
+        starts, "cauchy", horizon=5, windows=40, searches=2, search_windows=10, search_epochs=6, tolerance=1e-7
+    )
     state, spent = search.init(problem, jax.random.key(1)), 0
-    assert state.states.shape[1:] == ((0, 0) if isinstance(starts, KnownStarts) else (40, 2))
+    assert state.states.shape[1:] == ((0, 0) if starts is KnownStarts else (40, 2))
     for _ in range(25):
         state, epoch = search.step(problem, state)
         spent += epoch.control_steps
@@ -64,7 +75,7 @@ def test_one_search_finds_a_clean_spring_from_known_and_unknown_states(starts):
             break
     assert search.settled(state)
     truth = SPRING.parameters.to_unit(SPRING.parameters.vector(SPRING_TRUTH))
-    np.testing.assert_allclose(state.unit[0], truth, atol=1e-5)
+    np.testing.assert_allclose(state.point[0], truth, atol=1e-5)
     longest = search.init(problem, jax.random.key(1))
     assert spent <= search.whole_run(problem, longest, refining_epochs=25)
 
@@ -72,13 +83,10 @@ def test_one_search_finds_a_clean_spring_from_known_and_unknown_states(starts):
 def test_known_windows_leave_the_residuals_of_a_replay():
     log = recorded(SPRING, SPRING_TRUTH, 50, jax.random.key(0))
     problem, rows = CalibrationProblem(log, simulation.make(SPRING, threads=1)), np.array([3, 30])
-    unit = np.zeros((1, len(SPRING.parameters)))
-    (plan,) = (
-        KnownStarts("linear")
-        .windows(problem, rows, 4)
-        .plans(unit, np.zeros((1, 0, 0)), np.ones(1), np.ones((1, 0)), refining=True)
-    )
+    point = np.zeros((1, len(SPRING.parameters)))
+    starts = KnownStarts.at(problem, rows, 4, "linear")
+    (plan,) = starts.plans(point, np.zeros((1, 0, 0)), np.ones(1), np.ones((1, 0)), refining=True)
     windows = windows_at(log, log.transitions.observation[rows], rows, 4)
-    expected = window_residuals(problem.simulator, windows, unit, problem.typical_change)[0]
+    expected = window_residuals(problem.simulator, windows, point, problem.typical_change)[0]
     np.testing.assert_array_equal(plan.residuals, expected)
     assert (plan.steps[-1] == 0.0).all()

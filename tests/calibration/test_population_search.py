@@ -66,12 +66,13 @@ def test_the_estimate_is_the_search_in_physical_units(problem):
 
 
 def test_a_generation_says_what_it_cost_and_when_the_search_is_narrow():
-    key = jax.random.key(0)
-    state = SearchState(evolution.begin(np.zeros(2)), key, 1)
+    key, other = jax.random.split(jax.random.key(0))
+    state, spent = SearchState(evolution.begin(np.zeros(2)), key, 1), {"control_steps": 7, "failures": 2}
     candidates = evolution.ask(state.search, key)
-    following, epoch = next_generation(state, candidates, candidates[:, 0], control_steps=7, tolerance=0.0)
+    following, epoch = next_generation(state, candidates, candidates[:, 0], other, **spent, tolerance=0.0)
     assert (following.search.generation, epoch.control_steps, epoch.converged) == (1, 7, None)
+    assert (following.failures, following.key) == (3, other)
     assert epoch.metrics["cost"] == candidates[:, 0].min()
-    _, last = next_generation(state, candidates, candidates[:, 0], control_steps=7, tolerance=1.0)
+    _, last = next_generation(state, candidates, candidates[:, 0], other, **spent, tolerance=1.0)
     assert last.converged == "after 1 generations every deviation is below 1 of its range"
     assert following.search.mean[0] < 0.0

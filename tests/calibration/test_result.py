@@ -1,8 +1,13 @@
 import json
+from dataclasses import replace
 
 import numpy as np
+import pytest
+from test_holdout import REPORTS
 
 from madoc.calibration import CalibrationResult, ParameterEstimate
+from madoc.calibration.holdout import NotRun, Tried
+from madoc.errors import MadocError
 
 
 def result(**changes):
@@ -31,3 +36,28 @@ def test_what_is_not_known_is_left_out():
 
 def test_intervals_have_a_column_of_their_own():
     assert "[-9.850, -9.770]" in str(result())
+
+
+@pytest.mark.parametrize("report", REPORTS)
+def test_the_record_of_the_hold_out_comes_back_as_it_was(report):
+    compared = (Tried("madoc", 0.1, (0.0, 0.2), "CALIBRATED", 10, 1.5), NotRun("oted", "the budget is spent"))
+    for written in (report, replace(report, candidates=compared, chosen="madoc")):
+        stored = json.loads(json.dumps(result(holdout=written).to_json()))
+        assert CalibrationResult.from_json(stored).holdout == written
+        assert ("candidates" in stored["holdout"]) == (written is not report)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        (
+            {"holdout": {"measure": "prediction", "relative": 0.1}},
+            r"by this version of Madoc \(holdout: .*calibrate again, or delete its entry holdout",
+        ),
+        ({"spent": 3}, r"\(spent: Unexpected keyword argument\); calibrate again$"),
+        ({"parameters": {"gravity": {"std": 1.0}}}, r"\(parameters.gravity.estimate: Field required\)"),
+    ],
+)
+def test_another_file_is_refused_in_a_sentence(changes, sentence):
+    with pytest.raises(MadocError, match=sentence):
+        CalibrationResult.from_json(result().to_json() | changes)

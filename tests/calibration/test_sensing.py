@@ -7,8 +7,7 @@ import pytest
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, CmaEs, LeastSquares, Madoc, Oted
 from madoc.calibration.least_squares.calibrator import horizon_of
-from madoc.calibration.madoc.collection import sensed
-from madoc.calibration.madoc.sensing import noise_deviation, observation_warnings, window_length
+from madoc.calibration.madoc.collection import noise_deviation, with_sensor_noise
 from madoc.data import Disturbance, disturb, observed_task
 from madoc.errors import MadocError
 from madoc.simulation.rollout import Rollout
@@ -31,9 +30,9 @@ def problem_of(log, **disturbance):
 
 def test_windows_are_as_long_as_the_observation_wants(log):
     seen, hidden = problem_of(log), problem_of(log, hidden_velocities=True)
-    assert [window_length(problem, None, "logged") for problem in (seen, hidden)] == [1, 3]
-    assert window_length(hidden, 5, "logged") == 5
-    assert window_length(hidden, None, "replay") == 1
+    assert [Madoc().collection(problem).scaling.length for problem in (seen, hidden)] == [1, 3]
+    assert Madoc(window=5).collection(hidden).scaling.length == 5
+    assert Madoc(starts="replay").collection(hidden).scaling.length == 1
     with pytest.raises(MadocError, match=r"no episode .* has the 301 rows of a window; take a shorter one"):
         seen.features.windows("standardised", 301)
 
@@ -43,7 +42,7 @@ def test_rollouts_start_at_logged_states_where_those_are_known(log):
     blind = CalibrationProblem(
         log, simulation.make(replace(WHOLE, state_from_observation=None, posture=None), threads=1)
     )
-    assert [Madoc()._start_mode(problem) for problem in (seen, hidden, blind)] == ["logged", "logged", "policy"]
+    assert [Madoc().collection(problem).mode for problem in (seen, hidden, blind)] == ["logged", "logged", "policy"]
     assert [Oted()._anew(problem) for problem in (seen, hidden, blind)] == [True, False, False]
     assert [CmaEs("distribution")._acts(problem) for problem in (seen, hidden, blind)] == [False, True, True]
 
@@ -54,19 +53,20 @@ def test_simulated_readings_carry_the_noise_that_the_data_says_it_has(log):
     change = clean.typical_change
     np.testing.assert_allclose(noise_deviation(noisy, None), 0.1 * change, rtol=0.05)
     np.testing.assert_allclose(noise_deviation(noisy, "estimated"), 0.1 * change, rtol=0.3)
-    (told,) = observation_warnings(noisy, 1, noise_deviation(noisy, None), "logged")
-    assert told == "simulated observations were given sensor noise of 9.9 % of a step's change"
-    assert observation_warnings(clean, 1, noise_deviation(clean, None), "logged") == ()
+    (warning,) = Madoc().collection(noisy).warnings
+    assert warning == "simulated observations were given sensor noise of 9.9 % of a step's change"
+    assert Madoc().collection(clean).warnings == ()
 
 
 def test_a_reading_that_ends_a_row_begins_the_next():
     places = np.zeros((4, 2, 3, 1))
-    rows = Transitions(places, places, places[..., 0], places, places[..., 0], places[..., 0])
+    never = np.zeros((4, 2, 3), dtype=bool)
+    rows = Transitions(places, places, places[..., 0], places, never, never)
     rollout = Rollout(rows, np.ones((4, 2, 3), dtype=bool))
-    seen = sensed(rollout, np.array([2.0]), KEY).transitions
+    seen = with_sensor_noise(rollout, np.array([2.0]), KEY).transitions
     np.testing.assert_array_equal(seen.next_observation[:-1], seen.observation[1:])
     assert seen.observation.std() == pytest.approx(2.0, rel=0.5)
-    assert sensed(rollout, np.zeros(1), KEY) is rollout
+    assert with_sensor_noise(rollout, np.zeros(1), KEY) is rollout
 
 
 def test_horizons_follow_how_fast_a_robot_moves(log):
@@ -80,14 +80,14 @@ def test_horizons_follow_how_fast_a_robot_moves(log):
 
 
 def test_initial_states_are_estimated_where_the_data_asks_for_it(log):
-    phases = {
+    stages = {
         "undecided": {},
         "starting": {"noise": 0.1},
         "estimated": {"hidden_velocities": True},
     }
     for stage, disturbance in stages.items():
         assert LeastSquares().init(problem_of(log, **disturbance), KEY).stage == stage
-    assert LeastSquares(initial_states="logged").init(problem_of(log, noise=0.1), KEY).phase == "logged"
+    assert LeastSquares(initial_states="logged").init(problem_of(log, noise=0.1), KEY).stage == "logged"
     with pytest.raises(MadocError, match="does not determine its state"):
         LeastSquares(initial_states="logged").init(problem_of(log, hidden_velocities=True), KEY)
 

@@ -106,7 +106,7 @@ def test_it_stops_after_so_many_epochs_without_progress():
     watch = settled(blur=0.2)
     assert stalled(watched(watch, 19, blur=0.2), 20) is None
     sentence = stalled(watched(watch, 20, blur=0.2), 20)
-    assert sentence.startswith("the reward has nothing left to say")
+    assert sentence.startswith("the mismatch of simulated and logged rows has stayed at")
     assert sentence.endswith("0.2 for 20 epochs")
     assert stalled(watched(watch, 20, blur=0.05), 20) is None
 
@@ -118,35 +118,35 @@ def test_crumbs_add_up_to_progress():
     assert stalled(watch, 10) is None
 
 
-def told(watch=None, unit=(0.0, 0.0)):
+def warned(watch=None, unit=(0.0, 0.0)):
     return warnings(watch or settled(blur=0.1), np.array(unit), ("mass", "damping"))
 
 
 def test_a_healthy_run_is_not_warned_of():
-    assert told(unit=(-0.94, 0.94)) == ()
+    assert warned(unit=(-0.94, 0.94)) == ()
 
 
 def test_a_parameter_at_the_end_of_its_range_is_named():
-    (warning,) = told(unit=(0.5, -0.96))
+    (warning,) = warned(unit=(0.5, -0.96))
     assert warning == "at the end of its range: damping; widen the range or doubt the model"
-    assert "mass, damping" in told(unit=(1.0, -0.99))[0]
+    assert "mass, damping" in warned(unit=(1.0, -0.99))[0]
 
 
-def test_a_saturated_reward_is_told():
-    (warning,) = told(settled(blur=0.1, at_bound=0.75))
+def test_a_saturated_reward_is_warned():
+    (warning,) = warned(settled(blur=0.1, at_bound=0.75))
     assert "sure of 75% of the simulated rows (reward at its bound)" in warning
-    assert told(settled(blur=0.1, at_bound=SATURATED - 0.01)) == ()
+    assert warned(settled(blur=0.1, at_bound=SATURATED - 0.01)) == ()
 
 
 def test_saturation_long_past_is_forgotten():
-    assert told(watched(settled(blur=0.1, at_bound=1.0), 30, blur=0.1)) == ()
+    assert warned(watched(settled(blur=0.1, at_bound=1.0), 30, blur=0.1)) == ()
 
 
-def test_too_few_epochs_are_told():
-    (warning,) = told(watched(begun(), 3, blur=0.1))
+def test_too_few_epochs_are_warned():
+    (warning,) = warned(watched(begun(), 3, blur=0.1))
     assert "3 epochs of calibration" in warning
     assert "larger budget" in warning
 
 
 def test_warnings_add_up():
-    assert len(told(watched(begun(), 3, blur=0.1, at_bound=1.0), unit=(1.0, 0.0))) == 3
+    assert len(warned(watched(begun(), 3, blur=0.1, at_bound=1.0), unit=(1.0, 0.0))) == 3

@@ -19,12 +19,14 @@ CALIBRATION = [
 
 LEARNER = ["warmup_steps=500", "updates_per_step=0.01", "epoch_steps=500", "hidden=[16,16]", "replay_capacity=2000"]
 
+FAST_LEARNER = ["warmup_steps=500", "steps_per_update=100", "epoch_steps=500", "hidden=[16,16]", "replay_capacity=2000"]
+
 LEARNING = ["--budget", "1000", "--quiet", "--set", *LEARNER]
 
 WHOLE = [
     *("run", "hopper-medium", "--transitions", "1000", "--policy-budget", "1000", "--episodes", "2"),
     *CALIBRATION,
-    *("--policy-set", *LEARNER),
+    *("--policy-set", *FAST_LEARNER),
 ]
 
 

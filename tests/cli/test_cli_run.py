@@ -80,6 +80,13 @@ def test_a_log_without_truth_is_calibrated_and_learnt_from(recorded, tmp_path, c
     assert "no truth" in answer["sentence"]
 
 
+def test_a_policy_learnt_from_a_log_is_evaluated_at_the_truth_that_the_log_carries(recorded, tmp_path, capsys):
+    words = ["run", "hopper", "--data", recorded, *WHOLE[2:], "--no-yardsticks", "--out", tmp_path / "run"]
+    answer, code = asked_for_json(capsys, words)
+    assert code == 0
+    assert list(answer["evaluation"]["policies"]) == ["calibrated"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "moment",

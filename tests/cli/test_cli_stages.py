@@ -104,7 +104,17 @@ def test_evaluate_shows_policies_beside_the_yardsticks(whole, tmp_path, capsys):
 
 @pytest.mark.parametrize("at", ["distribution", "uniform"])
 def test_learn_over_a_distribution(whole, tmp_path, capsys, at):
-    words = ["learn", whole / "calibration" / "result.json", "--at", at, "--out", tmp_path / "policy", *LEARNING]
+    words = [
+        "learn",
+        whole / "calibration" / "result.json",
+        "--method",
+        "sac",
+        "--at",
+        at,
+        "--out",
+        tmp_path / "policy",
+        *LEARNING,
+    ]
     answer, code = asked_for_json(capsys, words)
     assert (answer["at"], answer["spent"], answer["budget_unit"], code) == (at, 1000, "control steps", 0)
 

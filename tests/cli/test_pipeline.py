@@ -1,5 +1,6 @@
 import json
 import warnings
+from pathlib import Path
 
 import pytest
 
@@ -10,11 +11,12 @@ from madoc.data import Disturbance
 from madoc.errors import MadocError
 from madoc.pipeline import CalibrationOrder, Reading, Search, Source, fingerprint, split_name
 from madoc.pipeline.data_stage import Machine
-from madoc.pipeline.folders import ended, restored_path, stored_path, working_folder
+from madoc.pipeline.folders import ended, working_folder
 from madoc.pipeline.keys import seed_key, stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
 from madoc.pipeline.orders import parse_settings
 from madoc.pipeline.preparation import prepare
+from madoc.report.records import restored_path, stored_path
 from madoc.simulation import make
 
 
@@ -71,9 +73,10 @@ def test_a_target_binds_what_was_not_calibrated():
 def test_paths_beside_the_folder_move_with_it(tmp_path):
     folder = tmp_path / "run" / "calibration"
     assert stored_path(tmp_path / "run" / "data.npz", folder) == "../data.npz"
-    assert restored_path("../data.npz", folder).resolve() == tmp_path / "run" / "data.npz"
+    assert Path(restored_path("../data.npz", folder)).resolve() == tmp_path / "run" / "data.npz"
     elsewhere = tmp_path / "data.npz"
-    assert restored_path(stored_path(elsewhere, folder), folder) == elsewhere
+    assert restored_path(stored_path(elsewhere, folder), folder) == str(elsewhere)
+    assert restored_path("mujoco/hopper/expert-v0", folder) == "mujoco/hopper/expert-v0"
 
 
 @pytest.mark.parametrize("kept", [False, True])

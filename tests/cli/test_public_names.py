@@ -28,6 +28,8 @@ def loaded_by(code):
 
 def test_a_robots_computer_needs_numpy_alone():
     assert loaded_by("import madoc; from madoc.numpy_policy import NumpyPolicy") == set()
+    without_gymnasium = "import sys; sys.modules['gymnasium'] = None"
+    assert loaded_by(f"{without_gymnasium}; import madoc; from madoc.numpy_policy import NumpyPolicy") == set()
 
 
 def test_the_command_line_starts_without_jax():

@@ -33,10 +33,16 @@ ACTING = SMALL | {"environments": 4, "epoch_steps": EPOCH, "updates_per_step": 0
 ACTING |= {"replay_capacity": 150}
 OFFLINE = SMALL | {"epoch_updates": EPOCH}
 
+FAST = SMALL | {"environments": 4, "epoch_steps": EPOCH, "steps_per_update": 10, "warmup_steps": EPOCH}
+FAST |= {"replay_capacity": 150, "judge_every": 4, "judge_episodes": 2}
+
 METHODS = {
     "sac": LEARNERS["sac"].make(**ACTING, judge_every=2 * EPOCH, judge_episodes=2),
     "sac-bc": LEARNERS["sac-bc"].make(**ACTING),
     "dr-bc": LEARNERS["dr-bc"].make(**ACTING),
+    "dr": LEARNERS["dr"].make(**ACTING),
+    "fast-sac": LEARNERS["fast-sac"].make(**FAST),
+    "rlpd": LEARNERS["rlpd"].make(**FAST),
     "h2o": LEARNERS["h2o"].make(**ACTING),
     "bc": LEARNERS["bc"].make(**OFFLINE),
     "cql": LEARNERS["cql"].make(**OFFLINE, critic_hidden=(8, 8), samples=2, cloning_updates=EPOCH),
@@ -57,7 +63,7 @@ METHODS = {
 }
 SIMULATING = [name for name, entry in LEARNERS.items() if entry.simulates]
 FED = [name for name, entry in LEARNERS.items() if entry.needs_data]
-REWARDED = ["h2o", "cql", "morec"]
+REWARDED = ["rlpd", "h2o", "cql", "morec"]
 
 
 @pytest.fixture(scope="module")
@@ -274,7 +280,7 @@ def test_data_without_rewards_is_refused_where_they_are_learnt_from(name, datase
 @pytest.mark.parametrize("name", REWARDED)
 def test_next_observations_of_other_rows_are_refused_where_they_are_learnt_from(name, dataset, problem):
     torn = replace(dataset, disturbance=Disturbance(shuffled="next_observations"))
-    with pytest.raises(MadocError, match="learns from what followed on each action"):
+    with pytest.raises(MadocError, match="learns from the outcomes of actions"):
         learn_policy(METHODS[name], replace(problem, dataset=torn), key=KEY, budget=BUDGET)
 
 

@@ -139,6 +139,21 @@ def test_parquet_of_lists_and_dates(columns, tmp_path):
     assert_same(logs.read(tmp_path / "log.parquet", robot), columns)
 
 
+@pytest.mark.parametrize("kind", [pa.list_(pa.float64()), pa.list_(pa.float64(), 2), pa.large_list(pa.float64())])
+def test_parquet_of_lists_with_missing_rows(tmp_path, kind):
+    file = tmp_path / "log.parquet"
+    pq.write_table(pa.table({"pair": pa.array([[1.0, 2.0], None, [3.0, 4.0]], kind)}), file, row_group_size=1)
+    np.testing.assert_array_equal(parquet_reader.read_columns(file)["pair"], [[1, 2], [np.nan, np.nan], [3, 4]])
+    pq.write_table(pa.table({"pair": pa.array([], kind)}), file)
+    assert parquet_reader.read_columns(file)["pair"].size == 0
+
+
+def test_parquet_of_lists_of_unequal_lengths(tmp_path):
+    pq.write_table(pa.table({"pair": [[1.0, 2.0], [3.0]]}), tmp_path / "log.parquet")
+    with pytest.raises(MadocError, match=r"as many values in every row of a list column of log.parquet, got 1 and 2"):
+        parquet_reader.read_columns(tmp_path / "log.parquet")
+
+
 def lerobot(folder, columns, *, together):
     """Two episodes, of one file each (version 2) or of one file (version 3)."""
     tables = []

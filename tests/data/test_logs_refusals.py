@@ -246,3 +246,12 @@ def test_lerobot_without_data(robot, tmp_path):
     (tmp_path / "logs" / "meta" / "info.json").write_text('{"features": {}}')
     with pytest.raises(MadocError, match="logs is no whole LeRobot dataset: no Parquet file in its folder data"):
         logs.read(tmp_path / "logs", robot)
+
+
+def test_lerobot_without_episodes(robot, tmp_path):
+    for folder in ("meta", "data"):
+        (tmp_path / "logs" / folder).mkdir(parents=True)
+    (tmp_path / "logs" / "meta" / "info.json").write_text('{"features": {}}')
+    pq.write_table(pa.table({"episode_index": pa.array([], pa.int64())}), tmp_path / "logs" / "data" / "file.parquet")
+    with pytest.raises(MadocError, match=r"expected at least one episode in .*logs, got none"):
+        logs.read(tmp_path / "logs", robot)

@@ -109,7 +109,7 @@ def test_broken_episodes_are_refused(hopper, tmp_path):
     cases = {
         "one more observation than rewards, and a reward, got 5 and 5 in episode 2": shorten("observations"),
         "as many rows in actions as in rewards, got 4 and 5": shorten("actions"),
-        "as many rows in truncations as in terminations, got 4 and 5": shorten("truncations"),
+        "as many rows in truncations as in rewards, got 4 and 5": shorten("truncations"),
         "expected 3 values per row of actions in every episode, got 2 in episode 2": narrow,
         "cannot read the Minari dataset": lambda group: group.pop("rewards"),
     }

@@ -17,9 +17,8 @@ def test_what_is_saved_comes_back_bit_for_bit(hopper, tmp_path):
     for field, values in vars(dataset.transitions).items():
         np.testing.assert_array_equal(getattr(loaded.transitions, field), values, err_msg=field)
     np.testing.assert_array_equal(loaded.episode_starts, dataset.episode_starts)
-    assert replace(loaded, transitions=None, episode_starts=None) == replace(
-        dataset, transitions=None, episode_starts=None
-    )
+    same = {name: getattr(dataset, name) for name in ("transitions", "episode_starts")}
+    assert replace(loaded, **same) == dataset
     assert [path.name for path in tmp_path.iterdir()] == ["made.npz"]
 
 
@@ -76,7 +75,7 @@ def rewrite(path, **changes):
         ({"metadata": np.array('{"version": 7}')}, r"expected file version 1, got 7 in .*made.npz"),
         ({"metadata": np.array("{")}, r"metadata of .*made.npz cannot be read"),
         ({"metadata": np.array("[]")}, r"metadata of .*made.npz cannot be read"),
-        ({"metadata": np.array('{"version": 1}')}, r"no 'origin' in the metadata of .*made.npz"),
+        ({"metadata": np.array('{"version": 1}')}, r"metadata of .*made.npz cannot be read \(.*task_name"),
         ({"reward": None}, r"no array 'reward' in .*made.npz"),
         ({"reward": np.zeros(3)}, "as many rows in reward as in observation, got 3 and 14"),
         ({"episode_starts": np.array([0.0, np.nan])}, "row numbers in episode_starts"),

@@ -4,12 +4,12 @@ import pytest
 from ruamel.yaml import YAML
 
 from madoc.calibration import ParameterEstimate
-from madoc.export import Exported, Provenance, save_patch, save_randomization, save_sysid_parameters
+from madoc.export import Exported, save_patch, save_randomization, save_sysid_parameters
 from madoc.parameters import Parameter
 from madoc.simulation.mjcf import Change
 
 read_yaml = YAML(typ="safe").load
-PROVENANCE = Provenance(
+PROVENANCE = dict(
     run="h0",
     method="least-squares",
     seed=0,

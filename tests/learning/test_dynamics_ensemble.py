@@ -84,7 +84,7 @@ def test_features_come_back():
     observation, following = jnp.asarray(rows.observation, jnp.float32), jnp.asarray(rows.next_observation, jnp.float32)
     pair = features.pair(observation, jnp.asarray(rows.action, jnp.float32))
     np.testing.assert_allclose(np.asarray(pair).std(0), 1.0, rtol=1e-4)
-    change = features.change(observation, following)
+    change = (following - observation) / features.change_scale[None]
     np.testing.assert_allclose(np.asarray(change).std(0), 1.0, rtol=1e-4)
     np.testing.assert_allclose(features.following(observation, change), following, rtol=1e-4, atol=1e-4)
 

@@ -7,21 +7,11 @@ import pytest
 from affine import affine
 from madoc.learning.dynamics_ratio import (
     Discriminators,
-    Scaling,
     blur,
     discriminator_loss,
     log_dynamics_ratio,
     overlap,
 )
-from madoc.types import Transitions
-
-
-def rows(observation, action, next_observation):
-    observation = np.asarray(observation, np.float64)
-    empty = np.zeros(observation.shape[:-1])
-    return Transitions(
-        observation, np.asarray(action, np.float64), empty, np.asarray(next_observation, np.float64), empty, empty
-    )
 
 
 def discriminators(pair, triple, bound=2.0, pair_bound=None):
@@ -173,46 +163,3 @@ def test_no_blur_leaves_features_as_they_are():
     rows = random_features()[1]
     for unblurred in blur((rows, rows), 0.0, jax.random.key(0)):
         np.testing.assert_array_equal(unblurred, rows)
-
-
-def test_standardised_scaling_by_hand():
-    # s: 1, 3 (mean 2, spread 1); a: 5, 5 (never moves: spread 1); s' - s: 2, 6 (spread 2)
-    scaling = Scaling.standardised(rows([[1], [3]], [[5], [5]], [[3], [9]]))
-    pair, following = scaling.features(rows([[1], [3], [4]], [[5], [5], [7]], [[3], [9], [4]]))
-    np.testing.assert_allclose(pair, [[-1, 0], [1, 0], [2, 2]])
-    np.testing.assert_allclose(following, [[1], [3], [0]])
-    assert pair.dtype == following.dtype == np.float32
-
-
-def test_raw_scaling_leaves_rows_as_they_are():
-    seen = rows([[1, -2], [3, 4]], [[5], [6]], [[7, 8], [9, 10]])
-    pair, following = Scaling.raw(seen).features(seen)
-    np.testing.assert_array_equal(pair, [[1, -2, 5], [3, 4, 6]])
-    np.testing.assert_array_equal(following, [[7, 8], [9, 10]])
-
-
-def test_standardised_features_are_of_order_one():
-    random = np.random.default_rng(0)
-    observation, action = random.normal(5, 20, (1000, 3)), random.normal(size=(1000, 2))
-    seen = rows(observation, action, observation + random.normal(0, 1e-3, (1000, 3)))
-    pair, following = Scaling.standardised(seen).features(seen)
-    np.testing.assert_allclose(pair.mean(0), 0, atol=1e-5)
-    np.testing.assert_allclose(pair.std(0), 1, rtol=1e-4)
-    np.testing.assert_allclose(following.std(0), 1, rtol=1e-4)
-
-
-def test_small_changes_of_large_values_survive_float32():
-    # in float32, 1e6 + 0.01 is 1e6: the difference has to be taken before
-    seen = rows([[1e6], [1e6]], np.zeros((2, 1)), [[1e6 + 0.01], [1e6 - 0.01]])
-    _, following = Scaling.standardised(seen).features(seen)
-    np.testing.assert_allclose(following, [[1], [-1]], rtol=1e-5)
-
-
-def test_features_take_any_leading_axes():
-    random = np.random.default_rng(0)
-    seen = rows(random.normal(size=(4, 5, 3)), random.normal(size=(4, 5, 2)), random.normal(size=(4, 5, 3)))
-    flat = rows(*(part.reshape(20, -1) for part in (seen.observation, seen.action, seen.next_observation)))
-    scaling = Scaling.standardised(flat)
-    for shaped, straight in zip(scaling.features(seen), scaling.features(flat), strict=True):
-        assert shaped.shape[:2] == (4, 5)
-        np.testing.assert_array_equal(shaped.reshape(20, -1), straight)

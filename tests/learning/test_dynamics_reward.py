@@ -20,8 +20,8 @@ def test_reward_by_hand(compiled):
 def test_losses_by_hand(compiled):
     # real logit log 3: -log 3/4; generated log 3: -log 1/4; the generator's is minus that
     logit = jnp.array([np.log(3.0)])
-    assert compiled(reward.telling_loss)(logit, logit) == pytest.approx(-np.log(0.75) - np.log(0.25), rel=1e-5)
-    assert compiled(reward.deceiving_loss)(logit) == pytest.approx(np.log(0.25), rel=1e-5)
+    assert compiled(reward.discriminator_loss)(logit, logit) == pytest.approx(-np.log(0.75) - np.log(0.25), rel=1e-5)
+    assert compiled(reward.generator_loss)(logit) == pytest.approx(np.log(0.25), rel=1e-5)
 
 
 def start(members=3):

@@ -103,7 +103,7 @@ def test_sac(draws):
     close(
         loss_and_slopes(
             lambda policy: sac_losses.actor_loss(
-                policy, CRITIC, OBSERVATION, temperature=TEMPERATURE, key=jax.random.key(0)
+                policy, CRITIC, OBSERVATION, temperature=TEMPERATURE, noise=jax.random.key(0)
             )[0],
             POLICY,
             lambda slopes: [layer.weight for layer in slopes.network.layers],

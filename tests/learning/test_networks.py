@@ -6,7 +6,7 @@ import optax
 import pytest
 
 from affine import affine, layered
-from madoc.learning.networks import Network, descend, drop, moving_average, scan_updates
+from madoc.learning.networks import Network, descend, drop, minimise, moving_average, scan_updates
 
 
 def test_network_is_affine_relu_affine(compiled):
@@ -129,3 +129,16 @@ def test_moving_average_ends():
     np.testing.assert_array_equal(moving_average(slow, fast, 0.0)["a"], slow["a"])
     np.testing.assert_allclose(moving_average(slow, fast, 1.0)["a"], fast["a"], rtol=1e-6)
     assert moving_average(slow, fast, 1.0)["n"] == 3  # counters are not averaged
+
+
+def test_minimise_descends_by_hand_and_draws_by_each_key():
+    # Loss w², rate 0.25: w halves in each step, from 4 to 2 to 1; the mean loss of the steps is (16 + 4) / 2.
+    sgd = optax.sgd(0.25)
+    weight = jnp.asarray(4.0)
+    weight, _, loss = minimise(lambda w, key: w**2, weight, sgd.init(weight), jax.random.key(0), optimiser=sgd, count=2)
+    assert (weight, loss) == (1.0, 10.0)
+    start, drawn = jnp.zeros(()), jax.vmap(jax.random.normal)(jax.random.split(jax.random.key(1), 3))
+    moved, _, _ = minimise(
+        lambda w, key: w * jax.random.normal(key), start, sgd.init(start), jax.random.key(1), optimiser=sgd, count=3
+    )
+    assert moved == pytest.approx(-0.25 * float(drawn.sum()), rel=1e-5)

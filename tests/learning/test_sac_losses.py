@@ -64,7 +64,7 @@ def test_actor_loss_is_temperature_times_log_density_minus_the_smaller_value(com
     policy = policy_of([[0.5], [0]], [0.25, np.log(0.4)])
     observation, key = jnp.array([[1.0], [-1.0], [2.0]]), jax.random.key(7)
     loss, (value, density) = compiled(sac_losses.actor_loss)(
-        policy, TWINS, observation, temperature=jnp.asarray(0.2), key=key
+        policy, TWINS, observation, temperature=jnp.asarray(0.2), noise=key
     )
     mean = 0.5 * np.array([1.0, -1.0, 2.0]) + 0.25
     raw = mean + 0.4 * np.asarray(jax.random.normal(key, (3, 1)), np.float64)[:, 0]

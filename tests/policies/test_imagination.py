@@ -7,7 +7,7 @@ from affine import affine
 from madoc.learning.dynamics_ensemble import Ensemble
 from madoc.learning.features import Features
 from madoc.learning.networks import stack
-from madoc.policies.imagination import Filter, Imagination, best_candidate, imagine, start_imagining
+from madoc.policies.imagination import best_candidate, imagine, start_imagining
 
 FEATURES = Features(jnp.zeros(2), jnp.ones(2), jnp.array([0.5]), jnp.asarray(1.0), jnp.asarray(2.0))
 LOGGED = jnp.array([[0.0], [10.0]])
@@ -28,13 +28,18 @@ def imagined(*, slope, steps=3, penalty=0.0, terminated=lambda o: o[:, 0] > 100,
     past = stack(2, lambda key: affine([[0.0, 0.0, slope]], [0.0]), jax.random.key(0))
     return imagine(
         certain([1.0, 3.0]),
-        Filter(jnp.arange(2), past),
+        jnp.arange(2),
+        past,
         FEATURES,
         lambda observation, key: jnp.zeros_like(observation),
         start_imagining(LOGGED[:1], 4, jax.random.key(1)),
         logged=LOGGED,
         terminated=terminated,
-        settings=Imagination(2, threshold, horizon, penalty),
+        state_of=lambda observation: observation,
+        samples=2,
+        threshold=threshold,
+        horizon=horizon,
+        penalty=penalty,
         steps=steps,
         key=jax.random.key(2),
     )

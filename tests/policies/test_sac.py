@@ -56,7 +56,7 @@ def test_the_best_judged_policy_is_handed_back(simulator):
     best, then = max(judged, key=lambda pair: pair[0])
     last = seen[-1][0]
     assert same(method.policy(last), then.learner.policy)
-    assert last.best_return == best
+    assert last.judged.best_return == best
     assert [then is state for _, state in judged].index(True) < len(judged) - 1, "the seed should show a fall"
 
 

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from madoc.calibration.holdout import (
     AgainstChance,
@@ -12,7 +13,6 @@ from madoc.calibration.holdout import (
     PredictionError,
     PredictionErrors,
     Tried,
-    holdout_to_json,
 )
 
 PARAMETERS = {
@@ -89,7 +89,7 @@ def result(**changes):
         "error": {"mean_absolute": 0.1, "mean_percent_of_range": 4.5, "per_parameter": {}},
         "covariance": (correlation * np.outer(deviation, deviation)).tolist(),
         "verdict": {"word": "CALIBRATED", "sentence": "the hold-out is predicted", "parameters": []},
-        "holdout": holdout_to_json(holdout),
+        "holdout": TypeAdapter(Predicted).dump_python(holdout, mode="json"),
     } | changes
 
 
@@ -135,7 +135,16 @@ def whole_folder(path):
     vectors = np.random.default_rng(0).normal(size=(4, 16))
     np.savez(folder / "embeddings.npz", names=np.array(list(PARAMETERS)), vectors=vectors)
     policy = {"return": 900.0, "return_std": 20.0, "normalized": 28.0, "length": 400.0}
-    write_json(path / "evaluation.json", {"episodes": 3, "policies": {"calibrated": policy, "truth": policy}})
+    write_json(
+        path / "evaluation.json",
+        {
+            "task": "hopper",
+            "physics": "legacy",
+            "episodes": 3,
+            "seed": 0,
+            "policies": {"calibrated": policy, "truth": policy},
+        },
+    )
     return path
 
 

@@ -18,7 +18,7 @@ def drawn(chart):
 
 def told(chart):
     """What the page's script is told."""
-    return json.loads(unescape(re.search(r"data-told='(.*?)'", str(chart)).group(1)))
+    return json.loads(unescape(re.search(r'data-values="(.*?)"', str(chart)).group(1)))
 
 
 @pytest.mark.parametrize(

@@ -11,16 +11,19 @@ from madoc.errors import MadocError
 from madoc.report import write_comparison, write_report
 from madoc.report.page import headline, run_context
 from madoc.report.reading import read_run
-from madoc.report.sections import ALL
-from madoc.report.sections.estimates import estimates
-from madoc.report.sections.holdout import residuals
+from madoc.report.sections import SECTIONS
 
-IDS = [section.__name__ for section in ALL]
+IDS = list(SECTIONS)
 
 
-def section(run, wanted):
-    """One section of a run's page."""
-    return next(each for each in run_context(read_run(run))["sections"] if each.id == wanted)
+def content(run, name):
+    """What the template of a section of a run's page shows."""
+    return SECTIONS[name][1](read_run(run))
+
+
+def drawn(run, name):
+    """The HTML of a section."""
+    return re.search(f'<section id="{name}">.*?</section>', write_report(run).read_text(), re.DOTALL).group()
 
 
 def test_a_page_has_every_section_of_a_whole_run(whole):
@@ -39,46 +42,47 @@ def test_a_page_says_what_a_bare_run_lacks(bare):
 
 
 def test_an_estimate_stands_where_it_belongs_in_its_range(whole):
-    row = next(row for row in estimates(read_run(whole)).data["rows"] if row["name"] == "body_mass.torso")
+    (row,) = [row for row in drawn(whole, "estimates").split('<div class="estimate ') if "<b>torso mass</b>" in row]
     # 3.4 ± 0.1 of 3 to 5, the truth at 3.53
-    assert (row["at"], row["from"], row["to"], row["truth_at"]) == (20.0, 15.0, 25.0, 26.5)
-    assert (row["estimate"], row["spread"], row["off_percent"]) == ("3.4", "3.3 to 3.5", "6.5")
+    assert 'class="mark" style="left:20.0%"' in row
+    assert 'class="span" style="left:15.0%;width:10.0%"' in row
+    assert 'class="true" style="left:26.5%"' in row
+    assert "<b>3.4</b> kg<small>3.3 to 3.5</small>" in row
+    assert "off by 6.5 %" in row
 
 
 def test_residuals_are_shares_of_a_steps_change(whole):
-    rows = residuals(read_run(whole)).data["rows"]
     # height: ±1 of 2, then 0.1 of 2; speed: ±2 of 4, then 0; the row that failed does not count
-    assert [(row["name"], row["before"], row["after"]) for row in rows] == [
-        ("height", "50 %", "5 %"),
-        ("speed", "50 %", "0 %"),
-    ]
-    assert rows[0]["factor"] == "10 times less"
+    height, speed = content(whole, "residuals")["rows"]
+    assert height == ("height", pytest.approx(0.5), pytest.approx(0.05), "10 times less")
+    assert speed == ("speed", pytest.approx(0.5), 0.0, "over 10 000 times less")
+    assert "50 % → <b>5 %</b>" in drawn(whole, "residuals")
 
 
 def test_the_strongest_correlation_is_told(whole):
-    assert section(whole, "correlations").data["told"] == ["leg mass and torso mass: −0.9"]
+    assert content(whole, "correlations")["strongest"] == ["leg mass and torso mass: −0.9"]
 
 
 def test_a_hold_out_is_told_by_its_own_measure(whole):
-    held = section(whole, "holdout").data
+    held = content(whole, "holdout")
     assert ("area under a classifier's curve, 0.5 is chance", "0.9 → 0.52") in held["facts"]
     assert [name for _, name in held["legend"]][-1] == "estimate"
     file = whole / "calibration" / "result.json"
     stored = json.loads(file.read_text())
     hidden = stored["holdout"] | {"measure": "fitted", "fitted_steps": 10}
     write_json(file, stored | {"holdout": hidden})
-    held = section(whole, "holdout").data
+    held = content(whole, "holdout")
     assert len(held["facts"]) == 2 and "control steps ahead of a fitted start" in held["chart"]
     write_json(file, stored | {"holdout": hidden | {"measure": "told apart"}})
-    assert section(whole, "holdout").data["chart"] is None
-    assert run_context(read_run(whole))["facts"][0].title == "told from the log"
+    assert content(whole, "holdout")["chart"] is None
+    assert run_context(read_run(whole))["facts"][0][0] == "told from the log"
 
 
 def test_time_is_told_by_stage(whole):
-    stages = section(whole, "cost").data["stages"]
-    assert [(stage["name"], stage["words"]) for stage in stages] == [
-        ("cloning", "2.0 s, 0 control steps"),
-        ("calibrating", "30 s, 3 000 control steps"),
+    stages = content(whole, "cost")["stages"]
+    assert [(stage["name"], stage["share"], stage["words"]) for stage in stages] == [
+        ("cloning", pytest.approx(2 / 32), "2.0 s, 0 control steps"),
+        ("calibrating", pytest.approx(30 / 32), "30 s, 3 000 control steps"),
     ]
 
 

@@ -30,6 +30,12 @@ def test_of_several_methods_the_log_of_the_kept_one_is_read(whole):
     assert len(read_run(whole).log) == 5
 
 
+def test_a_whole_run_is_read_before_its_calibration_begins(tmp_path):
+    write_json(tmp_path / "spec.json", {"command": "run", "name": "hopper", "data": "/logs/hopper.npz"})
+    run = read_run(tmp_path)
+    assert run.result is None and "/logs/hopper.npz" in run.spec_text
+
+
 def test_a_run_under_way_is_read_up_to_its_last_whole_line(bare):
     (bare / "result.json").unlink()
     line = '{"control_steps": 10, "seconds": 1.0, "stage": "searching", "metrics": {"cost": null}}\n'

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from madoc.robots.expressions import ExpressionError, Read, parse
+from madoc.errors import MadocError
+from madoc.robots.expressions import Read, parse
 
 VALUES = {"position(a)": 0.5, "velocity(a)": -2.0, "sensor(tip)[2]": 3.0, "position('left-knee')": 0.25}
 
@@ -134,12 +135,12 @@ def test_names_where_names_are_allowed():
     ],
 )
 def test_what_is_no_expression(text, sentence):
-    with pytest.raises(ExpressionError, match=sentence):
+    with pytest.raises(MadocError, match=sentence):
         parse(text)
 
 
 def test_unknown_names_have_the_nearest():
-    with pytest.raises(ExpressionError, match="unknown name 'heigth'; nearest: height"):
+    with pytest.raises(MadocError, match="unknown name 'heigth'; nearest: height"):
         parse("heigth", names=["height", "push"])
-    with pytest.raises(ExpressionError, match="unknown function 'position'"):
+    with pytest.raises(MadocError, match="unknown function 'position'"):
         parse("position(a)", names=["height"])

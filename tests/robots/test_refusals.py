@@ -130,7 +130,7 @@ CHANGES = [
     (
         DAMPING,
         "  - {field: dof_damping, elements: [], low: 0, high: 1}",
-        "expected at least one item in parameters.elements",
+        "expected at least 1 item in parameters.elements",
     ),
     (DAMPING, "  - {field: dof_damping, elements: [elbow, elbow], low: 0, high: 1}", "names an element twice"),
     (

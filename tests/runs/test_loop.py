@@ -14,6 +14,7 @@ import pytest
 
 from madoc.errors import MadocError
 from madoc.runs import checkpoint
+from madoc.runs.budget import Seconds
 from madoc.runs.loop import Tally, run
 from madoc.runs.run_folder import RunFolder
 from madoc.types import Epoch
@@ -32,8 +33,13 @@ def without_seconds(path):
     return [{name: value for name, value in line.items() if name != "seconds"} for line in lines(path)]
 
 
+def written(budget):
+    """A budget as a spec has it."""
+    return budget if isinstance(budget, int) else str(budget)
+
+
 def in_folder(path, *, budget=BUDGET, method=None, resume=False, spec=SPEC, **options):
-    with (RunFolder.open if resume else RunFolder.create)(path, spec | {"budget": budget}) as folder:
+    with (RunFolder.open if resume else RunFolder.create)(path, spec | {"budget": written(budget)}) as folder:
         return run(
             method or Wander(),
             None,
@@ -92,6 +98,7 @@ def test_a_run_leaves_its_files(tmp_path):
         "status": "finished",
         "sentence": finished.sentence,
         "control_steps": BUDGET,
+        "updates": 0,
         "seconds": finished.seconds,
     }
     events = list((tmp_path / "run/tensorboard").iterdir())
@@ -268,7 +275,7 @@ class Grows(Wander):
 
 
 def test_a_state_that_changes_shape_is_refused_before_it_is_saved(tmp_path):
-    with pytest.raises(MadocError, match=r"Grows changed the layout of its state: expected state\.sum to be"):
+    with pytest.raises(MadocError, match=r"the method changed the layout of its state: expected state\.sum to be"):
         in_folder(tmp_path / "run", method=Grows(), checkpoint_every=0.0)
 
 
@@ -288,3 +295,14 @@ def test_a_metrics_file_shorter_than_its_checkpoint_is_refused(tmp_path):
     os.truncate(tmp_path / "run/metrics.jsonl", 10)
     with pytest.raises(MadocError, match="has 10 bytes, its checkpoint says"):
         in_folder(tmp_path / "run", resume=True)
+
+
+def test_a_time_budget_is_kept_across_a_resume(tmp_path):
+    slow = Wander(seconds=0.02)
+    first = in_folder(tmp_path / "run", method=slow, budget=Seconds(0.2))
+    assert (first.status, first.sentence) == ("finished", "the budget of 0.2 s is spent")
+    assert 0.2 <= first.seconds < 5.0
+    second = in_folder(tmp_path / "run", method=slow, budget=Seconds(first.seconds + 0.3), resume=True)
+    assert second.status == "finished"
+    assert second.seconds >= first.seconds + 0.3
+    assert second.control_steps - first.control_steps <= 10 * (second.seconds - first.seconds) / 0.02 + 10

@@ -111,7 +111,7 @@ def lift(tmp_path):
         (tmp_path / "own" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "own" / name).write_bytes(content)
     task = robots.load(tmp_path / "own" / "lift.yaml").task
-    restored = robots.restore(json.loads(json.dumps(dict(task.source))))
+    restored = robots.restore(json.loads(json.dumps(dict(task.source)))).task
     (tmp_path / "own").rename(tmp_path / "moved")
     return simulation.make(restored, threads=1)
 
@@ -212,7 +212,7 @@ def test_a_rounding_writer_is_refused(tmp_path, monkeypatch):
 
 
 def test_a_change_that_cannot_be_written_is_refused(monkeypatch, tmp_path):
-    monkeypatch.setattr(mjcf, "_GROUPS", {})
+    monkeypatch.setattr(mjcf, "_ROWS", ())
     task = spring(Parameter("dof_damping", "slide", 0.0, 2.0))
     with pytest.raises(MadocError, match=r"written into its spec differs from the bound one in dof_damping by 0\.75"):
         save_mjcf(simulation.make(task, threads=1), np.array([1.25]), tmp_path / "model.xml")

@@ -41,6 +41,12 @@ class Script:
     def observe(self, state):
         return state
 
+    def unbiased(self, state):
+        return state
+
+    def replaced(self, systems, parameters):
+        raise NotImplementedError
+
 
 def test_axes_and_the_chain_of_states(spring_task):
     task = spring_task()

@@ -80,12 +80,10 @@ def test_when_mid_range_always_fails_that_is_the_sentence(spring_task):
         insensitive(simulator, np.full((4, 2), 1e12), np.zeros((4, 1)), key=KEY)
 
 
-@pytest.mark.parametrize(("states", "actions"), [(0, 0), (3, 2)])
-def test_no_rows_or_rows_that_do_not_pair_are_refused(spring_task, states, actions):
+def test_no_rows_are_refused(spring_task):
     simulator = CpuSimulator(spring_task(), threads=1)
-    sentence = f"expected as many states as actions, at least one, got {states} and {actions}"
-    with pytest.raises(MadocError, match=sentence):
-        insensitive(simulator, np.zeros((states, 2)), np.zeros((actions, 1)), key=KEY)
+    with pytest.raises(MadocError, match="expected at least one logged state"):
+        insensitive(simulator, np.zeros((0, 2)), np.zeros((0, 1)), key=KEY)
 
 
 def test_same_key_same_rows(spring_task):

@@ -131,7 +131,7 @@ def test_rejected_data_comes_before_all_else_and_open_parameters_before_no_impro
     ],
 )
 def test_rows_alone_are_judged_by_the_classifier(word, before, after):
-    at_mid_range, at_estimate = (Area(area, ends, 400) for area, *ends in (before, after))
+    at_mid_range, at_estimate = (Area(area, tuple(ends), 400) for area, *ends in (before, after))
     assert judge(replace(TOLD_APART, area_at_mid_range=at_mid_range, area_at_estimate=at_estimate)).word == word
 
 

@@ -1,27 +1,7 @@
 import numpy as np
 import pytest
 
-from madoc.verdict.statistics import area_under_curve, better_than_chance, interval_of, resampled, shares_of_ranges
-
-
-def test_the_area_by_hand():
-    # Of the four pairs (3, 1), (3, 2), (2, 1), (2, 2) the real score is above in three, and equal in one.
-    scores, real = np.array([3.0, 2.0, 1.0, 2.0]), np.array([True, True, False, False])
-    assert area_under_curve(scores, real) == pytest.approx(3.5 / 4)
-
-
-def test_the_weighted_area_by_hand():
-    # The simulated 2 counts three times the 1: (3·(1 + 3) + 2·1 half of 3 ...) = (4 + 1 + 1.5) / (2 · 4).
-    scores, real = np.array([3.0, 2.0, 1.0, 2.0]), np.array([True, True, False, False])
-    weights = np.array([1.0, 1.0, 1.0, 3.0])
-    assert area_under_curve(scores, real, weights) == pytest.approx((4 + 1 + 1.5) / 8)
-    assert area_under_curve(scores, real, np.ones(4)) == pytest.approx(area_under_curve(scores, real))
-
-
-def test_swapping_the_kinds_mirrors_the_area():
-    rng = np.random.default_rng(0)
-    scores, real = rng.integers(0, 5, 50).astype(float), rng.random(50) < 0.5
-    assert area_under_curve(scores, real) + area_under_curve(scores, ~real) == pytest.approx(1.0)
+from madoc.verdict.statistics import better_than_chance, interval_of, resampled, shares_of_ranges
 
 
 def test_the_interval_of_a_mean_is_as_wide_as_its_standard_error_says():

@@ -1,30 +1,16 @@
 """Calibrators: from logged data to parameters. One file or folder a method; `CALIBRATORS` finds them by name."""
 
-from madoc.calibration.base import CalibrationProblem, Calibrator, Estimate
-from madoc.calibration.baselines.cma_es.calibrator import CmaEs
-from madoc.calibration.baselines.droid import Droid
-from madoc.calibration.baselines.dropo.calibrator import Dropo
-from madoc.calibration.baselines.oted.calibrator import Oted
-from madoc.calibration.baselines.uncalibrated import Uncalibrated
-from madoc.calibration.calibrate import calibrate
-from madoc.calibration.least_squares.calibrator import LeastSquares
-from madoc.calibration.madoc.calibrator import Madoc
-from madoc.calibration.registry import CALIBRATORS
-from madoc.calibration.result import CalibrationResult, ParameterEstimate
-
-__all__ = [
-    "CALIBRATORS",
-    "CalibrationProblem",
-    "CalibrationResult",
-    "Calibrator",
-    "CmaEs",
-    "Droid",
-    "Dropo",
-    "Estimate",
-    "LeastSquares",
-    "Madoc",
-    "Oted",
-    "ParameterEstimate",
-    "Uncalibrated",
-    "calibrate",
-]
+from madoc.calibration.base import CalibrationProblem as CalibrationProblem
+from madoc.calibration.base import Calibrator as Calibrator
+from madoc.calibration.base import Estimate as Estimate
+from madoc.calibration.baselines.cma_es.calibrator import CmaEs as CmaEs
+from madoc.calibration.baselines.droid import Droid as Droid
+from madoc.calibration.baselines.dropo.calibrator import Dropo as Dropo
+from madoc.calibration.baselines.oted.calibrator import Oted as Oted
+from madoc.calibration.baselines.uncalibrated import Uncalibrated as Uncalibrated
+from madoc.calibration.calibrate import calibrate as calibrate
+from madoc.calibration.least_squares.calibrator import LeastSquares as LeastSquares
+from madoc.calibration.madoc.calibrator import Madoc as Madoc
+from madoc.calibration.registry import CALIBRATORS as CALIBRATORS
+from madoc.calibration.result import CalibrationResult as CalibrationResult
+from madoc.calibration.result import ParameterEstimate as ParameterEstimate

@@ -11,7 +11,7 @@ from madoc.data import Dataset, typical_change
 from madoc.errors import MadocError
 from madoc.identification.noise import regression_noise
 from madoc.identification.states import LoggedStates, probing_rows, states_of
-from madoc.learning.window_features import LoggedFeatures
+from madoc.learning.features import LoggedFeatures
 from madoc.simulation.base import Simulator
 from madoc.types import Method, State
 
@@ -20,31 +20,30 @@ from madoc.types import Method, State
 class CalibrationProblem:
     """A log and the simulator whose parameters are to be estimated from it.
 
-    The data's true parameters, where it carries any, are dropped here: no method can read them.
+    The data's true parameters, if it has any, are dropped here, so that no method can read them.
 
     Raises:
-        MadocError: The data belongs to another task, or shows another observation than the simulator.
+        MadocError: The data belongs to another task, or its observations differ from those of the simulator.
     """
 
     dataset: Dataset
     simulator: Simulator
 
     def __post_init__(self) -> None:
-        if self.dataset.task_name != self.simulator.task.name:
-            raise MadocError(
-                f"the data was recorded from {self.dataset.task_name}, the simulator is {self.simulator.task.name}"
-            )
-        logged, shown = self.dataset.transitions.observation.shape[-1], self.simulator.task.observation_size
+        task = self.simulator.task
+        if self.dataset.task_name != task.name:
+            raise MadocError(f"the data was recorded from {self.dataset.task_name}, the simulator is {task.name}")
+        logged, shown = self.dataset.transitions.observation.shape[-1], task.observation_size
         if logged != shown:
             raise MadocError(
-                f"the data has {logged} values per observation, the simulator's {self.simulator.task.name} shows "
+                f"the data has {logged} values per observation, the simulator's {task.name} shows "
                 f"{shown}; where the data hides velocities, make the simulator of data.observed_task(task, dataset)"
             )
         object.__setattr__(self, "dataset", replace(self.dataset, true_parameters=None))
 
     @cached_property
     def states(self) -> LoggedStates:
-        """What the data tells of the simulator's states."""
+        """The simulator's states as far as they can be computed from the data."""
         return states_of(self.dataset, self.simulator)
 
     @cached_property
@@ -54,27 +53,23 @@ class CalibrationProblem:
 
     @cached_property
     def estimated_noise(self) -> Float[np.ndarray, " observation"]:
-        """Standard deviation of the sensors' noise, as far as the log alone tells."""
+        """Standard deviation of the sensor noise of each channel, estimated from the log alone."""
         return regression_noise(self.dataset)
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Known reasons why the simulator cannot move exactly as the data does, one sentence each."""
+        """Known reasons why the simulator cannot reproduce the data exactly, one sentence each."""
         recorded, simulated = self.dataset.physics, self.simulator.task.physics
         gap = (
             f"the data was recorded in {recorded} physics and the simulator's is {simulated}: "
-            "the estimate will make up for the difference"
+            "the estimate will be biased by the difference"
         )
         gaps = () if recorded in ("unknown", simulated) else (gap,)
         findings = (finding.sentence for finding in self.dataset.findings if finding.level == "warning")
         return (*gaps, *self.dataset.disturbance.sentences(), *findings)
 
     def require_pairs(self) -> None:
-        """Refuse data in which it is not known which next observation followed which row.
-
-        Raises:
-            MadocError: The next observations are shuffled.
-        """
+        """Raise MadocError for data whose next observations are shuffled."""
         if self.dataset.disturbance.shuffled == "next_observations":
             raise MadocError(
                 "this method compares each row's next observation with a simulated one, and those of "
@@ -97,14 +92,14 @@ class Estimate:
     """An estimate of all parameters, in physical units.
 
     Attributes:
-        mean: Estimated value of each parameter.
-        std: Standard deviation of each parameter under the method's distribution.
-        groups: Indices of parameters that were calibrated together; empty is one group of all.
-        failures: Simulated rows that exploded and were left out.
-        warnings: What a user should know about it, one sentence each.
-        covariance: Joint covariance of the parameters, None where the method has none; its diagonal is `std` squared.
-        interval: 95 % confidence interval of each parameter, columns low and high; None where the method has none.
-        settled: Whether the search came to its end; False is a warning that a larger budget would change the estimate.
+        mean: The estimate of each parameter.
+        std: Standard deviation of each estimate.
+        groups: Indices of the parameters that were calibrated together; empty means one group of all.
+        failures: Number of simulated rows that diverged and were left out.
+        warnings: Reasons to doubt the estimate, one sentence each.
+        covariance: Covariance of the estimates, with `std` squared on its diagonal; None where it is unknown.
+        interval: 95 % confidence intervals, columns low and high; None where they are unknown.
+        settled: Whether the search came to its end; if not, a larger budget would change the estimate.
     """
 
     mean: Float[np.ndarray, " d"]
@@ -119,11 +114,10 @@ class Estimate:
 
 @runtime_checkable
 class EmbedsParameters(Protocol):
-    """An addition to the protocol for methods that learn which parameters act alike."""
+    """The interface of methods that learn which parameters have similar effects."""
 
     def embeddings(self, problem: CalibrationProblem, state: object) -> Float[np.ndarray, "d latent"] | None:
         """One vector for each parameter, close together for those that act alike; None before anything is learnt."""
-        ...
 
 
 @runtime_checkable
@@ -132,4 +126,3 @@ class Calibrator(Method[CalibrationProblem, State], Protocol[State]):
 
     def estimate(self, problem: CalibrationProblem, state: State) -> Estimate:
         """The best estimate so far."""
-        ...

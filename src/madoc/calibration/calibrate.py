@@ -1,4 +1,4 @@
-"""Run a calibrator on a problem: refuse what cannot work, spend the budget, report the estimate."""
+"""Run a calibrator on a problem."""
 
 from collections.abc import Mapping
 
@@ -31,18 +31,10 @@ def calibrate(
     quiet: bool = False,
     checkpoint_every: float = 30.0,
 ) -> CalibrationResult:
-    """Calibrate, and judge the estimate against the truth where that is given.
+    """Estimate the parameters, and compare the estimate with the truth where that is given.
 
-    Args:
-        method: What to run.
-        problem: Data and simulator.
-        key: The only source of randomness.
-        budget: Simulated control steps, of any kind.
-        truth: The target's physical values, by name or as a vector; only the finished estimate is compared with them.
-        folder: Where to keep logs, checkpoints and `result.json`.
-        resume: Go on from the folder's checkpoint.
-        quiet: Show no progress.
-        checkpoint_every: Seconds between checkpoints.
+    The budget counts simulated control steps of any kind. `truth` is the target's physical values, by name or as a
+    vector; only the finished estimate is compared with them. The other arguments are those of `madoc.runs.loop.run`.
 
     Raises:
         MadocError: The method refuses the problem, a parameter changes no next state, or `loop.run` refuses.
@@ -66,6 +58,7 @@ def calibrate(
         trace=lambda state: _trace(space, method.estimate(problem, state)),
     )
     estimate = method.estimate(problem, finished.state)
+    warnings = (*estimate.warnings, *exploded(estimate.failures, finished.control_steps))
     result = CalibrationResult(
         method=entry.name,
         task=problem.simulator.task.name,
@@ -73,20 +66,20 @@ def calibrate(
         sentence=finished.sentence,
         control_steps=finished.control_steps + probing,
         seconds=round(finished.seconds, 3),
-        seed=seed_of(key),
+        seed=int(np.asarray(jax.random.key_data(key))[-1]),
         groups=[[space.names[index] for index in group] for group in estimate.groups or [range(len(space))]],
         parameters=_parameters(space, estimate),
-        warnings=without_repeats(
-            (*estimate.warnings, *exploded(estimate.failures, finished.control_steps)), problem.doubts
-        ),
+        warnings=without_repeats(warnings, problem.doubts),
         error=None if true_values is None else calibration_error(estimate.mean, true_values, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
         settled=estimate.settled,
         problem=problem,
     )
     if folder is not None:
-        if isinstance(method, EmbedsParameters):
-            _keep_embeddings(folder, space, method.embeddings(problem, finished.state))
+        vectors = method.embeddings(problem, finished.state) if isinstance(method, EmbedsParameters) else None
+        if vectors is not None:
+            with replacing(folder.path / "embeddings.npz") as stream:
+                np.savez(stream, allow_pickle=False, names=np.array(space.names), vectors=vectors)
         folder.write_json("result.json", result.to_json())
     return result
 
@@ -94,19 +87,8 @@ def calibrate(
 def _trace(space: ParameterSpace, estimate: Estimate) -> dict[str, float]:
     """The mean and deviation of every parameter, as metrics for the log of the run."""
     columns = zip(space.names, estimate.mean.tolist(), estimate.std.tolist(), strict=True)
-    both = {
-        f"{kind}/{name}": value
-        for name, *pair in columns
-        for kind, value in zip(("estimate", "std"), pair, strict=True)
-    }
-    return {name: value for name, value in both.items() if np.isfinite(value)}
-
-
-def _keep_embeddings(folder: RunFolder, space: ParameterSpace, vectors: np.ndarray | None) -> None:
-    """Write `embeddings.npz`: the names of the parameters, and one learnt vector for each."""
-    if vectors is not None:
-        with replacing(folder.path / "embeddings.npz") as stream:
-            np.savez(stream, allow_pickle=False, names=np.array(space.names), vectors=vectors)
+    rows = ({f"estimate/{name}": mean, f"std/{name}": std} for name, mean, std in columns)
+    return {name: value for row in rows for name, value in row.items() if np.isfinite(value)}
 
 
 def _parameters(space: ParameterSpace, estimate: Estimate) -> dict[str, ParameterEstimate]:
@@ -117,8 +99,3 @@ def _parameters(space: ParameterSpace, estimate: Estimate) -> dict[str, Paramete
         row.name: ParameterEstimate(float(mean), float(std), row.low, row.high, row.unit, interval)
         for row, mean, std, interval in columns
     }
-
-
-def seed_of(key: PRNGKeyArray) -> int:
-    """The seed that `jax.random.key` was given (its low word)."""
-    return int(np.asarray(jax.random.key_data(key))[-1])

@@ -9,13 +9,13 @@ from jaxtyping import Float
 def at_end_of_range(
     scaled: Float[np.ndarray, " d"], names: tuple[str, ...], *, beyond: float = 0.98
 ) -> tuple[str, ...]:
-    """Name the estimates in [-1, 1] whose absolute value is larger than `beyond`."""
+    """Warn of estimates, scaled to [-1, 1], whose absolute value is larger than `beyond`."""
     ends = [name for name, value in zip(names, scaled, strict=True) if abs(value) > beyond]
     return (f"at the end of its range: {', '.join(ends)}; widen the range or doubt the model",) if ends else ()
 
 
 def exploded(failures: int, control_steps: int) -> tuple[str, ...]:
-    """Warn of simulated rows that failed, if any did."""
+    """Warn of simulated rows that diverged, if any did."""
     if not failures:
         return ()
     return (
@@ -25,6 +25,6 @@ def exploded(failures: int, control_steps: int) -> tuple[str, ...]:
 
 
 def without_repeats(warnings: Iterable[str], doubts: Iterable[str]) -> list[str]:
-    """The warnings of a method, then those of the check of the data that the method does not give already."""
+    """The warnings of a method, then the doubts about the data that the method does not state already."""
     own = list(dict.fromkeys(warnings))
     return [*own, *(doubt for doubt in doubts if not any(doubt.endswith(sentence) for sentence in own))]

@@ -1,17 +1,14 @@
-"""What rows held out from a calibration say of its estimate: the records a result carries, saved as JSON.
+"""How well an estimate explains rows held out from its calibration: the records that a result carries.
 
-How far the hold-out can be predicted depends on what a log tells of the robot's states, so there are three records:
-`Predicted`, `Fitted` and `ToldApart`. `madoc.verdict` fills them in and judges them.
+Which measure is possible depends on whether the robot's states can be computed from the log, so there are three
+records: `Predicted`, `Fitted` and `ToldApart`. `madoc.verdict` fills them in and judges them.
 """
 
-import functools
-from abc import ABC, abstractmethod
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 
-from madoc.errors import MadocError
 from madoc.identification.missing_terms import MissingTerm
 
 Word = Literal["CALIBRATED", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
@@ -19,13 +16,7 @@ Word = Literal["CALIBRATED", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMAT
 
 @dataclass(frozen=True)
 class Verdict:
-    """What to make of an estimate.
-
-    Attributes:
-        word: A key of `madoc.verdict.WORDS`.
-        sentence: The reason, with its numbers.
-        parameters: The parameters that it is about, if it is about some.
-    """
+    """The verdict on an estimate: a key of `madoc.verdict.WORDS`, the reason, and the parameters it concerns."""
 
     word: Word
     sentence: str
@@ -34,20 +25,16 @@ class Verdict:
     def __str__(self) -> str:
         return f"{self.word}: {self.sentence}"
 
-    def to_json(self) -> dict[str, object]:
-        """As JSON."""
-        return asdict(self) | {"parameters": list(self.parameters)}
-
 
 @dataclass(frozen=True)
 class PredictionError:
-    """Mean absolute error of predictions so many control steps ahead, in typical changes of a signal in one step.
+    """Mean absolute error of predictions, each signal in units of its typical change in one control step.
 
     Attributes:
-        steps: Control steps ahead.
-        mean: Over windows and signals.
+        steps: Horizon of the predictions in control steps.
+        mean: Mean over windows and signals.
         interval: 95 % confidence interval of the mean, from resampled episodes.
-        by_signal: Mean over windows of each signal.
+        by_signal: Mean over windows, by signal.
     """
 
     steps: int
@@ -58,17 +45,17 @@ class PredictionError:
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Prediction errors on the hold-out, at every horizon, of the simulator at several parameters.
+    """Prediction errors on the hold-out, one for each horizon, of the simulator at several parameters.
 
     Attributes:
-        mid_range: At the middle of every range.
+        mid_range: With every parameter at the middle of its range.
         estimate: At the estimate.
-        nearby_best: At the best parameters that a search from the estimate finds on the hold-out itself.
-        noise: What noise of the sensors alone would leave at those best parameters.
-        relative: Error at the estimate over that at mid-range, mean over horizons.
+        nearby_best: At the parameters that a search from the estimate finds best on the hold-out itself.
+        noise: Errors that sensor noise alone would cause at those best parameters.
+        relative: Error at the estimate divided by that at mid-range, mean over horizons.
         relative_interval: 95 % confidence interval of `relative`.
-        nearby_relative: The same ratio of the best parameters nearby, or of noise alone where that is larger.
-        windows: Stretches of the hold-out that were replayed.
+        nearby_relative: The same ratio for `nearby_best`, or for `noise` where that is larger.
+        windows: Number of windows of the hold-out that were replayed.
         failed_windows: How many of them failed in simulation at the estimate.
     """
 
@@ -85,12 +72,10 @@ class PredictionErrors:
 
 @dataclass(frozen=True)
 class Area:
-    """Area under the ROC curve of a classifier that tells simulated from logged rows; 0.5 is chance, 1 is certainty.
+    """Area under the ROC curve of a classifier of simulated and logged rows: 0.5 is chance, 1 is certainty.
 
-    Attributes:
-        area: On rows that the classifier was not trained on.
-        interval: 95 % confidence interval.
-        rows: Number of rows of both kinds.
+    `area` is measured on rows that the classifier was not trained on, `interval` is its 95 % confidence interval, and
+    `rows` is the number of simulated and logged rows together.
     """
 
     area: float
@@ -100,12 +85,12 @@ class Area:
 
 @dataclass(frozen=True)
 class AgainstChance:
-    """Whether predicted next observations belong to their rows, compared with the same rows paired at random.
+    """A permutation test of whether the logged next observations follow from their rows.
 
     Attributes:
-        prediction: What predicted, in words.
-        skill: 1 - error over the median error of random pairings: 1 is perfect, 0 is chance.
-        p_value: Share of random pairings that do as well.
+        prediction: The predictor, in words.
+        skill: 1 - error / median error of random pairings: 1 is perfect, 0 is chance.
+        p_value: Share of random pairings with no larger error.
     """
 
     prediction: str
@@ -115,7 +100,7 @@ class AgainstChance:
 
 @dataclass(frozen=True)
 class Tried:
-    """A method that was run and judged on the hold-out: its `score` (less is better), cost and verdict."""
+    """A method that was run and judged on the hold-out: its `score` (smaller is better), verdict and cost."""
 
     method: str
     score: float
@@ -134,22 +119,22 @@ class NotRun:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judged(ABC):
-    """What all measures of an estimate on a hold-out have in common.
+class Judged:
+    """The fields that all three records have in common.
 
     Attributes:
         split: How the rows were held out, in a sentence.
         rows: Number of rows held out.
         episodes: Number of episodes held out.
-        estimate: Of each parameter, in [-1, 1] of its range.
+        estimate: Estimate of each parameter, scaled to [-1, 1] over its range.
         interval_shares: Share of each parameter's range that its 95 % confidence interval covers, at most 1.
-        against_chance: How well next observations are predicted, by each of several means.
-        noise: Standard deviation of the sensors' noise by signal, in its unit, as far as it can be estimated.
-        control_steps: Simulated to find all of this.
+        against_chance: Permutation tests, one for each of several predictors.
+        noise: Standard deviation of the sensor noise of those signals where it can be estimated, in the signal's unit.
+        control_steps: Control steps that were simulated for this record.
         missing_terms: Terms that the model may lack, the most significant first.
         at_end: Parameters estimated at an end of their range that is no physical bound.
-        candidates: The methods that were compared on this hold-out, where several were.
-        chosen: The method among them whose estimate was kept.
+        candidates: The methods that were compared on this hold-out; None where only one was run.
+        chosen: The name of the method among them whose estimate was kept.
     """
 
     split: str
@@ -162,37 +147,28 @@ class Judged(ABC):
     control_steps: int
     missing_terms: tuple[MissingTerm, ...] = ()
     at_end: tuple[str, ...] = ()
-    candidates: tuple[Tried | NotRun, ...] = ()
+    candidates: tuple[Tried | NotRun, ...] | None = None
     chosen: str | None = None
 
     @property
-    @abstractmethod
-    def score(self) -> float:
-        """What estimates of one problem are compared by; less is better."""
-
-    @property
-    @abstractmethod
-    def score_interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the score."""
-
-    @property
     def clearest(self) -> AgainstChance:
-        """The prediction that is surest to be better than chance."""
+        """The test with the smallest p-value."""
         return min(self.against_chance, key=lambda each: (each.p_value, -each.skill))
 
     @property
     def chance(self) -> float:
-        """Upper bound of the probability that any of the predictions is as good by chance (Bonferroni)."""
+        """Upper bound of the probability that the clearest test is a product of chance (Bonferroni)."""
         return self.clearest.p_value * len(self.against_chance)
 
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedByErrors(Judged):
-    """What the measures that predict the hold-out have in common.
+    """The fields of the two records of prediction errors.
 
     Attributes:
-        errors: Of the predictions.
-        explained: Share of the squared residuals at the best parameters nearby that what came before explains.
+        errors: The prediction errors.
+        explained: Share of the squared residuals at the best parameters nearby that a regression on earlier values of
+            the log explains.
     """
 
     errors: PredictionErrors
@@ -200,22 +176,22 @@ class JudgedByErrors(Judged):
 
     @property
     def score(self) -> float:
-        """Prediction error over that of mid-range."""
+        """What estimates of one problem are compared by, smaller is better: the error relative to mid-range."""
         return self.errors.relative
 
     @property
     def score_interval(self) -> tuple[float, float]:
-        """Its interval."""
+        """95 % confidence interval of the score."""
         return self.errors.relative_interval
 
 
 @dataclass(frozen=True, kw_only=True)
 class Predicted(JudgedByErrors):
-    """The hold-out replayed from logged states: states can be rebuilt from what was logged.
+    """Windows of the hold-out replayed from logged states, where states can be computed from the log.
 
     Attributes:
-        autocorrelation: Of the residuals at the best parameters nearby, from step to step.
-        area_at_mid_range: How well a classifier tells replays at mid-range from logged windows.
+        autocorrelation: Lag-one autocorrelation of the residuals at the best parameters nearby.
+        area_at_mid_range: How well a classifier distinguishes replays at mid-range from logged windows.
         area_at_estimate: The same for replays at the estimate.
     """
 
@@ -227,12 +203,9 @@ class Predicted(JudgedByErrors):
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted(JudgedByErrors):
-    """Stretches of the hold-out predicted from states fitted to the stretches before: velocities are hidden.
+    """Predictions from states that were fitted to the `fitted_steps` control steps before, where velocities are hidden.
 
-    A horizon of the errors counts control steps behind the fitted stretch.
-
-    Attributes:
-        fitted_steps: Control steps of a fitted stretch.
+    The horizon of an error is counted from the end of those steps.
     """
 
     fitted_steps: int
@@ -241,10 +214,10 @@ class Fitted(JudgedByErrors):
 
 @dataclass(frozen=True, kw_only=True)
 class ToldApart(Judged):
-    """Rows of rollouts compared with rows of the hold-out by a classifier: no state can be rebuilt.
+    """Rollouts compared with the hold-out by a classifier, where no state can be computed from the log.
 
     Attributes:
-        area_at_mid_range: How well rollouts at mid-range are told from the hold-out.
+        area_at_mid_range: How well the classifier distinguishes rollouts at mid-range from the hold-out.
         area_at_estimate: The same for rollouts at the estimate.
     """
 
@@ -254,42 +227,14 @@ class ToldApart(Judged):
 
     @property
     def score(self) -> float:
-        """The area at the estimate, less that of chance."""
+        """What estimates of one problem are compared by, smaller is better: the area beyond that of chance."""
         return self.area_at_estimate.area - 0.5
 
     @property
     def score_interval(self) -> tuple[float, float]:
-        """Its interval."""
+        """95 % confidence interval of the score."""
         low, high = self.area_at_estimate.interval
         return low - 0.5, high - 0.5
 
 
-HoldOut: TypeAlias = Predicted | Fitted | ToldApart
-
-
-@functools.cache
-def _adapter() -> TypeAdapter[HoldOut]:
-    return TypeAdapter(Annotated[HoldOut, Field(discriminator="measure")])
-
-
-def holdout_to_json(holdout: HoldOut) -> dict[str, object]:
-    """As JSON; without `candidates` and `chosen` where only one method was run."""
-    omitted = {"candidates", "chosen"} if not holdout.candidates else set()
-    return dict(_adapter().dump_python(holdout, mode="json", exclude=omitted))
-
-
-def holdout_from_json(fields: object) -> HoldOut:
-    """What `holdout_to_json` wrote.
-
-    Raises:
-        MadocError: It is something else, such as the report of an older version.
-    """
-    try:
-        return _adapter().validate_python(fields)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, ("holdout", *first["loc"])))
-        raise MadocError(
-            f"this result's report on the hold-out was not written by this version of Madoc ({place}: {first['msg']}); "
-            "calibrate again, or delete its entry holdout to keep the estimate without it"
-        ) from error
+HoldOut: TypeAlias = Annotated[Predicted | Fitted | ToldApart, Field(discriminator="measure")]

@@ -1,24 +1,27 @@
-"""What a calibration returns: an estimate with its doubts, as a table, as JSON."""
+"""The result of a calibration, as a table and as JSON."""
 
+import functools
 import io
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from pydantic import ConfigDict, GetPydanticSchema, TypeAdapter, ValidationError
+from pydantic_core import core_schema
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.holdout import HoldOut, Verdict, holdout_from_json, holdout_to_json
+from madoc.calibration.holdout import HoldOut, Verdict
 from madoc.errors import MadocError
 
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """One parameter: `estimate` ± `std` within [`low`, `high`], in `unit`; `interval` is its 95 %, where known."""
+    """The estimate of one parameter and its standard deviation, range, unit and, where known, 95 % interval."""
 
     estimate: float
     std: float
@@ -35,21 +38,23 @@ class CalibrationResult:
     Attributes:
         method: Name of the method, as `madoc methods` lists it.
         task: Name of the task.
-        status: `finished` (budget spent), `converged`, `interrupted` or `diverged`.
+        status: `finished` (the budget is spent), `converged`, `interrupted` or `diverged`.
         sentence: The status in words.
-        control_steps: Simulated control steps spent, of any kind.
+        control_steps: Simulated control steps of any kind.
         seconds: Wall-clock time.
-        seed: Of the random key.
-        groups: Names of parameters calibrated together.
-        parameters: By name.
-        warnings: What to know before trusting it, one sentence each.
-        error: Only where the truth was given: `mean_absolute`, `mean_percent_of_range`, `per_parameter`.
-        covariance: Rows of the estimates' covariance in physical units, in the task's order, where known.
+        seed: Seed of the random key.
+        groups: Names of the parameters that were calibrated together.
+        parameters: Estimates by name.
+        warnings: Reasons to doubt the estimate, one sentence each.
+        error: `mean_absolute`, `mean_percent_of_range` and `per_parameter`; None where the truth was not given.
+        covariance: Covariance of the estimates in physical units, in the task's order; None where it is unknown.
         settled: Whether the method's search came to its end; its intervals mean nothing before.
-        verdict: What to make of it, where rows were held out to judge it by.
+        verdict: The judgement on held-out rows; None where none were held out.
         holdout: The numbers behind the verdict.
-        problem: What was calibrated to, while the program runs that calibrated; files do not keep it.
+        problem: The data and the simulator; None in a result that was read from a file.
     """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     method: str
     task: str
@@ -66,10 +71,12 @@ class CalibrationResult:
     settled: bool = True
     verdict: Verdict | None = None
     holdout: HoldOut | None = None
-    problem: CalibrationProblem | None = field(default=None, repr=False, compare=False)
+    problem: Annotated[CalibrationProblem | None, GetPydanticSchema(lambda kind, handler: core_schema.any_schema())] = (
+        field(default=None, repr=False, compare=False)
+    )
 
     def with_intervals(self, widened: Mapping[str, float], warning: str) -> "CalibrationResult":
-        """The same result with some 95 % intervals widened, to each side, by so many times their half-width."""
+        """The same result with some 95 % intervals widened, to each side, by a multiple of their half-width."""
         parameters = dict(self.parameters)
         for name, factor in widened.items():
             row = parameters[name]
@@ -81,55 +88,47 @@ class CalibrationResult:
 
     @property
     def mean(self) -> np.ndarray:
-        """The estimate as a vector (d,), physical units, in the task's order."""
+        """Estimates (d,) in physical units, in the task's order."""
         return np.array([parameter.estimate for parameter in self.parameters.values()])
 
     @property
     def interval(self) -> np.ndarray | None:
-        """95 % intervals (d, 2), where the method knows them."""
+        """95 % confidence intervals (d, 2); None where the method has none."""
         rows = [parameter.interval for parameter in self.parameters.values()]
         return None if None in rows else np.array(rows)
 
     @property
     def std(self) -> np.ndarray:
-        """Its spread (d,)."""
+        """Standard deviations (d,) in physical units."""
         return np.array([parameter.std for parameter in self.parameters.values()])
 
-    def to_json(self) -> dict[str, Any]:
-        """As JSON; what is not known (`error`, `covariance`, an `interval`, the `verdict`) is left out."""
-        fields = asdict(replace(self, verdict=None, holdout=None, problem=None))
-        for row in (fields, *fields["parameters"].values()):
-            for name in [name for name, value in row.items() if value is None]:
-                del row[name]
-        judged = {} if self.verdict is None else {"verdict": self.verdict.to_json()}
-        return fields | judged | ({} if self.holdout is None else {"holdout": holdout_to_json(self.holdout)})
+    def to_json(self) -> dict[str, object]:
+        """The fields but for `problem` as JSON; a field that is None is left out."""
+        return dict(_adapter().dump_python(self, mode="json", exclude={"problem"}, exclude_none=True))
 
     @classmethod
-    def from_json(cls, fields: dict[str, Any]) -> "CalibrationResult":
-        """What `to_json` wrote.
+    def from_json(cls, fields: object) -> "CalibrationResult":
+        """Read what `to_json` wrote.
 
         Raises:
-            MadocError: A field is missing or unknown, or another version wrote its report on the hold-out.
+            MadocError: A field is missing, unknown, or of another version of Madoc.
         """
         try:
-            parameters = {name: ParameterEstimate(**row) for name, row in fields["parameters"].items()}
-            verdict = Verdict(**fields["verdict"]) if "verdict" in fields else None
-            if verdict is not None:
-                verdict = replace(verdict, parameters=tuple(verdict.parameters))
-            holdout = holdout_from_json(fields["holdout"]) if "holdout" in fields else None
-            return cls(**{**fields, "parameters": parameters, "verdict": verdict, "holdout": holdout})
-        except (KeyError, TypeError, AttributeError) as error:
-            raise MadocError(f"this is not the result of a calibration: {error}") from error
+            return _adapter().validate_python(fields)
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"]))
+            remedy = " calibrate again"
+            if place.startswith("holdout"):
+                remedy += ", or delete its entry holdout to keep the estimate without its verdict"
+            raise MadocError(
+                f"this is not the result of a calibration by this version of Madoc ({place}: {first['msg']});{remedy}"
+            ) from error
 
     def table(self) -> Table:
-        """The parameters as a rich table: name, unit, estimate ± std, range, group; interval and error if known."""
-        table = Table(
-            title=f"{self.method} on {self.task}",
-            title_justify="left",
-            box=box.SIMPLE_HEAD,
-            padding=(0, 0),
-            pad_edge=False,
-        )
+        """The parameters as a rich table, with intervals and errors where they are known."""
+        title = f"{self.method} on {self.task}"
+        table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0), pad_edge=False)
         group_of = {name: index for index, names in enumerate(self.groups, 1) for name in names}
         table.add_column("parameter", min_width=max(map(len, self.parameters)))
         table.add_column("unit")
@@ -151,12 +150,8 @@ class CalibrationResult:
             table.add_row(*cells, *([f"{errors[name]:.2g}"] if errors else []))
         return table
 
-    def verdict_line(self) -> str:
-        """The verdict, to be read before the table; empty where there is none."""
-        return "" if self.verdict is None else str(self.verdict)
-
     def summary(self) -> str:
-        """Status, cost, error and warnings, a line each."""
+        """Status, cost, error and warnings, one line each."""
         lines = [
             f"{self.status}: {self.sentence}",
             f"{self.control_steps:,} control steps, {self.seconds:.0f} s, seed {self.seed}",
@@ -170,14 +165,18 @@ class CalibrationResult:
 
     def __str__(self) -> str:
         stream = io.StringIO()
-        console = Console(file=stream, width=100)
-        console.print(self.table())
-        verdict = f"{self.verdict_line()}\n" if self.verdict else ""
+        Console(file=stream, width=100).print(self.table())
+        verdict = f"{self.verdict}\n" if self.verdict else ""
         return verdict + stream.getvalue() + self.summary()
 
 
+@functools.cache
+def _adapter() -> TypeAdapter:
+    return TypeAdapter(CalibrationResult)
+
+
 def _span(interval: list[float] | None) -> str:
-    """An interval with the digits in which its ends differ."""
+    """An interval, rounded to the digits in which its ends differ."""
     if interval is None:
         return ""
     low, high = interval

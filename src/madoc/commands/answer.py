@@ -1,4 +1,4 @@
-"""What a command returns, and the options all commands share."""
+"""What a command returns and prints, and the options that all commands share."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from madoc.calibration import CalibrationResult
     from madoc.calibration.holdout import HoldOut
-    from madoc.pipeline.records import EvaluationRecord
+    from madoc.report.records import EvaluationRecord
 
 EXIT_CODES: Mapping[str, int] = {
     "finished": 0,
@@ -35,18 +35,12 @@ PLACE_NAMES: Mapping[str, str] = {
     "midrange": "at mid-range (yardstick)",
     "truth": "at the truth (yardstick)",
 }
-"""What a policy is called in a table, by where it was learnt."""
+"""Names of policies in tables, by where they were learnt."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The outcome of a command.
-
-    Attributes:
-        json: What `--json` prints.
-        text: What is printed without `--json`, one part after another.
-        status: A key of `EXIT_CODES`.
-    """
+    """The outcome of a command: what is printed with `--json` and without, and a key of `EXIT_CODES`."""
 
     json: Mapping[str, object]
     text: tuple[RenderableType, ...]
@@ -69,7 +63,7 @@ class Command(Protocol):
 
     @property
     def output(self) -> Output:
-        """What is shown."""
+        """What it prints."""
         ...
 
     def run(self) -> Answer:
@@ -98,8 +92,8 @@ def evaluation_text(evaluation: "EvaluationRecord") -> tuple[RenderableType, ...
 
 
 def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
-    """The verdict, the table, the comparison of methods, and the rest in lines."""
-    verdict = (result.verdict_line(),) if result.verdict else ()
+    """The verdict, the table of estimates, the comparison of methods, and a summary."""
+    verdict = (str(result.verdict),) if result.verdict else ()
     compared = (candidates_table(result.holdout),) if result.holdout and result.holdout.candidates else ()
     return (*verdict, result.table(), *compared, result.summary())
 
@@ -114,7 +108,7 @@ def candidates_table(holdout: "HoldOut") -> Table:
     for heading in (measure, "95 %", "control steps", "s"):
         table.add_column(heading, justify="right")
     table.add_column("verdict")
-    for row in holdout.candidates:
+    for row in holdout.candidates or ():
         if isinstance(row, NotRun):
             table.add_row(row.method, "", "", "", "", row.not_run)
             continue
@@ -130,15 +124,10 @@ def candidates_table(holdout: "HoldOut") -> Table:
 
 
 def calibration_status(result: "CalibrationResult") -> str:
-    """The key of `EXIT_CODES` that a calibration ends with: its verdict, where it has one."""
+    """The key of `EXIT_CODES` of a calibration: its verdict, where it has one."""
     return result.verdict.word if result.verdict else result.status
 
 
-def left_behind(path: Path, what: str) -> str:
-    """A line that says which file or folder was left where."""
-    return f"{what}: {path}"
-
-
 def page_line(page: Path | None) -> tuple[str, ...]:
-    """A line that says where the run's page is, if it could be written."""
-    return () if page is None else (left_behind(page, "report"),)
+    """A line that says where the report of a run is, if it could be written."""
+    return () if page is None else (f"report: {page}",)

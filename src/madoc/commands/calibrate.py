@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from madoc.commands.answer import Answer, Output, calibration_status, calibration_text, left_behind, page_line
+from madoc.commands.answer import Answer, Output, calibration_status, calibration_text, page_line
 from madoc.errors import MadocError
 from madoc.pipeline.orders import CalibrationOrder
 
@@ -29,11 +29,12 @@ class Calibrate:
 
     def run(self) -> Answer:
         """Calibrate, and leave the run folder."""
-        from madoc.pipeline import calibrate_in, default_folder, leave_report, split_name
+        from madoc.pipeline import calibrate_in, default_folder, split_name
+        from madoc.report import leave_report
 
         if split_name(self.order.task)[1]:
             raise MadocError(f"expected the name of a robot, got {self.order.task!r}; the data is given with --data")
         out = self.out or default_folder(self.order)
         result = calibrate_in(out, self.order, resume=self.resume, quiet=self.output.quiet)
-        lines = (*calibration_text(result), left_behind(out, "run folder"), *page_line(leave_report(out)))
+        lines = (*calibration_text(result), f"run folder: {out}", *page_line(leave_report(out)))
         return Answer(result.to_json(), lines, calibration_status(result))

@@ -1,6 +1,6 @@
 """`madoc check`."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
@@ -20,7 +20,7 @@ class Check:
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
-        """Read the logs, check them, and print what was found."""
+        """Read the logs and check them."""
         from madoc.diagnosis import tables, to_json
         from madoc.pipeline import check_logs
 
@@ -30,7 +30,7 @@ class Check:
             assert checked.refusal is not None
             answer = {"fatal": True, "findings": [checked.refusal.to_json()]}
             return Answer(answer, (f"fatal: {checked.refusal.sentence}",), status)
-        forecasts = [forecast.to_json() for forecast in checked.forecasts]
+        forecasts = [asdict(forecast) for forecast in checked.forecasts]
         lines = tuple(forecast.sentence for forecast in checked.forecasts)
         return Answer(
             to_json(checked.diagnosis, checked.space) | {"forecast": forecasts},

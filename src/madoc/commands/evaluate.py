@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from madoc.commands.answer import Answer, Output, evaluation_text, left_behind
+from madoc.commands.answer import Answer, Output, evaluation_text
 from madoc.pipeline.orders import EvaluationOrder
 
 
@@ -24,5 +24,5 @@ class Evaluate:
         from madoc.pipeline import evaluate_folder
 
         evaluation = evaluate_folder(self.folder, self.order, quiet=self.output.quiet)
-        lines = (*evaluation_text(evaluation), left_behind(self.folder / "evaluation.json", "evaluation"))
+        lines = (*evaluation_text(evaluation), f"evaluation: {self.folder / 'evaluation.json'}")
         return Answer(evaluation.to_json(), lines)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from madoc.commands.answer import Answer, Output, left_behind
+from madoc.commands.answer import Answer, Output
 
 
 @dataclass(frozen=True)
@@ -30,5 +30,5 @@ class Export:
         from madoc.pipeline import export_run
 
         files = export_run(self.folder, self.out, onnx=self.onnx)
-        lines = tuple(left_behind(path, what) for what, path in files.items())
+        lines = tuple(f"{what}: {path}" for what, path in files.items())
         return Answer({"files": {what: str(path) for what, path in files.items()}}, lines)

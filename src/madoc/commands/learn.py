@@ -6,8 +6,8 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from madoc.commands.answer import PLACE_NAMES, Answer, Output, left_behind
-from madoc.pipeline.orders import Physics, PolicyOrder
+from madoc.commands.answer import PLACE_NAMES, Answer, Output
+from madoc.pipeline.orders import Physics, PolicyOrder, parse_settings
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Learn:
             "status": learnt.status,
             "sentence": learnt.sentence,
             "control_steps": learnt.control_steps,
+            "updates": learnt.updates,
             "budget_unit": learnt.unit,
             "spent": learnt.spent,
             "seconds": learnt.seconds,
@@ -53,7 +54,7 @@ class Learn:
         lines = (
             f"{learnt.status}: {learnt.sentence}",
             f"{order.method} {self._place()}: {cost}",
-            left_behind(out / "policy.npz", "policy"),
+            f"policy: {out / 'policy.npz'}",
         )
         return Answer(answer, lines, learnt.status)
 
@@ -63,7 +64,7 @@ class Learn:
         from madoc.policies import LEARNERS
         from madoc.types import entry_of
 
-        entry = entry_of(make_method(LEARNERS, self.order.method, self.order.changes), LEARNERS)
+        entry = entry_of(make_method(LEARNERS, self.order.method, parse_settings(self.order.set)), LEARNERS)
         if entry.needs_parameters:
             return PLACE_NAMES[self.order.at]
         return PLACE_NAMES["uniform"] if entry.unit == "control steps" else "from the data alone"

@@ -1,4 +1,4 @@
-"""The command `madoc`: arguments in, words out. What the commands do is in `madoc.commands`."""
+"""The command `madoc`: it reads the arguments, runs the command of one of its siblings, and prints the answer."""
 
 import contextlib
 import io
@@ -6,10 +6,8 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Annotated
 
 import tyro
-from tyro.conf import subcommand
 
 from madoc.commands.answer import EXIT_CODES, Answer, Command
 from madoc.commands.calibrate import Calibrate
@@ -26,67 +24,41 @@ from madoc.commands.spec import Init, Spec
 from madoc.errors import MadocError
 from madoc.runs.files import json_text
 
-REFUSED = 2
-"""Exit code of a user's mistake."""
-INTERRUPTED = EXIT_CODES["interrupted"]
 WIDTH = 110
-"""Columns of a table where standard output is no terminal."""
+"""Width of a table in characters where standard output is no terminal."""
 
 Commands = (
-    Annotated[Run, subcommand("run")]
-    | Annotated[Record, subcommand("record")]
-    | Annotated[Calibrate, subcommand("calibrate")]
-    | Annotated[Selftest, subcommand("selftest")]
-    | Annotated[Learn, subcommand("learn")]
-    | Annotated[Evaluate, subcommand("evaluate")]
-    | Annotated[Init, subcommand("init")]
-    | Annotated[Spec, subcommand("spec")]
-    | Annotated[Check, subcommand("check")]
-    | Annotated[Report, subcommand("report")]
-    | Annotated[Export, subcommand("export")]
-    | Annotated[Tasks, subcommand("tasks")]
-    | Annotated[Methods, subcommand("methods")]
+    Run | Record | Calibrate | Selftest | Learn | Evaluate | Init | Spec | Check | Report | Export | Tasks | Methods
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line; its exit code. A user's mistake is one sentence on standard error and code 2."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
+    code = 0
     try:
-        command = _parse(given)
+        command = _parse(sys.argv[1:] if arguments is None else list(arguments))
         with _calm(), contextlib.redirect_stdout(sys.stderr):
             answer = command.run()
+        code = EXIT_CODES[answer.status]
+        _print(answer, as_json=command.output.json)
     except MadocError as error:
-        print(f"madoc: {error}", file=sys.stderr)
-        return REFUSED
+        return _refused(str(error))
     except KeyboardInterrupt:
         print("madoc: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except BrokenPipeError:  # the reader of the help has seen enough, as `head` does
-        return _hang_up()
+        return EXIT_CODES["interrupted"]
+    except BrokenPipeError:  # the reader, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more is written, not even at exit
     except OSError as error:  # a full disk, a folder that may not be written to, a name that is too long
-        print(f"madoc: {_refused_by_the_system(error)}", file=sys.stderr)
-        return REFUSED
-    try:
-        _say(answer, as_json=command.output.json)
-    except BrokenPipeError:
-        _hang_up()
-    except OSError as error:  # as of a full disk
-        print(f"madoc: {_refused_by_the_system(error)}", file=sys.stderr)
-        return REFUSED
-    return EXIT_CODES[answer.status]
+        where = "" if error.filename is None else f" at {error.filename!r:.200}"
+        reason = error.strerror or str(error)
+        return _refused(f"the system refused{where}: {reason}; check the path, the rights and the space, and try again")
+    return code
 
 
-def _refused_by_the_system(error: OSError) -> str:
-    reason = error.strerror or str(error)
-    where = "" if error.filename is None else f" at {error.filename!r:.200}"
-    return f"the system refused{where}: {reason}; check the path, the rights and the space, and try again"
-
-
-def _hang_up() -> int:
-    """Write no more to a closed pipe, not even at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0
+def _refused(sentence: str) -> int:
+    """Print why a command was refused; the exit code of a user's mistake."""
+    print(f"madoc: {sentence}", file=sys.stderr)
+    return EXIT_CODES["rejected"]
 
 
 def _parse(arguments: Sequence[str]) -> Command:
@@ -128,7 +100,7 @@ def _one_sentence(box: str) -> str:
 
 @contextlib.contextmanager
 def _calm() -> Iterator[None]:
-    """A block whose warnings are printed as one line each."""
+    """Print each warning of a block as one line."""
 
     def show(message: Warning | str, *where: object, **options: object) -> None:
         print(f"madoc: warning: {message}", file=sys.stderr)
@@ -138,7 +110,7 @@ def _calm() -> Iterator[None]:
         yield
 
 
-def _say(answer: Answer, *, as_json: bool) -> None:
+def _print(answer: Answer, *, as_json: bool) -> None:
     """Print an answer on standard output."""
     if as_json:
         print(json_text(dict(answer.json), what="the answer"), flush=True)
@@ -150,7 +122,3 @@ def _say(answer: Answer, *, as_json: bool) -> None:
         for part in answer.text:
             console.print(part, markup=False, highlight=False, soft_wrap=isinstance(part, str))
     print(capture.get(), end="", flush=True)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from madoc.commands.answer import Answer, Output, left_behind
+from madoc.commands.answer import Answer, Output
 from madoc.errors import MadocError
 from madoc.pipeline.orders import RecordOrder
 
@@ -57,4 +57,4 @@ class Record:
             "true_parameters": dataset.true_parameters,
         }
         line = f"{len(dataset):,} transitions in {episodes:,} episodes, mean return {mean_return:,.1f}, {seconds:.1f} s"
-        return Answer(answer, (line, *dataset.disturbance.sentences(), left_behind(out, "data")))
+        return Answer(answer, (line, *dataset.disturbance.sentences(), f"data: {out}"))

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from madoc.commands.answer import Answer, Output, left_behind
+from madoc.commands.answer import Answer, Output
 from madoc.errors import MadocError
 
 
@@ -31,4 +31,4 @@ class Report:
             raise MadocError("expected a run folder to show; name one, as runs/hopper-medium, or several to compare")
         one = len(self.runs) == 1
         page = write_report(self.runs[0], self.out) if one else write_comparison(self.runs, self.out)
-        return Answer({"page": str(page), "runs": [str(run) for run in self.runs]}, (left_behind(page, "report"),))
+        return Answer({"page": str(page), "runs": [str(run) for run in self.runs]}, (f"report: {page}",))

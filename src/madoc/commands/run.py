@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import RenderableType
 from tyro.conf import OmitArgPrefixes, arg
 
-from madoc.commands.answer import Answer, Output, evaluation_text, left_behind, page_line
+from madoc.commands.answer import Answer, Output, evaluation_text, page_line
 from madoc.pipeline.orders import RunOrder
 
 if TYPE_CHECKING:
-    from madoc.pipeline.records import Summary
+    from madoc.report.records import Summary
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,10 @@ class Run:
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
-        """Do it, and leave the folder."""
+        """Do all stages, and leave the folder."""
         from madoc.calibration import CalibrationResult
-        from madoc.pipeline import leave_report, run_all
+        from madoc.pipeline import run_all
+        from madoc.report import leave_report
 
         out = self.out or Path("runs") / self.order.name
         summary = run_all(self.order, out, resume=self.resume, quiet=self.output.quiet)
@@ -42,12 +43,12 @@ class Run:
 
 
 def _rest(summary: "Summary", out: Path) -> tuple[RenderableType, ...]:
-    """What came after the calibration, and where everything lies."""
+    """The stages after the calibration, and where all files are."""
     evaluation = () if summary.evaluation is None else evaluation_text(summary.evaluation)
-    files = [left_behind(out / "calibration" / "result.json", "estimate")]
-    files += [left_behind(out / f"policy-{at}" / "policy.npz", f"policy {at}") for at in summary.policies]
+    files = [f"estimate: {out / 'calibration' / 'result.json'}"]
+    files += [f"policy {at}: {out / f'policy-{at}' / 'policy.npz'}" for at in summary.policies]
     if summary.status == "finished":
-        files.append(left_behind(out / "summary.json", "summary"))
+        files.append(f"summary: {out / 'summary.json'}")
     elif summary.status == "interrupted":
         files.append("go on with the same command and --resume")
     return (*evaluation, f"{summary.status}: {summary.sentence}", *files)

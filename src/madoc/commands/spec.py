@@ -1,4 +1,4 @@
-"""`madoc init` and `madoc spec`: a robot of one's own."""
+"""`madoc init` and `madoc spec`, for a user's own robot."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +8,7 @@ from rich import box
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from madoc.commands.answer import Answer, Output, left_behind
+from madoc.commands.answer import Answer, Output
 from madoc.errors import MadocError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Init:
             "parameters": len(robot.spec.parameters),
         }
         parts = [f"{count} {what.removesuffix('s') if count == 1 else what}" for what, count in counts.items()]
-        lines = (f"{', '.join(parts)}; edit it, then: madoc spec {out}", left_behind(out, "spec"))
+        lines = (f"{', '.join(parts)}; edit it, then: madoc spec {out}", f"spec: {out}")
         return Answer({"spec": str(out), "name": robot.spec.name, **counts}, lines)
 
 
@@ -100,7 +100,7 @@ def describe(robot: "Robot") -> dict[str, object]:
 
 
 def _sentences(robot: "Robot") -> list[str]:
-    """What a user should know of the robot, one sentence each."""
+    """What a user should know about the robot, one sentence each."""
     task = robot.task
     sentences = [
         f"one action every {robot.spec.control_step:g} s, {task.frame_skip} physics steps each; "

@@ -1,4 +1,4 @@
-"""Logged data: `load` reads any known format into a `Dataset`, `save` writes Madoc's own.
+"""Logged data: `load` reads a file of any supported format into a `Dataset`, `save` writes Madoc's own.
 
 The names are in `__init__.pyi`; each is imported when it is first used, as options are declared here too.
 """

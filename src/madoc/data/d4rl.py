@@ -9,14 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from madoc.data.dataset import Dataset, close_episodes, starts_after
-from madoc.data.validation import as_matrix, as_transitions, check_lengths, require_arrays, require_file, validate
+from madoc.data.validation import as_matrix, as_transitions, require_arrays, require_file, validate
 from madoc.errors import MadocError
 from madoc.tasks import Task
-from madoc.types import Transitions
 
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
-REQUIRED = ("observations", "actions", "rewards", "terminals")
-OPTIONAL = ("next_observations", "timeouts")
 NAMES_HERE = {
     "observation": "observations",
     "action": "actions",
@@ -25,16 +21,14 @@ NAMES_HERE = {
     "terminated": "terminals",
     "truncated": "timeouts",
 }
-# D4RL's Ant: 27 values of state, then contact forces of 14 bodies that mujoco-py 2.x left at zero.
+OPTIONAL = {"next_observations", "timeouts"}
 ANT_WIDTH, ANT_STATE_WIDTH = 111, 27
+"""Values of D4RL's Ant: 27 of state, then contact forces of 14 bodies, which mujoco-py 2.x left at zero."""
 
 
 def recognises(path: Path) -> bool:
     """Whether the file begins like HDF5."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(SIGNATURE)) == SIGNATURE
+    return path.is_file() and bool(h5py.is_hdf5(path))
 
 
 def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
@@ -45,12 +39,8 @@ def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
     observation). The row before then ends its episode as truncated. Without any timeout, an episode is cut after every
     `task.max_episode_steps` rows, as in `qlearning_dataset`. An Ant of 111 values keeps the first 27; the other 84
     must be 0. Physics is legacy for names that end in -v0, -v1 or -v2, as D4RL's do, else unknown.
-
-    Raises:
-        MadocError: Missing, damaged, not this layout, or refused by `validate`.
     """
     arrays = _read_arrays(path)
-    check_lengths(arrays)
     has_next = "next_observations" in arrays
     names = NAMES_HERE if has_next else {**NAMES_HERE, "next_observation": "observations"}
     for name in {names["observation"], names["next_observation"]}:
@@ -62,40 +52,29 @@ def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
         transitions = replace(transitions, truncated=truncated)
     if not has_next:
         transitions = replace(transitions, next_observation=np.roll(transitions.observation, -1, axis=0))
-    dataset = _dataset(transitions, terminated | truncated, path, task)
+    starts = starts_after(terminated | truncated)
+    physics = "legacy" if re.search(r"-v[012]$", path.stem) else "unknown"
+    dataset = Dataset(close_episodes(transitions, starts), starts, task.name, physics, origin=str(path))
     dataset = validate(dataset, task, names, clip_actions=clip_actions)
     return dataset if has_next else _without_last_rows(dataset)
 
 
 def count_time_limits(ends: Bool[np.ndarray, " rows"], limit: int) -> Bool[np.ndarray, " rows"]:
     """Rows that reach a time limit of `limit` rows since the last end (or time limit)."""
-    rows = np.arange(len(ends))
-    starts = starts_after(ends) if len(ends) else rows
+    rows, starts = np.arange(len(ends)), starts_after(ends)
     age = rows - starts[np.searchsorted(starts, rows, side="right") - 1] + 1
     return (age % limit == 0) & ~ends
 
 
-def _dataset(transitions: Transitions, ends: np.ndarray, path: Path, task: Task) -> Dataset:
-    starts = starts_after(ends)
-    physics = "legacy" if re.search(r"-v[012]$", path.stem) else "unknown"
-    if len(ends):
-        transitions = close_episodes(transitions, starts)
-    return Dataset(transitions, starts, task_name=task.name, physics=physics, origin=str(path))
-
-
 def _without_last_rows(dataset: Dataset) -> Dataset:
     """Drop the last row of every episode; episodes of one row vanish."""
-    keep = np.ones(len(dataset), dtype=bool)
-    keep[dataset.episode_ends - 1] = False
-    episode = np.repeat(np.arange(len(dataset.episode_starts)), dataset.episode_ends - dataset.episode_starts)[keep]
-    if not len(episode):
+    rows = np.setdiff1d(np.arange(len(dataset)), dataset.episode_ends - 1)
+    if not len(rows):
         raise MadocError(
             f"expected episodes of two rows or more, got {len(dataset)} of one row in {dataset.origin}; "
             "without next_observations they hold no transition, so record longer ones"
         )
-    starts = starts_after(np.append(np.diff(episode) > 0, True))
-    transitions = close_episodes(dataset.transitions.take(keep), starts)
-    return replace(dataset, transitions=transitions, episode_starts=starts)
+    return dataset.take(rows, np.flatnonzero(np.diff(dataset.episode_of(rows), prepend=-1)))
 
 
 def _observation(values: np.ndarray, name: str, task: Task) -> Float[np.ndarray, "rows observation"]:
@@ -103,8 +82,8 @@ def _observation(values: np.ndarray, name: str, task: Task) -> Float[np.ndarray,
     if task.name != "ant" or observation.shape[1] != ANT_WIDTH:
         return observation
     forces = observation[:, ANT_STATE_WIDTH:]
-    if (forces != 0).any():
-        row, column = np.argwhere(forces != 0)[0]
+    if forces.any():
+        row, column = np.argwhere(forces)[0]
         raise MadocError(
             f"expected zeros after the first 27 values of an Ant of 111, got {forces[row, column]:g} in "
             f"row {row}, column {ANT_STATE_WIDTH + column} of {name}; contact forces are not part of this "
@@ -117,13 +96,13 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     require_file(path)
     try:
         with h5py.File(path, "r") as file:
-            present = [name for name in REQUIRED + OPTIONAL if isinstance(file.get(name), h5py.Dataset)]
-            require_arrays(present, REQUIRED, path, "if it is a Minari file, pass its directory instead")
-            return {name: np.atleast_1d(file[name][()]) for name in present}
-    except MadocError:
-        raise
+            present = [name for name in NAMES_HERE.values() if isinstance(file.get(name), h5py.Dataset)]
+            arrays = {name: np.atleast_1d(file[name][()]) for name in present}
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise MadocError(
             f"cannot read {path} as HDF5 ({error}); it is damaged, was cut short or has another format, "
             "copy or download it again"
         ) from error
+    required = [name for name in NAMES_HERE.values() if name not in OPTIONAL]
+    require_arrays(arrays, required, path, "if it is a Minari file, pass its directory instead")
+    return arrays

@@ -1,5 +1,6 @@
 """A dataset: logged transitions, where their episodes begin, and where they come from."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -23,11 +24,10 @@ class Dataset:
         task_name: The task it was recorded for.
         physics: `legacy`, `modern`, or `unknown` where the file does not say.
         origin: The file, or a description.
-        true_parameters: The target's physical values by parameter name, if known. Only evaluation reads them.
-        disturbance: What it is known to suffer from.
-        run_names: The run of each episode, where it was read from a user's logs: episodes of one name are stretches of
-            one run.
-        findings: What reading and checking it told.
+        true_parameters: The target's physical values by parameter name, where available. Only evaluation reads them.
+        disturbance: The noise, missing velocities and lost order that were put into it.
+        run_names: The run that each episode is from, where it was read from a user's logs.
+        findings: Notes and warnings of the reader.
     """
 
     transitions: Transitions
@@ -46,11 +46,24 @@ class Dataset:
     @property
     def episode_ends(self) -> Int[np.ndarray, " episodes"]:
         """One past the last row of every episode."""
-        return np.append(self.episode_starts[1:], len(self))
+        return np.append(self.episode_starts, len(self))[1:]
 
     def episode_of(self, rows: Int[np.ndarray, "*rows"]) -> Int[np.ndarray, "*rows"]:
         """The index of the episode that each of the given rows belongs to."""
         return np.searchsorted(self.episode_starts, rows, side="right") - 1
+
+    def take(self, rows: Int[np.ndarray, " rows"], starts: Int[np.ndarray, " episodes"]) -> "Dataset":
+        """A dataset of the given rows in their order, with the episode starts that they have there.
+
+        An episode is named after the run of its first row, and is truncated where it ends without being terminated.
+        """
+        names = self.run_names
+        return replace(
+            self,
+            transitions=close_episodes(self.transitions.take(rows), starts),
+            episode_starts=starts,
+            run_names=None if names is None else tuple(names[episode] for episode in self.episode_of(rows[starts])),
+        )
 
     def split(self, share: float = 0.2, *, key: PRNGKeyArray | None = None) -> tuple["Dataset", "Dataset"]:
         """Hold out about `share` of the rows to judge an estimate by: `train, held_out = dataset.split(0.2)`.
@@ -71,23 +84,39 @@ class Dataset:
 
 
 def starts_after(ends: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, " episodes"]:
-    """Rows where an episode begins, from whether a row ends one."""
-    return np.flatnonzero(np.append(True, ends[:-1]))
+    """Rows where an episode begins, from whether each row ends one."""
+    return np.flatnonzero(np.append(True, ends)[:-1])
 
 
 def close_episodes(transitions: Transitions, episode_starts: Int[np.ndarray, " episodes"]) -> Transitions:
     """Mark the last row of every episode truncated unless it is terminated: the record ends there."""
-    last = np.append(episode_starts[1:], len(transitions)) - 1
+    last = np.append(episode_starts, len(transitions))[1:] - 1
     truncated = np.array(transitions.truncated)
     truncated[last] |= ~np.asarray(transitions.terminated)[last]
     return replace(transitions, truncated=truncated)
 
 
+def join(datasets: Sequence[Dataset], origin: str) -> Dataset:
+    """Datasets of one robot as one, their rows one after another."""
+    offsets = np.cumsum([0, *(len(dataset) for dataset in datasets[:-1])])
+    starts = [dataset.episode_starts + offset for dataset, offset in zip(datasets, offsets, strict=True)]
+    return replace(
+        datasets[0],
+        transitions=jax.tree.map(
+            lambda *columns: np.concatenate(columns), *(dataset.transitions for dataset in datasets)
+        ),
+        episode_starts=np.concatenate(starts),
+        origin=origin,
+        run_names=tuple(name for dataset in datasets for name in dataset.run_names or ()) or None,
+        findings=tuple(finding for dataset in datasets for finding in dataset.findings),
+    )
+
+
 def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Dataset:
     """At most `max_transitions` transitions: whole episodes in a random order, the last one cut short.
 
-    The rule looks at episodes only, so it is the same for every format, and a smaller draw with the same key
-    is a prefix of a larger one. A dataset that is small enough comes back as it is.
+    The draw depends on the lengths of the episodes alone, so it is the same for every file format, and a smaller draw
+    with the same key is the beginning of a larger one. A dataset that is small enough is returned as it is.
 
     Raises:
         MadocError: `max_transitions` is not positive.
@@ -100,12 +129,8 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
     order = np.asarray(jax.random.permutation(key, len(starts)))
     filled = np.cumsum((ends - starts)[order])
     episodes = int(np.searchsorted(filled, max_transitions)) + 1
-    chosen = order[:episodes]
-    rows = np.concatenate([np.arange(starts[episode], ends[episode]) for episode in chosen])[:max_transitions]
-    new_starts = np.append(0, filled[: episodes - 1])
-    transitions = close_episodes(dataset.transitions.take(rows), new_starts)
-    names = None if dataset.run_names is None else tuple(dataset.run_names[episode] for episode in chosen)
-    return replace(dataset, transitions=transitions, episode_starts=new_starts, run_names=names)
+    rows = np.concatenate([np.arange(starts[episode], ends[episode]) for episode in order[:episodes]])
+    return dataset.take(rows[:max_transitions], np.append(0, filled[: episodes - 1]))
 
 
 def typical_change(dataset: Dataset) -> Float[np.ndarray, " observation"]:

@@ -1,4 +1,4 @@
-"""What keeps logged data from being clean, as the command line asks for it and as the data remembers it."""
+"""Disturbances of logged data, as options of the command line and as they are kept with the data."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ Velocities = Literal["logged", "differences"]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What is put into the data; an estimate made from it says so."""
+    """Disturbances put into the data; an estimate made from it names them in its warnings."""
 
     noise: float = 0.0
     """Observation noise as a share of a step's typical change: 0.1 is 10 %."""
@@ -44,7 +44,7 @@ class Disturbance:
         )
 
     def sentences(self) -> tuple[str, ...]:
-        """What a reader of an estimate should know of the data, one sentence each; none where it is clean."""
+        """Warnings for an estimate made from the data, one for each disturbance."""
         sentences = []
         if self.noise:
             sentences.append(

@@ -1,4 +1,4 @@
-"""Findings about a log: each with its level, what was found, where, and what to do."""
+"""Findings about a log: each with its level, a clause that says it, its place, and what to do."""
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass

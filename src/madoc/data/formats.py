@@ -19,7 +19,8 @@ class Format:
     """A layout of logged data.
 
     Attributes:
-        read: (path, task, clip_actions=...) -> validated dataset.
+        read: (path, task, clip_actions=...) -> validated dataset. A file that is missing, damaged, of another layout
+            or refused by `validate` raises a MadocError, as does a library that is not installed.
         recognises: path -> whether it has this layout, from the beginning of its content.
         description: A short description of the layout, for lists.
     """
@@ -47,7 +48,7 @@ def load(
     clip_actions: bool = False,
     download: bool = False,
 ) -> Dataset:
-    """Read logged data of a robot in any of the known formats.
+    """Read logged data of a robot in any of the supported formats.
 
     Args:
         path: A file, a Minari directory, or a Minari id.
@@ -59,7 +60,7 @@ def load(
         download: Fetch a Minari id that is not on this machine. Without it nothing touches the network.
 
     Raises:
-        MadocError: Missing, unreadable, of no known format, or not data of this task.
+        MadocError: Missing, unreadable, of no supported format, or not data of this task.
     """
     source = Path(path).expanduser()
     if format is not None and format not in FORMATS:
@@ -82,7 +83,7 @@ def recognise(path: Path) -> str:
     """The name of a file's format, from its content.
 
     Raises:
-        MadocError: Missing, empty, damaged beyond recognition, or of no known format.
+        MadocError: Missing, empty, damaged beyond recognition, or of no supported format.
     """
     for name, candidate in FORMATS.items():
         if candidate.recognises(path):

@@ -2,14 +2,16 @@
 
 import re
 import warnings
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from madoc.data.dataset import Dataset, close_episodes
-from madoc.data.validation import as_flags, as_matrix, as_vector, check_lengths, validate
+from madoc.data.dataset import Dataset, close_episodes, join
+from madoc.data.validation import as_matrix, as_transitions, validate
 from madoc.errors import MadocError
 from madoc.tasks import Task
 from madoc.types import Transitions
@@ -18,12 +20,12 @@ if TYPE_CHECKING:
     from minari import EpisodeData
 
 ID = re.compile(r"[\w-]+(/[\w-]+)*-v\d+")
-# Ant-v5: 27 values of state, then 78 contact forces, which the state determines.
 ANT_V5_WIDTH, ANT_STATE_WIDTH = 105, 27
+"""Values of Ant-v5: 27 of state, then 78 contact forces, which the state determines."""
 NAMES_HERE = {
+    "reward": "rewards",
     "observation": "observations",
     "action": "actions",
-    "reward": "rewards",
     "next_observation": "observations",
     "terminated": "terminations",
     "truncated": "truncations",
@@ -43,37 +45,24 @@ def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
     An Ant of 105 values keeps the first 27, and the rewards keep the contact cost they were recorded with.
     Physics is modern for environments v4 and later, legacy before, unknown without an environment. Rows are
     counted over all episodes joined.
-
-    Raises:
-        MadocError: `minari` is not installed, no such dataset here, damaged, not arrays, or refused by
-            `validate`.
     """
-    directory = local_directory(path)
-    episodes, environment = read_episodes(directory)
+    episodes, environment = read_episodes(local_directory(path))
     if not episodes:
         raise MadocError(f"expected at least one episode for {task.name}, got none in {path}")
-    lengths = [len(episode.rewards) for episode in episodes]
-    observations = [_observation(episode, task) for episode in episodes]
-    starts = np.append(0, np.cumsum(lengths)[:-1])
-    transitions = Transitions(
-        observation=_join([values[:-1] for values in observations], "observations"),
-        action=_join([as_matrix(episode.actions, "actions") for episode in episodes], "actions"),
-        reward=np.concatenate([as_vector(episode.rewards, "rewards") for episode in episodes]),
-        next_observation=_join([values[1:] for values in observations], "observations"),
-        terminated=np.concatenate([as_flags(episode.terminations, "terminations") for episode in episodes]),
-        truncated=np.concatenate([as_flags(episode.truncations, "truncations") for episode in episodes]),
+    version = re.search(r"-v(\d+)$", environment)
+    physics = "unknown" if version is None else "modern" if int(version[1]) >= 4 else "legacy"
+    parts = [_transitions(episode, task) for episode in episodes]
+    _check_widths([part.observation.shape[1] for part in parts], "observations")
+    _check_widths([part.action.shape[1] for part in parts], "actions")
+    start = np.zeros(1, dtype=np.int64)
+    dataset = join(
+        [Dataset(close_episodes(part, start), start, task.name, physics, str(path)) for part in parts], str(path)
     )
-    transitions = close_episodes(transitions, starts)
-    dataset = Dataset(transitions, starts, task.name, _physics(environment), origin=str(path))
     return validate(dataset, task, NAMES_HERE, clip_actions=clip_actions)
 
 
 def download(dataset_id: str) -> None:
-    """Fetch a Minari dataset from its public host, unless it is here. Nothing else needs a network.
-
-    Raises:
-        MadocError: `minari` is not installed, or the download failed.
-    """
+    """Fetch a Minari dataset from its public host, unless it is here. Nothing else needs a network."""
     minari = _import_minari()
     try:
         minari.load_dataset(dataset_id, download=True)
@@ -83,25 +72,8 @@ def download(dataset_id: str) -> None:
         ) from error
 
 
-def _import_minari() -> ModuleType:
-    try:
-        import minari
-    except ImportError as error:
-        raise MadocError(f'Minari datasets need the library: pip install "minari[hdf5]" ({error})') from error
-    return minari
-
-
-def _data_directory(path: Path) -> Path | None:
-    """The folder with the metadata: the path itself or its `data`."""
-    return next((folder for folder in (path / "data", path) if (folder / "metadata.json").is_file()), None)
-
-
 def local_directory(path: Path) -> Path:
-    """The folder of a dataset's episodes, by its folder or by its id.
-
-    Raises:
-        MadocError: There is none here, or Minari is not installed.
-    """
+    """The folder of a dataset's episodes, by its folder or by its id; a path or id that is not here is refused."""
     directory = _data_directory(path)
     if directory is not None:
         return directory
@@ -122,11 +94,7 @@ def local_directory(path: Path) -> Path:
 
 
 def read_episodes(directory: Path) -> tuple[list["EpisodeData"], str]:
-    """All episodes, and the id of their environment (empty if not recorded).
-
-    Raises:
-        MadocError: Minari is not installed, or the dataset is damaged.
-    """
+    """All episodes, and the id of their environment (empty if not recorded)."""
     minari = _import_minari()
     try:
         with warnings.catch_warnings():
@@ -142,18 +110,21 @@ def read_episodes(directory: Path) -> tuple[list["EpisodeData"], str]:
         ) from error
 
 
-def _join(parts: list[np.ndarray], name: str) -> np.ndarray:
-    widths = [part.shape[1] for part in parts]
-    for episode, width in enumerate(widths):
-        if width != widths[0]:
-            raise MadocError(
-                f"expected {widths[0]} values per row of {name} in every episode, got {width} in "
-                f"episode {episode}; record them again from one robot"
-            )
-    return np.concatenate(parts)
+def _import_minari() -> ModuleType:
+    try:
+        import minari
+    except ImportError as error:
+        raise MadocError(f'Minari datasets need the library: pip install "minari[hdf5]" ({error})') from error
+    return minari
 
 
-def _observation(episode: "EpisodeData", task: Task) -> np.ndarray:
+def _data_directory(path: Path) -> Path | None:
+    """The folder with the metadata: the path itself or its `data`."""
+    return next((folder for folder in (path / "data", path) if (folder / "metadata.json").is_file()), None)
+
+
+def _transitions(episode: "EpisodeData", task: Task) -> Transitions:
+    """The rows of an episode, which has one more observation than actions."""
     if isinstance(episode.observations, dict | tuple):
         raise MadocError(
             f"expected observations of {task.name} as one array, got a {type(episode.observations).__name__} "
@@ -166,15 +137,17 @@ def _observation(episode: "EpisodeData", task: Task) -> np.ndarray:
             f"expected one more observation than rewards, and a reward, got {len(observation)} and {steps} "
             f"in episode {episode.id}; record it again"
         )
-    check_lengths({"rewards": episode.rewards, "actions": episode.actions})
-    check_lengths({"terminations": episode.terminations, "truncations": episode.truncations})
     if task.name == "ant" and observation.shape[1] == ANT_V5_WIDTH:
-        return observation[:, :ANT_STATE_WIDTH]
-    return observation
+        observation = observation[:, :ANT_STATE_WIDTH]
+    arrays = {name: getattr(episode, name) for name in NAMES_HERE.values()}
+    rows = as_transitions({**arrays, "observations": observation[:-1]}, NAMES_HERE)
+    return replace(rows, next_observation=observation[1:])
 
 
-def _physics(environment: str) -> str:
-    version = re.search(r"-v(\d+)$", environment)
-    if version is None:
-        return "unknown"
-    return "modern" if int(version[1]) >= 4 else "legacy"
+def _check_widths(widths: Sequence[int], name: str) -> None:
+    for episode, width in enumerate(widths):
+        if width != widths[0]:
+            raise MadocError(
+                f"expected {widths[0]} values per row of {name} in every episode, got {width} in episode {episode}; "
+                "record them again from one robot"
+            )

@@ -2,32 +2,42 @@
 
 import json
 import os
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from madoc.data.dataset import Dataset
 from madoc.data.disturbance import Disturbance
 from madoc.data.disturbing import observed_task
 from madoc.data.findings import Finding
-from madoc.data.npz import array_names, is_npz, read_arrays
+from madoc.data.npz import holds, read_arrays
 from madoc.data.validation import NAMES, as_transitions, require_arrays, validate
 from madoc.errors import MadocError
 from madoc.parameters import FIELDS
 from madoc.runs.files import json_text, replacing
 from madoc.tasks import Task
 
-Part = TypeVar("Part")
 VERSION = 1
-REQUIRED = (*NAMES, "episode_starts", "metadata")
+
+
+@dataclass(frozen=True)
+class _Metadata:
+    """The fields of a `Dataset` that are kept as JSON."""
+
+    task_name: str
+    physics: str
+    origin: str
+    true_parameters: dict[str, float] | None
+    disturbance: Disturbance = field(default_factory=Disturbance)
+    run_names: tuple[str, ...] | None = None
+    findings: tuple[Finding, ...] = ()
 
 
 def recognises(path: Path) -> bool:
     """Whether the file is an npz with our metadata."""
-    return is_npz(path) and {"metadata", "episode_starts"} <= array_names(path)
+    return holds(path, "metadata", "episode_starts")
 
 
 def save(dataset: Dataset, path: str | os.PathLike) -> None:
@@ -41,66 +51,30 @@ def save(dataset: Dataset, path: str | os.PathLike) -> None:
         raise MadocError(f"expected a file to write to, got the directory {target}; add a file name")
     if not target.parent.is_dir():
         raise MadocError(f"no folder {target.parent} to write {target.name} into; make it first")
-    arrays = _arrays(dataset)
+    about = asdict(_Metadata(**{part.name: getattr(dataset, part.name) for part in fields(_Metadata)}))
+    if dataset.true_parameters is not None:
+        about["true_parameters"] = {name: float(value) for name, value in dataset.true_parameters.items()}
+    kinds = {name: FIELDS.get(name.split(".")[0]) for name in dataset.true_parameters or {}}
+    units = {name: "" if kind is None else kind.unit for name, kind in kinds.items()}  # for people who open the file
+    metadata = json_text({"version": VERSION, **about, "parameter_units": units}, what="metadata")
+    arrays = {name: np.asarray(getattr(dataset.transitions, name)) for name in NAMES}
+    starts = np.asarray(dataset.episode_starts)
     with replacing(target) as stream:
-        np.savez(stream, allow_pickle=False, **arrays)
-
-
-def load(path: str | os.PathLike) -> Dataset:
-    """Read a file of `save`, bit for bit.
-
-    Raises:
-        MadocError: Missing, damaged, not ours, or of another version.
-    """
-    source = Path(path).expanduser()
-    arrays = read_arrays(source)
-    require_arrays(arrays, REQUIRED, source, "it is not a file of Madoc, pass the --format it has")
-    metadata = _metadata(arrays["metadata"], source)
-    return Dataset(
-        as_transitions(arrays),
-        _row_numbers(arrays["episode_starts"], source),
-        task_name=metadata["task_name"],
-        physics=metadata["physics"],
-        origin=metadata["origin"],
-        true_parameters=metadata["true_parameters"],
-        disturbance=_part(Disturbance, metadata.get("disturbance", {}), source),
-        run_names=_part(tuple[str, ...], metadata["run_names"], source) if metadata.get("run_names") else None,
-        findings=_part(tuple[Finding, ...], metadata.get("findings", ()), source),
-    )
+        np.savez(stream, allow_pickle=False, **arrays, episode_starts=starts, metadata=np.array(metadata))
 
 
 def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
-    """`load`, checked against a task.
+    """Read a file of `save`, bit for bit.
 
     Raises:
-        MadocError: As `load`, or refused by `validate`.
+        MadocError: Missing, damaged, not ours, of another version, or refused by `validate`.
     """
-    dataset = load(path)
+    arrays = read_arrays(path)
+    hint = "it is not a file of Madoc, pass the --format it has"
+    require_arrays(arrays, (*NAMES, "episode_starts", "metadata"), path, hint)
+    metadata = _metadata(arrays["metadata"], path)
+    dataset = Dataset(as_transitions(arrays), _row_numbers(arrays["episode_starts"], path), **vars(metadata))
     return validate(dataset, observed_task(task, dataset), clip_actions=clip_actions)
-
-
-def _arrays(dataset: Dataset) -> dict[str, np.ndarray]:
-    truth = dataset.true_parameters
-    metadata = {
-        "version": VERSION,
-        "task_name": dataset.task_name,
-        "physics": dataset.physics,
-        "origin": dataset.origin,
-        "true_parameters": None if truth is None else {name: float(value) for name, value in truth.items()},
-        "disturbance": asdict(dataset.disturbance),
-        "run_names": dataset.run_names,
-        "findings": [finding.to_json() for finding in dataset.findings],
-        "parameter_units": {name: _unit(name) for name in truth or {}},
-    }
-    arrays = {name: np.asarray(getattr(dataset.transitions, name)) for name in NAMES}
-    starts = np.asarray(dataset.episode_starts)
-    return {**arrays, "episode_starts": starts, "metadata": np.array(json_text(metadata, what="metadata"))}
-
-
-def _unit(parameter_name: str) -> str:
-    """The unit of `field.element`, for people who open the file; empty for an unknown field."""
-    field = FIELDS.get(parameter_name.split(".")[0])
-    return "" if field is None else field.unit
 
 
 def _row_numbers(values: np.ndarray, path: Path) -> np.ndarray:
@@ -112,23 +86,13 @@ def _row_numbers(values: np.ndarray, path: Path) -> np.ndarray:
     return values.astype(np.int64)
 
 
-def _part(kind: type[Part], fields: object, path: Path) -> Part:
-    """A part of the metadata as its type."""
+def _metadata(text: np.ndarray, path: Path) -> _Metadata:
     try:
-        return TypeAdapter(kind).validate_python(fields)
-    except ValidationError as error:
-        raise MadocError(f"the metadata of {path} cannot be read ({error})") from error
-
-
-def _metadata(text: np.ndarray, path: Path) -> dict:
-    try:
-        metadata = json.loads(str(text))
-        version = metadata["version"]
+        stored = json.loads(str(text))
+        version = stored["version"]
+        if version == VERSION:
+            return TypeAdapter(_Metadata).validate_python(stored)
     except (ValueError, TypeError, KeyError) as error:
-        raise MadocError(f"metadata of {path} cannot be read ({error}); the file is damaged, make it again") from error
-    if version != VERSION:
-        raise MadocError(f"expected file version {VERSION}, got {version} in {path}; use the Madoc that wrote it")
-    missing = {"task_name", "physics", "origin", "true_parameters"} - set(metadata)
-    if missing:
-        raise MadocError(f"no {min(missing)!r} in the metadata of {path}; the file is damaged, make it again")
-    return metadata
+        reason = " ".join(str(error).split())
+        raise MadocError(f"metadata of {path} cannot be read ({reason}); the file is damaged, make it again") from error
+    raise MadocError(f"expected file version {VERSION}, got {version} in {path}; use the Madoc that wrote it")

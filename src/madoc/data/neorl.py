@@ -7,27 +7,23 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.data.dataset import Dataset, close_episodes
-from madoc.data.npz import array_names, is_npz, read_arrays
-from madoc.data.validation import (
-    NAMES,
-    as_matrix,
-    as_transitions,
-    as_vector,
-    check_lengths,
-    require_arrays,
-    validate,
-)
+from madoc.data.npz import holds, read_arrays
+from madoc.data.validation import NAMES, as_matrix, as_transitions, as_vector, require_arrays, validate
 from madoc.errors import MadocError
 from madoc.tasks import Task
 
-COLUMNS = ("obs", "next_obs", "action", "reward", "done")
-REQUIRED = (*COLUMNS, "index")
-NAMES_HERE = {**NAMES, "observation": "obs", "next_observation": "next_obs", "terminated": "done"}
+NAMES_HERE = {
+    **NAMES,
+    "observation": "obs",
+    "next_observation": "next_obs",
+    "terminated": "done",
+    "truncated": "done",
+}
 
 
 def recognises(path: Path) -> bool:
     """Whether the file is an npz with `obs` and `next_obs`."""
-    return is_npz(path) and {"obs", "next_obs"} <= array_names(path)
+    return holds(path, "obs", "next_obs")
 
 
 def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
@@ -35,25 +31,18 @@ def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
 
     `done` marks falls and time limits alike: it terminates where the task ends at the state rebuilt from
     `next_obs`, and truncates elsewhere. `index` holds episode ends in NeoRL's files and episode starts in
-    what its package hands out (`neorl/utils.py` puts a 0 in front); both are read. Physics is legacy: NeoRL
+    what its package returns (`neorl/utils.py` puts a 0 in front); both are read. Physics is legacy: NeoRL
     used mujoco-py.
-
-    Raises:
-        MadocError: Missing, damaged, not this layout, an observation that does not determine the state, or
-            refused by `validate`.
     """
     arrays = read_arrays(path)
-    require_arrays(arrays, REQUIRED, path, "pass the --format it has")
-    check_lengths({name: np.atleast_1d(arrays[name]) for name in COLUMNS})
+    require_arrays(arrays, (*NAMES_HERE.values(), "index"), path, "pass the --format it has")
     for name in ("obs", "next_obs"):
         arrays[name] = _without_root(arrays[name], name, task)
-    transitions = as_transitions(arrays, {**NAMES_HERE, "truncated": "done"})
+    transitions = as_transitions(arrays, NAMES_HERE)
     done = np.asarray(transitions.terminated)
     terminated = done & np.asarray(task.terminated(_rebuild(arrays["next_obs"], task)), dtype=bool)
-    transitions = replace(transitions, terminated=terminated, truncated=done & ~terminated)
     starts = _episode_starts(as_vector(arrays["index"], "index"), done)
-    if len(done):
-        transitions = close_episodes(transitions, starts)
+    transitions = close_episodes(replace(transitions, terminated=terminated, truncated=done & ~terminated), starts)
     dataset = Dataset(transitions, starts, task_name=task.name, physics="legacy", origin=str(path))
     return validate(dataset, task, NAMES_HERE, clip_actions=clip_actions)
 
@@ -88,4 +77,4 @@ def _episode_starts(index: np.ndarray, done: np.ndarray) -> Int[np.ndarray, " ep
             "the file is damaged, make it again"
         )
     starts = np.union1d(np.append(0, index.astype(int)), np.flatnonzero(done) + 1)
-    return starts[starts < max(rows, 1)]
+    return starts[starts < rows]

@@ -13,35 +13,21 @@ ZIP_SIGNATURE = b"PK\x03\x04"
 _UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, KeyError, zipfile.BadZipFile, zlib.error)
 
 
-def is_npz(path: Path) -> bool:
-    """Whether the file begins like a zip archive, whole or not."""
-    if not path.is_file():
+def holds(path: Path, *names: str) -> bool:
+    """Whether the file is an npz archive with all of the named arrays; a damaged archive is refused."""
+    if not _is_npz(path):
         return False
-    with path.open("rb") as file:
-        return file.read(len(ZIP_SIGNATURE)) == ZIP_SIGNATURE
-
-
-def array_names(path: Path) -> set[str]:
-    """Names of the arrays in an archive, without reading them.
-
-    Raises:
-        MadocError: The archive is damaged.
-    """
     try:
         with zipfile.ZipFile(path) as archive:
-            return {name.removesuffix(".npy") for name in archive.namelist()}
+            return {f"{name}.npy" for name in names} <= set(archive.namelist())
     except _UNREADABLE as error:
         raise _damaged(path, error) from error
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Every array of an archive by name.
-
-    Raises:
-        MadocError: No such file, no npz, damaged, cut short, or holding Python objects.
-    """
+    """Every array of an archive by name; one that is missing, damaged or holds Python objects is refused."""
     require_file(path)
-    if not is_npz(path):
+    if not _is_npz(path):
         raise MadocError(f"{path} is not an npz file; pass the --format it has")
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -49,9 +35,17 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     except _UNREADABLE as error:
         raise _damaged(path, error) from error
     for name, array in arrays.items():
-        if not isinstance(array, np.ndarray):  # NumPy hands on other members of a zip archive as bytes
+        if not isinstance(array, np.ndarray):  # NumPy returns other members of a zip archive as bytes
             raise MadocError(f"expected only arrays in {path}, got the file {name!r}; this is no log of columns")
     return arrays
+
+
+def _is_npz(path: Path) -> bool:
+    """Whether the file begins like a zip archive, even if it was cut short."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(ZIP_SIGNATURE)) == ZIP_SIGNATURE
 
 
 def _damaged(path: Path, error: Exception) -> MadocError:

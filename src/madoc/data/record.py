@@ -1,4 +1,4 @@
-"""Recording: a policy acts in a target, and its transitions become a dataset."""
+"""Recording of datasets: a policy acts in a simulated target."""
 
 from collections.abc import Callable
 
@@ -10,12 +10,12 @@ from madoc.data.dataset import Dataset, close_episodes, starts_after
 from madoc.errors import MadocError
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import begin, reset_states, roll
-from madoc.types import Policy, Transitions
+from madoc.types import Policy
 
 WALKERS = 100
-"""Largest number of episodes recorded at a time."""
+"""Number of episodes recorded at a time, at most."""
 _BLOCK = 100
-"""Control steps between two reports of progress."""
+"""Number of control steps between two reports of progress."""
 
 
 def record(
@@ -28,19 +28,11 @@ def record(
     origin: str,
     advance: Callable[[int], None] = lambda rows: None,
 ) -> Dataset:
-    """Sample a policy in the target for that many transitions.
+    """Transitions of a policy whose actions are sampled in the target, the simulator bound to `true_parameters`.
 
-    Episodes run from the task's reset to a fall or its time limit; what is cut by the end of the recording is
-    truncated there.
-
-    Args:
-        policy: The policy; its actions are sampled.
-        simulator: The robot, bound to `true_parameters`.
-        true_parameters: The target's physical values by name; they travel with the data.
-        transitions: Number of transitions.
-        key: Randomness.
-        origin: Description of the dataset.
-        advance: Called with the number of new rows.
+    An episode runs from the task's reset to a fall, to the time limit, or to the end of the recording, which truncates
+    it. The true parameters are physical values by name, and are kept in the dataset. `advance` is called with the
+    number of new rows.
 
     Raises:
         MadocError: The simulation diverges, or `transitions` is not positive.
@@ -79,17 +71,6 @@ def record(
     starts_at = starts_after(ends[:transitions])
     kept = close_episodes(seen.take(slice(transitions)), starts_at)
     return Dataset(kept, starts_at, simulator.task.name, simulator.task.physics, origin, dict(true_parameters))
-
-
-def join(datasets: list[Dataset], origin: str) -> Dataset:
-    """Datasets of one target, one after another."""
-    first = datasets[0]
-    offsets = np.cumsum([0, *(len(dataset) for dataset in datasets[:-1])])
-    starts = [dataset.episode_starts + offset for dataset, offset in zip(datasets, offsets, strict=True)]
-    joined: Transitions = jax.tree.map(
-        lambda *columns: np.concatenate(columns), *(dataset.transitions for dataset in datasets)
-    )
-    return Dataset(joined, np.concatenate(starts), first.task_name, first.physics, origin, first.true_parameters)
 
 
 def _one_walker_after_another(columns: tuple[np.ndarray, ...]) -> np.ndarray:

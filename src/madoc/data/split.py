@@ -6,13 +6,13 @@ import jax
 import numpy as np
 from jaxtyping import Int, PRNGKeyArray
 
-from madoc.data.dataset import Dataset, close_episodes
+from madoc.data.dataset import Dataset
 from madoc.errors import MadocError
 
 STRETCHES = 10
-"""Number of stretches that a log of one episode is cut into, to hold some of them out."""
+"""Number of stretches that a log of one episode is cut into, at least 2; some of them are held out."""
 _SHORTEST = 20
-"""Smallest mean number of rows in a stretch; of a shorter log of one episode the last rows are held out instead."""
+"""Mean rows of a stretch, at least; of a shorter log of one episode the last rows are held out instead."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Split:
 def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
     """Hold out about `share` of the rows: whole episodes drawn at random, at least one on each side.
 
-    An episode joins those held out where that brings their rows nearer to the share. A log of one episode, or of some
-    so uneven that whole ones come to less than half or more than twice the share, is cut into stretches, and some of
-    them are held out: the end alone of a run may not be like the rest, of a robot that has come to its goal. A log of
-    one episode too short for that has its last rows held out.
+    An episode is held out where that brings the number of rows held out nearer to the share. A log of one episode is
+    cut into stretches and some of them are held out, because the end of a run may differ from the rest, as when the
+    robot has reached its goal. So is a log whose whole episodes are so uneven that they give less than half or more
+    than twice the share. Of a single episode too short to cut, the last rows are held out.
 
     Raises:
         MadocError: The share is not between 0 and 1, or there are fewer than 2 rows.
@@ -50,10 +50,9 @@ def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
         return _stretches(dataset, share, key)
     if len(starts) == 1:
         cut = min(rows - 1, max(1, round((1.0 - share) * rows)))
-        begin = np.zeros(1, np.int64)
         return Split(
-            _part(dataset, np.arange(cut), begin),
-            _part(dataset, np.arange(cut, rows), begin),
+            dataset.take(np.arange(cut), starts),
+            dataset.take(np.arange(cut, rows), starts),
             f"the last {rows - cut:,} of {rows:,} rows are held out: there is only one episode, so they directly "
             "follow those calibrated to",
         )
@@ -68,11 +67,11 @@ def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
 
 
 def _stretches(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
-    """Split a log of few or uneven episodes: long ones are cut into stretches, each of which counts as an episode."""
+    """Cut long episodes into stretches, and hold out some of these as if they were episodes."""
     rows, spans = len(dataset), zip(dataset.episode_starts, dataset.episode_ends, strict=True)
     cuts = [np.linspace(start, end, -(-STRETCHES * (end - start) // rows), endpoint=False) for start, end in spans]
     starts = np.concatenate(cuts).astype(np.int64)
-    split = hold_out(_part(replace(dataset, run_names=None), np.arange(rows), starts), share, key)
+    split = hold_out(dataset.take(np.arange(rows), starts), share, key)
     held = len(split.held.episode_starts)
     few = "the only episode is" if len(dataset.episode_starts) == 1 else "long episodes are"
     sentence = (
@@ -85,14 +84,12 @@ def _stretches(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
 def episodes_of(dataset: Dataset, episodes: Int[np.ndarray, " episodes"]) -> Dataset:
     """A dataset of only the given episodes, in the order given."""
     starts, ends = dataset.episode_starts[episodes], dataset.episode_ends[episodes]
-    names = None if dataset.run_names is None else tuple(dataset.run_names[episode] for episode in episodes)
-    dataset = replace(dataset, run_names=names)
     rows = np.concatenate([np.arange(*span) for span in zip(starts, ends, strict=True)])
-    return _part(dataset, rows, np.cumsum([0, *(ends - starts)[:-1]]))
+    return dataset.take(rows, np.cumsum([0, *(ends - starts)[:-1]]))
 
 
 def _drawn(lengths: np.ndarray, share: float, order: np.ndarray) -> np.ndarray:
-    """A mask of the episodes that are held out."""
+    """Mask of the episodes that are held out, chosen in the given order until the share of the rows is met."""
     wanted, taken = share * lengths.sum(), 0
     held = np.zeros(len(lengths), dtype=bool)
     for episode in order:
@@ -103,8 +100,3 @@ def _drawn(lengths: np.ndarray, share: float, order: np.ndarray) -> np.ndarray:
     if not held.any():
         held[order[np.argmin(lengths[order])]] = True
     return held
-
-
-def _part(dataset: Dataset, rows: np.ndarray, starts: np.ndarray) -> Dataset:
-    transitions = close_episodes(dataset.transitions.take(rows), starts)
-    return replace(dataset, transitions=transitions, episode_starts=starts)

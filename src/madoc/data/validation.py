@@ -1,6 +1,6 @@
-"""Checks of every reader, so that a bad file is refused with one sentence before any budget is spent."""
+"""Checks that all readers share, so that a bad file is refused with one sentence before any budget is spent."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,17 +13,13 @@ from madoc.tasks import Task
 from madoc.types import Transitions
 
 ACTION_TOLERANCE = 1e-5
-"""Largest distance of an action from [-1, 1] that is clipped silently: a recorder may round ±1 or rescale it."""
+"""Distance of an action from [-1, 1], up to which it is clipped silently as a rounding error; beyond, it is refused."""
 FLOATS = ("observation", "action", "reward", "next_observation")
 NAMES = {name: name for name in (*FLOATS, "terminated", "truncated")}
 
 
 def require_file(path: Path) -> None:
-    """Refuse a path that is not a readable, non-empty file.
-
-    Raises:
-        MadocError: Missing, a directory, or empty.
-    """
+    """Refuse a path at which there is nothing, a directory, or an empty file."""
     if path.is_dir():
         raise MadocError(f"expected a file, got the directory {path}; name one of the files in it")
     if not path.is_file():
@@ -32,40 +28,16 @@ def require_file(path: Path) -> None:
         raise MadocError(f"{path} is empty; copy or download it again")
 
 
-def require_arrays(arrays: Iterable[str], wanted: Iterable[str], path: Path, hint: str) -> None:
-    """Refuse a file that lacks an array of its layout.
-
-    Raises:
-        MadocError: Names the first one missing and what is there.
-    """
-    present = sorted(arrays)
-    missing = [name for name in wanted if name not in present]
+def require_arrays(present: Collection[str], required: Collection[str], path: Path, hint: str) -> None:
+    """Refuse a file that lacks an array of its layout; the sentence ends with the hint."""
+    missing = [name for name in required if name not in present]
     if missing:
-        there = ", ".join(present) or "none of the layout's arrays"
+        there = ", ".join(sorted(present)) or "none of the layout's arrays"
         raise MadocError(f"no array {missing[0]!r} in {path}, there is: {there}; {hint}")
 
 
-def check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
-    """Refuse arrays that disagree in their number of rows.
-
-    Raises:
-        MadocError: Names two arrays and their rows.
-    """
-    (first, values), *others = arrays.items()
-    for name, other in others:
-        if len(other) != len(values):
-            raise MadocError(
-                f"expected as many rows in {name} as in {first}, got {len(other)} and {len(values)}; "
-                "the file is damaged or was written in part, make it again"
-            )
-
-
 def as_matrix(values: np.ndarray, name: str) -> Float[np.ndarray, "rows values"]:
-    """Values as float64 rows.
-
-    Raises:
-        MadocError: Not numbers, or not two axes.
-    """
+    """Values as float64 rows; other than numbers on two axes are refused."""
     numbers = _as_numbers(values, name)
     if numbers.ndim != 2:
         raise MadocError(f"expected {name} of shape (rows, values), got shape {numbers.shape}")
@@ -73,11 +45,7 @@ def as_matrix(values: np.ndarray, name: str) -> Float[np.ndarray, "rows values"]
 
 
 def as_vector(values: np.ndarray, name: str) -> Float[np.ndarray, " rows"]:
-    """Values as float64, one per row; a second axis of one value is dropped.
-
-    Raises:
-        MadocError: Not numbers, or more than one value a row.
-    """
+    """Values as float64, one per row, maybe on a second axis of length 1; others are refused."""
     numbers = _as_numbers(values, name)
     if numbers.ndim == 2 and numbers.shape[1] == 1:
         numbers = numbers[:, 0]
@@ -87,11 +55,7 @@ def as_vector(values: np.ndarray, name: str) -> Float[np.ndarray, " rows"]:
 
 
 def as_flags(values: np.ndarray, name: str) -> Bool[np.ndarray, " rows"]:
-    """Values as bool, one per row.
-
-    Raises:
-        MadocError: A value is neither 0 nor 1.
-    """
+    """Values as bool, one per row; a value that is neither 0 nor 1 is refused."""
     numbers = as_vector(values, name)
     odd = np.flatnonzero((numbers != 0) & (numbers != 1))
     if len(odd):
@@ -103,20 +67,18 @@ def as_transitions(arrays: Mapping[str, np.ndarray], names: Mapping[str, str] = 
     """Arrays of a file as transitions; `names` gives the file's name of each field.
 
     Raises:
-        MadocError: An array has the wrong kind of values or the wrong shape.
+        MadocError: An array has the wrong kind of values, the wrong shape, or another number of rows.
     """
     kinds = {"reward": as_vector, "terminated": as_flags, "truncated": as_flags}
-    return Transitions(**{field: kinds.get(field, as_matrix)(arrays[name], name) for field, name in names.items()})
+    fields = {field: kinds.get(field, as_matrix)(arrays[name], name) for field, name in names.items()}
+    _check_lengths(fields, names)
+    return Transitions(**fields)
 
 
 def validate(dataset: Dataset, task: Task, names: Mapping[str, str] = NAMES, *, clip_actions: bool = False) -> Dataset:
-    """The dataset, if it fits the task. Actions within rounding of [-1, 1] are clipped.
+    """The dataset, if it fits the task, with actions clipped to [-1, 1]: of any size if asked for, else roundings.
 
-    Args:
-        dataset: The rows of a file, as a reader made them.
-        task: The robot that they should be of.
-        names: The file's name of each field of `Transitions`, for error sentences.
-        clip_actions: Clip all actions to [-1, 1], as the motors do.
+    `names` are the file's names of the fields of `Transitions`, for error sentences.
 
     Raises:
         MadocError: Another task, no rows, lengths that disagree, a wrong width, a value that is not finite,
@@ -125,7 +87,7 @@ def validate(dataset: Dataset, task: Task, names: Mapping[str, str] = NAMES, *, 
     transitions = dataset.transitions
     if dataset.task_name != task.name:
         raise MadocError(f"expected data of {task.name}, got data of {dataset.task_name} in {dataset.origin}")
-    check_lengths({names[field]: getattr(transitions, field) for field in NAMES})
+    _check_lengths({field: np.asarray(getattr(transitions, field)) for field in NAMES}, names)
     if not len(dataset):
         raise MadocError(f"expected at least one transition for {task.name}, got none in {dataset.origin}")
     columns = {field: np.asarray(getattr(transitions, field)) for field in FLOATS}
@@ -145,6 +107,16 @@ def _as_numbers(values: np.ndarray, name: str) -> np.ndarray:
     if array.dtype.kind not in "fiub":
         raise MadocError(f"expected numbers in {name}, got dtype {array.dtype}")
     return array.astype(np.float64)
+
+
+def _check_lengths(fields: Mapping[str, np.ndarray], names: Mapping[str, str]) -> None:
+    (first, values), *others = fields.items()
+    for field, other in others:
+        if len(other) != len(values):
+            raise MadocError(
+                f"expected as many rows in {names[field]} as in {names[first]}, got {len(other)} and {len(values)}; "
+                "the file is damaged or was written in part, make it again"
+            )
 
 
 def _check_width(values: np.ndarray, task: Task, field: str, name: str) -> None:

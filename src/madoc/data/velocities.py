@@ -1,4 +1,4 @@
-"""Velocities that a log does not hold, from positions: central differences within an episode."""
+"""Velocities computed from logged positions: central differences within an episode."""
 
 from dataclasses import replace
 
@@ -14,11 +14,12 @@ from madoc.tasks import Task
 def moving_states(
     dataset: Dataset, task: Task
 ) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows state"]]:
-    """(qpos, qvel) before and after every row: positions as observed, velocities too, else by differences of positions.
+    """(qpos, qvel) before and after every row, with velocities as observed, or else by differences of positions.
 
-    A reading's velocity leads from the reading before it to the one after it, over two control steps; at the ends of
-    an episode from or to the reading itself, over one. Of motion at constant acceleration the former is exact, the
-    latter off by half a control step's worth. Positions that are not observed are NaN, and their velocities 0.
+    The velocity at a reading is the central difference of the readings before and after it, two control steps apart;
+    at the first and last reading of an episode it is the one-sided difference over one control step. At constant
+    acceleration the former is exact, and the latter is the velocity half a control step away. Positions that are not
+    observed are NaN, and their velocities 0.
 
     Raises:
         MadocError: The task's observation determines none of its positions.
@@ -45,22 +46,22 @@ def moving_states(
 
 
 def velocity_names(task: Task, addresses: Int[np.ndarray, " values"]) -> tuple[str, ...]:
-    """velocity(JOINT) as a spec reads it, of addresses in (qpos, qvel); velocity(JOINT)[2] where it has several."""
+    """Names of indices in (qpos, qvel) as in a spec: velocity(JOINT), or velocity(JOINT)[2] where it has several."""
     model = task.compile()
     names = []
     for dof in np.asarray(addresses) - model.nq:
         joint = model.dof_jntid[dof]
-        of_joint = np.flatnonzero(model.dof_jntid == joint)
-        part = f"[{dof - of_joint[0]}]" if len(of_joint) > 1 else ""
+        same_joint = np.flatnonzero(model.dof_jntid == joint)
+        part = f"[{dof - same_joint[0]}]" if len(same_joint) > 1 else ""
         names.append(f"velocity({model.joint(joint).name or joint}){part}")
     return tuple(names)
 
 
 def show_velocities(task: Task) -> Task:
-    """The same robot seen with the velocities that its signals do not tell, behind them: a state can then be rebuilt.
+    """The same robot with the velocities that its signals do not determine appended: a state can then be rebuilt.
 
     Raises:
-        MadocError: Its signals tell no position.
+        MadocError: Its signals determine no position.
     """
     posture, observe, sense = task.posture, task.observe, task.sense
     if posture is None:

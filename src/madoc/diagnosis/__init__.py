@@ -1,4 +1,4 @@
-"""What a log can and cannot say of a robot, before anything is calibrated."""
+"""A log and a model compared before any calibration."""
 
 from madoc.diagnosis.channels import Channel, refuse_fatal
 from madoc.diagnosis.diagnosis import Diagnosis, check

@@ -1,4 +1,4 @@
-"""Channels of a log: which of them move, which stand at a limit, which contradict each other."""
+"""Channels of a log: which of them never move, are at a limit, or contradict each other."""
 
 from dataclasses import dataclass
 
@@ -13,44 +13,34 @@ from madoc.simulation import Simulator
 from madoc.tasks import Task
 
 AT_LIMIT = 1.0 - 1e-6
-"""Size of an action in [0, 1], from which on it stands at its limit."""
+"""Absolute action in [0, 1]; from it on an action counts as at its limit."""
 MANY_AT_LIMIT = 0.1
 """Share in [0, 1] of rows with an action at its limit; above it the action is warned of."""
 HARDLY_USED = 0.05
-"""Largest size of an action in [0, 1]; below it the action is warned of."""
+"""Largest absolute value of an action in [0, 1]; an action that stays below it is warned of."""
 FEW_ROWS = 100
 """Number of rows; fewer are warned of."""
 _STILL = 1e-9
 """Range of the values over the largest of them; up to it, a channel counts as one that never moves."""
-_KNOWN_RATIOS = {
+_UNIT_ERRORS = {
     180.0 / np.pi: "one in degrees, the other in radians",
-    np.pi / 180.0: "one in degrees, the other in radians",
     1000.0: "one in thousandths (mm, ms) of the other",
-    1e-3: "one in thousandths (mm, ms) of the other",
     100.0: "one in cm, the other in m",
-    0.01: "one in cm, the other in m",
     2.0 * np.pi: "one in turns, the other in radians",
-    0.5 / np.pi: "one in turns, the other in radians",
     30.0 / np.pi: "a speed in rpm",
-    np.pi / 30.0: "a speed in rpm",
     -1.0: "one of them with its sign reversed",
 }
+"""Mistakes by the ratio, or its inverse, of a position's changes to those that its speed implies."""
 _TRUSTED = 0.5
-"""Squared correlation in [0, 1] of a position's changes with its speed; below it their ratio says nothing."""
+"""Squared correlation in [0, 1] of a position's changes with its speed; below it their ratio is not judged."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A signal or an action over the whole log, in its own unit.
+    """A signal or an action over the whole log, in its own unit, which is empty where the spec does not give it.
 
-    Attributes:
-        name: As the spec has it.
-        kind: `signal` or `action`.
-        unit: Of the numbers here; empty where it is not known.
-        low: Smallest value.
-        high: Largest value.
-        step: Deviation of its changes from row to row.
-        at_limits: Share of rows in which an action stands at an end of its range; 0 for signals.
+    `low` and `high` are the smallest and the largest value, `step` is the standard deviation of changes from row to
+    row, and `at_limits` the share of rows in which an action is at an end of its range.
     """
 
     name: str
@@ -89,21 +79,21 @@ def channels_of(dataset: Dataset, task: Task, robot: Robot | None = None) -> tup
     numbers = np.column_stack([both.min(0), both.max(0), (following - observation).std(0)]).tolist()
     columns = zip(signal_names(task), units, numbers, strict=True)
     signals = [Channel(name, "signal", unit, *values) for name, unit, values in columns]
-    unit_action = np.asarray(logged.action)
-    physical = _physical(unit_action, task)
+    scaled_action = np.asarray(logged.action)
+    physical = _physical(scaled_action, task)
     within = np.ones(len(dataset), dtype=bool)
     within[dataset.episode_ends - 1] = False  # the next row is of another episode
     change = np.diff(physical, axis=0)[within[:-1]]
     step = change.std(0) if len(change) else np.zeros(task.action_size)
     units = [channel.unit for channel in task.actions] or [""] * task.action_size
-    limits = (np.abs(unit_action) >= AT_LIMIT).mean(0)
+    limits = (np.abs(scaled_action) >= AT_LIMIT).mean(0)
     numbers = np.column_stack([physical.min(0), physical.max(0), step, limits]).tolist()
     columns = zip(action_names(task), units, numbers, strict=True)
     return (*signals, *(Channel(name, "action", unit, *values) for name, unit, values in columns))
 
 
 def channel_findings(dataset: Dataset, simulator: Simulator, channels: tuple[Channel, ...]) -> list[Finding]:
-    """Too few rows, channels that never move, actions at their limits, positions that contradict their speeds."""
+    """Findings on too few rows, channels that never move, actions at limits, and positions that contradict speeds."""
     findings = _size_findings(dataset, len(simulator.parameters))
     signals, actions = ([channel for channel in channels if channel.kind == kind] for kind in ("signal", "action"))
     nothing_moves = not any(channel.moves for channel in signals)
@@ -130,8 +120,8 @@ def _size_findings(dataset: Dataset, parameters: int) -> list[Finding]:
     return []
 
 
-def _limit_findings(channel: Channel, unit_action: Float[np.ndarray, " rows"]) -> list[Finding]:
-    largest = float(np.abs(unit_action).max())
+def _limit_findings(channel: Channel, scaled_action: Float[np.ndarray, " rows"]) -> list[Finding]:
+    largest = float(np.abs(scaled_action).max())
     if channel.at_limits > MANY_AT_LIMIT:
         what = f"it stands at an end of its range in {100 * channel.at_limits:.0f} % of the rows"
         remedy = "if the driver clips there, log what it applied and not what was asked for"
@@ -144,7 +134,7 @@ def _limit_findings(channel: Channel, unit_action: Float[np.ndarray, " rows"]) -
 
 
 def _speed_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
-    """Positions that do not change by their speeds times the control step: another unit or sign, wrapped angles."""
+    """Findings on positions that do not change by speed times control step: wrong units or signs, wrapped angles."""
     task = simulator.task
     if task.state_from_observation is None:
         return []
@@ -183,13 +173,14 @@ def _ratio_findings(change: np.ndarray, expected: np.ndarray, position: str, spe
     ratio = together / power
     if 0.8 < ratio < 1.25:
         return []
-    known = [text for factor, text in _KNOWN_RATIOS.items() if abs(ratio / factor - 1.0) < 0.1]
-    what = f"it changes {ratio:.3g} times as fast as {speed} says" + (f": {known[0]}?" if known else "")
+    factors = ((each, text) for factor, text in _UNIT_ERRORS.items() for each in (factor, 1.0 / factor))
+    mistake = next((f": {text}?" for factor, text in factors if abs(ratio / factor - 1.0) < 0.1), "")
+    what = f"it changes {ratio:.3g} times as fast as {speed} says{mistake}"
     return [Finding("warning", what, position, "look at units and signs in the spec and at control_step")]
 
 
 def _names_of_states(task: Task, size: int) -> list[str | None]:
-    """The signal that each value of (qpos, qvel) is rebuilt from; None where that is none of them alone."""
+    """The signal from which each value of (qpos, qvel) is rebuilt; None where there is not exactly one."""
     assert task.state_from_observation is not None
     names, width = signal_names(task), task.observation_size
     base = np.asarray(task.state_from_observation(np.zeros((1, width))))[:, :size]
@@ -198,11 +189,11 @@ def _names_of_states(task: Task, size: int) -> list[str | None]:
     return [names[source[0]] if len(source) == 1 else None for source in sources]
 
 
-def _physical(unit_action: Float[np.ndarray, "rows action"], task: Task) -> Float[np.ndarray, "rows action"]:
+def _physical(scaled_action: Float[np.ndarray, "rows action"], task: Task) -> Float[np.ndarray, "rows action"]:
     if not task.actions:
-        return unit_action
+        return scaled_action
     low, high = (np.array([getattr(channel, end) for channel in task.actions]) for end in ("low", "high"))
-    return low + (unit_action + 1.0) / 2.0 * (high - low)
+    return low + (scaled_action + 1.0) / 2.0 * (high - low)
 
 
 def refuse_fatal(findings: tuple[Finding, ...]) -> None:

@@ -1,4 +1,4 @@
-"""What a log can and cannot say of a robot, before anything is calibrated: `check` returns a `Diagnosis`."""
+"""A log and a model compared before any calibration: `check` returns a `Diagnosis`."""
 
 import time
 from dataclasses import dataclass
@@ -18,18 +18,16 @@ from madoc.simulation.sensitivity import insensitive
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """A log and a model compared, before any calibration.
+    """A log and a model compared before any calibration.
 
     Attributes:
-        rows: Number of transitions.
-        episodes: Number of stretches without a break.
-        runs: Number of recordings that they come from.
+        episodes: Number of stretches of rows without a break.
+        runs: Number of recordings that these come from.
         control_step: Time between two rows, s.
-        channels: Signals, then actions.
-        explanation: How well the model predicts the log; None where no state can be rebuilt.
-        excitation: How well the log could determine each parameter; None where a fatal finding came before.
-        findings: What to know, the worst first.
-        control_steps: Control steps simulated.
+        explanation: How well the model predicts the log; None where states are not exact.
+        excitation: How well the log can determine each parameter; None after a fatal finding.
+        findings: The findings, the worst first.
+        control_steps: Number of control steps simulated.
         seconds: Wall-clock time.
     """
 
@@ -54,10 +52,10 @@ def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None,
     """Compare a log with a model before any calibration.
 
     Args:
-        dataset: The log; findings of its reader are among those returned.
+        dataset: The log. Findings of its reader are among those returned.
         simulator: The model and the ranges of its parameters.
-        robot: For units and reasons, where the robot is one's own.
-        seed: Of the windows that are looked at and of the parameters that are tried.
+        robot: The user's own robot, if it is one: its spec gives units and reasons.
+        seed: Seed of the windows that are replayed and of the parameters that are tried.
     """
     started = time.monotonic()
     of_rows, of_box, of_actions, of_windows = jax.random.split(jax.random.key(seed), 4)

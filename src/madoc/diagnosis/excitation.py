@@ -1,4 +1,4 @@
-"""How well a log could determine each parameter: expected intervals and correlations of estimates."""
+"""How well a log can determine each parameter: expected intervals and correlations of estimates."""
 
 from dataclasses import dataclass, replace
 
@@ -7,7 +7,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from madoc.data import Dataset, typical_change
 from madoc.data.findings import Finding
-from madoc.identification.gauss_newton import damped_step, triangular_factors
+from madoc.identification.gauss_newton import descend
 from madoc.identification.information import bread, correlated_pairs, half_width, identifiability, meat, sandwich
 from madoc.identification.linearisation import difference_points, linearise
 from madoc.identification.replay import window_residuals
@@ -16,31 +16,29 @@ from madoc.identification.windows import disjoint_windows, drawn, longest_fit, w
 from madoc.simulation.base import Simulator
 
 WINDOWS = {5: 200, 20: 60}
-"""Windows at most, by their length in control steps.
-
-Long ones tell more where sensors are noisy, short ones where the robot is chaotic.
-"""
+"""Largest number of windows, by their length in control steps. Long ones narrow the intervals where sensors are noisy,
+short ones where the robot is chaotic."""
 ROUNDS = 3
-"""Number of linearisations. From the best draw two steps reach the residual that no parameter explains."""
+"""Number of linearisations, at least 1: from the best draw two steps reach the residuals that no parameters explain."""
 INSIDE = 0.98
-"""Largest |parameter| in [-1, 1] at which derivatives are taken: a mass of 0 or the like has none."""
+"""Largest |parameter| in [-1, 1] at which derivatives are taken, as there are none at, say, a mass of 0."""
 _DAMPING = 1e-8
-"""Relative damping of the steps: enough to keep directions that the log says nothing of where they are."""
+"""Marquardt's damping of a step, relative to the squared lengths of the columns: enough for unidentified directions."""
 WIDE = 0.25
 """Share in [0, 1] of its range; a parameter whose expected interval has a larger half width is warned of."""
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """How well the log could determine each parameter, at best.
+    """How well the log can determine each parameter at best.
 
     Attributes:
-        effect: Change of an observation by half of the parameter's range, over the residual that no parameter
-            explains; NaN where states are not exact, so that this residual is not known.
+        effect: Change of an observation by half of the parameter's range, over the residual that no parameters
+            explain; NaN where states are not exact, so that this residual cannot be computed.
         half_width: Half of the expected 95 % interval, in physical units; NaN likewise.
         pairs: Parameters whose estimates would be correlated: two names and the correlation.
-        sentences: Which parameters cannot be determined, or not apart from each other.
-        control_steps: Control steps simulated.
+        sentences: Which parameters, alone or together, cannot be determined.
+        control_steps: Number of control steps simulated.
     """
 
     effect: Float[np.ndarray, " d"]
@@ -55,15 +53,8 @@ def excite(
 ) -> Excitation:
     """Expected intervals from derivatives of residuals over windows of the log that do not overlap.
 
-    A few Gauss-Newton steps go to where the residual is what no parameter explains. It is the noise that the expected
-    intervals assume. Of short and long windows, those that determine the parameters better count.
-
-    Args:
-        dataset: The log.
-        simulator: The model.
-        logged: Exact states of the log.
-        start: Parameters in [-1, 1] that explain the log well already.
-        key: Draws the windows.
+    A few Gauss-Newton steps go from `start`, in [-1, 1], to where residuals are those that no parameters explain. The
+    expected intervals take these for noise. Of short and long windows, those with the narrower intervals count.
     """
     of_length = [_excited(dataset, simulator, logged, start=start, horizon=horizon, key=key) for horizon in WINDOWS]
     spans = simulator.parameters.high - simulator.parameters.low
@@ -86,21 +77,21 @@ def _excited(
     disjoint = disjoint_windows(dataset, rows, steps, gap=0)
     chosen, available = drawn(disjoint, WINDOWS[horizon], key), len(disjoint)
     windows = windows_at(dataset, states[chosen], rows[chosen], steps)
-    scale = typical_change(dataset)
-    unit, best, spent = np.clip(start, -0.9 * INSIDE, 0.9 * INSIDE), None, 0
-    for _ in range(ROUNDS):
-        points = difference_points(unit)
-        around = linearise(points, window_residuals(simulator, windows, points, scale))
-        spent += len(points) * len(windows) * steps
-        if not len(around.residuals):
-            break
-        if best is None or (around.residuals**2).mean() < (best.residuals**2).mean():
-            best = around
-        unit = unit + damped_step(*triangular_factors(around, 1.0, "linear"), unit, _DAMPING, limit=INSIDE)
-    if best is None:
+    linearisations, _, spent = descend(
+        simulator,
+        windows,
+        np.clip(start, -0.9 * INSIDE, 0.9 * INSIDE),
+        typical_change(dataset),
+        steps=ROUNDS,
+        loss="linear",
+        damping=_DAMPING,
+        limit=INSIDE,
+    )
+    if not linearisations:
         nothing = np.full(len(space), np.nan)
         sentence = f"the simulation fails in all {len(windows)} stretches tried; look at the ranges and the states"
         return Excitation(nothing, nothing, (), (sentence,), spent)
+    best = min(linearisations, key=lambda each: (each.residuals**2).mean())
     more = max(1.0, available / len(best.residuals))  # windows of the whole log for each of these
     certainty = sandwich(more * bread(best, 1.0, "linear"), more * meat(best, 1.0, "linear"))
     noise = max(float(np.sqrt((best.residuals**2).mean())), np.finfo(float).tiny)
@@ -114,7 +105,7 @@ def _excited(
 
 
 def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates) -> Excitation:
-    """Which estimates would correlate, from states that the log's actions lead to: its own cannot be rebuilt."""
+    """Which estimates would correlate, where the log's states are not exact; no intervals can be expected then."""
     space = simulator.parameters
     steps, count = max(WINDOWS.items())
     windows = probing_windows(logged, dataset, simulator, steps=steps, count=count)
@@ -132,15 +123,15 @@ def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates)
 
 
 def excitation_findings(excitation: Excitation, simulator: Simulator) -> list[Finding]:
-    """A warning for each parameter that the log would leave open, and for those it cannot tell apart."""
+    """A warning for each parameter with a wide expected interval, and for those that cannot be determined."""
     findings = [Finding("warning", sentence, "parameters") for sentence in excitation.sentences]
     named = " ".join(excitation.sentences)
     for parameter, width in zip(simulator.parameters.parameters, excitation.half_width, strict=True):
         share = width / (parameter.high - parameter.low)
         if share > WIDE and parameter.name not in named:
             what = (
-                f"the log says little of it: expect ± {width:.2g} {parameter.unit} (95 %), {100 * share:.0f} % of its "
-                "range"
+                f"the log hardly determines it: expect ± {width:.2g} {parameter.unit} (95 %), {100 * share:.0f} % of "
+                "its range"
             )
             remedy = "excite it more, record longer, or leave it out"
             findings.append(Finding("warning", what, parameter.name, remedy))

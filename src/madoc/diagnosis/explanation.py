@@ -1,4 +1,4 @@
-"""Whether the model, anywhere in the box, tells what happens next better than "nothing changes" does."""
+"""Whether the model, anywhere in the box, predicts the log better than "nothing changes" does."""
 
 from dataclasses import dataclass
 
@@ -21,22 +21,22 @@ WINDOWS = 64
 CORNERS, DRAWS = 8, 24
 """Number of corners of the box of parameters that are tried, and of points inside it."""
 HALF = 0.5
-"""Share in [0, 1] of the signals that move; if no draw explains so many, the model is at fault, not a signal."""
+"""Share in [0, 1] of the moving signals; if no draw explains so many, the finding is fatal and about the model."""
 CLEARLY = 0.7
 """Ratio in [0, 1] of the errors with and without a change of the actions; below it the change is suggested."""
 WORST = 10.0
-"""Largest error that a signal counts with, relative to that of "nothing changes"."""
+"""Largest error of a signal, relative to that of "nothing changes"; larger ones are clipped to it."""
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """Prediction errors relative to those of "nothing changes": 0 is perfect, from 1 on the model says nothing.
+    """Prediction errors relative to those of "nothing changes": 0 is perfect, from 1 on the model is of no use.
 
     Attributes:
-        horizons: Control steps ahead.
+        horizons: Numbers of control steps ahead.
         draws: Parameters tried, in [-1, 1]; the first is mid-range, then corners, then draws from the box.
         errors: By draw, horizon and signal; 1 where the simulation failed, NaN for a signal that never moves.
-        control_steps: Simulated.
+        control_steps: Number of control steps simulated.
     """
 
     horizons: tuple[int, ...]
@@ -46,24 +46,17 @@ class Explanation:
 
     @property
     def overall(self) -> Float[np.ndarray, "draws horizons"]:
-        """Root mean square over signals, none counting more than tenfold."""
+        """Root mean square of the errors over signals, each clipped to `WORST`."""
         return np.sqrt(np.nanmean(np.minimum(self.errors, WORST) ** 2, axis=-1))
 
     @property
     def best(self) -> int:
-        """The draw that is best over all horizons."""
+        """Index of the draw with the smallest geometric mean of the errors over horizons."""
         return int(np.argmin(np.log(np.maximum(self.overall, 1e-12)).mean(-1)))
 
 
 def explain(dataset: Dataset, simulator: Simulator, logged: LoggedStates, *, key: PRNGKeyArray) -> Explanation:
-    """Replay windows of the log from its states, at mid-range, in corners and at random points of the box.
-
-    Args:
-        dataset: The log.
-        simulator: The model.
-        logged: Exact states of the log.
-        key: Draws the windows and the points.
-    """
+    """Replay windows of the log from its exact states, at mid-range, in corners and at random points of the box."""
     of_windows, of_box = jax.random.split(key)
     states, rows = logged.exact()
     steps = longest_fit(dataset, rows, max(HORIZONS))
@@ -76,7 +69,7 @@ def explain(dataset: Dataset, simulator: Simulator, logged: LoggedStates, *, key
 
 
 def box_draws(count: int, key: PRNGKeyArray) -> Float[np.ndarray, "draws d"]:
-    """Mid-range, some corners, and a scrambled Halton sequence in between."""
+    """Mid-range, some corners of the box, and a scrambled Halton sequence inside it."""
     of_corners, of_inside = jax.random.split(key)
     corners = np.array(2.0 * jax.random.bernoulli(of_corners, 0.5, (CORNERS, count)) - 1.0, np.float64)
     seed = int(jax.random.randint(of_inside, (), 0, 2**31 - 1))
@@ -85,31 +78,28 @@ def box_draws(count: int, key: PRNGKeyArray) -> Float[np.ndarray, "draws d"]:
 
 
 def explanation_findings(explanation: Explanation, channels: tuple[Channel, ...]) -> list[Finding]:
-    """Signals that no draw explains: half of them or more, and the model is not this log's."""
+    """Findings on signals that no draw explains; one fatal finding if these are half of the signals or more."""
     names = [channel.name for channel in channels if channel.kind == "signal"]
     live = ~np.isnan(explanation.errors).all((0, 1))
-    reached = np.full(len(names), np.inf)
-    reached[live] = explanation.errors[..., live].min((0, 1))
-    lost = [name for name, error, moves in zip(names, reached, live, strict=True) if moves and error >= 1.0]
+    lost = [name for name, error in zip(names, explanation.errors.min((0, 1)), strict=True) if error >= 1.0]
     better = f"{_ahead(explanation.horizons)} steps ahead better than 'nothing changes' does"
     remedy = "look at its column, sign and unit in the spec, and at the model"
     if lost and len(lost) >= HALF * live.sum():
-        what = f"no draw from the box tells {', '.join(lost)} {better}"
+        what = f"no draw from the box predicts {', '.join(lost)} {better}"
         return [Finding("fatal", what, "the model", remedy.replace("its column, sign", "columns, signs"))]
     overall = explanation.overall
     if not lost and (overall[0] >= 1.0).all() and (overall.min(0) < 1.0).any():
         what = "at mid-range it is no better than 'nothing changes', in parts of the box it is"
         return [Finding("note", what, "the model")]
-    return [Finding("warning", f"no draw from the box tells it {better}", name, remedy) for name in lost]
+    return [Finding("warning", f"no draw from the box predicts it {better}", name, remedy) for name in lost]
 
 
 def action_findings(
     dataset: Dataset, simulator: Simulator, logged: LoggedStates, explanation: Explanation, *, key: PRNGKeyArray
 ) -> tuple[list[Finding], int]:
-    """Whether the log would be explained clearly better with an action reversed, a row later or a row earlier.
+    """Findings on actions that the model explains clearly better if they are reversed, a row later or a row earlier.
 
-    Returns:
-        The findings, and the control steps spent.
+    The second value is the number of control steps simulated.
     """
     task, (states, rows) = simulator.task, logged.exact()
     at = min(1, len(explanation.horizons) - 1)
@@ -165,7 +155,7 @@ def _errors(
 
 
 def _reversed(actions: Float[np.ndarray, "windows steps action"], task: Task, index: int) -> np.ndarray | None:
-    """The actions with one of them negated in its unit; None where that leaves its range or changes nothing."""
+    """The actions with one of them negated; None where that would leave its range or change nothing."""
     if task.actions:
         channel = task.actions[index]
         if abs(channel.low + channel.high) > 1e-9 * (channel.high - channel.low):

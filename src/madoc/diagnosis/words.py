@@ -22,7 +22,7 @@ MOST_ALIKE = 4
 
 
 def to_json(diagnosis: Diagnosis, space: ParameterSpace) -> dict[str, object]:
-    """Everything in it; what is not known is null."""
+    """The whole diagnosis; null stands for numbers that could not be computed."""
     excitation, signals = diagnosis.excitation, _signals(diagnosis)
     counts = ("rows", "episodes", "runs", "control_step", "fatal")
     channels = [asdict(channel) for channel in diagnosis.channels]
@@ -31,7 +31,7 @@ def to_json(diagnosis: Diagnosis, space: ParameterSpace) -> dict[str, object]:
             del channel["at_limits"]
     parameters = None
     if excitation is not None:
-        columns = zip(space.parameters, _known(excitation.effect), _known(excitation.half_width), strict=True)
+        columns = zip(space.parameters, _finite(excitation.effect), _finite(excitation.half_width), strict=True)
         parameters = {
             row.name: {"unit": row.unit, "low": row.low, "high": row.high, "effect": effect, "half_width": width}
             for row, effect, width in columns
@@ -50,14 +50,14 @@ def to_json(diagnosis: Diagnosis, space: ParameterSpace) -> dict[str, object]:
 
 def _explanation_json(explanation: Explanation, signals: list[str]) -> dict[str, object]:
     def of(draw: int) -> dict[str, list[float | None]]:
-        by_signal = {signal: _known(explanation.errors[draw, :, at]) for at, signal in enumerate(signals)}
-        return by_signal | {"overall": _known(explanation.overall[draw])}
+        by_signal = {signal: _finite(explanation.errors[draw, :, at]) for at, signal in enumerate(signals)}
+        return by_signal | {"overall": _finite(explanation.overall[draw])}
 
     return {"horizons": list(explanation.horizons), "midrange": of(0), "best_draw": of(explanation.best)}
 
 
 def tables(diagnosis: Diagnosis, space: ParameterSpace) -> tuple[RenderableType, ...]:
-    """The log, its channels, what the model explains, what the log could say of each parameter, and the findings."""
+    """The log, its channels, the model's prediction errors, the expected intervals of parameters, and the findings."""
     seconds, runs, episodes = diagnosis.rows * diagnosis.control_step, diagnosis.runs, diagnosis.episodes
     line = (
         f"{diagnosis.rows:,} rows in {runs} run{'s' * (runs != 1)} ({episodes} stretch{'es' * (episodes != 1)} without "
@@ -96,7 +96,7 @@ def _explanation_table(explanation: Explanation, signals: list[str]) -> Table:
 
 def _parameter_table(excitation: Excitation, space: ParameterSpace) -> Table:
     numbers = ("range", "effect of half of it", "expected 95 %", "of its range")
-    table = _table("what this log could tell of each parameter, at best", ("parameter", "unit"), numbers)
+    table = _table("how well this log can determine each parameter, at best", ("parameter", "unit"), numbers)
     for row, effect, width in zip(space.parameters, excitation.effect, excitation.half_width, strict=True):
         cells = (f"{effect:.3g} × noise", f"± {width:.2g}", f"{100 * width / (row.high - row.low):.2g} %")
         cells = cells if math.isfinite(width) else ("?", "?", "?")
@@ -133,5 +133,5 @@ def _percent(value: float) -> str:
     return f"{100 * value:.3g} %" if math.isfinite(value) else ""
 
 
-def _known(values: np.ndarray) -> list[float | None]:
+def _finite(values: np.ndarray) -> list[float | None]:
     return [float(value) if math.isfinite(value) else None for value in values]

@@ -1,1 +1,1 @@
-"""One floor under diagnosis, calibration and verdict: how far systems are from a log, and what the log can tell."""
+"""What diagnosis, calibration and verdict share: residuals of simulated systems, and the information in a log."""

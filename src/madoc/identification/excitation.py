@@ -1,79 +1,73 @@
-"""How sharply a log can determine each parameter at best, before or after any calibration."""
+"""How narrow the confidence interval of each parameter can be at best, before or after any calibration."""
 
 import numpy as np
 from jaxtyping import Float
 from scipy.stats import norm
 
-from madoc.data.dataset import Dataset
+from madoc.data.dataset import Dataset, spread_of
 from madoc.identification.gauss_newton import eliminate
 from madoc.identification.information import BOX_VARIANCE, CONFIDENCE
 from madoc.identification.linearisation import difference_points, linearise
-from madoc.identification.replay import Readings, slopes_at, spread_of, window_residuals
+from madoc.identification.replay import Readings, slopes_at, window_residuals
 from madoc.identification.states import LoggedStates, probing_windows
 from madoc.identification.windows import HORIZONS
 from madoc.simulation.base import Simulator
 
 WINDOWS = {"exact": 400, "approximate": 64, "unknown": 64}
-"""Most windows whose derivatives are taken, by the kind of states; those of all rows are scaled up from them."""
-_HARDLY_KNOWN = 0.25
-"""Share of the box's variance, from 0 to 1, above which the data has narrowed a direction by less than half."""
+"""Largest number of windows that are differentiated, by the kind of states; the result is scaled up to all rows."""
+_HARDLY_NARROWED = 0.25
+"""Share in [0, 1] of the box's variance; above it the data has narrowed a direction by less than half."""
 _STATE_DAMPING = 1e-9
-"""Relative damping of initial states that are eliminated: less than the error of their one-sided differences."""
+"""Damping of initial states, relative to the squared lengths of the columns: less than the error of differences."""
 
 
 def expected_half_widths(
     logged: LoggedStates,
     dataset: Dataset,
     simulator: Simulator,
-    unit: Float[np.ndarray, " d"],
+    point: Float[np.ndarray, " d"],
     noise: Float[np.ndarray, " observation"],
 ) -> tuple[Float[np.ndarray, " d"], int]:
-    """Half of each parameter's 95 % interval in [-1, 1] at best, and the control steps spent.
+    """Half of each parameter's smallest possible 95 % interval in [-1, 1], and the control steps simulated.
 
-    The inverse of Fisher's information, as if the noise of every observation were independent, added to what the box
-    tells: of single steps from exact states, else of windows whose initial states are eliminated.
-
-    Args:
-        logged: The states of the log that was calibrated to.
-        dataset: That log.
-        simulator: The model.
-        unit: Where the derivatives are taken, in [-1, 1].
-        noise: Standard deviation of what is compared, a single step or an observation, in its unit.
+    It is computed from the Fisher information at `point`, as if the noise of all observations were independent, plus
+    the prior information of the box: of single steps from exact states, else of windows whose initial states are
+    eliminated. `noise` is the standard deviation of a single step's residuals or of an observation, in its unit.
     """
     exact = logged.kind == "exact"
     windows = probing_windows(
         logged, dataset, simulator, steps=1 if exact else HORIZONS[-1], count=WINDOWS[logged.kind]
     )
     if exact:
-        points = difference_points(unit)
+        points = difference_points(point)
         slopes = linearise(points, window_residuals(simulator, windows, points, noise)).jacobian
         spent, share = len(points) * len(windows), len(dataset) / max(1, len(slopes))
     else:
         readings = Readings(
             windows.actions,
-            np.zeros((len(windows), windows.steps + 1, logged.measured)),  # derivatives do not depend on them
+            np.zeros((len(windows), windows.steps + 1, logged.measured)),  # derivatives do not depend on readings
             noise[: logged.measured],
             spread_of(windows.states[:, : logged.physical_size]),
         )
-        (around,) = slopes_at(simulator, readings, unit[None], windows.states[None])
+        (around,) = slopes_at(simulator, readings, point[None], windows.states[None])
         damping = np.full(len(windows), _STATE_DAMPING)
         slopes = eliminate(around, np.ones_like(around.residuals), damping).reduced.jacobian
-        columns = 1 + 2 * len(unit) + logged.physical_size
+        columns = 1 + 2 * len(point) + logged.physical_size
         spent = columns * len(windows) * windows.steps
         share = len(dataset) / windows.steps / max(1, int(around.whole.sum()))
-    flat = slopes.reshape(-1, len(unit))
-    information = flat.T @ flat * share + np.eye(len(unit)) / BOX_VARIANCE
+    flat = slopes.reshape(-1, len(point))
+    information = flat.T @ flat * share + np.eye(len(point)) / BOX_VARIANCE
     quantile = norm.ppf(0.5 + CONFIDENCE / 2.0)
     return quantile * np.sqrt(np.diag(widened(np.linalg.inv(information)))), spent
 
 
 def widened(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
-    """The covariance with directions that the data hardly determines as long as the box allows.
+    """The covariance with a larger variance of those directions that the data hardly narrows.
 
-    A direction of several parameters is longer than any of them: along it, each may go through all of its range while
-    the normal distribution that stands for the box ends on a ball.
+    The prior stands for the box by a ball, but a diagonal of the box is longer than its sides: along a direction of
+    several parameters each of them may go through its whole range.
     """
     variances, directions = np.linalg.eigh(covariance)
     longest = np.abs(directions).max(0)
-    variances = np.where(variances > _HARDLY_KNOWN * BOX_VARIANCE, variances / longest**2, variances)
+    variances = np.where(variances > _HARDLY_NARROWED * BOX_VARIANCE, variances / longest**2, variances)
     return (directions * variances) @ directions.T

@@ -15,20 +15,23 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import lsq_linear
 
-from madoc.identification.linearisation import Linearisation, WindowSlopes
-from madoc.identification.losses import Loss, loss_slope
+from madoc.identification.linearisation import Linearisation, WindowSlopes, difference_points, linearise
+from madoc.identification.losses import Loss, loss_slope, scale_of
+from madoc.identification.replay import window_residuals
+from madoc.identification.windows import Windows
+from madoc.simulation.base import Simulator
 
 _SHORTEST = 1e-3
-"""Least length of a state's column, relative to the window's longest; a value with a shorter one is kept where it is.
+"""Smallest length of a state value's column of derivatives, relative to the longest column of its window, in (0, 1).
 
-Between 0 and 1: a value that no observation shows must not move far.
+A shorter column is treated as this long, so that a value that hardly shows in any observation does not move far.
 """
 
 
 def triangular_factors(
     around: Linearisation, scale: float, loss: Loss
 ) -> tuple[Float[np.ndarray, "d d"], Float[np.ndarray, " d"]]:
-    """R and Qᵀr of the weighted problem √ρ' (J, r), divided by √values: all that a step needs of the residuals."""
+    """R and Qᵀr of the QR decomposition of √ρ' (J, r) / √values, from which steps of any damping are computed."""
     count = around.jacobian.shape[-1]
     residuals = around.residuals.reshape(-1)
     jacobian = around.jacobian.reshape(-1, count)
@@ -42,36 +45,73 @@ def triangular_factors(
 def damped_step(
     factor: Float[np.ndarray, "d d"],
     target: Float[np.ndarray, " d"],
-    unit: Float[np.ndarray, " d"],
+    point: Float[np.ndarray, " d"],
     damping: float,
     *,
     limit: float = 1.0,
 ) -> Float[np.ndarray, " d"]:
-    """The p that minimises ‖R p + Qᵀr‖² + λ ‖D p‖² with `unit` + p in [-limit, limit].
+    """The p that minimises ‖R p + Qᵀr‖² + λ ‖D p‖² with `point` + p in [-limit, limit].
 
     D is the length of each column of R, Marquardt's scaling, with a floor for columns that are nearly 0.
     """
     lengths = np.linalg.norm(factor, axis=0)
     lengths = np.maximum(lengths, 1e-6 * max(float(lengths.max()), 1e-12))
     rows = np.concatenate([factor, np.diag(np.sqrt(damping) * lengths)])
-    wanted = np.concatenate([-target, np.zeros(len(unit))])
-    step = lsq_linear(rows, wanted, bounds=(-limit - unit, limit - unit), method="bvls").x
-    return np.clip(unit + step, -limit, limit) - unit
+    wanted = np.concatenate([-target, np.zeros(len(point))])
+    step = lsq_linear(rows, wanted, bounds=(-limit - point, limit - point), method="bvls").x
+    return np.clip(point + step, -limit, limit) - point
+
+
+def descend(
+    simulator: Simulator,
+    windows: Windows,
+    start: Float[np.ndarray, " d"],
+    scale: Float[np.ndarray, " observation"],
+    *,
+    steps: int,
+    loss: Loss,
+    damping: float,
+    limit: float = 1.0,
+    shortest: float = 0.0,
+) -> tuple[list[Linearisation], Float[np.ndarray, "steps d"], int]:
+    """Take Gauss-Newton steps from `start` on windows whose initial states are known.
+
+    There are at most `steps` of them. They end early where every simulation fails, and after a step whose components
+    are all smaller than `shortest`.
+
+    Returns:
+        The linearisation before each step, the point after it, and the number of control steps simulated.
+    """
+    linearisations, visited, point, spent = [], list[Float[np.ndarray, " d"]](), start, 0
+    for _ in range(steps):
+        points = difference_points(point)
+        around = linearise(points, window_residuals(simulator, windows, points, scale))
+        spent += len(points) * len(windows) * windows.steps
+        if not len(around.residuals):
+            break
+        factors = triangular_factors(around, scale_of(around.residuals, loss), loss)
+        step = damped_step(*factors, point, damping, limit=limit)
+        point = point + step
+        linearisations.append(around)
+        visited.append(point)
+        if np.abs(step).max() < shortest:
+            break
+    return linearisations, np.array(visited).reshape(-1, len(start)), spent
 
 
 @dataclass(frozen=True)
 class Eliminated:
-    """What is left for the parameters once initial states are eliminated, and how the states follow them.
+    """The least-squares problem of the parameters alone, and how the initial states follow the parameters.
 
     Attributes:
-        reduced: Weighted residuals and derivatives that no initial state of their window can explain.
+        reduced: Weighted residuals and derivatives, projected on what no initial state of their window can explain.
         spare: 1 - leverage of each value: the share of its noise that its window's initial state does not absorb.
-        response: R⁻¹ Qᵀ (r, Jθ): minus the states' step is its first column plus the others times the parameters' step.
+        response: R⁻¹ Qᵀ (r, Jθ), from which `states_step` is computed.
     """
 
     reduced: Linearisation
     spare: Float[np.ndarray, "windows values"]
-    response: Float[np.ndarray, "windows n 1+d"]
+    response: Float[np.ndarray, "windows n columns"]
 
     def states_step(self, step: Float[np.ndarray, " d"]) -> Float[np.ndarray, "windows n"]:
         """The states' step that goes with a step of the parameters: -C⁻¹ (Jsᵀ r + Bᵀ p)."""
@@ -81,12 +121,10 @@ class Eliminated:
 def eliminate(
     slopes: WindowSlopes, weights: Float[np.ndarray, "windows values"], damping: Float[np.ndarray, " windows"]
 ) -> Eliminated:
-    """Project every window on what its initial state cannot explain.
+    """Project every window's residuals and derivatives on what its initial state cannot explain.
 
-    Args:
-        slopes: Residuals and derivatives.
-        weights: Of each squared residual.
-        damping: λ of each window: its state's step is that of ‖r + Js p‖² + λ ‖D p‖², D the lengths of the columns.
+    `weights` are those of the squared residuals. A window's state step p minimises ‖r + Js p‖² + λ ‖D p‖², with its
+    `damping` λ and the columns' lengths D.
     """
     windows, values, states = slopes.by_states.shape
     root = np.sqrt(weights)[..., None]

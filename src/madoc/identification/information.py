@@ -1,4 +1,4 @@
-"""Covariance and confidence intervals of a least-squares estimate, and what the data cannot identify; in [-1, 1]."""
+"""Covariance, confidence intervals and identifiability of a least-squares estimate in [-1, 1]."""
 
 from dataclasses import dataclass
 
@@ -10,26 +10,27 @@ from madoc.identification.linearisation import Linearisation
 from madoc.identification.losses import Loss, loss_curvature, loss_slope
 
 CONFIDENCE = 0.95
+"""Level of confidence intervals, in (0, 1)."""
 SETTLED = 0.1
-"""A step over its standard error, from 0 to 1: a smaller one changes nothing worth a simulation."""
+"""Ratio in [0, 1] of a step to the standard error; a smaller step is not worth a simulation."""
 BOX_VARIANCE = 1.0 / 3.0
-"""Variance of a uniform distribution over [-1, 1]: that of a direction that the data says nothing of."""
+"""Variance of a uniform distribution over [-1, 1]: that of a direction that the data does not identify."""
 _BLIND = 1e-12
-"""Curvature along a direction, relative to the largest, below which it is only the error of the differences."""
+"""Curvature along a direction relative to the largest; a smaller one is an error of the finite differences."""
 _CORRELATED = 0.95
-"""Correlation, from 0 to 1, above which a pair of parameters is named."""
+"""Absolute correlation in [0, 1]; a pair of parameters with a larger one is named."""
 _SHARE = 0.2
-"""Component of a direction, relative to its largest, above which a parameter is named as part of it."""
+"""Component of a direction relative to its largest; parameters with a larger one are named."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """The uncertainty of an estimate, in units of [-1, 1].
+    """The uncertainty of an estimate in [-1, 1].
 
     Attributes:
-        covariance: Of the estimate; directions that the data cannot identify have the box's variance.
-        correlation: Of the estimates by the curvature alone: residuals of clean data are rounding errors.
-        unidentified: Unit vectors that the data cannot identify, one a row.
+        covariance: Covariance of the estimate; directions that the data cannot identify have the box's variance.
+        correlation: Correlation by the curvature alone, as residuals of clean data are rounding errors.
+        unidentified: Directions that the data cannot identify, one a row, each of length 1.
     """
 
     covariance: Float[np.ndarray, "d d"]
@@ -38,16 +39,16 @@ class Uncertainty:
 
 
 def bread(around: Linearisation, scale: float, loss: Loss) -> Float[np.ndarray, "d d"]:
-    """Σ ψ' J Jᵀ, the curvature of the cost. Cauchy's tails curve downwards; should they prevail, Σ ρ' J Jᵀ."""
+    """Σ ψ' J Jᵀ, the curvature of the cost; Σ ρ' J Jᵀ where that is not positive definite, as in Cauchy's tails."""
     z = (around.residuals / scale) ** 2
     curved = _sum_of_products(around, loss_curvature(z, loss))
     return curved if np.linalg.eigvalsh(curved)[0] > 0 else _sum_of_products(around, loss_slope(z, loss))
 
 
 def meat(around: Linearisation, scale: float, loss: Loss) -> Float[np.ndarray, "d d"]:
-    """Σ g gᵀ over windows, g = Σ ψ J: the scatter of the windows' gradients; n / (n - d) for the parameters spent.
+    """Σ g gᵀ over windows, g = Σ ψ J: the scatter of the windows' gradients, times n / (n - d) for n windows.
 
-    Residuals of one window are taken to depend on each other, those of different windows not.
+    Residuals of one window may depend on each other, those of different windows are assumed to be independent.
     """
     windows, _, count = around.jacobian.shape
     slope = loss_slope((around.residuals / scale) ** 2, loss) * around.residuals
@@ -56,31 +57,27 @@ def meat(around: Linearisation, scale: float, loss: Loss) -> Float[np.ndarray, "
 
 
 def jackknife_meat(around: Linearisation, share: float, bread: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
-    """B C B of the covariance C that leaving out one window at a time has: (n - 1) / n Σ δ δᵀ, δ = (B - B_w)⁻¹ g_w.
+    """B C B with the jackknife covariance C of leaving out one window: (n - 1) / n Σ δ δᵀ, δ = (B - B_w)⁻¹ g_w.
 
-    g_w is the gradient of the window's cost and B_w its part of the bread B. In `meat` a window that weighs much hides
-    how far it has drawn the estimate towards itself; left out, it shows (Bell and McCaffrey 2002, the CR3 of MacKinnon
-    and White 1985). It matters where windows are few and differ.
-
-    Args:
-        around: Of a linear problem, weights included.
-        share: The bread over the sum of products of derivatives.
-        bread: The curvature.
+    g_w is the gradient of the window's cost and B_w its part of the bread B, which is `share` times the sum of products
+    of derivatives. A window of much weight draws the estimate towards itself, which `meat` does not show but leaving
+    the window out does (Bell and McCaffrey 2002, the CR3 of MacKinnon and White 1985). It matters where windows are few
+    and differ.
     """
     windows = len(around.jacobian)
     scores = np.einsum("wv,wvd->wd", around.residuals, around.jacobian)
     parts = share * np.einsum("wvd,wve->wde", around.jacobian, around.jacobian)
     others = bread - parts
     alone = np.linalg.eigvalsh(others)[:, 0] <= _BLIND * np.trace(bread)
-    others[alone] += parts[alone]  # nothing is known without it: it counts as it does in `meat`
+    others[alone] += parts[alone]  # without it the problem is singular: it counts as in `meat`
     influence = np.einsum("wde,we->wd", np.linalg.pinv(others, rcond=_BLIND, hermitian=True), scores) @ bread
     return influence.T @ influence * (windows - 1) / max(1, windows)
 
 
 def least_share(part: Linearisation, whole: Linearisation) -> float:
-    """The smallest eigenvalue of B_part v = λ B_whole v: what a part of the windows tells, where it tells least of all.
+    """The smallest eigenvalue of B_part v = λ B_whole v: the share of the information that a part of the windows holds.
 
-    Directions that all windows together do not identify are left out.
+    It is that of the worst direction, among those that all windows together identify.
     """
     values, vectors = np.linalg.eigh(_sum_of_products(whole, np.ones_like(whole.residuals)))
     identified = values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)
@@ -93,28 +90,24 @@ def least_share(part: Linearisation, whole: Linearisation) -> float:
 def at_least_noise(
     meat: Float[np.ndarray, "d d"], bread: Float[np.ndarray, "d d"], ratio: float
 ) -> Float[np.ndarray, "d d"]:
-    """The meat, widened where noise of equal variance in all windows would scatter the estimate more than windows do.
+    """The meat B C B of a covariance C, enlarged where C's variances are smaller than those of independent equal noise.
 
-    Few windows may scatter too little by chance; the residuals then tell the variance of the noise more surely.
-
-    Args:
-        meat: B C B of a covariance C.
-        bread: B.
-        ratio: Variance of a reading's gradient over its mean curvature: noise alone makes the covariance ratio B⁻¹.
+    The gradients of few windows may scatter too little by chance. Noise of the same variance in all windows has the
+    covariance `ratio` B⁻¹, with the ratio of the variance of a reading's gradient to its mean curvature.
     """
     inverse = np.linalg.pinv(bread, rcond=_BLIND, hermitian=True)
     covariance = inverse @ meat @ inverse
     by_windows, by_noise = np.diag(covariance), ratio * np.diag(inverse)
-    if (by_windows <= _BLIND * by_noise).any():  # as of a single window: it scatters against nothing
+    if (by_windows <= _BLIND * by_noise).any():  # as for a single window, which has no scatter
         return ratio * bread
     wider = np.sqrt(np.maximum(1.0, by_noise / np.maximum(by_windows, np.finfo(float).tiny)))
     return bread @ (wider[:, None] * covariance * wider) @ bread
 
 
 def sandwich(bread: Float[np.ndarray, "d d"], meat: Float[np.ndarray, "d d"]) -> Uncertainty:
-    """bread⁻¹ meat bread⁻¹ (Huber 1967) in directions that the data identifies, the box's variance in others.
+    """The covariance bread⁻¹ meat bread⁻¹ (Huber 1967) in identified directions, the box's variance in others.
 
-    It holds for robust losses, for channels of unequal noise, and for noise that is not normal.
+    It is valid for robust losses, for channels of unequal noise, and for noise that is not normal.
     """
     values, vectors = np.linalg.eigh(bread)
     identified: Bool[np.ndarray, " d"] = values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)
@@ -137,7 +130,7 @@ def half_width(covariance: Float[np.ndarray, "d d"], windows: int) -> Float[np.n
 
 
 def identifiability(uncertainty: Uncertainty, names: tuple[str, ...]) -> tuple[str, ...]:
-    """A sentence for each direction the data cannot identify, and one for the pairs it can hardly tell apart."""
+    """A sentence for each direction that the data cannot identify, and one on pairs of highly correlated estimates."""
     sentences: list[str] = []
     named: set[str] = set()
     for direction in np.abs(uncertainty.unidentified):

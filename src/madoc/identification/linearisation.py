@@ -6,20 +6,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 DIFFERENCE = 1e-4
-"""Half width of a central difference in [-1, 1].
-
-Its truncation error falls with the square, 1e-8 of the third derivative; rounding of next states (1e-16, and 1e-10
-at contacts, where MuJoCo's solver stops) divided by it stays below 1e-6 of a typical derivative.
-"""
+"""Half width of a central difference in [-1, 1]. Its truncation error is 1e-8 of the third derivative; rounding of next
+states (1e-16, and the solver's 1e-10 at contacts) divided by it is below 1e-6 of a typical derivative."""
 
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Residuals at a point and their derivatives there; windows whose simulation failed are left out.
+    """Residuals at a point, in typical changes of a channel, and their derivatives by parameters in [-1, 1].
 
-    Attributes:
-        residuals: In units of each channel's typical change.
-        jacobian: Their derivatives by parameters in [-1, 1].
+    Windows whose simulation failed are left out.
     """
 
     residuals: Float[np.ndarray, "windows values"]
@@ -40,9 +35,9 @@ class WindowSlopes:
     """Residuals of windows at a point, and their derivatives there by parameters and by each window's initial state.
 
     Attributes:
-        residuals: In units of each channel's typical change, or of its noise.
-        by_parameters: Their derivatives by parameters in [-1, 1].
-        by_states: Their derivatives by the window's own initial state, in units of each value's spread.
+        residuals: Residuals in typical changes of a channel, or in standard deviations of its noise.
+        by_parameters: Derivatives by parameters in [-1, 1].
+        by_states: Derivatives by the window's own initial state, in standard deviations of each value over the log.
         whole: Windows in which no simulation failed; the others are 0 everywhere.
     """
 
@@ -52,15 +47,15 @@ class WindowSlopes:
     whole: Bool[np.ndarray, " windows"]
 
     def over(self, deviation: Float[np.ndarray, " values"]) -> "WindowSlopes":
-        """The same with residuals in units of `deviation`."""
+        """Residuals and derivatives divided by the deviation of each value."""
         wide = deviation[:, None]
         return WindowSlopes(self.residuals / deviation, self.by_parameters / wide, self.by_states / wide, self.whole)
 
 
-def difference_points(unit: Float[np.ndarray, " d"]) -> Float[np.ndarray, "points d"]:
+def difference_points(point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "points d"]:
     """The point itself, then each parameter in turn a little higher, then a little lower, never outside the box."""
-    shift = DIFFERENCE * np.eye(len(unit))
-    return np.clip(np.concatenate([unit[None], unit + shift, unit - shift]), -1.0, 1.0)
+    shift = DIFFERENCE * np.eye(len(point))
+    return np.clip(np.concatenate([point[None], point + shift, point - shift]), -1.0, 1.0)
 
 
 def linearise(
@@ -79,10 +74,8 @@ def slopes_of_windows(
 ) -> WindowSlopes:
     """Derivatives by parameters and by initial states; the latter are one-sided.
 
-    Args:
-        points: The point alone, or its `difference_points`.
-        by_points: Residuals at these.
-        by_shifts: Residuals at the first point, each value of the initial states in turn moved by `DIFFERENCE`.
+    `by_points` are residuals at a point alone or at its `difference_points`, `by_shifts` those at the first point with
+    each value of the initial states in turn moved by `DIFFERENCE`.
     """
     whole = np.isfinite(by_points).all((0, 2)) & np.isfinite(by_shifts).all((0, 2))
     with np.errstate(invalid="ignore"):
@@ -94,7 +87,7 @@ def slopes_of_windows(
 def _central(
     points: Float[np.ndarray, "points d"], residuals: Float[np.ndarray, "points windows values"]
 ) -> Float[np.ndarray, "d windows values"]:
-    """Differences of residuals over those of the points, which may be a point without neighbours: then d is 0."""
+    """Differences of residuals divided by those of the points; d is 0 for a point without neighbours."""
     count = len(points) // 2
     width = np.diagonal(points[1 : count + 1] - points[count + 1 :])
     return (residuals[1 : count + 1] - residuals[count + 1 :]) / width[:, None, None]

@@ -1,9 +1,10 @@
-"""Robust losses of residuals, and how one epoch's residuals become the terms of a least-squares problem.
+"""Robust losses of residuals: their values, slopes, curvatures and scales.
 
 With z = (r / c)², a residual r costs c² / 2 · ρ(z); SciPy's `least_squares` has the same four. Its slope is
 ψ(r) = ρ'(z) r, the slope of that is ρ'(z) + 2 z ρ''(z).
 """
 
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -16,55 +17,54 @@ TUNING: dict[Loss, float] = {"linear": 1.0, "huber": 1.345, "soft-l1": 1.345, "c
 _NORMAL_90 = 1.644854
 """90th percentile of the absolute value of normal noise, in standard deviations."""
 _SHARE_OF_TAIL = 0.2
-"""Least robust deviation, from 0 to 1, relative to that of the 90th percentile."""
+"""Smallest robust standard deviation relative to that by the 90th percentile, in [0, 1]."""
 NORMAL_MAD = 1.4826
-"""Standard deviation over median absolute deviation of normal noise, to four places: 1.4826."""
+"""Standard deviation over median absolute deviation of normal noise."""
 _SMALLEST_SCALE = 1e-12
-"""Residuals are in units of a channel's typical change; below this they are rounding."""
+"""Residual in typical changes of a channel; smaller ones are rounding errors."""
 ALL_FAILED = 1e30
-"""Cost where no simulation succeeded; a state holds no infinity."""
+"""Cost where every simulation failed: large, but finite, as states of methods must be."""
 
 Residuals = Float[np.ndarray, "*windows values"]
 
 
+_FUNCTIONS: dict[Loss, tuple[Callable[[Residuals], Residuals], ...]] = {
+    "linear": (lambda z: z, np.ones_like, np.ones_like),
+    "huber": (
+        lambda z: np.where(z <= 1.0, z, 2.0 * np.sqrt(np.maximum(z, 1.0)) - 1.0),
+        lambda z: 1.0 / np.sqrt(np.maximum(z, 1.0)),
+        lambda z: (z <= 1.0).astype(np.float64),
+    ),
+    "soft-l1": (
+        lambda z: 2.0 * (np.sqrt(1.0 + z) - 1.0),
+        lambda z: 1.0 / np.sqrt(1.0 + z),
+        lambda z: (1.0 + z) ** -1.5,
+    ),
+    "cauchy": (np.log1p, lambda z: 1.0 / (1.0 + z), lambda z: (1.0 - z) / (1.0 + z) ** 2),
+}
+"""ρ(z), ρ'(z) and ρ'(z) + 2 z ρ''(z) of each loss."""
+
+
 def loss_value(z: Residuals, loss: Loss) -> Residuals:
-    """ρ(z): z; z up to 1 and 2√z - 1 beyond; 2(√(1 + z) - 1); ln(1 + z)."""
-    if loss == "linear":
-        return z
-    if loss == "huber":
-        return np.where(z <= 1.0, z, 2.0 * np.sqrt(np.maximum(z, 1.0)) - 1.0)
-    if loss == "soft-l1":
-        return 2.0 * (np.sqrt(1.0 + z) - 1.0)
-    return np.log1p(z)
+    """ρ(z)."""
+    return _FUNCTIONS[loss][0](z)
 
 
 def loss_slope(z: Residuals, loss: Loss) -> Residuals:
     """ρ'(z): the weight of a squared residual."""
-    if loss == "linear":
-        return np.ones_like(z)
-    if loss == "huber":
-        return 1.0 / np.sqrt(np.maximum(z, 1.0))
-    if loss == "soft-l1":
-        return 1.0 / np.sqrt(1.0 + z)
-    return 1.0 / (1.0 + z)
+    return _FUNCTIONS[loss][1](z)
 
 
 def loss_curvature(z: Residuals, loss: Loss) -> Residuals:
-    """ρ'(z) + 2 z ρ''(z): how fast ψ grows with the residual. Negative for Cauchy's far tails."""
-    if loss == "linear":
-        return np.ones_like(z)
-    if loss == "huber":
-        return (z <= 1.0).astype(np.float64)
-    if loss == "soft-l1":
-        return (1.0 + z) ** -1.5
-    return (1.0 - z) / (1.0 + z) ** 2
+    """ρ'(z) + 2 z ρ''(z): the derivative of ψ by the residual. It is negative in Cauchy's tails."""
+    return _FUNCTIONS[loss][2](z)
 
 
 def curvature_share(z: Residuals, loss: Loss) -> float:
-    """Mean of ψ' over the mean of ρ': the curvature of the loss over that of the weighted squares.
+    """Mean of ψ' over the mean of ρ': the curvature of the loss over that of the weighted squares, at least 0.1.
 
-    One number for all residuals, as their slopes do not depend on how large they are (Huber 1981, section 7.6). Not
-    below a tenth: past that Cauchy's tails prevail, and residuals are no longer noise.
+    It is one number for all residuals, as derivatives do not depend on their size (Huber 1981, section 7.6). Only where
+    Cauchy's tails prevail, so that residuals are not noise, would it be smaller.
     """
     if loss == "linear" or not z.size:
         return 1.0
@@ -79,10 +79,10 @@ def scale_of(residuals: Residuals, loss: Loss) -> float:
 
 
 def robust_deviation(size: Float[np.ndarray, "*values"]) -> float:
-    """The standard deviation of normal noise with this median of |residuals|, in typical changes of a step.
+    """The standard deviation of normal noise with the same median of |residuals|, in typical changes of a step.
 
-    Where a robot rests and its sensors are coarse, most residuals are 0. So it is not below a fifth of what the 90th
-    percentile makes it, as far as that is less than a step's change and so may be noise.
+    Where a robot rests and its sensors are coarse, most residuals are 0. It is therefore at least a fifth of the
+    standard deviation by the 90th percentile, of which at most 1, a step's change, counts.
     """
     tail = min(float(np.percentile(size, 90)), 1.0)
     return max(NORMAL_MAD * float(np.median(size)), _SHARE_OF_TAIL * tail / _NORMAL_90)

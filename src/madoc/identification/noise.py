@@ -14,34 +14,32 @@ from itertools import combinations_with_replacement
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.data.dataset import Dataset
+from madoc.data.dataset import Dataset, spread_of
 from madoc.identification.losses import NORMAL_MAD, robust_deviation
 from madoc.identification.states import states_observed_as
 from madoc.simulation.base import Simulator
 
 OUTLIER = 5.0
-"""Robust standard deviations at which residuals are clipped; of normal values one in two million is larger.
-
-A contact turns small noise into a large residual.
-"""
+"""Robust standard deviations to which residuals are clipped, as contacts turn small noise into large ones; of normal
+values one in two million is larger."""
 STEP = 1e-3
 """Change of an observation, in typical changes of a step, by which the derivative of a control step is taken."""
 SLOPE_LIMIT = 2.0
 """Largest derivative of a channel by itself over a control step; a contact's is larger, and is clipped to it."""
 _MOST_ROWS = 20_000
-"""Rows of a log that the regression looks at; more would hardly change a variance."""
+"""Largest number of rows in the regression; more would hardly change a variance."""
 _LEAST_SLOPE = 0.3
-"""Derivative of the next observation by the one before it, below which a channel's noise counts as 0: unknown."""
+"""Absolute derivative of the next observation by the one before it; with a smaller one the noise counts as 0."""
 _SHORTEST = 5
-"""Fewest rows of an episode whose second differences have next neighbours; shorter ones are left out."""
+"""Smallest number of rows of an episode; shorter ones have too few second differences and are left out."""
 _STANDARD_ERRORS = 3.0
-"""Standard errors that a variance must be above 0; below, the noise counts as 0."""
+"""Ratio of a variance to its standard error; with a smaller one the noise counts as 0."""
 _LEAST_SPARE = 0.05
-"""1 - leverage of a reading, from 0 to 1, below which it is left out: its residual is small whatever the noise."""
+"""1 - leverage of a reading, in [0, 1]; with less it is left out, as its residual is small whatever the noise."""
 _LEAST_SHARE = 1e-3
-"""Of the noisiest channel's deviation: no channel weighs more than a million times as much as another."""
+"""Smallest deviation relative to the noisiest channel's: no channel has more than a million times another's weight."""
 _SMALLEST = 1e-12
-"""Least deviation, in a channel's typical change in a step; below this it is rounding."""
+"""Smallest deviation in typical changes of a channel in a step; below it are rounding errors."""
 
 
 def regression_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:
@@ -57,8 +55,7 @@ def regression_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:
     )
     count = observation.shape[1]
     columns = np.concatenate([observation, action], axis=-1)
-    spread = columns.std(0)
-    scale = np.where(spread > 1e-8, spread, 1.0)
+    scale = spread_of(columns)
     columns = (columns - columns.mean(0)) / scale
     products = [columns[:, i] * columns[:, j] for i, j in combinations_with_replacement(range(columns.shape[1]), 2)]
     inputs = np.column_stack([columns, *products, np.ones(len(columns))])
@@ -106,10 +103,7 @@ def consecutive_noise(
     reading, with opposite signs: E[r_t r_{t+1}] = -A σ². A model error that does not alternate makes the estimate
     smaller, so it is never taken for noise.
 
-    Args:
-        first: Residuals of the earlier rows.
-        second: Residuals of the later rows.
-        slopes: A, the derivative of each channel by itself over a control step, as from `own_slopes`.
+    `slopes` are A, the derivative of each channel by itself over a control step, as from `own_slopes`.
     """
     slope = np.clip(slopes, -SLOPE_LIMIT, SLOPE_LIMIT)
     weight = (slope**2).sum(0)
@@ -120,11 +114,9 @@ def consecutive_noise(
 def residual_noise(
     residuals: Float[np.ndarray, "windows readings channels"], unknowns: int
 ) -> Float[np.ndarray, " channels"]:
-    """Noise from residuals of a fit that leaves nothing else: their root mean square over the degrees of freedom.
+    """Noise from residuals of a fit that are nothing but noise: root of their mean square per degree of freedom.
 
-    Args:
-        residuals: NaN in windows that failed, which are left out; 0 is returned if all of them did.
-        unknowns: Fitted to each window.
+    Windows that failed, with NaN, are left out; it is 0 if all did. `unknowns` were fitted to each window.
     """
     residuals = residuals[np.isfinite(residuals).all((1, 2))]
     values = residuals.shape[1] * residuals.shape[2]
@@ -137,12 +129,9 @@ def channel_noise(
 ) -> Float[np.ndarray, " channels"]:
     """Noise from residuals of a fit, most of which are noise: median |r| / √(1 - leverage), times 1.4826.
 
-    A residual's variance is σ² (1 - leverage), whatever was fitted; without the division short windows would look
-    less noisy than they are.
+    A residual's variance is σ² (1 - leverage), whatever was fitted.
 
-    Args:
-        residuals: In units of each channel's typical change in a step.
-        spare: 1 - leverage of each.
+    Residuals are in typical changes of a step, `spare` is 1 - leverage of each.
     """
     free = spare > _LEAST_SPARE
     scaled = np.where(free, residuals / np.sqrt(np.where(free, spare, 1.0)), np.nan)
@@ -162,24 +151,19 @@ def clipped(residuals: Float[np.ndarray, "rows observation"]) -> Float[np.ndarra
 def own_slopes(
     simulator: Simulator,
     dataset: Dataset,
-    unit: Float[np.ndarray, " d"],
+    point: Float[np.ndarray, " d"],
     rows: Int[np.ndarray, " rows"],
     scale: Float[np.ndarray, " observation"],
 ) -> Float[np.ndarray, "rows observation"]:
-    """The derivative of each channel after a control step by the same channel before it; 0 where it is not known.
+    """The derivative of each channel after a control step by the same channel before it; 0 where it is not computable.
 
-    Args:
-        simulator: What simulates.
-        dataset: The log.
-        unit: Parameters in [-1, 1].
-        rows: Rows with exact states at which the derivatives are taken.
-        scale: Typical change of each channel in a step.
+    It is taken at parameters in [-1, 1] and rows with exact states. `scale` is a step's typical change of each channel.
     """
     moves = [np.zeros(len(scale)), *(STEP * np.diag(scale))]
     observation = np.asarray(dataset.transitions.observation)
     states = np.stack([states_observed_as(dataset, simulator.task, rows, observation + move) for move in moves])
     action = np.asarray(dataset.transitions.action)[rows]
-    system = simulator.bind(simulator.parameters.to_physical(unit)[None])
+    system = simulator.bind(simulator.parameters.to_physical(point)[None])
     flat = states.reshape(1, -1, states.shape[-1])
     rebuilt = np.isfinite(flat).all(-1, keepdims=True)
     flat = np.where(rebuilt, flat, np.tile(states[:1], (len(moves), 1, 1)).reshape(flat.shape))

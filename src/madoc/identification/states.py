@@ -1,4 +1,4 @@
-"""What a log tells of the simulator's states: decided once, for diagnosis, calibration and verdict alike."""
+"""The simulator states that a log's rows were in, as exactly as the log's observations determine them."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -17,12 +17,12 @@ from madoc.simulation.velocities import unseen_positions
 from madoc.tasks import Task
 
 _PROBED = 64
-"""Logged actions taken from a reset where states are unknown; parameters that matter show within seconds."""
+"""Number of logged actions taken from a reset where states are unknown: within seconds every parameter matters."""
 
 
 @dataclass(frozen=True)
 class LoggedStates:
-    """The simulator states that a log's rows were in, as far as its observations tell.
+    """The simulator states that a log's rows were in, as exactly as its observations determine them.
 
     Attributes:
         kind: `exact` where observations determine the states; `approximate` where they show every position and the
@@ -157,7 +157,7 @@ def with_pending(
 def probing_rows(
     logged: LoggedStates, dataset: Dataset, simulator: Simulator
 ) -> tuple[Float[np.ndarray, "rows state"], Float[np.ndarray, "rows action"]]:
-    """States and actions at which every parameter must matter.
+    """States and actions at which to test whether a parameter matters.
 
     They are the logged ones, exact or approximate. Where states are unknown they are the states that the first logged
     actions lead to from a reset at mid-range parameters: at rest many parameters have no effect.
@@ -179,8 +179,8 @@ def probing_rows(
 def probing_windows(logged: LoggedStates, dataset: Dataset, simulator: Simulator, *, steps: int, count: int) -> Windows:
     """At most `count` windows from states as in `probing_rows`, each under `steps` logged actions.
 
-    Shorter ones if no episode is as long. Where states are unknown the windows' logged observations are not those of
-    their states: only what changes with the parameters is of use.
+    They are shorter if no episode is as long. Where states are unknown the logged observations do not belong to them,
+    and only derivatives by the parameters are of use.
     """
     if logged.starts_known:
         steps = longest_fit(dataset, logged.rows, steps)

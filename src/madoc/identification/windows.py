@@ -1,7 +1,6 @@
 """Windows: stretches of consecutive rows of one episode, to be replayed from the state at their first row.
 
-Every function that picks windows takes `rows`, the ascending rows at which one may begin because a state is known
-there, and returns positions in `rows`.
+Every function that picks windows takes `rows`, the ascending rows at which one may begin, and returns positions in it.
 """
 
 from dataclasses import dataclass
@@ -14,10 +13,8 @@ from madoc.data.dataset import Dataset
 from madoc.errors import MadocError
 
 HORIZONS = (1, 5, 20)
-"""Window lengths, in control steps, at which simulated and logged motion are compared before and after a calibration.
-
-One step shows what most methods fit; an error that is small in each step adds up over many.
-"""
+"""Window lengths in control steps at which simulated and logged motion are compared. Most methods fit single steps; an
+error that is small in each of them adds up."""
 
 Positions = Int[np.ndarray, " windows"]
 
@@ -138,12 +135,12 @@ def consecutive_rows(dataset: Dataset, rows: Int[np.ndarray, " states"]) -> Posi
     return np.flatnonzero((np.diff(rows) == 1) & (np.diff(episode) == 0))
 
 
-def drawn(positions: Positions, count: int, key: PRNGKeyArray) -> Positions:
+def drawn(positions: Int[np.ndarray, " possible"], count: int, key: PRNGKeyArray) -> Positions:
     """At most `count` of the positions drawn at random, in ascending order."""
     return positions[np.sort(np.asarray(jax.random.permutation(key, len(positions)))[:count])]
 
 
-def evenly(positions: Positions, count: int) -> Positions:
+def evenly(positions: Int[np.ndarray, " possible"], count: int) -> Positions:
     """At most `count` of the positions, spread evenly."""
     if len(positions) <= count:
         return positions

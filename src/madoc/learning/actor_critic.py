@@ -1,7 +1,7 @@
 """A tanh-Gaussian actor, twin critics and a learnt temperature, and one gradient step of each."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -11,27 +11,27 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from madoc.learning import sac_losses
 from madoc.learning.features import Features
-from madoc.learning.networks import adam, descend, moving_average
+from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend, moving_average
 from madoc.learning.sac_losses import TwinCritic
-from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
+from madoc.learning.tanh_gaussian import Noise, TanhGaussianPolicy, sample
 
 Batch = dict[str, Array]
 """Rows as `replay.sample` gives them: observation, action, reward, next_observation, terminated."""
 
-
 STILL = 1e-3
-"""Added to the spread of an observation, as TD3+BC does: what hardly moved in the data may move far in a simulator."""
+"""Constant added to the standard deviation of each observation channel, as in TD3+BC. Without it, a channel that hardly
+moved in the data would reach the networks as a huge value once it moves in a simulator."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ActorCritic:
-    """Everything that gradient updates change."""
+    """The networks, the temperature, and the states of their optimisers."""
 
     policy: TanhGaussianPolicy
     critic: TwinCritic
     target_critic: TwinCritic
-    log_temperature: Float[Array, ""]
+    log_temperature: Scalar
     policy_optimiser: PyTree
     critic_optimiser: PyTree
     temperature_optimiser: PyTree
@@ -39,13 +39,7 @@ class ActorCritic:
 
 @dataclass(frozen=True)
 class Descent:
-    """The optimisers of an actor-critic.
-
-    Attributes:
-        policy: Of the policy, and of the temperature.
-        critic: Of the critics.
-        target_rate: τ of the target critics.
-    """
+    """The optimisers of the policy (and its temperature) and of the critics, and the target critics' rate τ."""
 
     policy: optax.GradientTransformation
     critic: optax.GradientTransformation
@@ -67,17 +61,10 @@ def fresh(
     features: Features | None = None,
     key: PRNGKeyArray,
 ) -> ActorCritic:
-    """New networks, temperature 1.
+    """New networks for so many values of an observation and of an action, temperature 1.
 
-    Args:
-        observation: Values of an observation.
-        action: Values of an action.
-        hidden: Units per layer.
-        critic_hidden: Those of the critics; None is `hidden`.
-        descent: How they will change.
-        features: How the data's observations are standardised, as TD3+BC has it (Fujimoto & Gu 2021, section 5); None
-            where there is no data, and networks see observations as they are.
-        key: Of the weights.
+    Without `critic_hidden`, critics have the layers of the policy. With `features`, networks see observations
+    standardised as those of the data, as in TD3+BC (Fujimoto & Gu 2021, section 5).
     """
     of_policy, of_critic = jax.random.split(key)
     seen = {}
@@ -98,12 +85,24 @@ def fresh(
     )
 
 
+def standardising(
+    learner: ActorCritic, offset: Float[Array, " observation"], scale: Float[Array, " observation"]
+) -> ActorCritic:
+    """The same weights, for observations that are standardised with this offset and scale."""
+    networks = learner.policy, learner.critic, learner.target_critic
+    changed = (eqx.tree_at(lambda net: (net.offset, net.scale), network, (offset, scale)) for network in networks)
+    return replace(learner, **dict(zip(("policy", "critic", "target_critic"), changed, strict=True)))
+
+
 def bellman_target(
-    learner: ActorCritic, batch: Batch, key: PRNGKeyArray, *, discount: float, entropy: bool = True
-) -> Float[Array, " rows"]:
-    """Where the critics of a batch should go; without `entropy`, the backup leaves out -α log π."""
+    learner: ActorCritic, batch: Batch, noise: Noise, *, discount: float | Array, entropy: bool = True
+) -> PerRow:
+    """Target of the critics for each row of a batch; without `entropy`, it leaves out the term -α log π.
+
+    `discount` is one number, or one for each row where rows span several control steps.
+    """
     following = batch["next_observation"]
-    action, density = sample(*learner.policy.distribution(following), key)
+    action, density = sample(*learner.policy.distribution(following), noise)
     return sac_losses.soft_target(
         batch["reward"],
         batch["terminated"],
@@ -116,48 +115,32 @@ def bellman_target(
 
 def critic_step(
     learner: ActorCritic, loss_of: Callable[[TwinCritic], tuple[Array, Array]], descent: Descent
-) -> tuple[ActorCritic, tuple[Float[Array, ""], Float[Array, ""]]]:
-    """One step of the critics down a loss, and of the target critics behind them.
+) -> tuple[ActorCritic, tuple[Scalar, Scalar]]:
+    """One gradient step of the critics; the target critics then move towards them.
 
-    Args:
-        learner: What to improve.
-        loss_of: critic -> its loss, and a part of it worth watching.
-        descent: How.
-
-    Returns:
-        The learner, and both numbers as they were before the step.
+    `loss_of` gives the loss of a critic and a part of it to report. Both are returned as they were before the step.
     """
     (loss, part), gradients = eqx.filter_value_and_grad(loss_of, has_aux=True)(learner.critic)
     critic, optimiser = descend(descent.critic, gradients, learner.critic_optimiser, learner.critic)
     target_critic = moving_average(learner.target_critic, critic, descent.target_rate)
-    learner = eqx.tree_at(
-        lambda parts: (parts.critic, parts.target_critic, parts.critic_optimiser),
-        learner,
-        (critic, target_critic, optimiser),
-    )
-    return learner, (loss, part)
+    return replace(learner, critic=critic, target_critic=target_critic, critic_optimiser=optimiser), (loss, part)
 
 
 def actor_step(
     learner: ActorCritic,
-    observation: Float[Array, "rows observation"],
-    key: PRNGKeyArray,
+    observation: Observations,
+    noise: Noise,
     descent: Descent,
     combine: Callable[[TanhGaussianPolicy, Array, Array], Array] = lambda policy, loss, value: loss,
 ) -> tuple[ActorCritic, dict[str, Array]]:
-    """One step of the policy and of the temperature.
+    """One gradient step of the policy and of the temperature, on actions sampled with the noise.
 
-    Args:
-        learner: What to improve.
-        observation: Where to improve it.
-        key: Of the sampled actions.
-        descent: How.
-        combine: (policy, SAC's loss, value of each row) -> what the policy descends. SAC's loss alone by default.
+    `combine` makes the policy's loss of (policy, SAC's loss, value of each row); by default it is SAC's loss.
     """
 
     def loss_of(policy: TanhGaussianPolicy) -> tuple[Array, tuple[Array, Array]]:
         loss, (value, density) = sac_losses.actor_loss(
-            policy, learner.critic, observation, temperature=jnp.exp(learner.log_temperature), key=key
+            policy, learner.critic, observation, temperature=jnp.exp(learner.log_temperature), noise=noise
         )
         return combine(policy, loss, value), (loss, density)
 
@@ -168,23 +151,24 @@ def actor_step(
     log_temperature, temperature_optimiser = descend(
         descent.policy, slope, learner.temperature_optimiser, learner.log_temperature
     )
-    learner = eqx.tree_at(
-        lambda parts: (parts.policy, parts.policy_optimiser, parts.log_temperature, parts.temperature_optimiser),
+    learner = replace(
         learner,
-        (policy, policy_optimiser, log_temperature, temperature_optimiser),
+        policy=policy,
+        policy_optimiser=policy_optimiser,
+        log_temperature=log_temperature,
+        temperature_optimiser=temperature_optimiser,
     )
     return learner, {"actor_loss": loss, "entropy": -density.mean(), "temperature": jnp.exp(log_temperature)}
 
 
 def soft_critic_step(
-    learner: ActorCritic, batch: Batch, key: PRNGKeyArray, descent: Descent, *, discount: float
+    learner: ActorCritic, batch: Batch, noise: Noise, descent: Descent, *, discount: float | Array
 ) -> tuple[ActorCritic, dict[str, Array]]:
-    """SAC's own step of the critics."""
-    target = bellman_target(learner, batch, key, discount=discount)
+    """One gradient step of the critics down SAC's loss."""
+    target = bellman_target(learner, batch, noise, discount=discount)
 
     def loss_of(critic: TwinCritic) -> tuple[Array, Array]:
-        loss = sac_losses.critic_loss(critic, batch["observation"], batch["action"], target)
-        return loss, loss
+        return sac_losses.critic_loss(critic, batch["observation"], batch["action"], target), target.mean()
 
-    learner, (loss, _) = critic_step(learner, loss_of, descent)
-    return learner, {"critic_loss": loss, "value_target": target.mean()}
+    learner, (loss, mean) = critic_step(learner, loss_of, descent)
+    return learner, {"critic_loss": loss, "value_target": mean}

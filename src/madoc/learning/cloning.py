@@ -6,20 +6,20 @@ import equinox as eqx
 import jax
 import numpy as np
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Float, PRNGKeyArray, PyTree
 
-from madoc.learning.networks import adam, descend, scalars, scan_updates
+from madoc.learning.networks import Actions, Observations, Scalar, adam, minimise
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy, log_density
 from madoc.types import Metrics, Transitions
 
-Pairs = tuple[Float[Array, "rows observation"], Float[Array, "rows action"]]
+Pairs = tuple[Observations, Actions]
 """Logged observations and actions on the device, float32."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Clone:
-    """A policy that is learning to act as the log's, the state of its optimiser, and its epochs of learning so far."""
+    """A policy in training to act as the one that recorded the log, its optimiser's state, and its epochs so far."""
 
     policy: TanhGaussianPolicy
     optimiser: PyTree
@@ -34,14 +34,9 @@ def fresh_clone(
     key: PRNGKeyArray,
     scale: Float[np.ndarray, " observation"] | None = None,
 ) -> Clone:
-    """An untrained clone that standardises observations as the log has them.
+    """An untrained clone that standardises observations by their logged mean and by `scale`.
 
-    Args:
-        logged: The log's rows.
-        hidden: Units per layer.
-        learning_rate: Adam's.
-        key: Of the weights.
-        scale: What observations are divided by; None takes their standard deviation, 0.001 at least.
+    Without a `scale`, the standard deviation of each channel is taken, but at least 0.001.
     """
     observation = np.asarray(logged.observation)
     policy = TanhGaussianPolicy(
@@ -55,9 +50,7 @@ def fresh_clone(
     return Clone(policy, adam(learning_rate).init(eqx.filter(policy, eqx.is_array)), 0)
 
 
-def cloning_loss(
-    policy: TanhGaussianPolicy, observation: Float[Array, "rows observation"], action: Float[Array, "rows action"]
-) -> Float[Array, ""]:
+def cloning_loss(policy: TanhGaussianPolicy, observation: Observations, action: Actions) -> Scalar:
     """Mean negative log-likelihood of the data's actions under the policy."""
     return -log_density(action, *policy.distribution(observation)).mean()
 
@@ -65,30 +58,24 @@ def cloning_loss(
 def continue_cloning(
     clone: Clone, logged: Pairs, key: PRNGKeyArray, *, learning_rate: float, batch: int, updates: int
 ) -> tuple[Clone, Metrics]:
-    """One epoch: `updates` updates of the clone on batches of logged rows."""
-    optimiser = adam(learning_rate)
-    policy, state, metrics = _update(
-        clone.policy, clone.optimiser, logged, key, optimiser=optimiser, batch=batch, count=updates
-    )
-    return Clone(policy, state, clone.epochs + 1), scalars(metrics)
+    """Train the clone for one epoch: `updates` updates on random batches of logged rows."""
+    carried = clone.policy, clone.optimiser
+    policy, optimiser, loss = _train(*carried, logged, key, adam(learning_rate), batch, updates)
+    return Clone(policy, optimiser, clone.epochs + 1), {"cloning_loss": float(loss)}
 
 
 @eqx.filter_jit
-def _update(
+def _train(
     policy: TanhGaussianPolicy,
     optimiser_state: PyTree,
     logged: Pairs,
     key: PRNGKeyArray,
-    *,
     optimiser: optax.GradientTransformation,
     batch: int,
-    count: int,
-) -> tuple[TanhGaussianPolicy, PyTree, dict[str, Array]]:
-    def update(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, dict[str, Array]]:
-        policy, optimiser_state = carry
+    updates: int,
+) -> tuple[TanhGaussianPolicy, PyTree, Scalar]:
+    def loss_of(policy: TanhGaussianPolicy, key: PRNGKeyArray) -> Scalar:
         rows = jax.random.randint(key, (batch,), 0, len(logged[0]))
-        loss, gradients = eqx.filter_value_and_grad(cloning_loss)(policy, logged[0][rows], logged[1][rows])
-        return descend(optimiser, gradients, optimiser_state, policy), {"cloning_loss": loss}
+        return cloning_loss(policy, logged[0][rows], logged[1][rows])
 
-    (policy, optimiser_state), metrics = scan_updates(update, (policy, optimiser_state), key, count)
-    return policy, optimiser_state, metrics
+    return minimise(loss_of, policy, optimiser_state, key, optimiser=optimiser, count=updates)

@@ -4,13 +4,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from madoc.learning.networks import Actions, Observations, PerRow, Scalar
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy, sample
 
 
-def log_integral(
-    value: Float[Array, "samples rows"], log_density: Float[Array, "samples rows"]
-) -> Float[Array, " rows"]:
+def log_integral(value: Float[Array, "samples rows"], log_density: Float[Array, "samples rows"]) -> PerRow:
     """Log ∫ exp Q(s, a) da per row, from actions of known density (appendix F): log mean exp(Q - log density).
 
     Any mixture of proposals will do, as each sample alone is an unbiased estimate of the integral. The authors' code
@@ -21,8 +20,8 @@ def log_integral(
 
 def proposals(
     policy: TanhGaussianPolicy,
-    observation: Float[Array, "rows observation"],
-    next_observation: Float[Array, "rows observation"],
+    observation: Observations,
+    next_observation: Observations,
     *,
     samples: int,
     key: PRNGKeyArray,
@@ -44,11 +43,11 @@ def proposals(
 
 def conservative_gap(
     critic: TwinCritic,
-    observation: Float[Array, "rows observation"],
-    action: Float[Array, "rows action"],
+    observation: Observations,
+    action: Actions,
     proposed: tuple[Float[Array, "proposals rows action"], Float[Array, "proposals rows"]],
-) -> Float[Array, ""]:
-    """Eq. (4), the term α weighs: mean of log ∫ exp Q(s, a) da - Q(s, a of the data), summed over the twins."""
+) -> Scalar:
+    """Eq. (4), the term with weight α: mean of log ∫ exp Q(s, a) da - Q(s, a of the data), summed over the twins."""
     actions, log_density = proposed
     repeated = jnp.broadcast_to(observation, (*actions.shape[:2], observation.shape[-1]))
     pairs = zip(critic(repeated, actions), critic(observation, action), strict=True)
@@ -58,17 +57,17 @@ def conservative_gap(
 
 def cql_loss(
     critic: TwinCritic,
-    observation: Float[Array, "rows observation"],
-    action: Float[Array, "rows action"],
-    target: Float[Array, " rows"],
+    observation: Observations,
+    action: Actions,
+    target: PerRow,
     proposed: tuple[Float[Array, "proposals rows action"], Float[Array, "proposals rows"]],
     *,
     weight: float,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Scalar, Scalar]:
     """Eq. (4): Bellman error plus `weight` times the gap; also the gap.
 
-    The squared error counts whole, not half as the paper prints it: the authors' code does so, and their weights of 5
-    and 10 belong to that.
+    The squared error is not halved as it is in the paper: it is not in the authors' code, to which their weights of 5
+    and 10 belong.
     """
     first, second = critic(observation, action)
     bellman = jnp.mean((first - target) ** 2) + jnp.mean((second - target) ** 2)

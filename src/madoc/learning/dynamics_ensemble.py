@@ -8,21 +8,21 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from madoc.learning.features import Features
-from madoc.learning.networks import Network, descend, map_stack, scan_updates, stack
+from madoc.learning.networks import Network, PerRow, Scalar, map_stack, minimise, stack
 
 BOUNDS_WEIGHT = 0.01
-"""How hard the learnt bounds of the variance are pulled together; the authors' (Chua et al., appendix A.1)."""
+"""Weight in the loss of the distance between the learnt bounds of the log variance (Chua et al., appendix A.1)."""
 DECAY = (2.5e-5, 1e-4)
-"""Of the first layer's weights and of the last's, as MOPO's code has them; evenly between."""
+"""Weight decay of the first layer and of the last, from MOPO's code; layers between are spaced evenly."""
 
 
 class Ensemble(eqx.Module):
-    """Models of (s, a) -> mean and std of (change of s, reward), all standardised as `Features` has them.
+    """Models of (s, a) -> mean and std of (change of s, reward), all standardised by `Features`.
 
     Attributes:
-        networks: A stack, one network a model.
-        largest: Upper ends of the log variance, learnt, one an output.
-        smallest: Lower ends.
+        networks: A stack of networks, one for each model.
+        largest: Learnt upper bound of the log variance of each output.
+        smallest: Learnt lower bound of the same.
     """
 
     networks: Network
@@ -40,7 +40,7 @@ class Ensemble(eqx.Module):
 
     @property
     def count(self) -> int:
-        """How many models."""
+        """Number of models."""
         return len(self.networks.layers[0].weight)
 
     def __call__(
@@ -57,7 +57,7 @@ class Ensemble(eqx.Module):
         return self._bounded(map_stack(lambda network, rows: network(rows), self.networks, pair))
 
     def only(self, model: Int[Array, ""]) -> "Ensemble":
-        """One model of it, as an ensemble of one."""
+        """An ensemble of a single one of the models."""
         networks = jax.tree.map(lambda leaf: leaf[model][None], self.networks)
         return eqx.tree_at(lambda ensemble: ensemble.networks, self, networks)
 
@@ -70,7 +70,7 @@ class Ensemble(eqx.Module):
 
 def likelihood_loss(
     ensemble: Ensemble, pair: Float[Array, "models rows pair"], target: Float[Array, "models rows outputs"]
-) -> Float[Array, ""]:
+) -> Scalar:
     """Eq. (1), Chua et al. 2018: squared error over variance plus log variance, averaged over rows and outputs.
 
     Summed over the models, with the learnt bounds of the variance pulled together.
@@ -80,16 +80,12 @@ def likelihood_loss(
     return error.mean((1, 2)).sum() + BOUNDS_WEIGHT * (ensemble.largest - ensemble.smallest).sum()
 
 
-def weight_decay(ensemble: Ensemble) -> Float[Array, ""]:
-    """Half the squared norm of every layer's weights, each layer's times its `DECAY`, summed over layers and models."""
-    weights = [layer.weight for layer in ensemble.networks.layers]
-    return sum(
-        (
-            0.5 * decay * (weight**2).sum()
-            for decay, weight in zip(np.linspace(*DECAY, len(weights)), weights, strict=True)
-        ),
-        start=jnp.zeros(()),
-    )
+def weight_decay(ensemble: Ensemble) -> Scalar:
+    """Half the squared norm of the weights of each layer, times its `DECAY`, summed over layers and models."""
+    layers = ensemble.networks.layers
+    decays = np.linspace(*DECAY, len(layers))
+    terms = (0.5 * decay * (layer.weight**2).sum() for decay, layer in zip(decays, layers, strict=True))
+    return sum(terms, start=jnp.zeros(()))
 
 
 def holdout_error(
@@ -100,14 +96,14 @@ def holdout_error(
     return ((mean - jnp.broadcast_to(target, mean.shape)) ** 2).mean((1, 2))
 
 
-def uncertainty_penalty(std: Float[Array, "models rows outputs"], features: Features) -> Float[Array, " rows"]:
+def uncertainty_penalty(std: Float[Array, "models rows outputs"], features: Features) -> PerRow:
     """u(s, a) of MOPO, Yu et al. 2020: the largest norm over the models of the std, in physical units."""
     scale = jnp.append(features.change_scale, features.reward_scale)
     return jnp.linalg.norm(std * jnp.broadcast_to(scale, std.shape), axis=-1).max(0)
 
 
 def training_rows(draws: Int[Array, "*rows"], holdout_every: int) -> Int[Array, "*rows"]:
-    """The j-th of the rows that are fitted to: all but every `holdout_every`-th."""
+    """Row numbers of the given draws from the training rows, which are all rows but every `holdout_every`-th."""
     return draws + draws // (holdout_every - 1)
 
 
@@ -122,18 +118,14 @@ def fit(
     count: int,
     holdout_every: int,
 ) -> tuple[Ensemble, PyTree, dict[str, Array]]:
-    """`count` updates; every model draws batches of its own, which is what makes them differ."""
+    """`count` updates. Every model draws its own batches, so that the models differ."""
     size = len(rows[0]) - len(rows[0]) // holdout_every
 
-    def update(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, dict[str, Array]]:
-        ensemble, optimiser_state = carry
+    def loss_of(ensemble: Ensemble, key: PRNGKeyArray) -> Scalar:
         drawn = training_rows(jax.random.randint(key, (ensemble.count, batch), 0, size), holdout_every)
-        loss, gradients = eqx.filter_value_and_grad(_fitting_loss)(ensemble, rows[0][drawn], rows[1][drawn])
-        return descend(optimiser, gradients, optimiser_state, ensemble), {"model_loss": loss}
+        return likelihood_loss(ensemble, rows[0][drawn], rows[1][drawn]) + weight_decay(ensemble)
 
-    (ensemble, optimiser_state), metrics = scan_updates(update, (ensemble, optimiser_state), key, count)
-    return ensemble, optimiser_state, metrics
-
-
-def _fitting_loss(ensemble: Ensemble, pair: Array, target: Array) -> Float[Array, ""]:
-    return likelihood_loss(ensemble, pair, target) + weight_decay(ensemble)
+    ensemble, optimiser_state, loss = minimise(
+        loss_of, ensemble, optimiser_state, key, optimiser=optimiser, count=count
+    )
+    return ensemble, optimiser_state, {"model_loss": loss}

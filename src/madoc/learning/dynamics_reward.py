@@ -1,13 +1,12 @@
-"""The dynamics reward of MOREC (Luo et al. 2024, arXiv 2310.05422): how real a transition looks, learnt by opposition.
+"""The dynamics reward of MOREC (Luo et al. 2024, arXiv 2310.05422): how real a transition looks, learnt adversarially.
 
-The authors never published how they train it. What they say of it: inverse reinforcement learning of a dynamics agent
-whose "policy" is the transition, in the manner of GAIL (Ho & Ermon 2016, arXiv 1606.03476), with an ensemble of past
-discriminators. Chosen here: as the agent's action, the next state, earns its reward at once, the generator climbs the
-reward's own gradient through its sample, without a reinforcement learner; and discriminators see blurred next states,
-without which a deterministic simulator is at once distinguished from any model.
+The authors describe inverse reinforcement learning of a dynamics agent whose "policy" is the transition, in the manner
+of GAIL (Ho & Ermon 2016, arXiv 1606.03476), with an ensemble of past discriminators; how they train it is unpublished.
+Here the generator follows the gradient of the reward through its sample, as the reward of a next state is immediate.
+Next states are blurred: without noise, a discriminator at once distinguishes a deterministic simulator from any model.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -16,10 +15,10 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from madoc.learning.dynamics_ensemble import Ensemble
-from madoc.learning.networks import Network, descend, map_stack, scan_updates, stack
+from madoc.learning.networks import Network, PerRow, Scalar, descend, map_stack, scan_updates, stack
 
 SURE = 0.999
-"""Largest mean probability that counts; the authors'."""
+"""Largest mean probability of a real transition, to which larger ones are clipped; the authors'."""
 
 
 @jax.tree_util.register_dataclass
@@ -28,11 +27,11 @@ class Opposition:
     """A generator of transitions, the discriminator against it, and past discriminators.
 
     Attributes:
-        generator: A dynamics model, an ensemble of one.
-        discriminator: (s, a, change of s) -> logit that it is real.
-        past: A stack of earlier discriminators, the newest last: together they are the reward.
-        generator_optimiser: State of its optimiser.
-        discriminator_optimiser: State of its optimiser.
+        generator: A dynamics model, as an ensemble of one.
+        discriminator: (s, a, change of s) -> logit that the transition is real.
+        past: A stack of earlier discriminators, the latest last, which together give the reward.
+        generator_optimiser: State of the generator's optimiser.
+        discriminator_optimiser: State of the discriminator's optimiser.
     """
 
     generator: Ensemble
@@ -52,7 +51,7 @@ def opposition(
     optimiser: optax.GradientTransformation,
     key: PRNGKeyArray,
 ) -> Opposition:
-    """The start of it."""
+    """The generator given, and an untrained discriminator that also stands for all past ones."""
     discriminator = Network(pair + change, 1, hidden, key=key)
     return Opposition(
         generator,
@@ -69,18 +68,18 @@ def logit(
     return discriminator(jnp.concatenate([pair, change], axis=-1))[..., 0]
 
 
-def telling_loss(real: Float[Array, " rows"], generated: Float[Array, " rows"]) -> Float[Array, ""]:
-    """The discriminator's: mean of -log D on real transitions and of -log(1 - D) on generated ones, from logits."""
+def discriminator_loss(real: PerRow, generated: PerRow) -> Scalar:
+    """Loss of the discriminator: mean of -log D on real and of -log(1 - D) on generated transitions, from logits."""
     return jax.nn.softplus(-real).mean() + jax.nn.softplus(generated).mean()
 
 
-def deceiving_loss(generated: Float[Array, " rows"]) -> Float[Array, ""]:
-    """The generator's: minus the mean reward -log(1 - D), from logits."""
+def generator_loss(generated: PerRow) -> Scalar:
+    """Loss of the generator: minus the mean reward -log(1 - D), from logits."""
     return -jax.nn.softplus(generated).mean()
 
 
 def dynamics_reward(logits: Float[Array, "members *rows"]) -> Float[Array, "*rows"]:
-    """R = -log(1 - mean D) over past discriminators; 0.69 where they are undecided."""
+    """R = -log(1 - mean D) over past discriminators; 0.69 where D is a half."""
     return -jnp.log1p(-jnp.minimum(jax.nn.sigmoid(logits).mean(0), SURE))
 
 
@@ -92,14 +91,12 @@ def reward_of(
 
 
 def remember(opposition: Opposition) -> Opposition:
-    """The newest discriminator in, the oldest out."""
+    """Add the discriminator to the past ones, and drop the oldest of these."""
 
     def shifted(past: Array, newest: Array) -> Array:
         return jnp.concatenate([past[1:], newest[None]]) if eqx.is_array(past) else past
 
-    return eqx.tree_at(
-        lambda parts: parts.past, opposition, jax.tree.map(shifted, opposition.past, opposition.discriminator)
-    )
+    return replace(opposition, past=jax.tree.map(shifted, opposition.past, opposition.discriminator))
 
 
 def oppose(
@@ -112,7 +109,7 @@ def oppose(
     count: int,
     noise: float,
 ) -> tuple[Opposition, dict[str, Array]]:
-    """`count` updates of discriminator and generator, in turns; the discriminator is then remembered."""
+    """`count` alternating updates of discriminator and generator; the discriminator then joins the past ones."""
 
     def update(carry: Opposition, key: PRNGKeyArray) -> tuple[Opposition, dict[str, Array]]:
         of_rows, of_sample, of_real, of_generated = jax.random.split(key, 4)
@@ -124,22 +121,22 @@ def oppose(
             mean, std = (part[0, :, :-1] for part in generator(pair))
             return mean + std * jax.random.normal(of_sample, mean.shape) + blur[1]
 
-        def telling(discriminator: Network) -> Array:
-            deceit = jax.lax.stop_gradient(generated(carry.generator))
-            return telling_loss(logit(discriminator, pair, change + blur[0]), logit(discriminator, pair, deceit))
+        def loss_of_discriminator(discriminator: Network) -> Array:
+            fake = jax.lax.stop_gradient(generated(carry.generator))
+            return discriminator_loss(logit(discriminator, pair, change + blur[0]), logit(discriminator, pair, fake))
 
-        loss, gradients = eqx.filter_value_and_grad(telling)(carry.discriminator)
+        loss, gradients = eqx.filter_value_and_grad(loss_of_discriminator)(carry.discriminator)
         discriminator, discriminator_optimiser = descend(
             optimiser, gradients, carry.discriminator_optimiser, carry.discriminator
         )
 
-        def deceiving(generator: Ensemble) -> Array:
-            return deceiving_loss(logit(discriminator, pair, generated(generator)))
+        def loss_of_generator(generator: Ensemble) -> Array:
+            return generator_loss(logit(discriminator, pair, generated(generator)))
 
-        deceived, gradients = eqx.filter_value_and_grad(deceiving)(carry.generator)
+        lost, gradients = eqx.filter_value_and_grad(loss_of_generator)(carry.generator)
         generator, generator_optimiser = descend(optimiser, gradients, carry.generator_optimiser, carry.generator)
         following = Opposition(generator, discriminator, carry.past, generator_optimiser, discriminator_optimiser)
-        return following, {"discriminator_loss": loss, "generated_reward": -deceived}
+        return following, {"discriminator_loss": loss, "generated_reward": -lost}
 
     following, metrics = scan_updates(update, opposition, key, count)
     return remember(following), metrics

@@ -1,7 +1,8 @@
-"""Networks and the scan that trains them."""
+"""Multilayer perceptrons, and the loops that train them."""
 
 from collections.abc import Callable, Sequence
 from functools import cache
+from itertools import pairwise
 from typing import TypeVar
 
 import equinox as eqx
@@ -13,6 +14,13 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from madoc.types import Metrics
 
 Carry = TypeVar("Carry")
+Input = TypeVar("Input")
+
+Scalar = Float[Array, ""]
+PerRow = Float[Array, " rows"]
+Observations = Float[Array, "rows observation"]
+Actions = Float[Array, "rows action"]
+"""Arrays of a batch on the device: one number, a number for each row, an observation and an action of each row."""
 
 
 class Network(eqx.Module):
@@ -34,10 +42,7 @@ class Network(eqx.Module):
     ) -> None:
         sizes = (inputs, *hidden, outputs)
         keys = jax.random.split(key, len(sizes) - 1)
-        self.layers = [
-            eqx.nn.Linear(size, following, key=layer_key)
-            for size, following, layer_key in zip(sizes[:-1], sizes[1:], keys, strict=True)
-        ]
+        self.layers = [eqx.nn.Linear(*ends, key=key) for ends, key in zip(pairwise(sizes), keys, strict=True)]
         self.dropout = dropout
         self.activation = activation
 
@@ -59,13 +64,13 @@ class Network(eqx.Module):
 def standardise(
     rows: Float[Array, "*rows n"], offset: Float[Array, " n"], scale: Float[Array, " n"]
 ) -> Float[Array, "*rows n"]:
-    """(rows - offset) / scale, of which neither is learnt."""
+    """(rows - offset) / scale. No gradient reaches the offset or the scale, so neither is trained."""
     offset, scale = (jnp.broadcast_to(jax.lax.stop_gradient(part), rows.shape) for part in (offset, scale))
     return (rows - offset) / scale
 
 
 def drop(rows: Float[Array, "*rows units"], rate: float, key: PRNGKeyArray) -> Float[Array, "*rows units"]:
-    """Dropout. A unit is dropped by one random byte, so the rate is met to within 1/512; four come from one number."""
+    """Dropout that spends one random byte a unit, four of each 32-bit draw, so the rate is exact to within 1/512."""
     bound = round(256 * rate)
     words = jax.random.bits(key, (-(-rows.size // 4),), jnp.uint32)
     draws = jax.lax.bitcast_convert_type(words, jnp.uint8).reshape(-1)[: rows.size].reshape(rows.shape)
@@ -73,14 +78,14 @@ def drop(rows: Float[Array, "*rows units"], rate: float, key: PRNGKeyArray) -> F
 
 
 def stack(count: int, make: Callable[[PRNGKeyArray], Carry], key: PRNGKeyArray) -> Carry:
-    """`count` modules of one shape as one, with a leading axis on every array."""
+    """`count` modules of one structure as a single module, whose arrays have a leading axis of that length."""
     return eqx.filter_vmap(make)(jax.random.split(key, count))
 
 
 def map_stack(
     apply: Callable[[Carry, Array], Array], stacked: Carry, inputs: Float[Array, "members *rows"] | None = None
 ) -> Array:
-    """Apply each module of a stack to its own inputs, one after the other: plain products, the fastest on a CPU."""
+    """Apply each module of a stack to its own inputs, one after the other: on a CPU faster than a batched product."""
     arrays, static = eqx.partition(stacked, eqx.is_array)
     return jax.lax.map(lambda parts: apply(eqx.combine(parts[0], static), parts[1]), (arrays, inputs))
 
@@ -88,25 +93,51 @@ def map_stack(
 def scan_updates(
     update: Callable[[Carry, PRNGKeyArray], tuple[Carry, dict[str, Array]]], carry: Carry, key: PRNGKeyArray, count: int
 ) -> tuple[Carry, dict[str, Array]]:
-    """Run `count` updates in one `lax.scan`; returns the last carry and the mean of each metric."""
+    """Run `count` updates in one `lax.scan`. Returns the last carry and the mean of each metric over the updates."""
+    return scan_inputs(update, carry, jax.random.split(key, count))
+
+
+def scan_inputs(
+    update: Callable[[Carry, Input], tuple[Carry, dict[str, Array]]], carry: Carry, inputs: Input
+) -> tuple[Carry, dict[str, Array]]:
+    """One update for each leading index of `inputs`, in one `lax.scan`; the last carry and the mean of each metric."""
     arrays, static = eqx.partition(carry, eqx.is_array)
 
-    def body(arrays: PyTree, key: PRNGKeyArray) -> tuple[PyTree, dict[str, Array]]:
-        following, metrics = update(eqx.combine(arrays, static), key)
+    def body(arrays: PyTree, given: Input) -> tuple[PyTree, dict[str, Array]]:
+        following, metrics = update(eqx.combine(arrays, static), given)
         return eqx.filter(following, eqx.is_array), metrics
 
-    arrays, metrics = jax.lax.scan(body, arrays, jax.random.split(key, count))
+    arrays, metrics = jax.lax.scan(body, arrays, inputs)
     return eqx.combine(arrays, static), jax.tree.map(jnp.mean, metrics)
 
 
+def minimise(
+    loss_of: Callable[[Carry, PRNGKeyArray], Scalar],
+    parameters: Carry,
+    optimiser_state: PyTree,
+    key: PRNGKeyArray,
+    *,
+    optimiser: optax.GradientTransformation,
+    count: int,
+) -> tuple[Carry, PyTree, Scalar]:
+    """`count` steps down a loss that draws its own batch with the key given to it; also its mean over the steps."""
+
+    def update(carry: tuple[Carry, PyTree], key: PRNGKeyArray) -> tuple[tuple[Carry, PyTree], dict[str, Array]]:
+        loss, gradients = eqx.filter_value_and_grad(loss_of)(carry[0], key)
+        return descend(optimiser, gradients, carry[1], carry[0]), {"loss": loss}
+
+    (parameters, optimiser_state), metrics = scan_updates(update, (parameters, optimiser_state), key, count)
+    return parameters, optimiser_state, metrics["loss"]
+
+
 def scalars(metrics: dict[str, Array]) -> Metrics:
-    """The metrics of a scan, off the device."""
+    """The metrics of a scan as Python floats."""
     return {name: float(value) for name, value in metrics.items()}
 
 
 @cache
 def adam(learning_rate: float) -> optax.GradientTransformation:
-    """Optax's Adam; the same object for the same rate, so that what was traced with it is not traced again."""
+    """Optax's Adam. One object for each rate, so that JAX does not trace again a function that takes it."""
     return optax.adam(learning_rate)
 
 

@@ -1,4 +1,4 @@
-"""A ring of rows on the device, filled by jitted writes and sampled inside jitted updates."""
+"""A ring buffer of rows on the device, written by jitted calls and sampled inside jitted updates."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -48,14 +48,14 @@ def add(replay: Replay, rows: Mapping[str, Array | np.ndarray], valid: Bool[Arra
 
 
 def clear(replay: Replay) -> Replay:
-    """The same ring with nothing in it."""
+    """The same buffer without rows."""
     return Replay(replay.rows, jnp.zeros((), jnp.int32))
 
 
-def sample(replay: Replay, key: PRNGKeyArray, batch: int) -> dict[str, Array]:
-    """`batch` rows drawn uniformly with replacement."""
+def sample(replay: Replay, key: PRNGKeyArray, *shape: int) -> dict[str, Array]:
+    """Rows drawn uniformly with replacement, with leading axes of this shape."""
     size = jnp.minimum(replay.written, replay.capacity)
-    index = jax.random.randint(key, (batch,), 0, size)
+    index = jax.random.randint(key, shape, 0, size)
     return jax.tree.map(lambda ring: ring[index], replay.rows)
 
 

@@ -9,26 +9,30 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from madoc.learning.networks import Network, standardise
 
 LOG_STD_RANGE = (-5.0, 2.0)
+"""Range of the log standard deviation before squashing; values beyond it are clipped."""
 _EDGE = 1.0 - 1e-5
-"""Actions recorded at ±1 are read as this: the density of a squashed Gaussian ends there."""
+"""Largest absolute action that has a density; recorded actions beyond it, such as ±1, are replaced by it."""
+Values = Float[Array | np.ndarray, "*rows n"]
 
 
-def sample(
-    mean: Float[Array, "*rows n"], log_std: Float[Array, "*rows n"], key: PRNGKeyArray
-) -> tuple[Float[Array, "*rows n"], Float[Array, "*rows"]]:
+Noise = PRNGKeyArray | Float[Array, "*rows n"]
+"""A random key, or standard normal numbers drawn beforehand: drawing those of many updates together is faster."""
+
+
+def sample(mean: Values, log_std: Values, noise: Noise) -> tuple[Float[Array, "*rows n"], Float[Array, "*rows"]]:
     """A reparameterised draw in (-1, 1) and its log density."""
-    raw = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+    if jnp.issubdtype(noise.dtype, jax.dtypes.prng_key):
+        noise = jax.random.normal(noise, mean.shape)
+    raw = mean + jnp.exp(log_std) * noise
     return jnp.tanh(raw), _log_density(raw, mean, log_std)
 
 
-def log_density(
-    value: Float[Array, "*rows n"], mean: Float[Array, "*rows n"], log_std: Float[Array, "*rows n"]
-) -> Float[Array, "*rows"]:
+def log_density(value: Values, mean: Values, log_std: Values) -> Float[Array, "*rows"]:
     """Log density of values in [-1, 1]."""
     return _log_density(jnp.arctanh(jnp.clip(value, -_EDGE, _EDGE)), mean, log_std)
 
 
-def _log_density(raw: Array, mean: Array, log_std: Array) -> Array:
+def _log_density(raw: Values, mean: Values, log_std: Values) -> Array:
     """Log N(raw; mean, std) - log |d tanh(raw) / d raw|, summed over the last axis (SAC, appendix C)."""
     standard = (raw - mean) * jnp.exp(-log_std)
     normal = -0.5 * standard**2 - log_std - 0.5 * np.log(2 * np.pi)
@@ -66,7 +70,7 @@ class TanhGaussianPolicy(eqx.Module):
         return mean, jnp.clip(log_std, *LOG_STD_RANGE)
 
     def __call__(
-        self, observation: Float[Array, "*rows observation"], key: PRNGKeyArray | None = None
+        self, observation: Float[Array | np.ndarray, "*rows observation"], key: PRNGKeyArray | None = None
     ) -> Float[Array, "*rows action"]:
         """A sampled action with a key, tanh of the mean without."""
         mean, log_std = self.distribution(jnp.asarray(observation, jnp.float32))

@@ -1,8 +1,9 @@
-from .calibration_stage import Calibrated as Calibrated
+from .calibrated import Calibrated as Calibrated
+from .calibrated import read_calibration as read_calibration
 from .calibration_stage import calibrate_in as calibrate_in
 from .calibration_stage import default_folder as default_folder
-from .calibration_stage import read_calibration as read_calibration
 from .check_stage import check_logs as check_logs
+from .check_stage import selftest_of as selftest_of
 from .data_stage import fingerprint as fingerprint
 from .data_stage import load_source as load_source
 from .data_stage import record as record
@@ -23,6 +24,4 @@ from .orders import RunOrder as RunOrder
 from .orders import Search as Search
 from .orders import SelftestOrder as SelftestOrder
 from .orders import Source as Source
-from .report_stage import leave_report as leave_report
-from .selftest_stage import selftest_of as selftest_of
 from .whole import run_all as run_all

@@ -1,50 +1,28 @@
-"""Calibration as a stage: from an order and a folder to a result, and back from the folder."""
+"""Calibration as a stage: by one method, or by `auto`, which compares several on the hold-out and keeps the best."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
-from madoc.calibration import CALIBRATORS, CalibrationResult
-from madoc.errors import MadocError
-from madoc.parameters import Parameter, ParameterSpace
-from madoc.pipeline.auto_stage import calibrate_auto
-from madoc.pipeline.data_stage import Machine
-from madoc.pipeline.folders import ENDED
-from madoc.pipeline.methods import make_method
-from madoc.pipeline.one_method import calibrate_prepared
-from madoc.pipeline.orders import AUTO, CalibrationOrder, Source
-from madoc.pipeline.preparation import check_order, method_of, prepare
-from madoc.pipeline.records import SpecRecord, read_spec
+from madoc.calibration import CALIBRATORS, CalibrationResult, Calibrator, calibrate
+from madoc.calibration.holdout import NotRun, Tried
+from madoc.errors import MadocError, unknown_name
+from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
+from madoc.pipeline.keys import seed_key
+from madoc.pipeline.methods import hyperparameters, make_method
+from madoc.pipeline.orders import AUTO, CalibrationOrder
+from madoc.pipeline.preparation import Prepared, check_order, method_of, prepare
 from madoc.runs.files import read_json
-from madoc.tasks import Task
+from madoc.verdict import Assessment, assess
+from madoc.verdict.evidence import evidence, save_evidence
+from madoc.verdict.judge import explains_all
 
+COMPARISON = "comparison.json"
+"""Name of the file that `auto` leaves of what it has compared."""
+CANDIDATES = {"least-squares": 2 / 3, "madoc": 1 / 2}
+"""The methods that `auto` tries, in this order (seconds before minutes), with the largest share of the budget of each.
 
-@dataclass(frozen=True)
-class Calibrated:
-    """A calibration read back from its files.
-
-    Attributes:
-        machine: The robot before any choice of the run.
-        task: The robot with the calibrated parameters and their ranges.
-        result: The estimate.
-        spec: What the run was asked; the defaults for a bare result.
-        folder: Where the result was found.
-    """
-
-    machine: Machine
-    task: Task
-    result: CalibrationResult
-    spec: SpecRecord
-    folder: Path
-
-    @property
-    def source(self) -> Source | None:
-        """The data, where a run folder remembers it."""
-        return None if self.spec.data is None else self.spec.data.source(self.folder)
-
-    @property
-    def seed(self) -> int:
-        """The seed of the calibration."""
-        return self.result.seed if self.spec.seed is None else self.spec.seed
+What a method does not spend is left to those after it.
+"""
 
 
 def calibrate_in(
@@ -58,9 +36,9 @@ def calibrate_in(
     out = Path(out)
     check_order(order, out)
     if method_of(order) == AUTO:
-        return calibrate_auto(out, prepare(order), resume=resume, quiet=quiet)
+        return _calibrate_auto(out, prepare(order), resume=resume, quiet=quiet)
     method = make_method(CALIBRATORS, method_of(order), order.search.changes)
-    return calibrate_prepared(out, prepare(order), method, resume=resume, quiet=quiet)[0]
+    return _calibrate_by(method, out, prepare(order), resume=resume, quiet=quiet)[0]
 
 
 def default_folder(order: CalibrationOrder) -> Path:
@@ -68,47 +46,133 @@ def default_folder(order: CalibrationOrder) -> Path:
     return Path("runs") / f"{Path(order.task).stem}-{method_of(order)}-{order.search.seed}"
 
 
-def read_calibration(path: str | Path, *, physics: str | None = None) -> Calibrated:
-    """A finished calibration: a run folder of `madoc calibrate` or `madoc run`, or a bare `result.json`.
-
-    Args:
-        path: The folder or file.
-        physics: Of the simulator, for a result that lies in no run folder; None is `legacy`.
+def candidates_for(prepared: Prepared) -> dict[str, Calibrator]:
+    """The candidates of `auto` by name; a hyperparameter is changed under a name such as `madoc.updates`.
 
     Raises:
-        MadocError: There is none, or it has not ended.
+        MadocError: A hyperparameter is named otherwise, or as `make_method`.
     """
-    path = Path(path)
-    folder = path if path.is_dir() else path.parent
-    if (folder / "calibration" / "spec.json").exists() and path.is_dir():
-        folder = folder / "calibration"
-    file = folder / "result.json" if path.is_dir() else path
-    spec = read_spec(folder)
-    if path.is_dir() and spec.command == "calibrate" and not calibration_ended(folder):
-        raise MadocError(f"the calibration in {folder} has not ended; go on with it with --resume first")
-    if not file.exists():
-        raise MadocError(f"there is no calibration at {path}; name a run folder or its result.json")
-    result = CalibrationResult.from_json(read_json(file))
-    machine = Machine.restored(replace(spec, task=result.task, physics=spec.physics or physics))
-    task = replace(machine.task, parameters=_searched(result, machine.task.parameters))
-    return Calibrated(machine, task, result, spec, folder)
+    changed: dict[str, dict[str, object]] = {name: {} for name in CANDIDATES}
+    for setting, value in prepared.order.search.changes.items():
+        whole, _, part = setting.partition(".")
+        name = whole.replace("_", "-")
+        if name not in changed or not part:
+            raise unknown_name("hyperparameter of auto", setting, [f"{candidate}.NAME" for candidate in CANDIDATES])
+        changed[name][part] = value
+    return {name: make_method(CALIBRATORS, name, changed[name]) for name in CANDIDATES}
 
 
-def calibration_ended(folder: Path) -> bool:
-    """Whether the whole result is there; the loop leaves a shorter one a moment before it, and one without verdict."""
-    if not (folder / "result.json").exists():
-        return False
-    result = read_json(folder / "result.json")
-    judged = read_spec(folder).holdout is None or result["status"] not in ENDED or "verdict" in result
-    return "parameters" in result and judged
+def _calibrate_by(
+    method: Calibrator, out: Path, prepared: Prepared, *, resume: bool, quiet: bool
+) -> tuple[CalibrationResult, Assessment | None]:
+    """Calibrate by one method, and judge the result; no assessment without a hold-out or an end of the run."""
+    problem = prepared.problem
+    spec = prepared.spec(out) | {"hyperparameters": hyperparameters(method)}
+    with working_folder(out, spec, resume=resume) as folder:
+        result = calibrate(
+            method,
+            problem,
+            key=seed_key(prepared.seed),
+            budget=prepared.budget,
+            truth=prepared.calibrated_truth,
+            folder=folder,
+            resume=resume,
+            quiet=quiet,
+        )
+        if prepared.holdout is None or result.status not in ENDED:
+            return result, None
+        assessment = assess(result, prepared.bench)
+        result = assessment.result
+        _leave_evidence(out, prepared, result)
+        folder.write_json("result.json", result.to_json())
+        return result, assessment
 
 
-def _searched(result: CalibrationResult, whole: ParameterSpace) -> ParameterSpace:
-    """Exactly the parameters and ranges of a result."""
-    known = {row.name: row for row in whole.parameters}
-    rows = []
-    for name, row in result.parameters.items():
-        field_name, _, element = name.partition(".")
-        named = known.get(name) or Parameter(field_name, element, row.low, row.high)
-        rows.append(replace(named, low=row.low, high=row.high))
-    return ParameterSpace(tuple(rows))
+def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool) -> CalibrationResult:
+    """Try the candidates within the budget, each in a folder of its own, and keep what predicts the hold-out best.
+
+    The first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and so does a
+    verdict on the data itself. Killed at any moment and resumed, the result has the same bits but for its seconds.
+
+    Returns:
+        The best candidate's result, with the cost of all of them; `holdout` has a row for each candidate.
+
+    Raises:
+        MadocError: Every candidate refuses the data, or as `candidates_for`.
+    """
+    methods = candidates_for(prepared)
+    spec = prepared.spec(out) | {"hyperparameters": {name: hyperparameters(made) for name, made in methods.items()}}
+    with working_folder(out, spec, resume=resume, keep=COMPARISON) as folder:
+        if ended(out, COMPARISON) and read_json(out / COMPARISON).get("budget") == prepared.budget:
+            return CalibrationResult.from_json(read_json(folder.result))
+        folder.result.unlink(missing_ok=True)
+        rows: list[Tried | NotRun] = []
+        tried: list[tuple[CalibrationResult, Assessment]] = []
+        for name, share in CANDIDATES.items():
+            left = prepared.budget - sum(result.control_steps for result, _ in tried)
+            reason = _reason_to_stop(tried, left) or _refusal(methods[name], prepared)
+            if reason:
+                rows.append(NotRun(name, reason))
+                continue
+            part = replace(prepared, method=name, budget=max(1, min(round(share * prepared.budget), left)))
+            place = out / name
+            result, assessment = _calibrate_by(methods[name], place, part, resume=holds_run(place), quiet=quiet)
+            if assessment is None:  # interrupted or diverged
+                if result.status == "diverged" and tried:
+                    rows.append(NotRun(name, result.sentence))
+                    continue
+                return result
+            tried.append((result, assessment))
+            rows.append(_row(result, assessment))
+            folder.write_json(COMPARISON, {"candidates": [asdict(row) for row in rows]})
+        if not tried:
+            raise MadocError("; ".join(f"{row.method}: {row.not_run}" for row in rows if isinstance(row, NotRun)))
+        best = _best(tried, rows)
+        _leave_evidence(out, prepared, best)
+        compared = {"candidates": [asdict(row) for row in rows], "chosen": best.method, "budget": prepared.budget}
+        folder.write_json(COMPARISON, compared)
+        folder.write_json("result.json", best.to_json())
+        return best
+
+
+def _leave_evidence(out: Path, prepared: Prepared, result: CalibrationResult) -> None:
+    """Leave `evidence.npz`: windows of the hold-out beside their simulation."""
+    arrays = evidence(prepared.bench, result.mean, control_step=prepared.simulator.control_step)
+    save_evidence(out / "evidence.npz", arrays)
+
+
+def _reason_to_stop(tried: list[tuple[CalibrationResult, Assessment]], left: int) -> str:
+    """Why no other candidate is needed, or none can be tried; empty to go on."""
+    for result, assessment in tried:
+        word = assessment.verdict.word
+        if word == "DATA_REJECTED":
+            return "the data was rejected, and no method changes that"
+        if word == "CALIBRATED" and explains_all(assessment.holdout):
+            return f"{result.method} explains the hold-out down to its noise"
+    return "" if left > 0 else "the budget is spent"
+
+
+def _refusal(method: Calibrator, prepared: Prepared) -> str:
+    """Why a candidate refuses this data; empty if it takes it."""
+    try:
+        method.init(prepared.problem, seed_key(prepared.seed))
+    except MadocError as error:
+        return f"refused: {error}"
+    return ""
+
+
+def _row(result: CalibrationResult, assessment: Assessment) -> Tried:
+    """A row of the comparison."""
+    holdout, word = assessment.holdout, assessment.verdict.word
+    return Tried(result.method, holdout.score, holdout.score_interval, word, result.control_steps, result.seconds)
+
+
+def _best(tried: list[tuple[CalibrationResult, Assessment]], rows: list[Tried | NotRun]) -> CalibrationResult:
+    """The best result, with the cost of all."""
+    best, assessment = min(tried, key=lambda pair: pair[1].holdout.score)
+    return replace(
+        best,
+        control_steps=sum(result.control_steps for result, _ in tried),
+        seconds=round(sum(result.seconds for result, _ in tried), 3),
+        holdout=replace(assessment.holdout, candidates=tuple(rows), chosen=best.method),
+    )

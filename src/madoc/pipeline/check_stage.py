@@ -1,28 +1,36 @@
-"""Checking a user's logs before anything is solved: read, look, forecast."""
+"""Checks of data before it is calibrated to: what a log shows, and whether a calibration to it would find a truth."""
 
 from dataclasses import dataclass
 
+import jax
+
 from madoc import robots, simulation
-from madoc.calibration import CalibrationProblem
+from madoc.calibration import CALIBRATORS, CalibrationProblem
 from madoc.data import Disturbance, disturb, logs, observed_task
 from madoc.data.findings import Finding
 from madoc.diagnosis import Diagnosis, check
+from madoc.diagnosis.channels import signal_names
 from madoc.errors import MadocError
 from madoc.parameters import ParameterSpace
+from madoc.pipeline.calibration_stage import candidates_for
 from madoc.pipeline.forecast import Forecast, forecast
 from madoc.pipeline.keys import stage_key
-from madoc.pipeline.orders import CheckOrder
+from madoc.pipeline.methods import make_method
+from madoc.pipeline.orders import AUTO, CalibrationOrder, CheckOrder, SelftestOrder
+from madoc.pipeline.preparation import check_order, prepare
+from madoc.verdict.predicted import sensor_noise
+from madoc.verdict.selftest import Selftest, selftest
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What `madoc check` found.
+    """The outcome of a check: a diagnosis of the log, or the refusal of one that cannot be read.
 
     Attributes:
         space: The robot's parameters.
-        diagnosis: Of the log; None where it could not be read.
-        forecasts: Of how long methods would take; none after a fatal finding.
-        refusal: Why the log could not be read.
+        diagnosis: What the log shows; None where it cannot be read.
+        forecasts: How long methods would take; none after a fatal finding.
+        refusal: Why the log cannot be read.
     """
 
     space: ParameterSpace
@@ -37,12 +45,10 @@ class Checked:
 
 
 def check_logs(order: CheckOrder) -> Checked:
-    """Read logs of a robot of one's own and say what they can and cannot tell, with velocities put in if asked.
-
-    A log that cannot be read is a finding too; a spec that cannot be read is refused.
+    """Read logs of a user's own robot, with velocities put in if asked, and diagnose them.
 
     Raises:
-        MadocError: The spec or its model is refused.
+        MadocError: The robot's spec or its model is refused; the refusal of a log is part of the outcome.
     """
     robot = robots.load(order.spec)
     task = robot.task
@@ -60,3 +66,33 @@ def check_logs(order: CheckOrder) -> Checked:
         return Checked(task.parameters, diagnosis)
     forecasts = forecast(CalibrationProblem(dataset, simulator), budget=order.budget)
     return Checked(task.parameters, diagnosis, forecasts)
+
+
+def selftest_of(order: SelftestOrder, *, quiet: bool = False) -> Selftest:
+    """Plant truths in the order's robot, replay the logged actions, and calibrate to each replay.
+
+    The method is the order's; of `auto`, the first candidate that does not refuse.
+
+    Raises:
+        MadocError: The order cannot be carried out, or every method refuses.
+    """
+    calibration = CalibrationOrder(order.task, order.source, order.search)
+    check_order(calibration)
+    if order.truths < 1:
+        raise MadocError(f"expected at least 1 truth to plant, got {order.truths}")
+    prepared = prepare(calibration)
+    if prepared.method == AUTO:
+        methods = list(candidates_for(prepared).values())
+    else:
+        methods = [make_method(CALIBRATORS, prepared.method, order.search.changes)]
+    key = stage_key(order.search.seed, "selftest")
+    return selftest(
+        methods,
+        prepared.dataset,
+        prepared.simulator,
+        noise=sensor_noise(prepared.bench),
+        signals=signal_names(prepared.simulator.task),
+        keys=[jax.random.fold_in(key, index) for index in range(order.truths)],
+        budget=prepared.budget,
+        quiet=quiet,
+    )

@@ -14,8 +14,8 @@ from madoc.data.native import recognises as is_recorded
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import RecordOrder, Source
-from madoc.pipeline.records import SpecRecord
 from madoc.policies.behaviours import QUALITIES, record_quality
+from madoc.report.records import SpecRecord
 from madoc.robots import Robot
 from madoc.runs.files import read_json
 from madoc.runs.progress import bar
@@ -25,12 +25,7 @@ from madoc.tasks import TASKS, Task
 
 @dataclass(frozen=True)
 class Machine:
-    """A robot before any choice of a run.
-
-    Attributes:
-        task: With all of its parameters at their normal ranges.
-        robot: What its spec file says, where it is a robot of one's own.
-    """
+    """A robot with all of its parameters at their normal ranges, and the content of its spec file, if it has one."""
 
     task: Task
     robot: Robot | None = None
@@ -55,12 +50,12 @@ class Machine:
             MadocError: The spec names no robot, or keeps one that cannot be made.
         """
         if spec.robot is not None:
-            robot = robots.restore_robot(spec.robot)
+            robot = robots.restore(spec.robot)
             return cls(robot.task, robot)
         return cls(tasks.make(spec.task, spec.physics or "legacy"))
 
     def in_physics(self, physics: str) -> "Machine":
-        """The same robot in other physics; one's own has its own alone."""
+        """The same robot in other physics; a user's own robot has only its own."""
         same = self.robot is not None or physics == self.task.physics
         return self if same else Machine(tasks.make(self.task.name, physics))
 
@@ -84,7 +79,7 @@ class Machine:
             raise MadocError(f"the truth has no value for {missing[0]}; add it, or leave it out of --parameters")
 
     def stored(self) -> dict[str, object]:
-        """What a run's `spec.json` keeps of a robot of one's own, so that the folder is complete; else nothing."""
+        """The entry of a user's own robot in `spec.json`, from which it is restored; nothing for one of Madoc's."""
         return {} if self.task.source is None else {"robot": dict(self.task.source)}
 
 
@@ -105,14 +100,9 @@ def split_name(name: str) -> tuple[str, str]:
 
 
 def record(simulator: Simulator, quality: str, *, transitions: int, key: PRNGKeyArray, quiet: bool = False) -> Dataset:
-    """Record one of the paper's datasets in the target with the paper's truth.
+    """Record this many rows of one of the paper's datasets in the target with the paper's truth.
 
-    Args:
-        simulator: The robot.
-        quality: `medium`, `medium-replay`, `medium-expert`, `neorl-low`, `neorl-medium` or `neorl-high`.
-        transitions: Rows wanted.
-        key: The only source of randomness.
-        quiet: Show no progress.
+    The quality is `medium`, `medium-replay`, `medium-expert`, `neorl-low`, `neorl-medium` or `neorl-high`.
 
     Raises:
         MadocError: The quality is unknown, no behaviour policies are shipped for the robot, or no row is wanted.
@@ -147,7 +137,7 @@ def load_source(source: Source, machine: Machine, *, seed: int) -> Dataset:
     """Read logged data of a robot, and disturb it if the source says so.
 
     Raises:
-        MadocError: As `data.load`, or `logs.read` for a robot of one's own, and `data.disturb`; or friction is to be
+        MadocError: As `data.load`, or `logs.read` for a user's own robot, and `data.disturb`; or friction is to be
             changed after the fact, or several files are given where one is read.
     """
     task, reading = machine.task, source.reading
@@ -160,7 +150,9 @@ def load_source(source: Source, machine: Machine, *, seed: int) -> Dataset:
             dataset = data.subsample(dataset, source.max_transitions, key)
     else:
         if len(source.paths) != 1:
-            raise MadocError(f"expected one file or dataset of {task.name}, got {len(source.paths)}: {source.words}")
+            raise MadocError(
+                f"expected one file or dataset of {task.name}, got {len(source.paths)}: {', '.join(source.paths)}"
+            )
         dataset = data.load(
             source.paths[0],
             task,

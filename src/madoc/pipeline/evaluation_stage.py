@@ -8,8 +8,8 @@ from madoc.evaluation import evaluate
 from madoc.pipeline.data_stage import Machine, read_truth
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import EvaluationOrder
-from madoc.pipeline.records import EvaluationRecord, SpecRecord, read_spec
 from madoc.policies import load_policy
+from madoc.report.records import EvaluationRecord, SpecRecord, read_spec
 from madoc.runs.files import write_json
 from madoc.runs.progress import bar
 
@@ -17,13 +17,10 @@ from madoc.runs.progress import bar
 def evaluate_folder(
     folder: Path, order: EvaluationOrder | None = None, *, names: Sequence[str] = (), quiet: bool = False
 ) -> EvaluationRecord:
-    """Evaluate the policies of a run in the target, on the same starts, and leave `evaluation.json`.
+    """Evaluate policies of a run in the target, on the same starts, and leave `evaluation.json`.
 
-    Args:
-        folder: A run folder with policies in it, or the folder of one policy.
-        order: Episodes, seed and truth; without a truth, the one that the run remembers is taken.
-        names: Only the policies of these names; empty takes all.
-        quiet: Show no progress.
+    The folder is that of a run or of one policy. Without `names` all its policies are evaluated; without a truth in
+    the order, that of the run is taken.
 
     Raises:
         MadocError: There is no policy, the truth is not known, or a number is out of range.

@@ -1,12 +1,13 @@
 """Export as a stage: a finished calibration as files for other tools."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 from madoc import simulation
 from madoc.errors import MadocError
-from madoc.export import Exported, Provenance, save_onnx, save_patch, save_randomization, save_sysid_parameters
+from madoc.export import Exported, save_onnx, save_patch, save_randomization, save_sysid_parameters
 from madoc.numpy_policy import NumpyPolicy
-from madoc.pipeline.calibration_stage import Calibrated, read_calibration
+from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
 from madoc.simulation import Simulator
 from madoc.simulation.mjcf import save_mjcf
@@ -16,13 +17,10 @@ from madoc.simulation.write import nominal_values
 def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dict[str, Path]:
     """Leave a finished calibration as MJCF, patch, randomization ranges and parameters for `mujoco.sysid`.
 
-    Args:
-        run: A run folder of `madoc calibrate` or `madoc run`.
-        out: Folder for the files; None takes `export` in the run folder.
-        onnx: Write the run's policies as ONNX too.
+    Policies are written too, as ONNX, if asked. The folder `out` is `export` in the run folder by default.
 
     Returns:
-        The files by what they are.
+        The path of each file by its description.
 
     Raises:
         MadocError: There is no finished calibration, no policy where `onnx` wants one, or a file cannot be written.
@@ -58,36 +56,27 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dic
     return files
 
 
-def provenance_of(calibrated: Calibrated) -> Provenance:
-    """Where an estimate comes from, as its run folder remembers it."""
-    verdict = calibrated.result.verdict
+def provenance_of(calibrated: Calibrated) -> dict[str, object]:
+    """Where an estimate comes from, as its run folder says; None or empty where it does not."""
+    result, verdict = calibrated.result, calibrated.result.verdict
     stored, whole = calibrated.spec.data, calibrated.folder.resolve()
-    data = (
-        {} if stored is None else {"paths": list(stored.paths), "rows": stored.rows, "fingerprint": stored.fingerprint}
-    )
-    return Provenance(
-        run=whole.parent.name if whole.name == "calibration" else whole.name,
-        method=calibrated.result.method,
-        seed=calibrated.seed,
-        data=data,
-        versions=calibrated.spec.versions,
-        verdict=None if verdict is None else verdict.to_json(),
-        warnings=calibrated.result.warnings,
-    )
+    return {
+        "run": whole.parent.name if whole.name == "calibration" else whole.name,
+        "method": result.method,
+        "seed": result.seed,
+        "verdict": None if verdict is None else asdict(verdict),
+        "data": stored and {"paths": list(stored.paths), "rows": stored.rows, "fingerprint": stored.fingerprint},
+        "versions": dict(calibrated.spec.versions),
+        "warnings": list(result.warnings),
+    }
 
 
 def _stepping(simulator: Simulator) -> dict[str, object]:
-    """How the model must be stepped to move as it was calibrated to."""
+    """How the model must be stepped to move as in calibration."""
     task, steps = simulator.task, simulator.task.frame_skip
     channels = [
-        {
-            "name": channel.name,
-            "actuator": channel.actuator,
-            "low": channel.low,
-            "high": channel.high,
-            "unit": channel.unit,
-            "control_per_unit": channel.scale,
-        }
+        {name: getattr(channel, name) for name in ("name", "actuator", "low", "high", "unit")}
+        | {"control_per_unit": channel.scale}
         for channel in task.actions
     ]
     held = "held for a control step; the solver starts cold (qacc_warmstart = 0) at each"

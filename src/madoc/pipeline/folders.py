@@ -1,4 +1,4 @@
-"""Run folders of the stages: a new one that is refused leaves nothing, a finished one is recognised."""
+"""Run folders of the stages: none is left of a refused run, and those of finished runs are recognised."""
 
 import shutil
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ ENDED = ("finished", "converged")
 def working_folder(
     path: Path, spec: dict[str, object], *, resume: bool, keep: str = "checkpoint.npz"
 ) -> Iterator[RunFolder]:
-    """The locked folder of a run, new or, with `resume`, as it was left.
+    """The locked folder of a run: a new one, or with `resume` that of an earlier run.
 
     Args:
         path: The folder.
@@ -42,23 +42,12 @@ def working_folder(
 
 
 def holds_run(path: Path) -> bool:
-    """Whether a run has been started there."""
+    """Whether a run has been started in a folder."""
     return (path / "spec.json").exists()
 
 
 def ended(path: Path, also: str | None = None) -> bool:
-    """Whether the run there came to its end, and left the file `also` after it."""
+    """Whether the run in a folder has ended, and the file `also` is there as well."""
     if not (path / "result.json").exists() or (also is not None and not (path / also).exists()):
         return False
     return read_json(path / "result.json").get("status") in ENDED
-
-
-def stored_path(path: Path, folder: Path) -> str:
-    """A path as the spec in `folder` remembers it: relative beside the folder, so that both can move."""
-    target, parent = path.expanduser().resolve(), folder.expanduser().resolve().parent
-    return f"../{target.relative_to(parent)}" if target.is_relative_to(parent) else str(target)
-
-
-def restored_path(text: str, folder: Path) -> Path:
-    """The path that `stored_path` wrote."""
-    return folder / text

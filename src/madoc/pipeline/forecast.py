@@ -1,7 +1,7 @@
-"""How long methods would take on this machine, from a second of each."""
+"""Forecasts of how long methods would take on this machine, from a second of each."""
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import jax
 
@@ -11,36 +11,27 @@ from madoc.errors import MadocError
 REFINING_EPOCHS = 6
 """Number of steps on all windows that least squares usually takes."""
 PREPARATION = 1.15
-"""Time of a whole run of Madoc over that of its calibrating epochs, as cloning and grouping come first: measured with
-the defaults on Hopper."""
+"""Ratio of the time of a whole run of Madoc to that of its calibrating epochs: measured with the defaults on Hopper."""
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """A method's time, or why it would refuse.
-
-    Attributes:
-        method: Name of the method.
-        seconds: Expected duration; None where the method refuses the data.
-        control_steps: The most control steps that it would simulate.
-        refusal: Why it refuses the data; empty where it does not.
-    """
+    """Expected duration of a method and its control steps at most; `seconds` is None where it refuses the data."""
 
     method: str
     seconds: float | None
     control_steps: int
     refusal: str = ""
 
-    def to_json(self) -> dict[str, object]:
-        """Its fields."""
-        return asdict(self)
-
     @property
     def sentence(self) -> str:
         """The forecast in words."""
         if self.seconds is None:
             return f"{self.method} would refuse: {self.refusal}"
-        return f"{self.method}: about {_duration(self.seconds)} for {self.control_steps:,} control steps"
+        duration = f"{max(1.0, self.seconds):.0f} s"
+        if self.seconds >= 90:
+            duration = f"{self.seconds / 60:.0f} min" if self.seconds < 5400 else f"{self.seconds / 3600:.1f} h"
+        return f"{self.method}: about {duration} for {self.control_steps:,} control steps"
 
 
 def forecast(problem: CalibrationProblem, *, budget: int) -> tuple[Forecast, ...]:
@@ -78,9 +69,3 @@ def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
         return Forecast(name, None, 0, str(error))
     epochs = budget / method.epoch_steps
     return Forecast(name, times[0] + PREPARATION * epochs * times[1], budget)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{max(1.0, seconds):.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,4 +1,4 @@
-"""Randomness of the stages: one seed, one stream a stage."""
+"""Random keys of the stages: one seed, and a stream of its own for each stage."""
 
 import zlib
 
@@ -8,7 +8,7 @@ from jaxtyping import PRNGKeyArray
 from madoc.errors import MadocError
 
 LARGEST_SEED = 2**32 - 1
-"""`jax.random.key` takes no more bits without 64-bit mode."""
+"""Largest seed: `jax.random.key` takes 32 bits."""
 
 
 def seed_key(seed: int) -> PRNGKeyArray:
@@ -23,11 +23,8 @@ def seed_key(seed: int) -> PRNGKeyArray:
 
 
 def stage_key(seed: int, stage: str) -> PRNGKeyArray:
-    """The key of another stage; a stage does the same alone as within `madoc run`.
+    """The random key of a stage by its name, the same within `madoc run` as alone.
 
-    The checksum is far from the small numbers that keys are split and folded with inside the stages.
-
-    Raises:
-        MadocError: The seed is negative or too large.
+    The name's checksum is far from the small numbers that stages fold into their keys.
     """
     return jax.random.fold_in(seed_key(seed), zlib.crc32(stage.encode()))

@@ -10,29 +10,28 @@ from madoc import simulation
 from madoc.calibration import CalibrationResult
 from madoc.data import Dataset
 from madoc.errors import MadocError, unknown_name
-from madoc.parameters import ParameterSpace
-from madoc.pipeline.calibration_stage import Calibrated
+from madoc.parameters import ParameterDistribution, ParameterSpace
+from madoc.pipeline.calibrated import Calibrated
 from madoc.pipeline.data_stage import load_source, read_truth
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
-from madoc.pipeline.orders import Place, PolicyOrder
+from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder, parse_settings
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
     NormalParameters,
-    ParameterDistribution,
     PolicyProblem,
     UniformParameters,
     learn_policy,
     require_reward,
 )
+from madoc.runs.budget import read_budget
 from madoc.simulation import Simulator
 from madoc.types import entry_of
 
 PLACES: tuple[str, ...] = get_args(Place)
-"""Where a policy may be learnt: at the estimate, over the calibrated distribution, over the whole box, in the
-uncalibrated simulator, in the target itself."""
+"""Where a policy may be learnt, as `PolicyOrder.at` explains."""
 
 
 def learn_in(
@@ -40,20 +39,14 @@ def learn_in(
 ) -> LearnedPolicy:
     """Learn a policy, and leave a run folder with `policy.npz`.
 
-    Args:
-        out: The folder.
-        calibrated: The calibration.
-        order: What to learn, and where; without a truth, the one that the calibration remembers is taken.
-        resume: Go on with the run in the folder.
-        quiet: Show no progress.
+    Without a truth in the order, that of the calibration is taken.
 
     Raises:
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
-    method = make_method(LEARNERS, order.method, order.changes)
+    method = make_method(LEARNERS, order.method, parse_settings(order.set))
     entry = entry_of(method, LEARNERS)
-    if order.budget < 1:
-        raise MadocError(f"expected a budget of at least 1 {entry.unit.removesuffix('s')}, got {order.budget}")
+    budget = read_budget(entry.usual_budget if order.budget is None else order.budget, entry.unit)
     if not entry.needs_parameters and order.at != PLACES[0]:
         raise MadocError(
             f"{order.method} does not learn at given parameters, so --at {order.at} would change nothing; leave it out"
@@ -72,21 +65,21 @@ def learn_in(
         "method": order.method,
         "hyperparameters": hyperparameters(method),
         "seed": order.seed,
-        "budget": order.budget,
+        "budget": budget if isinstance(budget, int) else str(budget),
         "truth": truth,
     } | calibrated.machine.stored()
     with working_folder(out, spec, resume=resume) as folder:
-        # One that an interrupted run left would be taken for the finished policy after a kill.
+        # The policy of an interrupted run would look finished if this run were killed.
         (out / "policy.npz").unlink(missing_ok=True)
         problem = PolicyProblem(simulator, parameters, dataset)
-        return learn_policy(method, problem, key=key, budget=order.budget, folder=folder, resume=resume, quiet=quiet)
+        return learn_policy(method, problem, key=key, budget=budget, folder=folder, resume=resume, quiet=quiet)
 
 
 def policy_folder_name(at: str, method: str) -> str:
-    """`policy-calibrated`, with the method behind it unless that is SAC; `policy-cql` where the place is no matter."""
+    """`policy-calibrated`, with the method unless that is the default; `policy-cql` where it needs no parameters."""
     if not LEARNERS[method].needs_parameters:
         return f"policy-{method}"
-    return f"policy-{at}" if method == "sac" else f"policy-{at}-{method}"
+    return f"policy-{at}" if method == DEFAULT_LEARNER else f"policy-{at}-{method}"
 
 
 def _logged(calibrated: Calibrated, method: str) -> Dataset:
@@ -96,7 +89,7 @@ def _logged(calibrated: Calibrated, method: str) -> Dataset:
             f"{method} learns from logged data, and a bare result names no data; "
             "give it the run folder of the calibration"
         )
-    dataset = load_source(calibrated.source, calibrated.machine, seed=calibrated.seed)
+    dataset = load_source(calibrated.source, calibrated.machine, seed=calibrated.result.seed)
     if dataset.disturbance.hidden_velocities:
         raise MadocError(
             f"{method} learns from whole observations, and {dataset.origin} hides velocities; "

@@ -1,10 +1,10 @@
-"""Methods by name, with some of their hyperparameters changed."""
+"""Methods by name, with changes to their hyperparameters."""
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass, replace
-from typing import Any, NoReturn, TypeVar, get_type_hints
+from functools import partial
+from typing import Any, TypeVar, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -62,30 +62,20 @@ def _types(kind: type, prefix: str = "") -> dict[str, Any]:
 
 
 def _typed(name: str, value: object, hint: Any, method: str) -> object:
-    """A value as the type that a hyperparameter has."""
+    """A value as the type that a hyperparameter has; text is read as JSON, or else as itself."""
+    adapter = TypeAdapter(hint)
+    readings = [partial(adapter.validate_python, value)]
+    if isinstance(value, str):
+        readings.insert(0, partial(adapter.validate_json, value))
     refusal: ValidationError | None = None
-    for candidate in _readings(value):
+    for read in readings:
         try:
-            typed: object = TypeAdapter(hint).validate_python(candidate)
+            typed: object = read()
         except ValidationError as error:
-            refusal = refusal or error
+            refusal = error
             continue
         if isinstance(typed, float) and not math.isfinite(typed):
             raise MadocError(f"hyperparameter {name} of {method} must be finite, got {value!r}")
         return typed
     what = hint.__name__ if isinstance(hint, type) else str(hint).removeprefix("typing.")
     raise MadocError(f"hyperparameter {name} of {method} is {what}, got {value!r}") from refusal
-
-
-def _readings(value: object) -> list[object]:
-    """What a value may mean, in the order of trial: text is the JSON that it holds, or itself."""
-    if not isinstance(value, str):
-        return [value]
-    try:
-        return [json.loads(value, parse_constant=_no_constant), value]
-    except ValueError:
-        return [value]
-
-
-def _no_constant(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a finite number")

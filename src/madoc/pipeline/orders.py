@@ -1,4 +1,4 @@
-"""What the stages can be asked: every option is declared here once, with its default and its help text.
+"""The orders of the stages: every option is declared here once, with its default and its help text.
 
 The command line reads these classes, and the stages carry them out. Nothing heavy is imported, so `--help` is quick.
 """
@@ -19,6 +19,9 @@ Physics = Literal["legacy", "modern"]
 Place = Literal["calibrated", "distribution", "uniform", "midrange", "truth"]
 Settings = UseAppendAction[tuple[tuple[str, ...], ...]]
 """Hyperparameters as texts: `--set a=1 b=2 --set c=3` is `(("a=1", "b=2"), ("c=3",))`."""
+
+DEFAULT_LEARNER = "fast-sac"
+"""Name of the policy learner that is used by default."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +49,6 @@ class Source:
     def __post_init__(self) -> None:
         if not self.paths:
             raise MadocError("expected the log after --data, got nothing; name a file or a folder")
-
-    @property
-    def words(self) -> str:
-        """The paths as a sentence has them."""
-        return ", ".join(self.paths)
 
     def absolute(self) -> "Source":
         """The source that means the same from any working directory; the id of a Minari dataset stays what it is."""
@@ -83,17 +81,13 @@ class Search:
 
     @property
     def changes(self) -> dict[str, str]:
-        """Hyperparameters that differ from the method's own, by name.
-
-        Raises:
-            MadocError: One is not `name=value`, or is given twice.
-        """
+        """Hyperparameters that differ from the method's defaults, as `parse_settings` reads them."""
         return parse_settings(self.set, starts=self.starts)
 
 
 @dataclass(frozen=True)
 class CalibrationOrder:
-    """What a calibration is asked."""
+    """Options of a calibration."""
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
@@ -107,7 +101,7 @@ class CalibrationOrder:
 
 @dataclass(frozen=True)
 class SelftestOrder:
-    """What a selftest is asked."""
+    """Options of a selftest."""
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
@@ -119,7 +113,7 @@ class SelftestOrder:
 
 @dataclass(frozen=True)
 class CheckOrder:
-    """What a check of logs is asked."""
+    """Options of a check of logs."""
 
     spec: Annotated[Positional[Path], arg(metavar="SPEC")]
     """The spec file of the robot, as robot.yaml."""
@@ -139,7 +133,7 @@ class CheckOrder:
 
 @dataclass(frozen=True)
 class RecordOrder:
-    """What a recording is asked."""
+    """Options of a recording."""
 
     name: Annotated[Positional[str], arg(metavar="TASK-QUALITY")]
     """TASK-QUALITY: hopper-medium, halfcheetah-medium-replay, walker2d-neorl-high, ..."""
@@ -156,31 +150,27 @@ class RecordOrder:
 
 @dataclass(frozen=True)
 class PolicyOrder:
-    """What a policy learner is asked."""
+    """Options of a policy learner."""
 
-    method: str = "sac"
+    method: str = DEFAULT_LEARNER
     """A policy learner, as `madoc methods` lists it; some need the run's data."""
     at: Place = "calibrated"
     """The parameters to learn at: the estimate; draws from the calibrated distribution, or from the whole box, anew
     every epoch; or a yardstick: mid-range, or the truth, which only an evaluation knows."""
     set: Settings = ()
     """Hyperparameters of the method as name=value."""
-    budget: int = 300_000
-    """Simulated control steps, or updates of a learner that does not simulate, as `madoc methods` says."""
+    budget: int | str | None = None
+    """Simulated control steps, or updates of a learner that does not simulate, as `madoc methods` says; or a time, as
+    300s or 15min. Default: 2400000 for fast-sac and rlpd, else 300000."""
     seed: int = 0
     """Of all randomness."""
     truth: Path | None = None
     """JSON file {parameter: value}, for --at truth. Default: what the run remembers."""
 
-    @property
-    def changes(self) -> dict[str, str]:
-        """Hyperparameters that differ from the method's own, by name."""
-        return parse_settings(self.set)
-
 
 @dataclass(frozen=True)
 class EvaluationOrder:
-    """What an evaluation of policies is asked."""
+    """Options of an evaluation of policies."""
 
     episodes: int = 20
     """Episodes for each policy, from the same starts."""
@@ -192,7 +182,7 @@ class EvaluationOrder:
 
 @dataclass(frozen=True)
 class RunOrder:
-    """What the whole job is asked: to record or load, calibrate, learn and evaluate."""
+    """Options of a whole run: to record or load, calibrate, learn and evaluate."""
 
     name: Annotated[Positional[str], arg(metavar="TASK-QUALITY")]
     """TASK-QUALITY to record, as hopper-medium; with --data the name of the robot is enough."""
@@ -204,12 +194,13 @@ class RunOrder:
     search: OmitArgPrefixes[Search] = field(default_factory=lambda: Search(method="madoc", budget=300_000))
     truth: Path | None = None
     """JSON file {parameter: value} to judge by; no method ever sees it. Default: the data's, if it has any."""
-    learner: str = "sac"
+    learner: str = DEFAULT_LEARNER
     """A policy learner, as `madoc methods` lists it."""
     policy_set: Settings = ()
     """Hyperparameters of the learner as name=value."""
-    policy_budget: int = 300_000
-    """Simulated control steps for each policy, or updates of a learner that does not simulate."""
+    policy_budget: int | str | None = None
+    """Simulated control steps for each policy, or updates of a learner that does not simulate; or a time, as 300s.
+    Default: 2400000 for fast-sac and rlpd, else 300000."""
     yardsticks: bool = True
     """Learn also a policy at mid-range and one at the truth."""
     episodes: int = 20

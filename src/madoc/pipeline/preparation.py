@@ -1,4 +1,4 @@
-"""From an order to what a calibration needs: the data, the robot, the problem, and what results are judged on."""
+"""Preparation of a calibration: the robot, the data, the problem, and what results are judged on."""
 
 import warnings
 from dataclasses import asdict, dataclass, replace
@@ -12,35 +12,34 @@ from madoc.data.split import hold_out
 from madoc.diagnosis import check, refuse_fatal
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.data_stage import Machine, fingerprint, load_source, read_truth
-from madoc.pipeline.folders import stored_path
 from madoc.pipeline.keys import seed_key, stage_key
 from madoc.pipeline.orders import AUTO, CalibrationOrder
-from madoc.pipeline.records import DataRecord
+from madoc.report.records import DataRecord, stored_path
 from madoc.simulation import Simulator
 from madoc.tasks import Task
 from madoc.verdict import Bench
 
 HOLDOUT = 0.2
-"""Share of the rows that `auto` holds out unless told otherwise, as cross-validation in five folds does."""
+"""Share of the rows that `auto` holds out by default, as in five-fold cross-validation."""
 BUDGET = 300_000
-"""Control steps of one method, unless told otherwise."""
+"""Control steps of one method by default."""
 AUTO_BUDGET = 600_000
-"""Control steps of all of `auto`'s candidates together, unless told otherwise."""
+"""Control steps of all candidates of `auto` together by default."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """What an order comes to.
+    """An order with its defaults resolved, its data and its robot.
 
     Attributes:
         order: What was asked.
         method: Name of the calibrator, or `auto`.
         budget: Simulated control steps.
         holdout: Share of the rows that no method sees; None where nothing is judged.
-        machine: The robot before any choice of the order.
+        machine: The robot with all of its parameters at their normal ranges.
         dataset: All rows.
-        simulator: Of the robot as the order wants it.
-        truth: The target's physical values by name, as the order or the data has them.
+        simulator: Simulator of the parameters, ranges and physics that the order names.
+        truth: True values by name, from the order or else from the data.
     """
 
     order: CalibrationOrder
@@ -76,7 +75,7 @@ class Prepared:
         return None if self.truth is None else {name: self.truth[name] for name in names}
 
     def spec(self, out: Path) -> dict[str, object]:
-        """What the `spec.json` of the run folder `out` keeps; `records.SpecRecord` reads it."""
+        """What the `spec.json` of the run folder `out` keeps; `SpecRecord` reads it."""
         search, source, task = self.order.search, self.order.source, self.simulator.task
         files = {path: Path(path).expanduser() for path in source.paths}
         stored = DataRecord(
@@ -105,16 +104,12 @@ class Prepared:
 
 
 def method_of(order: CalibrationOrder) -> str:
-    """The calibrator that an order means: `auto` for a robot of one's own, else `madoc`, unless it names one."""
+    """The calibrator of an order; by default `auto` for a user's own robot, else `madoc`."""
     return order.search.method or (AUTO if robots.is_spec_path(order.task) else "madoc")
 
 
 def check_order(order: CalibrationOrder, out: Path | None = None) -> None:
-    """Refuse what can be refused without looking at the data.
-
-    Args:
-        order: What is asked.
-        out: The run folder; a run's files must not come to lie among the logs, which they would hide.
+    """Refuse what can be refused without reading the data, such as a run folder `out` that holds the logs.
 
     Raises:
         MadocError: The seed, the budget or the share held out is impossible, or the folder holds the logs.
@@ -134,7 +129,7 @@ def check_order(order: CalibrationOrder, out: Path | None = None) -> None:
 
 
 def prepare(order: CalibrationOrder) -> Prepared:
-    """Read the data and the robot of an order, and check the logs of a robot of one's own.
+    """Read the robot and the data of an order, and check the logs of a user's own robot.
 
     Raises:
         MadocError: The robot, the data or the truth is refused, or the check finds the data to be useless.
@@ -156,7 +151,7 @@ def prepare(order: CalibrationOrder) -> Prepared:
 
 
 def _read(order: CalibrationOrder) -> tuple[Machine, Dataset, Task]:
-    """The robot, its data, and the task as the order wants it searched."""
+    """The robot, its data, and the task with the parameters and ranges that are calibrated."""
     search = order.search
     machine = Machine.named(order.task, search.physics)
     for name in search.parameters:
@@ -169,7 +164,7 @@ def _read(order: CalibrationOrder) -> tuple[Machine, Dataset, Task]:
     task = observed_task(machine.task.with_level(search.level), dataset)
     if recorded is not None and recorded != task.physics:
         warnings.warn(
-            f"{order.source.words} was recorded in {recorded} physics and is calibrated in {task.physics}: "
+            f"{', '.join(order.source.paths)} was recorded in {recorded} physics and is calibrated in {task.physics}: "
             "the estimate will make up for the difference; leave out --physics to take the data's",
             stacklevel=2,
         )

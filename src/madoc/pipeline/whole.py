@@ -1,4 +1,4 @@
-"""The main job from one call: data, calibration, policies, evaluation, each stage skipped where it is done."""
+"""All stages in one call: data, calibration, policies, evaluation; a stage that has ended is skipped."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -6,7 +6,8 @@ from pathlib import Path
 from madoc import data
 from madoc.calibration import CALIBRATORS, CalibrationResult
 from madoc.errors import MadocError
-from madoc.pipeline.calibration_stage import Calibrated, calibrate_in, calibration_ended, read_calibration
+from madoc.pipeline.calibrated import Calibrated, calibration_ended, read_calibration
+from madoc.pipeline.calibration_stage import calibrate_in
 from madoc.pipeline.data_stage import Machine, load_source, read_truth, record_named, split_name
 from madoc.pipeline.evaluation_stage import evaluate_folder
 from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
@@ -23,21 +24,22 @@ from madoc.pipeline.orders import (
     Source,
     parse_settings,
 )
-from madoc.pipeline.records import Summary, read_record
 from madoc.policies import LEARNERS, require_reward
+from madoc.report.records import Summary, read_object, read_record
+from madoc.runs.budget import read_budget
 from madoc.runs.files import read_json
+from madoc.types import entry_of
 
 
 def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = False) -> Summary:
-    """Do the main job, and leave a folder with all of it.
+    """Do all stages, and leave a folder with their files.
 
     The folder holds `data.npz`, the run folders `calibration`, `policy-calibrated`, `policy-midrange` and
     `policy-truth`, `evaluation.json` and `summary.json`. Killed at any moment and resumed, the summary is the
     same but for its seconds.
 
     Returns:
-        The summary. Its `status` is `finished`; or that of the stage that was interrupted or diverged, and then
-        it has what there was until that stage.
+        The summary. Its `status` is `finished`, or that of the stage that was interrupted or diverged.
 
     Raises:
         MadocError: The order cannot be carried out.
@@ -78,14 +80,13 @@ def _source(order: RunOrder) -> Source:
 
 
 def _spec(order: RunOrder, machine: Machine) -> dict[str, object]:
-    """The order as `spec.json` keeps it, refused here if any stage would refuse it."""
+    """The order as JSON for `spec.json`; it is refused here already if a later stage would refuse it."""
     require_reward(machine.task)
     if order.data is None and not split_name(order.name)[1]:
         raise MadocError(f"expected TASK-QUALITY to record, as {order.name}-medium, or --data FILE to load")
     for what, value in {
         "transition": order.transitions,
         "control step of budget": order.search.budget,
-        "control step of policy budget": order.policy_budget,
         "episode": order.episodes,
     }.items():
         if value is not None and value < 1:
@@ -93,6 +94,8 @@ def _spec(order: RunOrder, machine: Machine) -> dict[str, object]:
     seed_key(order.search.seed)
     calibrator = make_method(CALIBRATORS, order.search.method or "madoc", order.search.changes)
     learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
+    if order.policy_budget is not None:
+        read_budget(order.policy_budget, entry_of(learner, LEARNERS).unit)
     resolved = {
         "command": "run",
         "truth": read_truth(order.truth),
@@ -128,7 +131,7 @@ def _learn(order: RunOrder, calibrated: Calibrated, at: Place, folder: Path, *, 
     if not ended(folder, "policy.npz"):
         asked = PolicyOrder(order.learner, at, order.policy_set, order.policy_budget, order.search.seed)
         learn_in(folder, calibrated, asked, resume=holds_run(folder), quiet=quiet)
-    return read_record(dict[str, object], folder / "result.json")
+    return read_object(folder / "result.json")
 
 
 def _beginning(order: RunOrder, calibrated: Calibrated) -> Summary:

@@ -16,7 +16,7 @@ from madoc.types import Count, Epoch, Layers, NotNegative, check_hyperparameters
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class BCState:
-    """Everything cloning carries."""
+    """The state of behaviour cloning."""
 
     clone: Clone
     key: PRNGKeyArray
@@ -24,7 +24,7 @@ class BCState:
 
 @dataclass(frozen=True)
 class BC:
-    """Behaviour cloning: maximises the likelihood of the data's actions; acts with the mean.
+    """Behaviour cloning: the policy of the largest likelihood of the data's actions, which acts with its mean.
 
     Attributes:
         hidden: Units per layer.

@@ -18,7 +18,7 @@ from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hy
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CQLState:
-    """Everything CQL carries."""
+    """The state of CQL."""
 
     learner: ActorCritic
     key: PRNGKeyArray
@@ -40,7 +40,7 @@ class CQL:
         cloning_updates: In the first updates the policy clones instead of climbing values that mean nothing yet. The
             authors' 40 000 are of 3 million updates; these of 300 000, in which the temperature has not fallen yet:
             their entropy term is left out here, it would pull the clone from the data.
-        epoch_updates: Gradient updates per `step`. With the default networks one costs about as much as 20 of SAC's.
+        epoch_updates: Gradient updates per epoch. With the default networks one costs about as much as 20 of SAC's.
         batch: Rows per update.
         discount: γ.
         target_rate: τ of the target critics.
@@ -87,9 +87,8 @@ class CQL:
         of_update, key = jax.random.split(state.key)
         clones = state.updates < self.cloning_updates
         learner, metrics = self._update(state.learner, problem.logged, of_update, clones, self.epoch_updates)
-        stage = "cloning" if clones else "learning"
-        following = CQLState(learner, key, state.updates + self.epoch_updates)
-        return following, Epoch(scalars(metrics), updates=self.epoch_updates, stage=stage)
+        epoch = Epoch(scalars(metrics), updates=self.epoch_updates, stage="cloning" if clones else "learning")
+        return CQLState(learner, key, state.updates + epoch.updates), epoch
 
     @eqx.filter_jit
     def _update(

@@ -15,23 +15,19 @@ from madoc.runs.files import replacing
 
 
 def save_policy(policy: TanhGaussianPolicy, path: str | Path, *, task_name: str) -> None:
-    """Write a policy, whole or not at all."""
-    with replacing(Path(path)) as stream:
-        np.savez(stream, allow_pickle=False, **_arrays(policy, task_name))
-
-
-def _arrays(policy: TanhGaussianPolicy, task_name: str) -> dict[str, np.ndarray]:
-    """A policy as named arrays, float32, matrices (inputs, outputs)."""
+    """Write a policy as float32 arrays, with matrices of shape (inputs, outputs), whole or not at all."""
     layers = policy.network.layers
     arrays: dict[str, np.ndarray] = {"about": np.array(json.dumps({"task": task_name, "layers": len(layers)}))}
     for index, layer in enumerate(layers):
         arrays[f"weight_{index}"] = np.asarray(layer.weight.T)
         arrays[f"bias_{index}"] = np.asarray(layer.bias)
-    return arrays | {"offset": np.asarray(policy.offset), "scale": np.asarray(policy.scale)}
+    arrays |= {"offset": np.asarray(policy.offset), "scale": np.asarray(policy.scale)}
+    with replacing(Path(path)) as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
 
 
 def load_policy(path: str | Path) -> TanhGaussianPolicy:
-    """Read a policy to act, sample, or go on learning with.
+    """Read a policy.
 
     Raises:
         MadocError: The file is missing or is not a policy that Madoc saved.

@@ -26,7 +26,7 @@ from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hy
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Learning:
-    """What gradient updates change."""
+    """The part of the state that gradient updates change."""
 
     learner: ActorCritic
     discriminators: Discriminators
@@ -36,7 +36,7 @@ class Learning:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class H2OState:
-    """Everything H2O carries."""
+    """The state of H2O."""
 
     learning: Learning
     interaction: Interaction
@@ -53,9 +53,9 @@ class H2O:
     of the spread.
 
     Attributes:
-        hidden: Units per layer of policy, critics and discriminators.
-        environments: Rows acting at a time, spread evenly over the systems.
-        epoch_steps: Control steps per `step`.
+        hidden: Numbers of units of the hidden layers of policy, critics and discriminators.
+        environments: Number of episodes simulated at a time, spread evenly over the systems.
+        epoch_steps: Control steps per epoch.
         updates_per_step: Gradient updates per control step.
         warmup_steps: Control steps with uniform random actions before the first update.
         batch: Rows per update, logged and simulated in equal numbers.

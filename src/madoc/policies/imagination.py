@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -15,47 +16,16 @@ from madoc.learning.networks import Network
 from madoc.types import Policy
 
 LARGEST_CHANGE = 10.0
-"""A sampled change of an observation is cut there, in units of its spread."""
+"""Largest change of an observation in one step, in standard deviations of the change; larger samples are clipped."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ImaginedRows:
-    """Imagined rows under way: where they stand, and for how many steps they have been imagined."""
+    """The observations of imagined rows, and their ages in steps."""
 
     observation: Float[Array, "rows observation"]
     age: Int[Array, " rows"]
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Filter:
-    """Which of the sampled transitions are believed (Luo et al. 2024, section 4).
-
-    Attributes:
-        elites: The models that may be sampled from.
-        past: The dynamics reward's discriminators.
-    """
-
-    elites: Int[Array, " elites"]
-    past: Network
-
-
-@dataclass(frozen=True)
-class Imagination:
-    """Settings of imagined rollouts.
-
-    Attributes:
-        samples: Next states drawn from each elite; the one of the highest dynamics reward is kept.
-        threshold: A row whose best dynamics reward is below ends there, as if it had fallen.
-        horizon: Steps after which a row starts again.
-        penalty: λ of MOPO, for each unit of the models' uncertainty.
-    """
-
-    samples: int
-    threshold: float
-    horizon: int
-    penalty: float
 
 
 def start_imagining(logged: Float[Array, "logged observation"], rows: int, key: PRNGKeyArray) -> ImaginedRows:
@@ -72,25 +42,49 @@ def best_candidate(
     return candidates[best, rows], rewards[best, rows]
 
 
+@eqx.filter_jit
 def imagine(
     ensemble: Ensemble,
-    believed: Filter,
+    elites: Int[Array, " elites"],
+    past: Network,
     features: Features,
     policy: Policy,
     under_way: ImaginedRows,
     *,
     logged: Float[Array, "logged observation"],
     terminated: Callable[[Array], Bool[Array, " rows"]],
-    settings: Imagination,
+    state_of: Callable[[Array], Array],
+    samples: int,
+    threshold: float,
+    horizon: int,
+    penalty: float,
     steps: int,
     key: PRNGKeyArray,
 ) -> tuple[ImaginedRows, Batch, dict[str, Array]]:
-    """Act for `steps` steps in every row; rows that end start again at logged observations.
+    """Act for `steps` steps in every row; rows that end restart at logged observations.
 
-    Observations stay within the logged ones' range, widened by its width on either side.
+    Of the next states drawn from the models, the one with the highest dynamics reward is kept (Luo et al. 2024, section
+    4). Observations are clipped to the range of the logged ones, widened by its width on either side.
+
+    Args:
+        ensemble: The dynamics models.
+        elites: Indices of the models to sample from.
+        past: The discriminators of the dynamics reward.
+        features: The standardisation of the data.
+        policy: The policy that acts.
+        under_way: The rows.
+        logged: Observations to restart at.
+        terminated: Whether the task ends at a state.
+        state_of: The state at an observation.
+        samples: Number of next states drawn from each elite.
+        threshold: A row whose best dynamics reward is below ends there, as if it had fallen.
+        horizon: Number of steps after which a row restarts.
+        penalty: λ of MOPO, the weight of the models' uncertainty in the reward.
+        steps: Number of steps.
+        key: Randomness.
 
     Returns:
-        Where the rows stand, the imagined rows flat in time and row, and how they went.
+        The rows after the last step, the transitions flat in time and row, and metrics.
     """
     low, high = logged.min(0), logged.max(0)
     low, high = low - (high - low), high + (high - low)
@@ -101,36 +95,36 @@ def imagine(
         action = policy(observation, of_action)
         pair = features.pair(observation, action)
         mean, std = ensemble(pair)
-        elite_mean, elite_std = mean[believed.elites], std[believed.elites]
-        shape = (settings.samples, *elite_mean.shape)
+        elite_mean, elite_std = mean[elites], std[elites]
+        shape = (samples, *elite_mean.shape)
         noise = jax.random.normal(of_sample, shape)
         drawn = jnp.broadcast_to(elite_mean, shape) + jnp.broadcast_to(elite_std, shape) * noise
         candidates = drawn.reshape(-1, *elite_mean.shape[1:])
         change = jnp.clip(candidates[..., :-1], -LARGEST_CHANGE, LARGEST_CHANGE)
         pairs = jnp.broadcast_to(pair, (*change.shape[:2], pair.shape[-1]))
         outcome, reality = best_candidate(
-            jnp.concatenate([change, candidates[..., -1:]], axis=-1), reward_of(believed.past, pairs, change)
+            jnp.concatenate([change, candidates[..., -1:]], axis=-1), reward_of(past, pairs, change)
         )
         following = features.following(observation, outcome[:, :-1])
         following = jnp.clip(following, jnp.broadcast_to(low, following.shape), jnp.broadcast_to(high, following.shape))
-        penalty = uncertainty_penalty(std, features)
+        uncertainty = uncertainty_penalty(std, features)
         reward = features.reward_offset + features.reward_scale * outcome[:, -1]
-        unreal = reality < settings.threshold
-        ends = terminated(following) | unreal
+        unreal = reality < threshold
+        ends = terminated(state_of(following)) | unreal
         row = {
             "observation": observation,
             "action": action,
-            "reward": reward - settings.penalty * penalty,
+            "reward": reward - penalty * uncertainty,
             "next_observation": following,
             "terminated": ends.astype(jnp.float32),
         }
-        again = ends | (under_way.age + 1 >= settings.horizon)
+        again = ends | (under_way.age + 1 >= horizon)
         fresh = _some(logged, len(observation), of_restart)
         state = jnp.where(jnp.broadcast_to(again[:, None], fresh.shape), fresh, following)
         metrics = {
             "dynamics_reward": reality.mean(),
             "stopped": unreal.mean(),
-            "penalty": penalty.mean(),
+            "penalty": uncertainty.mean(),
             "imagined_reward": reward.mean(),
         }
         return ImaginedRows(state, jnp.where(again, 0, under_way.age + 1)), (row, metrics)

@@ -1,4 +1,4 @@
-"""Acting in simulated systems and remembering what came of it: what learners that simulate share."""
+"""Acting in simulated systems and storing the transitions, for all learners that simulate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.learning import replay
+from madoc.learning.moments import Moments
 from madoc.policies.base import PolicyProblem
 from madoc.simulation.rollout import Rollout, Walkers, begin, reset_states, roll
 from madoc.types import Epoch, Policy
@@ -21,9 +22,10 @@ COLUMNS: Sequence[str] = ("observation", "action", "reward", "next_observation",
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Interaction:
-    """What acting carries: what was seen, where the rows stand, and what it has cost."""
+    """The replay buffer, the present state and return of every row, and the control steps and failures so far."""
 
     replay: replay.Replay
+    observed: Moments
     walkers: Walkers
     episode_return: Float[np.ndarray, "systems rows"]
     control_steps: int
@@ -31,37 +33,33 @@ class Interaction:
 
 
 def start_acting(problem: PolicyProblem, key: PRNGKeyArray, *, environments: int, capacity: int) -> Interaction:
-    """An empty replay, and rows at reset states, spread evenly over the systems.
+    """An empty replay buffer, and rows at reset states, spread evenly over the systems.
 
     Raises:
-        MadocError: The environments do not fill the systems.
+        MadocError: The number of environments is not a multiple of that of the systems.
     """
     simulator = problem.simulator
     systems = len(problem.systems(key, environments))
     if environments % systems:
         raise MadocError(f"expected a multiple of {systems} environments for {systems} systems, got {environments}")
     observation, action = (simulator.task.observation_size,), (simulator.action_size,)
-    ring = replay.empty(
-        capacity, observation=observation, action=action, reward=(), next_observation=observation, terminated=()
-    )
+    columns = dict(zip(COLUMNS, (observation, action, (), observation, ()), strict=True))
+    ring = replay.empty(capacity, **columns)
     walkers = begin(reset_states(simulator), key, systems=systems, rows=environments // systems)
-    return Interaction(ring, walkers, np.zeros(walkers.age.shape), 0, 0)
+    return Interaction(ring, Moments.none(simulator.task.observation_size), walkers, np.zeros(walkers.age.shape), 0, 0)
 
 
-def act_on(
+def roll_on(
     problem: PolicyProblem, state: Interaction, policy: Policy, key: PRNGKeyArray, *, control_steps: int
-) -> tuple[Interaction, dict[str, float]]:
-    """Act for so many control steps in all. Where parameters are distributed, all systems are drawn anew first.
+) -> tuple[Rollout, Walkers]:
+    """Act for `control_steps` in all. Where parameters are distributed, all systems are drawn anew first.
 
     A row goes on in its new system from where it stood in the old one, as the paper's own rollouts do when
-    parameters change inside an episode.
-
-    Returns:
-        What is carried now, and the mean return of the episodes that ended, if any did.
+    parameters change inside an episode. The state does not change.
     """
     of_systems, of_action, of_restart = jax.random.split(key, 3)
     simulator = problem.simulator
-    rollout, walkers = roll(
+    return roll(
         simulator.bind(problem.systems(of_systems, state.walkers.age.size)),
         simulator.task,
         policy,
@@ -71,10 +69,19 @@ def act_on(
         key=of_action,
         restart_key=of_restart,
     )
+
+
+def remember(state: Interaction, rollout: Rollout, walkers: Walkers) -> tuple[Interaction, dict[str, float]]:
+    """Add the transitions of a rollout to the replay buffer, whose old arrays are consumed.
+
+    Returns:
+        The interaction, and as metrics the failures and the mean return of the episodes that ended, if any did.
+    """
     rows = {name: replay.flatten_rows(getattr(rollout.transitions, name), 3) for name in COLUMNS}
     finished, episode_return = _episode_returns(rollout, state.episode_return)
     following = Interaction(
         replay.add(state.replay, rows, rollout.valid.reshape(-1)),
+        state.observed.including(rows["observation"].astype(np.float64)),
         walkers,
         episode_return,
         state.control_steps + rollout.valid.size,
@@ -94,21 +101,23 @@ def explore_or_act(
     warmup_steps: int,
     updates_per_step: float,
 ) -> tuple[Interaction, Epoch, int]:
-    """As `act_on`, with uniform random actions until `warmup_steps` control steps have been taken.
+    """Act for `control_steps` in all, and store the transitions; random actions until `warmup_steps` have been taken.
 
     Returns:
-        What is carried now, the epoch so far, and how many updates are due.
+        The interaction, the epoch so far, and how many updates are due.
     """
     explores = state.control_steps < warmup_steps
     acting = UniformPolicy(problem.simulator.action_size) if explores else policy
-    following, metrics = act_on(problem, state, acting, key, control_steps=control_steps)
+    rolled = roll_on(problem, state, acting, key, control_steps=control_steps)
+    following, metrics = remember(state, *rolled)
     taken = following.control_steps - state.control_steps
     due = round(updates_per_step * taken) if following.control_steps >= warmup_steps else 0
-    return following, Epoch(metrics, control_steps=taken, stage="exploring" if explores else "learning"), due
+    stage = "exploring" if explores else "learning"
+    return following, Epoch(metrics, control_steps=taken, updates=due, stage=stage), due
 
 
 class UniformPolicy(eqx.Module):
-    """What explores before the first update: uniform random actions in [-1, 1]; 0 without a key."""
+    """The policy of the exploration before the first update: uniform random actions in [-1, 1]; 0 without a key."""
 
     action_size: int = eqx.field(static=True)
 

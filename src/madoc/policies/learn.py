@@ -1,4 +1,4 @@
-"""Run a policy learner on a problem and hand back its policy."""
+"""Run a policy learner on a problem."""
 
 from dataclasses import dataclass
 
@@ -8,28 +8,20 @@ from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
 from madoc.policies.files import save_policy
 from madoc.policies.registry import LEARNERS
 from madoc.runs import loop
+from madoc.runs.budget import Budget
 from madoc.runs.run_folder import RunFolder
 from madoc.types import Policy, State, Unit, entry_of
 
 
 @dataclass(frozen=True)
 class LearnedPolicy:
-    """A policy and how its learning ended.
-
-    Attributes:
-        policy: Acts; deterministic without a key.
-        status: As `loop.Finished` has it.
-        sentence: The status in words.
-        control_steps: Simulated control steps spent.
-        spent: How much of the budget, in `unit`.
-        unit: What the budget counted: control steps of a learner that simulates, updates of one that does not.
-        seconds: Wall-clock time.
-    """
+    """A policy, and how its learning ended: see `madoc.runs.loop.Finished`; `spent` is counted in `unit`."""
 
     policy: Policy
     status: str
     sentence: str
     control_steps: int
+    updates: int
     spent: int
     unit: Unit
     seconds: float
@@ -40,7 +32,7 @@ def learn_policy(
     problem: PolicyProblem,
     *,
     key: PRNGKeyArray,
-    budget: int,
+    budget: Budget | str,
     folder: RunFolder | None = None,
     resume: bool = False,
     quiet: bool = False,
@@ -48,10 +40,11 @@ def learn_policy(
 ) -> LearnedPolicy:
     """Learn until the budget is spent.
 
-    The budget is simulated control steps for a learner that simulates and gradient updates for one that does not:
-    the entry in `LEARNERS` says which. With one update per control step, a budget means as many updates for either.
+    The budget counts simulated control steps for a learner that simulates and gradient updates for one that does not;
+    its entry in `LEARNERS` says which. At one update per control step, the number of updates is the same for both.
+    Or it is a time: `Seconds(300)`, or `300s` or `5min` as text.
 
-    With a folder, `policy.npz` is left there: `madoc.numpy_policy` acts from it without JAX.
+    With a folder, the policy is saved there as `policy.npz`, which `madoc.numpy_policy` reads without JAX.
 
     Raises:
         MadocError: The robot has no reward, the method refuses the problem, or `loop.run` refuses.
@@ -74,12 +67,6 @@ def learn_policy(
     policy = method.policy(finished.state)
     if folder is not None:
         save_policy(policy, folder.path / "policy.npz", task_name=problem.simulator.task.name)
-    return LearnedPolicy(
-        policy,
-        finished.status,
-        finished.sentence,
-        finished.control_steps,
-        finished.spent,
-        entry.unit,
-        round(finished.seconds, 3),
-    )
+    seconds = round(finished.seconds, 3)
+    counts = finished.control_steps, finished.updates, finished.spent, entry.unit, seconds
+    return LearnedPolicy(policy, finished.status, finished.sentence, *counts)

@@ -1,6 +1,5 @@
 """MOREC: SAC in a learnt model, of whose transitions only those that look real are kept (arXiv 2310.05422)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -19,24 +18,20 @@ from madoc.learning.features import Features
 from madoc.learning.networks import adam, scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.imagination import Filter, Imagination, ImaginedRows, imagine, start_imagining
+from madoc.policies.imagination import ImaginedRows, imagine, start_imagining
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MORECState:
-    """Everything MOREC carries.
+    """The state of MOREC.
 
     Attributes:
-        ensemble: The dynamics models.
-        ensemble_optimiser: State of their optimiser.
-        elites: Those of the smallest error on held-out rows.
-        opposition: What becomes the dynamics reward.
-        learner: SAC.
-        replay: Imagined rows.
-        under_way: Imagined rows and where they stand.
-        key: The random key.
+        elites: Indices of the models of the smallest error on held-out rows.
+        opposition: Generator and discriminators; the past discriminators make up the dynamics reward.
+        replay: Imagined transitions.
+        under_way: Imagined rows in progress.
         preparing: Updates of models and discriminators so far.
     """
 
@@ -66,7 +61,7 @@ class MOREC:
     policy and critics see standardised observations.
 
     Attributes:
-        hidden: Units per layer of policy and critics.
+        hidden: Numbers of units of the hidden layers of policy and critics.
         model_hidden: Units per layer of a dynamics model.
         models: Dynamics models.
         elites: How many of them are sampled from.
@@ -74,8 +69,8 @@ class MOREC:
         discriminator_hidden: Units per layer of a discriminator.
         discriminators: Past discriminators that make up the dynamics reward; one is kept every `epoch_updates`.
         discriminator_updates: Updates of generator and discriminator, after the models'. Chosen, not the authors'.
-        noise: On next states that discriminators see while they learn, in units of a step's change. Chosen.
-        samples: Candidates from each elite.
+        noise: Standard deviation of the noise on the discriminators' inputs, in units of a step's change. Chosen.
+        samples: Next states drawn from each elite.
         threshold: An imagined row whose best dynamics reward is below ends there.
         horizon: Longest imagined rollout, in control steps.
         penalty: λ of MOPO, on rewards and state changes in their units. The authors chose it by dataset: 15 for Hopper
@@ -83,8 +78,8 @@ class MOREC:
         real: Share of logged rows in a batch.
         imagined_per_update: Imagined transitions for each update of the policy.
         imagined_rows: Rows imagined at a time.
-        epoch_updates: Gradient updates per `step`.
-        holdout_every: Every so-manieth logged row is kept from the models, to choose the elites by.
+        epoch_updates: Gradient updates per epoch.
+        holdout_every: The elites are chosen on every `holdout_every`-th logged row, which the models do not see.
         batch: Rows per update.
         discount: γ.
         target_rate: τ of the target critics.
@@ -164,7 +159,7 @@ class MOREC:
         )
 
     def step(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, Epoch]:
-        """`epoch_updates` updates of the models, of the discriminators, or of the policy."""
+        """One epoch: `epoch_updates` updates of the models, of the discriminators, or of the policy."""
         key, following = jax.random.split(state.key)
         stages = {"fitting": self._fit, "opposing": self._oppose, "learning": self._learn}
         stage = self._stage(state)
@@ -176,13 +171,13 @@ class MOREC:
         return state, Epoch(scalars(metrics), stage=stage, fraction=prepared)
 
     def _stage(self, state: MORECState) -> str:
-        """What the next epoch does."""
-        if state.preparing < self.model_updates:
-            return "fitting"
-        return "opposing" if state.preparing < self.model_updates + self.discriminator_updates else "learning"
+        """The stage of the next epoch."""
+        if state.preparing >= self.model_updates + self.discriminator_updates:
+            return "learning"
+        return "fitting" if state.preparing < self.model_updates else "opposing"
 
     def _fit(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
-        """Fit the models, and rank them."""
+        """Fit the models, and choose the elites."""
         ensemble, optimiser, elites, metrics = self._update_models(
             state.ensemble, state.ensemble_optimiser, problem.logged, problem.features, state.key
         )
@@ -238,46 +233,26 @@ class MOREC:
         of_imagination, of_updates = jax.random.split(state.key)
         task = problem.simulator.task
         assert task.state_from_observation is not None
-        believed = Filter(state.elites, state.opposition.past)
-        under_way, rows, imagined = self._imagine(
-            (task.terminated, task.state_from_observation),
+        under_way, rows, imagined = imagine(
             state.ensemble,
-            believed,
+            state.elites,
+            state.opposition.past,
             problem.features,
             state.learner.policy,
             state.under_way,
-            problem.logged["observation"],
-            of_imagination,
+            logged=problem.logged["observation"],
+            terminated=task.terminated,
+            state_of=task.state_from_observation,
+            samples=self.samples,
+            threshold=self.threshold,
+            horizon=self.horizon,
+            penalty=self.penalty,
+            steps=-(-self.epoch_updates * self.imagined_per_update // self.imagined_rows),
+            key=of_imagination,
         )
         seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
         learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
         return replace(state, learner=learner, replay=seen, under_way=under_way), imagined | metrics
-
-    @eqx.filter_jit
-    def _imagine(
-        self,
-        ends: tuple[Callable, Callable],
-        ensemble: Ensemble,
-        believed: Filter,
-        features: Features,
-        policy: TanhGaussianPolicy,
-        under_way: ImaginedRows,
-        logged: Array,
-        key: PRNGKeyArray,
-    ) -> tuple[ImaginedRows, Batch, dict[str, Array]]:
-        terminated, to_state = ends
-        return imagine(
-            ensemble,
-            believed,
-            features,
-            policy,
-            under_way,
-            logged=logged,
-            terminated=lambda observation: terminated(to_state(observation)),
-            settings=Imagination(self.samples, self.threshold, self.horizon, self.penalty),
-            steps=-(-self.epoch_updates * self.imagined_per_update // self.imagined_rows),
-            key=key,
-        )
 
     @eqx.filter_jit
     def _update_policy(

@@ -5,6 +5,7 @@ from functools import partial
 from madoc.policies.base import PolicyLearner
 from madoc.policies.bc import BC
 from madoc.policies.cql import CQL
+from madoc.policies.fast_sac import FastSAC
 from madoc.policies.h2o import H2O
 from madoc.policies.morec import MOREC
 from madoc.policies.sac import SAC
@@ -13,7 +14,10 @@ from madoc.types import MethodEntry
 CLONING = {"cloning": 2.5}
 """SAC+BC's weight of SAC's loss beside the cloning error: TD3+BC's."""
 
-_sac = partial(MethodEntry[PolicyLearner], kind=SAC, shown=("return_in_simulator", "temperature"))
+SAC_SHOWN = ("return_in_simulator", "temperature")
+
+_sac = partial(MethodEntry[PolicyLearner], kind=SAC, shown=SAC_SHOWN)
+_fast_sac = partial(MethodEntry[PolicyLearner], kind=FastSAC, shown=SAC_SHOWN, usual_budget=2_400_000)
 _offline = partial(MethodEntry[PolicyLearner], unit="updates", simulates=False, needs_parameters=False)
 
 _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
@@ -24,12 +28,35 @@ _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
         year=2018,
         needs_data=False,
     ),
+    _fast_sac(
+        name="fast-sac",
+        summary="SAC for cheap simulation",
+        paper="Li et al., PQL",
+        year=2023,
+        needs_data=False,
+    ),
+    _fast_sac(
+        name="rlpd",
+        summary="fast-sac, half of each batch logged",
+        paper="Ball et al., RLPD",
+        year=2023,
+        settings={"logged_share": 0.5},
+    ),
     _sac(
         name="sac-bc",
         summary="SAC, cloning the data's actions too",
         paper="Jiang et al., Madoc",
         year=2024,
         settings=CLONING,
+    ),
+    _sac(
+        name="dr",
+        summary="SAC over the whole box",
+        paper="Tobin et al., randomization",
+        year=2017,
+        settings={"randomize": True},
+        needs_data=False,
+        needs_parameters=False,
     ),
     _sac(
         name="dr-bc",

@@ -7,7 +7,6 @@ import jax
 from jaxtyping import Array, PRNGKeyArray
 
 from madoc.errors import MadocError
-from madoc.evaluation import evaluate
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
 from madoc.learning.networks import scalars, scan_updates
@@ -15,6 +14,7 @@ from madoc.learning.sac_losses import cloned_actor_loss, cloning_error
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, explore_or_act, start_acting
+from madoc.policies.judging import Judged, judge
 from madoc.policies.systems import UniformParameters
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
@@ -22,19 +22,17 @@ from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hy
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SACState:
-    """Everything SAC carries.
+    """The state of SAC.
 
     Attributes:
-        best: The policy that did best when judged.
-        best_return: Its mean return then.
-        judged: Control steps of learning at the last judgement; 0 before the first.
+        best: The policy with the highest mean return so far.
+        best_return: Its mean return.
+        judged: Control steps of learning at the last evaluation; 0 before the first.
     """
 
     learner: ActorCritic
     interaction: Interaction
-    best: TanhGaussianPolicy
-    best_return: float
-    judged: int
+    judged: Judged
     key: PRNGKeyArray
 
 
@@ -43,9 +41,9 @@ class SAC:
     """Soft actor-critic with twin critics and a learnt temperature, in many environments at a time.
 
     Attributes:
-        hidden: Units per layer of policy and critics.
-        environments: Rows acting at a time, spread evenly over the systems.
-        epoch_steps: Control steps per `step`.
+        hidden: Numbers of units of the hidden layers of policy and critics.
+        environments: Number of episodes simulated at a time, spread evenly over the systems.
+        epoch_steps: Control steps per epoch.
         updates_per_step: Gradient updates per control step.
         warmup_steps: Control steps with uniform random actions before the first update.
         batch: Rows per update.
@@ -101,7 +99,7 @@ class SAC:
         interaction = start_acting(
             self._place(problem), of_start, environments=self.environments, capacity=self.replay_capacity
         )
-        return SACState(learner, interaction, learner.policy, 0.0, 0, key)
+        return SACState(learner, interaction, Judged.none(learner.policy), key)
 
     def step(self, problem: PolicyProblem, state: SACState) -> tuple[SACState, Epoch]:
         """Act for `epoch_steps` control steps, then update, then judge the policy where that is due."""
@@ -121,24 +119,14 @@ class SAC:
             learner, losses = self._update(learner, interaction.replay, logged, of_update, due)
             epoch = replace(epoch, metrics=epoch.metrics | scalars(losses))
         following = replace(state, learner=learner, interaction=interaction, key=key)
-        judges = self.judge_every and interaction.control_steps >= state.judged + self.judge_every
+        judges = self.judge_every and interaction.control_steps >= state.judged.last + self.judge_every
         if judges and learner is not state.learner:
-            following, mean_return, spent = self._judge(problem, following, of_judging)
-            metrics = epoch.metrics | {"judged_return": mean_return}
-            epoch = replace(epoch, metrics=metrics, control_steps=epoch.control_steps + spent, unbudgeted=spent)
+            place, spent = self._place(problem), interaction.control_steps
+            judged, epoch = judge(
+                place, learner.policy, state.judged, epoch, of_judging, episodes=self.judge_episodes, spent=spent
+            )
+            following = replace(following, judged=judged)
         return following, epoch
-
-    def _judge(self, problem: PolicyProblem, state: SACState, key: PRNGKeyArray) -> tuple[SACState, float, int]:
-        """Keep the policy if no earlier one's mean return was as high; also that return, and the control steps."""
-        of_systems, of_episodes = jax.random.split(key)
-        systems = self._place(problem).systems(of_systems, self.judge_episodes)
-        evaluation = evaluate(
-            state.learner.policy, problem.simulator, systems, key=of_episodes, episodes=self.judge_episodes
-        )
-        mean = float(evaluation.returns.mean())
-        if not state.judged or mean > state.best_return:
-            state = replace(state, best=state.learner.policy, best_return=mean)
-        return replace(state, judged=state.interaction.control_steps), mean, int(evaluation.lengths.sum())
 
     @eqx.filter_jit
     def _update(
@@ -175,4 +163,4 @@ class SAC:
 
     def policy(self, state: SACState) -> TanhGaussianPolicy:
         """The best policy so far, the latest where none was judged; deterministic without a key."""
-        return state.best if state.judged else state.learner.policy
+        return state.judged.best if state.judged.last else state.learner.policy

@@ -1,6 +1,8 @@
-"""A run folder as a page to look at: it reads folders only, and knows no method by name."""
+"""A run folder as a page to look at; it reads folders only, and knows no method by name.
 
-from madoc.report.comparison import write_comparison
-from madoc.report.page import write_report
+The names are in `__init__.pyi`; each is imported when it is first used, as the records are wanted without the page.
+"""
 
-__all__ = ["write_comparison", "write_report"]
+from madoc import lazily
+
+__getattr__, __dir__, __all__ = lazily(__name__)

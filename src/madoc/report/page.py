@@ -1,33 +1,21 @@
 """The page of a run: one HTML file with all it needs inside, and no script needed to read it."""
 
 import datetime
-import functools
-from dataclasses import dataclass, replace
+import warnings
+from dataclasses import dataclass
 from pathlib import Path
-
-import jinja2
 
 from madoc.calibration.holdout import HoldOut, ToldApart
 from madoc.errors import MadocError
-from madoc.report import sections
 from madoc.report.reading import Run, read_run
-from madoc.report.sections import Shown
-from madoc.report.words import count, duration, number
+from madoc.report.rendering import GENERATOR, templates
+from madoc.report.sections import SECTIONS
+from madoc.report.words import TONES, count, duration, number, percent
 from madoc.runs.files import replacing
-
-GENERATOR = "madoc report"
-"""What a page says it was made by; only such files are written over."""
 
 
 def write_report(run: Path, out: Path | None = None) -> Path:
-    """Write the page of one run.
-
-    Args:
-        run: A folder of `madoc calibrate` or `madoc run`, ended or not.
-        out: The page; None takes `report.html` in the folder.
-
-    Returns:
-        Where it is.
+    """Write the page of one run, ended or not; by default it is `report.html` in the run folder.
 
     Raises:
         MadocError: There is no run, a file of it is damaged, or the page cannot be written.
@@ -38,32 +26,39 @@ def write_report(run: Path, out: Path | None = None) -> Path:
     return page
 
 
-def run_context(run: Run) -> Shown:
+def leave_report(folder: Path) -> Path | None:
+    """Write `report.html` into a run folder; a failure is a warning only, as the result is written already."""
+    try:
+        return write_report(folder)
+    except Exception as error:
+        warnings.warn(f"no report.html was written into {folder}: {error}", stacklevel=2)
+        return None
+
+
+def run_context(run: Run) -> dict[str, object]:
     """What the template of one run shows."""
-    made = [section(run) for section in sections.ALL]
-    if not run.parameters:
-        made = [replace(each, absent=sections.NOT_ENDED) if each.data is None else each for each in made]
+    present, absent = [], []
+    for name, (title, section) in SECTIONS.items():
+        content = section(run)
+        if isinstance(content, str):
+            content = content if run.parameters else "The run has not ended."
+            absent.append({"id": name, "title": title, "content": content})
+        else:
+            present.append({"id": name, "title": title, "content": content})
     return {
         "title": f"{run.spec.task} · {run.method}",
         "run": run,
         "verdict": headline(run),
         "facts": _facts(run),
-        "sections": made,
-        "absent": [section for section in made if section.data is None],
+        "sections": present,
+        "absent": absent,
         "ended": _ended(run),
     }
 
 
 @dataclass(frozen=True)
 class Headline:
-    """What stands on top of a page.
-
-    Attributes:
-        word: The verdict; how the run ended, where it was given none.
-        tone: Class that colours it.
-        sentence: The reason.
-        note: How the run ended.
-    """
+    """The top of a page: the verdict (or how the run ended), its colour class, the reason, and how the run ended."""
 
     word: str
     tone: str
@@ -75,52 +70,44 @@ _UNJUDGED = {
     "interrupted": ("doubtful", "The run was interrupted: the estimate is that of the moment."),
     "diverged": ("bad", "The run stopped on a number that is none: do not use the estimate."),
 }
-"""Tone and sentence of a run without a verdict, by how it ended."""
+"""Colour class and sentence of a run without a verdict, by how it ended."""
 
 
 def headline(run: Run) -> Headline:
-    """The verdict, or how the run ended where it was given none."""
+    """The verdict of a run, or how it ended where it has no verdict."""
     if run.result is None:
         sentence = "The run has not ended: this page shows what it has done so far."
         return Headline((run.status or "NOT ENDED").upper(), "doubtful", sentence, run.sentence)
     if run.result.verdict is not None:
         verdict = run.result.verdict
-        return Headline(verdict.word.replace("_", " "), sections.TONES[verdict.word], verdict.sentence, run.sentence)
+        return Headline(verdict.word.replace("_", " "), TONES[verdict.word], verdict.sentence, run.sentence)
     if run.result.status in _UNJUDGED:
         return Headline(run.result.status.upper(), *_UNJUDGED[run.result.status], run.sentence)
     sentence = "Nothing was held out, so this estimate was not tried on data it has not seen."
     return Headline("NO VERDICT", "neutral", sentence, run.sentence)
 
 
-@dataclass(frozen=True)
-class Fact:
-    """A number worth the top of the page."""
-
-    title: str
-    value: str
-    note: str
-
-
-def _facts(run: Run) -> list[Fact]:
+def _facts(run: Run) -> list[tuple[str, str, str]]:
+    """Numbers for the top of the page: the title, value and note of each."""
     facts = [_on_holdout(run.holdout)] if run.holdout else []
     if run.error_percent is not None:
-        facts.append(Fact("off the truth", f"{number(run.error_percent, 3)} %", "of the range, on average"))
+        facts.append(("off the truth", f"{number(run.error_percent, 3)} %", "of the range, on average"))
     if run.result is not None:
-        facts.append(Fact("control steps", count(run.result.control_steps), "simulated"))
-        facts.append(Fact("time", duration(run.result.seconds), "wall clock"))
-    if run.spec.data is not None and run.spec.data.rows is not None:
-        facts.append(Fact("log", count(run.spec.data.rows), f"rows · {run.spec.data.fingerprint}"))
+        facts.append(("control steps", count(run.result.control_steps), "simulated"))
+        facts.append(("time", duration(run.result.seconds), "wall clock"))
+    if run.spec.data is not None:
+        facts.append(("log", count(run.spec.data.rows), f"rows · {run.spec.data.fingerprint}"))
     return facts
 
 
-def _on_holdout(held: HoldOut) -> Fact:
-    """The hold-out's measure in one number."""
+def _on_holdout(held: HoldOut) -> tuple[str, str, str]:
+    """The measure of the hold-out in one number."""
     if isinstance(held, ToldApart):
         low, high = (number(end, 2) for end in held.area_at_estimate.interval)
         note = f"area of a classifier, {low} to {high}; 0.5 is chance"
-        return Fact("told from the log", number(held.area_at_estimate.area, 2), note)
-    value, low, high = (f"{number(100 * share, 3)} %" for share in (held.score, *held.score_interval))
-    return Fact("error on the hold-out", value, f"of mid-range's; {low} to {high}")
+        return "told from the log", number(held.area_at_estimate.area, 2), note
+    value, low, high = map(percent, (held.score, *held.score_interval))
+    return "error on the hold-out", value, f"of mid-range's; {low} to {high}"
 
 
 def _ended(run: Run) -> str:
@@ -131,32 +118,16 @@ def _ended(run: Run) -> str:
     return datetime.datetime.fromtimestamp(file.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
 
 
-def write_page(page: Path, template: str, context: Shown) -> None:
-    """Render a template into a file, whole or not at all.
+def write_page(page: Path, template: str, context: dict[str, object]) -> None:
+    """Render a template into a file, whole or not at all; every word from a run's files is escaped.
 
     Raises:
-        MadocError: There is something else than a page of ours, or it cannot be written.
+        MadocError: The place is taken by something else than a page of ours, or the file cannot be written.
     """
     if page.is_dir():
         raise MadocError(f"{page} is a folder; name a file for the page, as {page / 'report.html'}")
     if page.exists() and GENERATOR not in page.read_bytes()[:2000].decode("utf-8", "replace"):
         raise MadocError(f"{page} exists and is no page of madoc report; choose another --out")
-    text = render(template, context)
+    text = templates().get_template(template).render(context)
     with replacing(page) as stream:
         stream.write(text.encode())
-
-
-def render(template: str, context: Shown) -> str:
-    """A template's text; every word from a file is escaped."""
-    return _environment().get_template(template).render(context | {"generator": GENERATOR})
-
-
-@functools.cache
-def _environment() -> jinja2.Environment:
-    return jinja2.Environment(
-        loader=jinja2.PackageLoader("madoc.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )

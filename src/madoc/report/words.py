@@ -1,6 +1,18 @@
-"""Numbers and names as a reader wants them."""
+"""Numbers and names as text for a reader; most of these functions are filters of the templates."""
 
 import math
+from collections.abc import Sequence
+
+from madoc.calibration.result import ParameterEstimate
+
+TONES = {
+    "CALIBRATED": "good",
+    "NO_IMPROVEMENT": "doubtful",
+    "NOT_IDENTIFIABLE": "doubtful",
+    "MODEL_MISMATCH": "bad",
+    "DATA_REJECTED": "bad",
+}
+"""Class in the style sheet of each verdict's colour."""
 
 _FIELD_WORDS = {
     "body_mass": "mass",
@@ -15,7 +27,7 @@ _FIELD_WORDS = {
     "action_delay": "delay",
     "signal_bias": "bias",
 }
-"""What a parameter's field is called beside its element."""
+"""Words for the field of a parameter."""
 
 _METRIC_WORDS = {
     "accuracy_sa": "from (s, a)",
@@ -23,6 +35,7 @@ _METRIC_WORDS = {
     "discriminator_loss_sa": "from (s, a)",
     "discriminator_loss_sas": "from (s, a, s′)",
 }
+"""Words for metrics whose name would say less."""
 
 
 def parameter_title(name: str) -> str:
@@ -37,31 +50,39 @@ def metric_title(name: str) -> str:
     return _METRIC_WORDS.get(name, name.replace("_", " "))
 
 
+def unit_words(unit: str) -> str:
+    """A unit, and nothing for that of a ratio."""
+    return "" if unit == "1" else unit
+
+
 def number(value: float | None, digits: int = 4) -> str:
-    """So many significant digits, a real minus, powers of ten only for the very large and small."""
+    """A value with this many significant digits; powers of ten only where it is very large or small."""
     if value is None or not math.isfinite(value):
         return "–"
     size = abs(value)
     if size and (size < 1e-4 or size >= 1e7):
         mantissa, _, exponent = f"{value:.{max(digits - 2, 0)}e}".partition("e")
-        return f"{mantissa}·10{_superscript(int(exponent))}".replace("-", "−")
+        power = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+        return f"{mantissa}·10{power}".replace("-", "−")
     if size >= 10 ** (digits - 1):
-        return f"{value:,.0f}".replace(",", " ").replace("-", "−")
-    text = f"{value:.{digits}g}"
-    return text.replace("-", "−")
+        return count(value)
+    return f"{value:.{digits}g}".replace("-", "−")
+
+
+def percent(share: float) -> str:
+    """A share of 1 in percent."""
+    return f"{number(100 * share, 3)} %"
 
 
 def count(value: float) -> str:
-    """A whole number, thousands apart."""
-    return f"{value:,.0f}".replace(",", " ")
+    """A whole number with a space between thousands."""
+    return f"{value:,.0f}".replace(",", " ").replace("-", "−")
 
 
 def short_count(value: float) -> str:
     """`60k`, `1.5M`: for the ticks of an axis."""
-    for size, letter in ((1e6, "M"), (1e3, "k")):
-        if abs(value) >= size:
-            return f"{value / size:g}{letter}".replace("-", "−")
-    return f"{value:g}".replace("-", "−")
+    size, letter = next(unit for unit in ((1e6, "M"), (1e3, "k"), (0.0, "")) if abs(value) >= unit[0])
+    return f"{value / (size or 1.0):g}{letter}".replace("-", "−")
 
 
 def duration(seconds: float) -> str:
@@ -76,5 +97,23 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
-def _superscript(value: int) -> str:
-    return str(value).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+def interval_words(ends: Sequence[float]) -> str:
+    """An interval by its ends, or by its half-width where the ends agree in four digits."""
+    low, high = (number(end) for end in ends)
+    return f"{low} to {high}" if low != high else f"± {number((ends[1] - ends[0]) / 2, 2)}"
+
+
+def spread(row: ParameterEstimate) -> tuple[float, float]:
+    """Ends of the 95 % interval of an estimate; without one, of one standard deviation to either side."""
+    low, high = row.interval or (row.estimate - row.std, row.estimate + row.std)
+    return low, high
+
+
+def spread_words(row: ParameterEstimate) -> str:
+    """The 95 % interval of an estimate; without one, its standard deviation."""
+    return interval_words(row.interval) if row.interval else f"± {number(row.std, 2)}"
+
+
+def place(value: float, low: float, high: float) -> float:
+    """Where a value stands between two ends, in %; a value beyond an end stands at the end."""
+    return round(min(max((value - low) / (high - low), 0.0), 1.0) * 100, 3)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from madoc import tasks
 from madoc.errors import MadocError, unknown_name
-from madoc.robots.model import ModelFiles
+from madoc.robots.model import ModelFiles, read_bytes
 from madoc.robots.spec import RobotSpec, read_spec
 from madoc.robots.task import Robot, Signal, make_robot
 from madoc.tasks import TASKS, Task
@@ -30,42 +30,23 @@ def load(path: str | Path) -> Robot:
         raise MadocError(
             f"expected the spec file of a robot, got {file}, which {what}; write one with: madoc init MODEL"
         )
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise MadocError(f"could not read {file}: {error.strerror or error}") from error
+    content = read_bytes(file)
     spec, document = read_spec(content, file.name)
-    try:
+    with document.at("model"):
         model = ModelFiles.read(file.parent / spec.model)
-    except MadocError as error:
-        raise document.error(("model",), str(error)) from error
     return replace(make_robot(content, file.name, model), path=file)
 
 
-def restore(source: Mapping[str, object]) -> Task:
-    """The task that `Task.source` describes, without reading any file.
-
-    Raises:
-        MadocError: The source is damaged.
-    """
-    return restore_robot(source).task
-
-
-def restore_robot(source: Mapping[str, object]) -> Robot:
-    """The robot that `Task.source` describes, without reading any file.
-
-    Raises:
-        MadocError: The source is damaged.
-    """
+def restore(source: Mapping[str, object]) -> Robot:
+    """The robot that `Task.source` describes, without reading any file; a damaged source is refused."""
     file, spec, model = (source.get(name) for name in ("file", "spec", "model"))
     try:
         if not (isinstance(file, str) and isinstance(spec, str) and isinstance(model, Mapping)):
             raise ValueError("it has no file, spec or model")
-        return make_robot(spec.encode(), file, ModelFiles.from_json(model))
-    except MadocError:
-        raise
+        content, files = spec.encode(), ModelFiles.from_json(model)
     except ValueError as error:
         raise MadocError(f"the robot in this run's spec.json cannot be read: {error}; restore the file") from error
+    return make_robot(content, file, files)
 
 
 def resolve(name: str | Path, physics: str | None = None) -> Task:
@@ -94,26 +75,10 @@ def is_spec_path(name: str | Path) -> bool:
     return str(name) not in TASKS and (Path(name).suffix.lower() in SUFFIXES or Path(name).expanduser().exists())
 
 
-def remake(task: Task, physics: str | None = None) -> Task:
-    """The same robot with all of its parameters in their normal ranges."""
-    return tasks.make(task.name, physics or task.physics) if task.source is None else restore(task.source)
-
-
 def schema() -> dict[str, object]:
     """JSON schema of the spec file."""
     made = RobotSpec.model_json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **made, "title": "Madoc robot spec"}
 
 
-__all__ = [
-    "Robot",
-    "RobotSpec",
-    "Signal",
-    "is_spec_path",
-    "load",
-    "remake",
-    "resolve",
-    "restore",
-    "restore_robot",
-    "schema",
-]
+__all__ = ["Robot", "RobotSpec", "Signal", "is_spec_path", "load", "resolve", "restore", "schema"]

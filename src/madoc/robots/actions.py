@@ -3,9 +3,8 @@
 import mujoco
 import numpy as np
 
-from madoc.robots.draft import SCALES, Draft
-from madoc.robots.model import AddedActuator, is_slide
-from madoc.robots.spec import ActionSpec
+from madoc.robots.model import AddedActuator, Draft, is_slide
+from madoc.robots.spec import SCALES, ActionSpec
 from madoc.tasks.base import ActionChannel
 
 KNOWN_UNITS = (*SCALES, "N·m", "Nm", "N", "rad", "rad/s", "m", "m/s", "V", "A", "%", "1")
@@ -13,17 +12,14 @@ KNOWN_UNITS = (*SCALES, "N·m", "Nm", "N", "rad", "rad/s", "m", "m/s", "V", "A",
 
 
 def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
-    """The actuator that an action adds to the model; None where the action names one of the model's.
-
-    Raises:
-        MadocError: The model lacks the joint or actuator, or the action does not fit it.
-    """
+    """The actuator that an action adds to the model; None where the action names one of the model's."""
     action, document = draft.spec.actions[index], draft.document
     actuators = [actuator.name for actuator in draft.base.actuators if actuator.name]
     if action.joint is None:
         if action.actuator not in actuators:
             place = ("actions", index, "actuator")
             raise document.unknown(place, "the name of an actuator", str(action.actuator), actuators)
+        _check_free(draft, index)
         return None
     place, joint = ("actions", index, "joint"), draft.base.joint(action.joint)
     if joint is None:
@@ -44,21 +40,13 @@ def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
     scale = SCALES.get(action.unit or "", 1.0)
     assert action.low is not None and action.high is not None  # the spec requires both beside joint:
     ends = action.low * scale, action.high * scale
-    if action.means in ("torque", "force"):
-        return AddedActuator(action.name, action.joint, *ends)
-    gain = action.kp if action.means == "position" else action.kd
-    assert gain is not None  # the spec requires kp of a position servo and kd of a velocity servo
-    return AddedActuator(
-        action.name, action.joint, *ends, gain, stiffness=action.kp or 0.0, damping=action.kd or 0.0, limit=action.limit
-    )
+    stiffness, damping = action.kp or 0.0, action.kd or 0.0
+    gain = {"position": stiffness, "velocity": damping}.get(str(action.means), 1.0)
+    return AddedActuator(action.name, action.joint, *ends, gain, stiffness, damping, action.limit)
 
 
 def action_channel(draft: Draft, model: mujoco.MjModel, index: int) -> ActionChannel:
-    """The channel of an action.
-
-    Raises:
-        MadocError: It has no limits, an unknown unit, or the actuator of another action.
-    """
+    """The channel of an action; one without limits, of an unknown unit or of a driven actuator is refused."""
     action = draft.spec.actions[index]
     name = action.actuator or action.name
     actuators = [model.actuator(number).name for number in range(model.nu)]
@@ -72,12 +60,6 @@ def action_channel(draft: Draft, model: mujoco.MjModel, index: int) -> ActionCha
                 ("actions", index), f"expected low: and high:, as the actuator {name!r} has no ctrlrange in the model"
             )
         low, high = (float(end) for end in model.actuator_ctrlrange[actuator])
-    first = [row.actuator for row in draft.spec.actions[:index]]
-    if action.actuator is not None and action.actuator in first:
-        line = draft.document.line(("actions", first.index(action.actuator), "actuator"))
-        raise draft.document.error(
-            ("actions", index, "actuator"), f"the actuator {name!r} is driven by line {line} already"
-        )
     unit = action.unit or _action_unit(action, model, actuator)
     if unit and unit not in KNOWN_UNITS:
         raise draft.document.unknown(("actions", index, "unit"), "a unit that is known", unit, KNOWN_UNITS)
@@ -93,13 +75,8 @@ def _action_unit(action: ActionSpec, model: mujoco.MjModel, actuator: int) -> st
     """The SI unit of a channel without a given unit, from its joint; empty where it drives one of the model's own."""
     if action.joint is None:
         return ""
-    slide = is_slide(model, int(model.actuator_trnid[actuator, 0]))
-    units = {
-        "torque": "N·m",
-        "force": "N",
-        "position": "m" if slide else "rad",
-        "velocity": "m/s" if slide else "rad/s",
-    }
+    position = "m" if is_slide(model, int(model.actuator_trnid[actuator, 0])) else "rad"
+    units = {"torque": "N·m", "force": "N", "position": position, "velocity": f"{position}/s"}
     return units[str(action.means)]
 
 
@@ -107,24 +84,23 @@ def idle_actuators(model: mujoco.MjModel, actions: tuple[ActionChannel, ...]) ->
     """A sentence about the actuators that no action drives; empty where there are none."""
     driven = {channel.actuator for channel in actions}
     names = [model.actuator(index).name for index in range(model.nu)]
-    idle = [name or f"number {index}" for index, name in enumerate(names) if name not in driven]
-    if not idle:
-        return ()
-    return (f"no action drives the model's actuators {', '.join(idle)}: their control is always 0",)
+    idle = ", ".join(name or f"number {index}" for index, name in enumerate(names) if name not in driven)
+    return (f"no action drives the model's actuators {idle}: their control is always 0",) if idle else ()
 
 
 def _check_free(draft: Draft, index: int) -> None:
-    """Refuse a joint that another actuator drives already."""
-    action, place = draft.spec.actions[index], ("actions", index, "joint")
+    """Refuse a joint or an actuator that another action or, for a joint, an actuator of the model drives already."""
+    action = draft.spec.actions[index]
+    key, driven = ("actuator", action.actuator) if action.joint is None else ("joint", action.joint)
     for actuator in draft.base.actuators:
         if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == action.joint:
             name = actuator.name or "without a name"
             raise draft.document.error(
-                place,
-                f"the joint {action.joint!r} has an actuator {name!r} in the model; drive that with actuator: {name}, "
+                ("actions", index, key),
+                f"the joint {driven!r} has an actuator {name!r} in the model; drive that with actuator: {name}, "
                 "or take it out of the model",
             )
-    others = [row.joint for row in draft.spec.actions[:index]]
-    if action.joint in others:
-        first = draft.document.line(("actions", others.index(action.joint), "joint"))
-        raise draft.document.error(place, f"the joint {action.joint!r} is driven by line {first} already")
+    others = [getattr(row, key) for row in draft.spec.actions[:index]]
+    if driven in others:
+        line = draft.document.line(("actions", others.index(driven), key))
+        raise draft.document.error(("actions", index, key), f"the {key} {driven!r} is driven by line {line} already")

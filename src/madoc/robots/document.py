@@ -1,7 +1,8 @@
 """YAML with the line of everything in it, so that a mistake is reported where it was made; and YAML written."""
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from ruamel.yaml import YAML
@@ -24,12 +25,7 @@ DEEPEST = 20
 
 @dataclass(frozen=True)
 class Document:
-    """The content of a YAML file.
-
-    Attributes:
-        file: The name of the file, for error sentences.
-        data: Mappings and lists that know their lines, text, numbers, booleans or None.
-    """
+    """The name of a YAML file and its content: mappings and lists that know their lines, and plain values."""
 
     file: str
     data: object
@@ -48,17 +44,21 @@ class Document:
         """An error about the value at a place, with the file and the line in front."""
         return MadocError(f"{self.file}, line {self.line(place)}: {sentence}")
 
+    @contextmanager
+    def at(self, *place: str | int) -> Iterator[None]:
+        """Put the file and the line of a value in front of an error that is raised inside."""
+        try:
+            yield
+        except MadocError as error:
+            raise self.error(place, str(error)) from error
+
     def unknown(self, place: Place, what: str, name: str, known: Iterable[str]) -> MadocError:
         """An error about a name that is not among the known ones; it lists the nearest of them."""
         return self.error(place, f"expected {what}, got {name!r}; {nearest_hint(name, known)}")
 
 
 def read_document(content: bytes, file: str) -> Document:
-    """Read YAML 1.2 that has no tags, no anchors and no key twice.
-
-    Raises:
-        MadocError: The content is not such YAML; the sentence names the line.
-    """
+    """Read YAML 1.2 that has no tags, no anchors and no key twice; anything else is refused with its line."""
     if len(content) > LARGEST:
         raise MadocError(
             f"{file} has {len(content):,} bytes, a robot's spec at most {LARGEST:,}; is it the right file?"

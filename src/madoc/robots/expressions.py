@@ -7,11 +7,13 @@
 import ast
 import math
 import operator
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from types import ModuleType
 
-from madoc.errors import nearest_hint
+import numpy as np
+
+from madoc.errors import MadocError, nearest_hint
 from madoc.tasks.base import Batch
 
 READS = ("position", "velocity", "sensor")
@@ -33,19 +35,9 @@ _BINARY: dict[type, Callable[[Batch, Batch], Batch]] = {
 _UNARY: dict[type, Callable[[Batch], Batch]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
 
 
-class ExpressionError(ValueError):
-    """A text that is not an expression; the sentence says why."""
-
-
 @dataclass(frozen=True)
 class Read:
-    """One value that an expression reads.
-
-    Attributes:
-        kind: `position`, `velocity`, `sensor`; `name` for a bare name, where those are allowed.
-        name: The joint or sensor, or the bare name.
-        index: Which of its values; None where no index is written.
-    """
+    """One value that an expression reads: its kind (one of `READS`, or `name` for a bare name), its name and index."""
 
     kind: str
     name: str
@@ -73,12 +65,7 @@ Sum = tuple[dict[Read, float], float]
 
 @dataclass(frozen=True)
 class Expression:
-    """A parsed expression.
-
-    Attributes:
-        text: The expression as it was written.
-        reads: The values it reads, each once.
-    """
+    """A parsed expression: the text as it was written, and the values it reads, each once."""
 
     text: str
     reads: tuple[Read, ...]
@@ -98,22 +85,24 @@ def parse(text: str, *, names: Collection[str] | None = None) -> Expression:
     """An expression of joints and sensors; or, with `names`, of these names alone.
 
     Raises:
-        ExpressionError: The text is not such an expression.
+        MadocError: The text is not such an expression, reads nothing, or has no value, as `1 / 0`.
     """
     if len(text) > LONGEST:
-        raise ExpressionError(f"expected at most {LONGEST} characters, got {len(text)}")
+        raise MadocError(f"expected at most {LONGEST} characters, got {len(text)}")
     try:
         root = _tree(ast.parse(text.strip(), mode="eval").body, names)
         reads = tuple(dict.fromkeys(_reads(root)))
-        constant = not reads and _value(root, lambda _: 0.0, math)
-    except ExpressionError:
+        with np.errstate(all="ignore"):
+            value = _value(root, lambda _: np.zeros(1), np)
+        _affine(root)
+    except MadocError:
         raise
     except SyntaxError as error:
-        raise ExpressionError(f"expected an expression, got {text!r}, which does not parse") from error
+        raise MadocError(f"expected an expression, got {text!r}, which does not parse") from error
     except (RecursionError, MemoryError, ArithmeticError, ValueError) as error:
-        raise ExpressionError(f"expected an expression with a value, got {text!r}") from error
+        raise MadocError(f"expected an expression with a value, got {text!r}") from error
     if not reads:
-        raise ExpressionError(f"{text!r} is {constant:g} whatever the robot does; read a joint or a sensor")
+        raise MadocError(f"{text!r} is {value:g} whatever the robot does; read a joint or a sensor")
     return Expression(text, reads, root)
 
 
@@ -122,7 +111,7 @@ def _tree(node: ast.expr, names: Collection[str] | None) -> Node:
         case ast.Constant(value=number) if isinstance(number, int | float) and not isinstance(number, bool):
             return float(number)
         case ast.Constant(value=other):
-            raise ExpressionError(f"expected a number, got {other!r}")
+            raise MadocError(f"expected a number, got {other!r}")
         case ast.Name(id="pi"):
             return math.pi
         case ast.BinOp() if type(node.op) in _BINARY:
@@ -131,37 +120,33 @@ def _tree(node: ast.expr, names: Collection[str] | None) -> Node:
             return Operation(_UNARY[type(node.op)], (_tree(node.operand, names),))
         case ast.Call(func=ast.Name(id=function)) if function in FUNCTIONS:
             if node.keywords or len(node.args) != FUNCTIONS[function]:
-                raise ExpressionError(f"{function} takes {FUNCTIONS[function]} values, got {len(node.args)}")
+                raise MadocError(f"{function} takes {FUNCTIONS[function]} values, got {len(node.args)}")
             return Operation(function, tuple(_tree(argument, names) for argument in node.args))
     return _read(node, names)
 
 
 def _read(node: ast.expr, names: Collection[str] | None) -> Read:
-    """The joint, sensor or name that a node reads.
-
-    Raises:
-        ExpressionError: The node reads none of them.
-    """
+    """The joint, sensor or name that a node reads; nodes that read none of them are refused."""
     match node:
         case ast.Name(id=name):
             if names is None:
-                raise ExpressionError(
+                raise MadocError(
                     f"{name!r} alone reads nothing; write position({name}), velocity({name}) or sensor({name})"
                 )
             if name in names:
                 return Read("name", name)
-            raise ExpressionError(f"unknown name {name!r}; {nearest_hint(name, [*names, *FUNCTIONS, 'pi'])}")
+            raise MadocError(f"unknown name {name!r}; {nearest_hint(name, [*names, *FUNCTIONS, 'pi'])}")
         case ast.Subscript(value=ast.Call() as call, slice=ast.Constant(value=int() as index)) if index is not True:
             inner = _read(call, names)
             return Read(inner.kind, inner.name, index)
         case ast.Call(func=ast.Name(id=kind), args=[argument], keywords=[]) if kind in READS and names is None:
             return Read(kind, _name_in(argument, kind))
         case ast.Call(func=ast.Name(id=kind)) if kind in READS and names is None:
-            raise ExpressionError(f"{kind} takes one name, as {kind}(NAME)")
+            raise MadocError(f"{kind} takes one name, as {kind}(NAME)")
         case ast.Call(func=ast.Name(id=name)):
             known = [*FUNCTIONS, *(READS if names is None else ())]
-            raise ExpressionError(f"unknown function {name!r}; {nearest_hint(name, known)}")
-    raise ExpressionError(f"expected arithmetic, got {ast.unparse(node)!r}")
+            raise MadocError(f"unknown function {name!r}; {nearest_hint(name, known)}")
+    raise MadocError(f"expected arithmetic, got {ast.unparse(node)!r}")
 
 
 def _name_in(argument: ast.expr, kind: str) -> str:
@@ -169,18 +154,16 @@ def _name_in(argument: ast.expr, kind: str) -> str:
         case ast.Name(id=name) | ast.Constant(value=str() as name):
             return name
     text = ast.unparse(argument)
-    raise ExpressionError(
+    raise MadocError(
         f"expected the name of a {'sensor' if kind == 'sensor' else 'joint'} in {kind}({text}), "
         f'in quotes where it is no plain word, as {kind}("left-knee")'
     )
 
 
-def _reads(node: Node) -> Iterator[Read]:
-    if isinstance(node, Read):
-        yield node
-    elif isinstance(node, Operation):
-        for argument in node.arguments:
-            yield from _reads(argument)
+def _reads(node: Node) -> list[Read]:
+    if isinstance(node, Operation):
+        return [read for argument in node.arguments for read in _reads(argument)]
+    return [node] if isinstance(node, Read) else []
 
 
 def _value(node: Node, look_up: Callable[[Read], Batch], namespace: ModuleType) -> Batch:

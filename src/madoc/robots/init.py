@@ -2,18 +2,20 @@
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from madoc.errors import MadocError
+from madoc.parameters import FIELDS, Parameter
 from madoc.robots.document import yaml_text
 from madoc.robots.expressions import Read
 from madoc.robots.model import ModelFiles, compiled, is_single, is_slide
+from madoc.robots.space import SLIDE_UNITS
 from madoc.runs.files import replacing
-from madoc.simulation.write import element_names
+from madoc.simulation.write import element_names, nominal_values
 from madoc.tasks import TASKS
 
 Fields = dict[str, str | float]
@@ -28,11 +30,15 @@ _PARTS = {
 """Names of the values of a joint's position and velocity, where it has several."""
 
 
+_REMARKS = {"actuator_gain": "", "geom_friction": "sliding, in contacts; "}
+"""What stands in a comment instead of the unit of a field."""
+
+
 def write_spec(model: Path, out: Path) -> None:
     """Write a first spec for a model to a new file.
 
     Raises:
-        MadocError: The file is there already, the folder is not, or the model cannot be used.
+        MadocError: The file exists already, its folder does not, or the model cannot be used.
     """
     from madoc.robots import load
 
@@ -51,11 +57,7 @@ def write_spec(model: Path, out: Path) -> None:
 
 
 def spec_text(model: Path, out: Path) -> str:
-    """The text of a first spec for a model, with comments, for a file at `out`.
-
-    Raises:
-        MadocError: The model cannot be read, or nothing in it has a name.
-    """
+    """The text of a first spec for a model, with comments, for a file at `out`; a model without names is refused."""
     files = ModelFiles.read(model)
     made = compiled(files.spec, files.main)
     joints = element_names(made, "joint")
@@ -68,11 +70,12 @@ def spec_text(model: Path, out: Path) -> str:
     timestep = float(made.opt.timestep)
     step = timestep * max(1, round(_USUAL_STEP / timestep))
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", model.stem).strip("_-") or "robot"
+    relative = Path(os.path.relpath(model.resolve(), out.parent.resolve())).as_posix()
     lines = [
         f"# A robot for Madoc, written from {model.name} by `madoc init`. What it means: madoc spec {out.name}",
         "madoc: 1",
         f"name: {_quoted('my_' + name if name in TASKS else name)}",
-        f"model: {_quoted(_relative(model, out.parent))}  # MJCF or URDF, relative to this file",
+        f"model: {_quoted(relative)}  # MJCF or URDF, relative to this file",
         f"control_step: {step:.12g}  # s between two actions; a multiple of the model's timestep, {timestep:.12g} s",
         "",
         "# The observation: one number a line. Each reads position(JOINT), velocity(JOINT) or sensor(NAME), one of",
@@ -116,14 +119,12 @@ def _signals(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[str, st
         for joint in joints:
             index = model.joint(joint).id
             speed, reads = kind == "velocity", str(Read(kind, joint))
-            parts = _PARTS.get(int(model.jnt_type[index]))
-            if parts is None:
+            if is_single(model, index):
                 unit = "m" if is_slide(model, index) else "rad"
                 yield (f"{joint}_speed", reads, f"{unit}/s") if speed else (joint, reads, unit)
                 continue
-            for at, part in enumerate(parts[speed]):
-                unit = "1" if part[0] == "q" else {"v": "m/s", "w": "rad/s"}.get(part[0], "m")
-                yield f"{joint}_{part}", f"{reads}[{at}]", unit
+            for at, part in enumerate(_PARTS[int(model.jnt_type[index])][speed]):
+                yield f"{joint}_{part}", f"{reads}[{at}]", {"q": "1", "v": "m/s", "w": "rad/s"}.get(part[0], "m")
 
 
 def _sensors(model: mujoco.MjModel) -> Iterator[str]:
@@ -152,16 +153,13 @@ def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Itera
         low, high = model.actuator_ctrlrange[index] if limited else (-1.0, 1.0)
         comment = "" if limited else "  # the model has no ctrlrange: write its limits"
         yield {"name": name, "actuator": actuator, "low": float(low), "high": float(high)}, comment
-    if model.nu:
-        return
-    for joint in joints:
+    for joint in joints if not model.nu else ():
         index = model.joint(joint).id
         if not is_single(model, index):
             continue
-        slide = is_slide(model, index)
         limited = bool(model.jnt_actfrclimited[index])
         low, high = model.jnt_actfrcrange[index] if limited else (-1.0, 1.0)
-        means, unit = ("force", "N") if slide else ("torque", "N·m")
+        means, unit = ("force", "N") if is_slide(model, index) else ("torque", "N·m")
         comment = "" if limited else f"  # the model has no limit: write the motor's largest {means}"
         fields = {"name": f"{joint}_{means}", "joint": joint, "means": means}
         yield {**fields, "low": float(low), "high": float(high), "unit": unit}, comment
@@ -169,38 +167,49 @@ def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Itera
 
 def _parameters(model: mujoco.MjModel, joints: list[str]) -> Iterator[str]:
     """Parameters of bodies, joints, actuators and contacts; those less likely to matter are written as comments."""
-    rows = [*_masses(model), *_stiffness(model, joints), *_of_joints(model, joints), *_gains(model), *_contacts(model)]
+    sprung = [joint for joint in joints if is_single(model, model.joint(joint).id)]
+    geoms = [model.geom(name) for name in element_names(model, "geom")]
+    touching = [geom.name for geom in geoms if geom.contype[0] or geom.conaffinity[0]]
+    rows = [
+        *_scaled(model, "body_mass", _heavy_bodies(model), wanted=True),
+        *_scaled(model, "jnt_stiffness", sprung, wanted=True),
+        *_dissipation(model, joints),
+        *_scaled(model, "actuator_gain", element_names(model, "actuator")),
+        *_scaled(model, "geom_friction", touching),
+    ]
     active = 0
     for fields, comment, wanted in rows:
         active += wanted
         yield f"  {'' if wanted and active <= _ACTIVE else '# '}- {_mapping(**fields)}  # {comment}"
 
 
-def _masses(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
+def _heavy_bodies(model: mujoco.MjModel) -> Iterator[str]:
+    """Names of bodies that move and have a mass; a body without a name takes that of its first joint."""
     bodies = element_names(model, "body")
     for body in range(1, model.nbody):
-        mass = float(model.body_mass[body])
-        if mass <= 0.0 or model.body_weldid[body] == 0:
+        if model.body_mass[body] <= 0.0 or model.body_weldid[body] == 0:
             continue
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body)
+        name = model.body(body).name
         if not name and model.body_jntnum[body]:
-            joint = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, model.body_jntadr[body])
-            name = joint if joint and joint not in bodies else ""
+            joint = model.joint(model.body_jntadr[body]).name
+            name = "" if joint in bodies else joint
         if name:
-            yield _around("body_mass", name, mass), f"kg; the model has {mass:.4g}", True
+            yield name
 
 
-def _stiffness(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
-    """Stiffness of joints that have a spring."""
-    for joint in joints:
-        index = model.joint(joint).id
-        value = float(np.atleast_1d(model.jnt_stiffness[index])[0])
-        if value > 0 and is_single(model, index):
-            unit = "N/m" if is_slide(model, index) else "N·m/rad"
-            yield _around("jnt_stiffness", joint, value), f"{unit}; the model has {value:.4g}", True
+def _scaled(
+    model: mujoco.MjModel, field: str, names: Iterable[str], *, wanted: bool = False
+) -> Iterator[tuple[Fields, str, bool]]:
+    """A field of elements where the model's value is above 0, from half of it to twice."""
+    for name in names:
+        (value,) = nominal_values(model, Parameter(field, name, 0.0, 1.0))
+        if value > 0:
+            unit = _REMARKS[field] if field in _REMARKS else f"{_unit(model, field, name)}; "
+            fields: Fields = {"field": field, "element": name, "low": _round(value / 2), "high": _round(value * 2)}
+            yield fields, f"{unit}the model has {value:.4g}", wanted
 
 
-def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
+def _dissipation(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
     """Damping and dry friction of joints; those neither driven nor damped are comments, as they may be a root's."""
     on_joints = np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     # Through tendons an actuator may drive any joint.
@@ -210,35 +219,18 @@ def _of_joints(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Field
             index = model.joint(joint).id
             if int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_FREE:
                 continue
-            dof = model.jnt_dofadr[index]
-            value = float(getattr(model, field)[dof])
+            (value,) = nominal_values(model, Parameter(field, joint, 0.0, 1.0))
             # Where the model has none: the damping that would stop the joint and all bodies on it in 0.1 s.
-            high = 2 * value if value > 0 else 10 * float(model.dof_M0[dof])
-            slide = is_slide(model, index)
-            units = ("N·s/m", "N") if slide else ("N·m·s/rad", "N·m")
-            unit = units[field == "dof_frictionloss"]
+            high = 2 * value if value > 0 else 10 * float(model.dof_M0[model.jnt_dofadr[index]])
             fields: Fields = {"field": field, "element": joint, "low": 0.0, "high": _round(high)}
-            yield fields, f"{unit}; the model has {value:.4g}", wanted and (value > 0 or index in driven)
+            comment = f"{_unit(model, field, joint)}; the model has {value:.4g}"
+            yield fields, comment, wanted and (value > 0 or index in driven)
 
 
-def _gains(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
-    for actuator in element_names(model, "actuator"):
-        value = float(model.actuator_gainprm[model.actuator(actuator).id, 0])
-        if value > 0:
-            yield _around("actuator_gain", actuator, value), f"the model has {value:.4g}", False
-
-
-def _contacts(model: mujoco.MjModel) -> Iterator[tuple[Fields, str, bool]]:
-    """Sliding friction of what collides."""
-    for geom in element_names(model, "geom"):
-        index = model.geom(geom).id
-        value = float(model.geom_friction[index, 0])
-        if value > 0 and (model.geom_contype[index] or model.geom_conaffinity[index]):
-            yield _around("geom_friction", geom, value), f"sliding, in contacts; the model has {value:.4g}", False
-
-
-def _around(field: str, element: str, value: float) -> Fields:
-    return {"field": field, "element": element, "low": _round(value / 2), "high": _round(value * 2)}
+def _unit(model: mujoco.MjModel, field: str, element: str) -> str:
+    """The unit of a field of a body or a joint."""
+    slides = field in SLIDE_UNITS and is_slide(model, model.joint(element).id)
+    return SLIDE_UNITS[field] if slides else FIELDS[field].unit
 
 
 def _round(value: float) -> float:
@@ -260,8 +252,3 @@ def _number(value: float) -> float:
 def _quoted(value: str | Fields) -> str:
     """Text or a mapping as YAML on one line, with quotes where they are needed."""
     return yaml_text(value, width=10_000, flow=True).removesuffix("...\n").strip()
-
-
-def _relative(model: Path, folder: Path) -> str:
-    """The model's path as seen from the spec's folder."""
-    return Path(os.path.relpath(model.resolve(), folder.resolve())).as_posix()

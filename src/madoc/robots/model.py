@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 
 from madoc.errors import MadocError
+from madoc.robots.document import Document
+from madoc.robots.spec import RobotSpec
 from madoc.tasks.base import compiled_model
 
 _MESH = re.compile(r"""<mesh[^>]*\bfilename\s*=\s*["']([^"']+)["']""")
@@ -18,11 +20,9 @@ _MESH = re.compile(r"""<mesh[^>]*\bfilename\s*=\s*["']([^"']+)["']""")
 
 @dataclass(frozen=True)
 class ModelFiles:
-    """A model file and all files that it refers to.
+    """The name of a model file, and the contents of it and of all files that it refers to.
 
-    Attributes:
-        main: Name of the model file.
-        files: Path from the model file's folder, or the name that the model uses, and content of each file.
+    A file is named by its path from the model file's folder, or as the model names it.
     """
 
     main: str
@@ -30,11 +30,7 @@ class ModelFiles:
 
     @classmethod
     def read(cls, path: Path) -> "ModelFiles":
-        """Read a model file and everything that it refers to.
-
-        Raises:
-            MadocError: A file is missing or cannot be read.
-        """
+        """Read a model file and everything that it refers to; a missing file is refused."""
         contents = {path.name: _read(path)}
         if is_urdf(contents[path.name]):
             for name in dict.fromkeys(_MESH.findall(contents[path.name].decode(errors="replace"))):
@@ -46,7 +42,8 @@ class ModelFiles:
             dependencies = []  # compiling the model gives the better error
         for file in map(Path, dependencies):
             if file != path and file.resolve() != path.resolve():
-                contents[_from(file, path.parent)] = _read(file, path.name)
+                inside = file.is_relative_to(path.parent)
+                contents[(file.relative_to(path.parent) if inside else file).as_posix()] = _read(file, path.name)
         return cls(path.name, tuple(contents.items()))
 
     def to_json(self) -> dict[str, object]:
@@ -55,11 +52,7 @@ class ModelFiles:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, object]) -> "ModelFiles":
-        """The files that `to_json` wrote.
-
-        Raises:
-            ValueError: The content is damaged, or it is not of `to_json`.
-        """
+        """The files that `to_json` wrote; a ValueError says what is damaged."""
         main, contents = stored.get("main"), stored.get("contents")
         if not isinstance(main, str) or not isinstance(contents, Mapping):
             raise ValueError("its model has no main file or no contents")
@@ -69,9 +62,6 @@ class ModelFiles:
         """A MuJoCo spec of the model, in which joints and actuators without a name are named by what they belong to.
 
         A joint takes the name of its body, where it is the only one there, and an actuator that of its joint.
-
-        Raises:
-            MadocError: MuJoCo refuses the model; the sentence is MuJoCo's.
         """
         others = dict(self.files)
         try:
@@ -90,6 +80,15 @@ class ModelFiles:
         of_joint = [part for part in spec.actuators if part.trntype == mujoco.mjtTrn.mjTRN_JOINT]
         _name_by_owner([(actuator, actuator.target) for actuator in of_joint], spec.actuators)
         return spec
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A spec with its lines, and the MuJoCo spec of its model file, without the actuators that it adds."""
+
+    spec: RobotSpec
+    document: Document
+    base: mujoco.MjSpec
 
 
 @dataclass(frozen=True)
@@ -139,11 +138,7 @@ def make_model(
 
 
 def compiled(spec: Callable[[], mujoco.MjSpec], file: str) -> mujoco.MjModel:
-    """The shared model of a spec (`tasks.base.compiled_model`).
-
-    Raises:
-        MadocError: The model of this file does not compile; the sentence is MuJoCo's.
-    """
+    """The shared model of a spec (`tasks.base.compiled_model`); an error of MuJoCo is passed on as a refusal."""
     try:
         return compiled_model(spec)
     except (ValueError, mujoco.FatalError) as error:
@@ -182,6 +177,11 @@ def _read(path: Path, owner: str = "") -> bytes:
     if not path.is_file():
         refers = f"{owner} refers to {path}, which is" if owner else f"there is no model file {path}: it is"
         raise MadocError(f"{refers} {'a directory' if path.is_dir() else 'missing'}; check the path")
+    return read_bytes(path)
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file; one that cannot be read is refused."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -198,13 +198,6 @@ def _mesh_path(name: str, model: Path) -> Path:
         if path.is_file():
             return path
     raise MadocError(f"{model.name} refers to {name}, which is neither beside it nor in its package; check the path")
-
-
-def _from(file: Path, folder: Path) -> str:
-    try:
-        return file.relative_to(folder).as_posix()
-    except ValueError:
-        return file.as_posix()
 
 
 def _stored(content: bytes) -> str | dict[str, str]:

@@ -1,32 +1,26 @@
 """Signals as functions: of a state, of the model's sensors, and back to a state where they determine it."""
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
-from madoc.errors import nearest_hint
-from madoc.robots.expressions import Expression, ExpressionError, Read
+from madoc.errors import MadocError, nearest_hint
+from madoc.robots.expressions import Expression, Read
 from madoc.simulation.write import element_names
 from madoc.tasks.base import Batch
 
-_POSITIONS = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}
-_VELOCITIES = {mujoco.mjtJoint.mjJNT_FREE: 6, mujoco.mjtJoint.mjJNT_BALL: 3}
 Span = tuple[int, int]
 """Address of the first value, and number of values."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Addresses of a model's positions, velocities and sensor values.
+    """Where a joint's position and velocity are in a state, and a sensor's reading in sensordata, by name.
 
     Attributes:
-        position: Joint -> address of its position in a state, and its number of values.
-        velocity: Joint -> address of its velocity in a state, and its number of values.
-        sensor: Sensor -> address of its reading in sensordata, and its number of values.
         physical: Number of values of (qpos, qvel).
         accelerating: Sensors that depend on the control as well.
     """
@@ -42,44 +36,32 @@ class Layout:
         """The layout of a model."""
         joints = [model.joint(name) for name in element_names(model, "joint")]
         sensors = [model.sensor(name) for name in element_names(model, "sensor")]
-        accelerating = (one.name for one in sensors if int(one.needstage[0]) == mujoco.mjtStage.mjSTAGE_ACC)
         return cls(
-            position={one.name: (int(one.qposadr[0]), _POSITIONS.get(int(one.type[0]), 1)) for one in joints},
-            velocity={
-                one.name: (int(model.nq + one.dofadr[0]), _VELOCITIES.get(int(one.type[0]), 1)) for one in joints
-            },
-            sensor={one.name: (int(one.adr[0]), int(one.dim[0])) for one in sensors},
+            position={joint.name: (int(joint.qposadr[0]), len(joint.qpos0)) for joint in joints},
+            velocity={joint.name: (int(model.nq + joint.dofadr[0]), len(joint.damping)) for joint in joints},
+            sensor={sensor.name: (int(sensor.adr[0]), int(sensor.dim[0])) for sensor in sensors},
             physical=int(model.nq + model.nv),
-            accelerating=frozenset(accelerating),
+            accelerating=frozenset(one.name for one in sensors if one.needstage[0] == mujoco.mjtStage.mjSTAGE_ACC),
         )
 
     def address(self, read: Read) -> int:
-        """Address of a value in the state or in sensordata.
-
-        Raises:
-            ExpressionError: The model has no such joint or sensor, or not so many values.
-        """
+        """Address of a value in the state or in sensordata; what the model does not have is refused."""
         known: dict[str, Span] = getattr(self, read.kind)
         what = "sensor" if read.kind == "sensor" else "joint"
         if read.name not in known:
             hint = nearest_hint(read.name, known, none=f"it names no {what}")
-            raise ExpressionError(f"the model has no {what} {read.name!r}; {hint}")
+            raise MadocError(f"the model has no {what} {read.name!r}; {hint}")
         start, count = known[read.name]
         if read.index is None and count > 1:
-            raise ExpressionError(f"{read} has {count} values; pick one, as {read}[0]")
+            raise MadocError(f"{read} has {count} values; pick one, as {read}[0]")
         if not 0 <= (read.index or 0) < count:
-            raise ExpressionError(f"{read} does not exist: it has {count} value{'s' * (count > 1)}, counted from 0")
+            raise MadocError(f"{read} does not exist: it has {count} value{'s' * (count > 1)}, counted from 0")
         return start + (read.index or 0)
 
 
 @dataclass(frozen=True)
 class Signals:
-    """The observation of a robot: pure functions, batched, on NumPy or JAX arrays.
-
-    Attributes:
-        expressions: The expression of each signal, in order.
-        layout: The addresses in the model.
-    """
+    """The observation of a robot, one expression a signal: pure functions, batched, on NumPy or JAX arrays."""
 
     expressions: tuple[Expression, ...]
     layout: Layout
@@ -87,9 +69,8 @@ class Signals:
     @property
     def read_sensors(self) -> frozenset[str]:
         """Names of the sensors that the signals read."""
-        return frozenset(
-            read.name for expression in self.expressions for read in expression.reads if read.kind == "sensor"
-        )
+        reads = (read for expression in self.expressions for read in expression.reads)
+        return frozenset(read.name for read in reads if read.kind == "sensor")
 
     def observe(self, state: Batch) -> Batch:
         """State -> observation."""
@@ -100,7 +81,7 @@ class Signals:
         return self._stacked(self.expressions, state, sensordata)
 
     def undetermined(self) -> tuple[str, ...]:
-        """A sentence for each joint position and velocity that appears in no signal that is a weighted sum."""
+        """A sentence for each joint position and velocity that is in no signal that is a weighted sum."""
         sums = [affine[0] for expression in self.expressions if (affine := expression.affine()) is not None]
         covered = {self.layout.address(read) for reads in sums for read in reads if read.kind != "sensor"}
         return tuple(
@@ -111,13 +92,14 @@ class Signals:
         )
 
     def _stacked(self, expressions: Sequence[Expression], state: Batch, sensordata: Batch | None) -> Batch:
+        """Values of expressions; where one has none it is NaN or infinite, without a warning of NumPy."""
         namespace = state.__array_namespace__()
 
         def look_up(read: Read) -> Batch:
             source: Batch = sensordata if read.kind == "sensor" else state
             return source[..., self.layout.address(read)]
 
-        with quiet_arithmetic():
+        with np.errstate(all="ignore"):
             return namespace.stack([expression.value(look_up, namespace) for expression in expressions], axis=-1)
 
     def rebuild(self) -> Callable[[Batch], Batch] | None:
@@ -179,8 +161,3 @@ def _scaled_rows(forward: Float[np.ndarray, "signals state"]) -> tuple[np.ndarra
     scale = np.abs(forward).max(1, initial=0.0, keepdims=True)
     even = np.divide(forward, scale, out=np.zeros_like(forward), where=scale > 0)
     return even, np.where(scale > 0, scale, 1.0)
-
-
-def quiet_arithmetic() -> AbstractContextManager[None]:
-    """No warnings of NumPy where an expression has no value: it is then NaN or infinite, and checked as such."""
-    return np.errstate(all="ignore")

@@ -2,14 +2,12 @@
 
 import mujoco
 
-from madoc.errors import MadocError
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
-from madoc.robots.draft import Draft
 from madoc.robots.expressions import parse
-from madoc.robots.model import is_slide
+from madoc.robots.model import Draft, is_slide
 from madoc.robots.signals import signal_unit
 from madoc.robots.spec import ParameterSpec
-from madoc.simulation.write import element_names, find_elements
+from madoc.simulation.write import element_names
 
 SLIDE_UNITS = {
     "dof_damping": "N·s/m",
@@ -22,11 +20,7 @@ SLIDE_UNITS = {
 
 
 def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
-    """The parameters, each with the unit that follows from its elements.
-
-    Raises:
-        MadocError: The model lacks an element, a quantity is calibrated twice, or one value would have two units.
-    """
+    """The parameters, each with the unit that follows from its elements."""
     parameters: list[Parameter] = []
     for index, given in enumerate(draft.spec.parameters):
         _check_elements(draft, model, index)
@@ -59,24 +53,15 @@ def _check_distinct(draft: Draft, index: int, parameter: Parameter, other: int, 
 def _check_elements(draft: Draft, model: mujoco.MjModel, index: int) -> None:
     """Refuse elements that the model or the signals do not have, with the nearest that they have."""
     given = draft.spec.parameters[index]
-    parameter = given.parameter()
     kind = FIELDS[given.field].element
-    for position, element in enumerate(parameter.elements):
-        place = ("parameters", index, *(("elements", position) if given.elements else ("element",)))
-        if kind == "signal":
-            known = [signal.name for signal in draft.spec.signals]
-            if element not in known:
-                raise draft.document.unknown(place, "the name of a signal", element, known)
-            continue
-        try:
-            find_elements(
-                model, given.model_copy(update={"elements": None, "element": element, "name": None}).parameter()
-            )
-        except MadocError as error:
-            if kind is None:
-                raise
-            known = element_names(model, kind)
-            raise draft.document.unknown(place, f"the name of a {kind}", element, known) from error
+    if kind is None:
+        return
+    names = [signal.name for signal in draft.spec.signals] if kind == "signal" else element_names(model, kind)
+    also = element_names(model, "joint") if kind == "body" else []  # a joint names its body
+    for position, element in enumerate(given.parameter().elements):
+        if element not in names and element not in also:
+            place = ("parameters", index, *(("elements", position) if given.elements else ("element",)))
+            raise draft.document.unknown(place, f"the name of a {kind}", element, names)
 
 
 def _unit_of(draft: Draft, model: mujoco.MjModel, index: int) -> str:
@@ -96,12 +81,9 @@ def _element_unit(draft: Draft, model: mujoco.MjModel, given: ParameterSpec, ele
     if given.field in SLIDE_UNITS:
         return SLIDE_UNITS[given.field] if is_slide(model, int(model.joint(element).id)) else ""
     if given.field == "signal_bias":
-        names = [signal.name for signal in draft.spec.signals]
-        index = names.index(element)
+        index = [signal.name for signal in draft.spec.signals].index(element)
         return signal_unit(draft, model, parse(draft.spec.signals[index].reads), index)
-    if given.field == "actuator_gain":
-        return _gain_unit(model, int(model.actuator(element).id))
-    return ""
+    return _gain_unit(model, int(model.actuator(element).id)) if given.field == "actuator_gain" else ""
 
 
 def _gain_unit(model: mujoco.MjModel, actuator: int) -> str:

@@ -1,17 +1,24 @@
 """The spec file of a robot: its keys and their types, checked before any model is read."""
 
 import math
-from collections.abc import Iterator
 from functools import lru_cache
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
-from madoc.errors import MadocError, nearest_hint
+from madoc.errors import nearest_hint
 from madoc.parameters import FIELDS, Parameter
 from madoc.robots.document import Document, Place, read_document
 from madoc.tasks import TASKS
+
+SCALES: dict[str, float] = {
+    **dict.fromkeys(("deg", "deg/s", "°", "°/s"), math.pi / 180.0),
+    **dict.fromkeys(("mm", "mm/s", "mN·m", "mNm", "N·mm", "Nmm", "mN"), 1e-3),
+    **dict.fromkeys(("cm", "cm/s"), 1e-2),
+    "km/h": 1.0 / 3.6,
+}
+"""Units that are converted, each as a multiple of its SI unit."""
 
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]+$")]
 File = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00-\x1f]+$")]
@@ -56,22 +63,20 @@ class ActionSpec(Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> "ActionSpec":
-        _refuse(not _one(self.joint, self.actuator), "expected either joint: or actuator:, got both or neither")
-        if self.actuator is not None:
-            for key in ("means", "kp", "kd", "limit"):
-                given = getattr(self, key) is not None
-                _refuse(given, f"{key}: belongs to joint:, the actuator {self.actuator!r} has its own in the model")
-        else:
+        neither_or_both = (self.joint is None) == (self.actuator is None)
+        _refuse(neither_or_both, "expected either joint: or actuator:, got both or neither")
+        given = [key for key in ("means", "kp", "kd", "limit") if getattr(self, key) is not None]
+        if self.actuator is not None and given:
+            raise ValueError(f"{given[0]}: belongs to joint:, the actuator {self.actuator!r} has its own in the model")
+        if self.joint is not None:
             _refuse(self.means is None, "expected means: torque, force, position or velocity beside joint:")
             _refuse(self.low is None or self.high is None, "expected low: and high: beside joint:")
             _refuse(self.means == "position" and self.kp is None, "expected kp: of a position servo")
             _refuse(self.means == "velocity" and not self.kd, "expected kd: above 0 of a velocity servo")
-            _refuse(self.means != "position" and self.kp is not None, f"kp: means nothing beside means: {self.means}")
-            servo = self.means in ("position", "velocity")
-            for key in ("kd", "limit"):
-                given = getattr(self, key) is not None
-                _refuse(given and not servo, f"{key}: means nothing beside means: {self.means}")
-        _refuse(_one(self.low, self.high), "expected both low: and high:, got one of them")
+            _refuse(self.means == "velocity" and self.kp is not None, "kp: means nothing beside means: velocity")
+            if self.means in ("torque", "force") and len(given) > 1:
+                raise ValueError(f"{given[1]}: means nothing beside means: {self.means}")
+        _refuse((self.low is None) != (self.high is None), "expected both low: and high:, got one of them")
         if self.low is not None and self.high is not None:
             _refuse(self.low >= self.high, f"expected low below high, got {self.low:g} and {self.high:g}")
         return self
@@ -97,18 +102,11 @@ class ParameterSpec(Part):
     @model_validator(mode="after")
     def _consistent(self) -> "ParameterSpec":
         _refuse(self.element is not None and self.elements is not None, "expected element: or elements:, got both")
-        try:
-            self.parameter()
-        except MadocError as error:
-            raise ValueError(str(error)) from error
+        self.parameter()  # pydantic reports what it refuses, as a MadocError is a ValueError
         return self
 
     def parameter(self, unit: str = "") -> Parameter:
-        """The parameter, in the unit of its field or in another.
-
-        Raises:
-            MadocError: The values do not make a parameter.
-        """
+        """The parameter, in the unit of its field or in another."""
         element = tuple(self.elements) if self.elements else self.element or ""
         return Parameter(self.field, element, self.low, self.high, self.name or "", unit)
 
@@ -154,13 +152,18 @@ class RobotSpec(Part):
         return name
 
 
+_PARTS: dict[str | int, type[Part]] = {
+    "signals": SignalSpec,
+    "actions": ActionSpec,
+    "parameters": ParameterSpec,
+    "log": LogSpec,
+}
+"""The parts of the spec by their key, for the keys that each may have."""
+
+
 @lru_cache(maxsize=32)
 def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
-    """A spec and the lines of its parts; the same content is parsed once.
-
-    Raises:
-        MadocError: One sentence about the first mistake, with its line.
-    """
+    """A spec and the lines of its parts, parsed once; the first mistake is refused with its line."""
     document = read_document(content, file)
     if not isinstance(document.data, dict):
         raise document.error((), "expected keys and values, as `name: my_robot`; write one with: madoc init MODEL")
@@ -177,13 +180,9 @@ def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
 
 
 def _refuse(wrong: bool, sentence: str) -> None:
-    """Pydantic reports the ValueErrors of validators."""
+    """Raise a ValueError, which pydantic reports, where something is wrong."""
     if wrong:
         raise ValueError(sentence)
-
-
-def _one(first: object, second: object) -> bool:
-    return (first is None) != (second is None)
 
 
 def _place(detail: ErrorDetails) -> Place:
@@ -198,17 +197,15 @@ def _sentence(detail: ErrorDetails, place: Place) -> str:
         *whole, key = place
         return f"expected {key}: {'here' if not whole else 'in this part of ' + str(whole[0])}"
     if kind == "extra_forbidden":
-        return f"unknown key {place[-1]!r}; {nearest_hint(str(place[-1]), _keys_at(place[:-1]))}"
+        part = _PARTS[place[0]] if len(place) > 1 else RobotSpec
+        return f"unknown key {place[-1]!r}; {nearest_hint(str(place[-1]), part.model_fields)}"
     if kind == "value_error":
         return str(detail["ctx"]["error"])
     if kind == "string_type" and isinstance(got, int | float):
         return f"expected text in {what}, got {got!r}; put it in quotes"
-    expected = detail["msg"].removeprefix("Input should ").removeprefix("be ").removeprefix("have ")
+    expected = detail["msg"].partition(" should ")[2].partition(" after ")[0].removeprefix("be ").removeprefix("have ")
     expected = {
         "string_pattern_mismatch": "a name of letters, digits, _ . and -" if place == ("name",) else "a printable name",
-        "string_too_long": f"at most {detail.get('ctx', {}).get('max_length')} characters",
-        "string_too_short": "some text",
-        "too_short": "at least one item",
         "float_type": "a number",
         "float_parsing": "a number",
         "model_type": "keys and values",
@@ -227,22 +224,3 @@ def _shown(value: object) -> str:
         return "nothing" if value is None else "an empty list"
     text = str(value) if isinstance(value, float) and not math.isfinite(value) else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _keys_at(place: Place) -> list[str]:
-    """The keys that a part of the spec may have."""
-    part: type[BaseModel] = RobotSpec
-    for key in place:
-        if isinstance(key, str) and key in part.model_fields:
-            inner = next(_models_in(part.model_fields[key].annotation), None)
-            if inner is None:
-                return []
-            part = inner
-    return list(part.model_fields)
-
-
-def _models_in(annotation: object) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for inner in get_args(annotation):
-        yield from _models_in(inner)

@@ -13,14 +13,13 @@ from jaxtyping import PRNGKeyArray
 from madoc import simulation
 from madoc.errors import MadocError
 from madoc.robots.actions import action_channel, added_actuator, idle_actuators
-from madoc.robots.draft import Draft
-from madoc.robots.expressions import ExpressionError, Read, parse
-from madoc.robots.model import ModelFiles, compiled, make_model
-from madoc.robots.sensing import Signals, quiet_arithmetic
+from madoc.robots.expressions import Read, parse
+from madoc.robots.model import Draft, ModelFiles, compiled, make_model
+from madoc.robots.sensing import Signals
 from madoc.robots.signals import read_signals, signal_unit
 from madoc.robots.space import parameter_space
 from madoc.robots.spec import RobotSpec, read_spec
-from madoc.tasks.base import ActionChannel, Batch, Task
+from madoc.tasks.base import ActionChannel, Batch, Task, never_terminated
 
 
 @dataclass(frozen=True)
@@ -60,22 +59,16 @@ class Robot:
 
 @lru_cache(maxsize=32)
 def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
-    """The robot that a spec describes; of the same content, the same robot.
-
-    Raises:
-        MadocError: Spec and model do not fit; the sentence names the line of the spec.
-    """
+    """The robot that a spec describes; of the same content, the same robot. A mistake is refused with its line."""
     spec, document = read_spec(content, file)
-    try:
-        base = files.spec()
-    except MadocError as error:
-        raise document.error(("model",), str(error)) from error
-    draft = Draft(spec, document, base)
+    with document.at("model"):
+        draft = Draft(spec, document, files.spec())
     _check_names(draft)
     try:
         factory, model = _model(draft, files.main)
     except MadocError:
-        _check_compiles(draft, files.main)
+        with document.at("model"):  # where the file does not compile by itself, the mistake is there
+            compiled(draft.base.copy, files.main)
         raise
     signals = read_signals(draft, model)
     actions = tuple(action_channel(draft, model, index) for index in range(len(spec.actions)))
@@ -93,7 +86,7 @@ def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
         observation_size=len(names),
         observe=partial(_needs_a_system, spec.name) if signals.read_sensors else signals.observe,
         reward=_reward(draft, signals, actions),
-        terminated=_never,
+        terminated=never_terminated,
         reset_noise=partial(_no_noise, size=model.nq + model.nv + pending * len(actions)),
         parameters=space,
         ranges={"normal": space},
@@ -109,10 +102,8 @@ def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
         rewarded=spec.reward is not None,
         source={"file": file, "spec": content.decode("utf-8-sig"), "model": files.to_json()},
     )
-    try:
+    with document.at("model"):
         simulation.make(task, threads=1)
-    except MadocError as error:
-        raise document.error(("model",), str(error)) from error
     shown = tuple(
         Signal(given.name, signal_unit(draft, model, expression, index), expression.text)
         for index, (given, expression) in enumerate(zip(spec.signals, signals.expressions, strict=True))
@@ -122,21 +113,11 @@ def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
 
 def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco.MjModel]:
     """The function that builds the MuJoCo spec with the added actuators, and its model."""
-    actuators = (added_actuator(draft, index) for index in range(len(draft.spec.actions)))
+    actuators = [added_actuator(draft, index) for index in range(len(draft.spec.actions))]
     added = tuple(actuator for actuator in actuators if actuator is not None)
     factory = partial(make_model, draft.base, added, draft.spec.timestep)
-    try:
+    with draft.document.at("actions"):
         return factory, compiled(factory, file)
-    except MadocError as error:
-        raise draft.document.error(("actions",), str(error)) from error
-
-
-def _check_compiles(draft: Draft, file: str) -> None:
-    """Refuse a model file that does not compile by itself: the mistake is then there, and not in the actions."""
-    try:
-        compiled(draft.base.copy, file)
-    except MadocError as error:
-        raise draft.document.error(("model",), str(error)) from error
 
 
 def _check_names(draft: Draft) -> None:
@@ -171,28 +152,18 @@ def _frame_skip(draft: Draft, model: mujoco.MjModel) -> int:
 def _reward(
     draft: Draft, signals: Signals, actions: tuple[ActionChannel, ...]
 ) -> Callable[[Batch, Batch, Batch], Batch]:
-    """(state, action, next state) -> reward: the spec's expression, or 0 where it has none.
-
-    Raises:
-        MadocError: The expression does not parse, has no value, or reads a signal that needs a sensor.
-    """
+    """(state, action, next state) -> reward: the spec's expression, or 0 where it has none."""
     if draft.spec.reward is None:
         return _no_reward
     of_signals = {signal.name: index for index, signal in enumerate(draft.spec.signals)}
     of_actions = {channel.name: index for index, channel in enumerate(actions)}
-    place = ("reward",)
-    try:
+    with draft.document.at("reward"):
         expression = parse(draft.spec.reward, names=[*of_signals, *of_actions])
-        expression.value(lambda _: np.zeros(1), np)
-    except ExpressionError as error:
-        raise draft.document.error(place, str(error)) from error
-    except ArithmeticError as error:
-        raise draft.document.error(place, f"expected an expression with a value, got {draft.spec.reward!r}") from error
     for read in expression.reads:
         inside = signals.expressions[of_signals[read.name]].reads if read.name in of_signals else ()
         if any(part.kind == "sensor" for part in inside):
             raise draft.document.error(
-                place, f"a reward is a function of state and action, and the signal {read.name!r} reads a sensor"
+                ("reward",), f"a reward is a function of state and action, and the signal {read.name!r} reads a sensor"
             )
 
     def reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
@@ -205,7 +176,7 @@ def _reward(
             middle, half = (channel.low + channel.high) / 2.0, (channel.high - channel.low) / 2.0
             return middle + half * action[..., of_actions[read.name]]
 
-        with quiet_arithmetic():
+        with np.errstate(all="ignore"):
             return expression.value(look_up, namespace)
 
     return reward
@@ -213,10 +184,6 @@ def _reward(
 
 def _no_reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
     return 0.0 * next_state[..., 0]
-
-
-def _never(next_state: Batch) -> Batch:
-    return next_state.__array_namespace__().zeros(next_state.shape[:-1], dtype=bool)
 
 
 def _no_noise(key: PRNGKeyArray, count: int, *, size: int) -> jax.Array:

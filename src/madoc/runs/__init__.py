@@ -1,1 +1,1 @@
-"""What a run is made of: the loop under a budget, checkpoints, the run folder, files, interruption and progress."""
+"""Runs of any method: the loop under a budget, checkpoints, the run folder, files, interruption and progress."""

@@ -1,4 +1,4 @@
-"""Save a method's state to one `.npz` file and get the same bits back. No pickle."""
+"""Save a method's state in one `.npz` file and read the same bits back, without pickle."""
 
 import json
 import zipfile
@@ -17,27 +17,28 @@ from madoc.runs.files import json_text, replacing
 State = TypeVar("State")
 
 FORMAT = 2
-"""Version of the file's layout: one `.npy` member a leaf, and `checkpoint.json` for all the rest."""
+"""Version of the file's layout: one `.npy` member for each array, and `checkpoint.json` for everything else."""
 
-_VALUES: dict[str, tuple[type, Callable[[str], object]]] = {
-    "bool": (bool, lambda text: text == "True"),
-    "int": (int, int),
-    "float": (float, float),
-    "str": (str, str),
+_READERS: dict[str, Callable[[str], object]] = {
+    "bool": lambda text: text == "True",
+    "int": int,
+    "float": float,
+    "str": str,
 }
-"""Python values a state may hold, and how to read them back from `str(value)`; exact for all four."""
+"""Types of the Python values that a state may hold, and how to read them back, exactly, from `str(value)`."""
+_ARRAYS = ("jax", "numpy", "scalar")
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """What a leaf of a state is, without its numbers.
+    """The type of a leaf of a state.
 
     Attributes:
-        kind: "jax", "numpy" or "scalar" (a NumPy scalar): an array; "key": random key; "value": Python value;
-            "static": a function, never saved.
-        dtype: Its dtype, the name of a key's generator, or the Python type of a value.
-        shape: Its shape.
-        weak: Whether a JAX array is weakly typed; losing that would change promotions, and so bits.
+        kind: `jax`, `numpy` or `scalar` (of NumPy) for arrays, `key` for random keys, `value` for Python values, and
+            `static` for functions, which are not saved.
+        dtype: The dtype, the name of a key's generator, or the Python type of a value.
+        shape: The shape of an array or of keys.
+        weak: Whether a JAX array is weakly typed, which decides dtypes of what is computed from it.
     """
 
     kind: str
@@ -50,9 +51,8 @@ class Leaf:
         return {"key": "random key ", "static": "function"}.get(self.kind, "") + self.dtype + shape
 
     def fits(self, other: "Leaf") -> bool:
-        """Whether one may take the other's place: the same but for where an array lives."""
-        arrays = ("jax", "numpy", "scalar")
-        same_kind = self.kind == other.kind or (self.kind in arrays and other.kind in arrays)
+        """Whether one may take the other's place; JAX and NumPy arrays may take each other's."""
+        same_kind = self.kind == other.kind or (self.kind in _ARRAYS and other.kind in _ARRAYS)
         return same_kind and self.dtype == other.dtype and self.shape == other.shape
 
 
@@ -61,7 +61,7 @@ Layout = dict[str, Leaf]
 
 
 def layout(state: object) -> Layout:
-    """What the leaves of a state are.
+    """The types of the leaves of a state.
 
     Raises:
         MadocError: A leaf is of a type that cannot be saved.
@@ -70,7 +70,7 @@ def layout(state: object) -> Layout:
 
 
 def difference(got: Layout, expected: Layout) -> str | None:
-    """The first place where two layouts do not fit, in words; None if they fit."""
+    """The first leaf that does not fit, in words; None if all fit."""
     for path in [*expected, *got]:
         if path not in got:
             return f"expected {path} ({expected[path]}), which is missing"
@@ -84,44 +84,43 @@ def difference(got: Layout, expected: Layout) -> str | None:
 def first_non_finite(state: object) -> str | None:
     """The path of the first leaf that holds a NaN or an infinity; None if there is none."""
     for path, leaf in _leaves(state):
-        if _is_inexact(leaf) and not np.isfinite(np.asarray(leaf)).all():
+        inexact = jnp.issubdtype(getattr(leaf, "dtype", type(leaf)), jnp.inexact)
+        if inexact and not np.isfinite(np.asarray(leaf)).all():
             return path
     return None
 
 
 def save(path: Path, state: object, extra: Mapping[str, object]) -> None:
-    """Write a state, and a small JSON dictionary beside it, whole or not at all.
+    """Write a state, and a small JSON dictionary with it, whole or not at all.
 
-    Leaves go to the disk one after the other, so a large replay buffer is never copied as a whole. Equal
-    states and extras give equal files.
+    Arrays are written one after the other, so a large replay buffer is never copied. Equal states and extras give
+    equal files.
 
     Raises:
-        MadocError: A leaf is of a type that cannot be saved, `extra` is not strict JSON, or the disk refuses.
+        MadocError: A leaf is of a type that cannot be saved, `extra` is not strict JSON, or writing failed.
     """
     leaves = layout(state)
-    values = {name: str(leaf) for name, leaf in _leaves(state) if leaves[name].kind == "value"}
     about = {
         "format": FORMAT,
         "leaves": {name: asdict(leaf) for name, leaf in leaves.items() if leaf.kind != "static"},
-        "values": values,
+        "values": {name: str(leaf) for name, leaf in _leaves(state) if leaves[name].kind == "value"},
         "extra": extra,
     }
     text = json_text(about, what=path.name)
     with replacing(path) as stream, zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr(zipfile.ZipInfo("checkpoint.json"), text)
+        archive.writestr(zipfile.ZipInfo("checkpoint.json"), text)  # a ZipInfo of our own carries no clock time
         for name, leaf in _leaves(state):
             if leaves[name].kind not in ("value", "static"):
-                # A ZipInfo of our own carries no clock time.
                 with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, _to_numpy(leaf), allow_pickle=False)
 
 
 def load(path: Path, like: State) -> tuple[State, dict[str, Any]]:
-    """The state and the extra dictionary that `save` wrote.
+    """Read the state and the extra dictionary that `save` wrote.
 
     Args:
         path: The file.
-        like: A state of the same structure, from the method's `init`; gives the structure and the functions.
+        like: A state from the method's `init`, which gives the structure and the functions.
 
     Raises:
         MadocError: The file is missing or damaged, or holds the state of another method, setting or version.
@@ -150,17 +149,12 @@ def load(path: Path, like: State) -> tuple[State, dict[str, Any]]:
 
 
 def _leaves(state: object) -> list[tuple[str, object]]:
-    flat, _ = jax.tree_util.tree_flatten_with_path(state)
-    return [("state" + jax.tree_util.keystr(path), leaf) for path, leaf in flat]
-
-
-def _is_inexact(leaf: object) -> bool:
-    if isinstance(leaf, np.ndarray | np.generic | jax.Array):
-        return bool(jnp.issubdtype(leaf.dtype, jnp.inexact))
-    return isinstance(leaf, float)
+    """The leaves of a state with their paths."""
+    return [("state" + jax.tree_util.keystr(path), leaf) for path, leaf in jax.tree.leaves_with_path(state)]
 
 
 def _describe(path: str, leaf: object) -> Leaf:
+    """The type of a leaf."""
     if isinstance(leaf, jax.Array):
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             return Leaf("key", str(jax.random.key_impl(leaf)), leaf.shape)
@@ -169,7 +163,7 @@ def _describe(path: str, leaf: object) -> Leaf:
         if leaf.dtype.hasobject or leaf.dtype.names or np.dtype(leaf.dtype.name) != leaf.dtype:
             raise MadocError(f"cannot save {path}: NumPy dtype {leaf.dtype!r}; expected plain native numbers")
         return Leaf("numpy" if isinstance(leaf, np.ndarray) else "scalar", leaf.dtype.name, leaf.shape)
-    if type(leaf).__name__ in _VALUES and type(leaf) is _VALUES[type(leaf).__name__][0]:
+    if type(leaf) in (bool, int, float, str):
         return Leaf("value", type(leaf).__name__)
     if callable(leaf):
         return Leaf("static")
@@ -184,26 +178,22 @@ def _to_numpy(leaf: object) -> np.ndarray:
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         leaf = jax.random.key_data(leaf)
     array = np.asarray(leaf)
-    foreign = np.dtype(array.dtype.str) != array.dtype  # bfloat16 and its kin: npy would forget what they are
+    foreign = np.dtype(array.dtype.str) != array.dtype  # bfloat16 and the like: npy would forget what they are
     return array.view(f"u{array.dtype.itemsize}") if foreign else array
 
 
 def _restore(archive: zipfile.ZipFile, name: str, leaf: Leaf, values: dict[str, str]) -> object:
+    """A leaf from its member of the archive, or from the values."""
     if leaf.kind == "value":
-        return _VALUES[leaf.dtype][1](values[name])
+        return _READERS[leaf.dtype](values[name])
     with archive.open(f"{name}.npy") as member:
         array = np.lib.format.read_array(member, allow_pickle=False)
     if leaf.kind == "key":
         return jax.random.wrap_key_data(jnp.asarray(array), impl=leaf.dtype)
-    dtype = np.dtype(leaf.dtype)
-    array = array.view(dtype) if array.dtype != dtype else array
+    array = array.view(np.dtype(leaf.dtype))
     if array.shape != leaf.shape:
         raise ValueError(f"{name} has shape {array.shape}, recorded as {leaf.shape}")
-    if leaf.kind == "numpy":
-        return array
-    if leaf.kind == "scalar":
-        return array[()]
-    if leaf.weak:
-        weak = jnp.full(leaf.shape, dtype.type(0).item())
-        return weak.at[...].set(array) if weak.dtype == dtype else jnp.asarray(array)
-    return jnp.asarray(array)
+    if leaf.kind != "jax":
+        return array if leaf.kind == "numpy" else array[()]
+    weak = jnp.full(leaf.shape, array.dtype.type(0).item())
+    return weak.at[...].set(array) if leaf.weak and weak.dtype == array.dtype else jnp.asarray(array)

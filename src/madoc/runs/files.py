@@ -13,7 +13,7 @@ from madoc.errors import MadocError
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A binary stream; what it got becomes the file `path` if the block ends well, else nothing changes.
+    """A binary stream that replaces the file `path` at the end of the block; an error leaves the old file.
 
     After the block the content is on the disk, not in a cache: a power cut leaves the old or the new file.
 
@@ -37,16 +37,16 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what killed writers left half-written in a folder that no other process writes to."""
+    """Delete the half-written files of killed processes from a folder that no other process writes to."""
     for leftover in folder.glob(".*.tmp"):
         leftover.unlink(missing_ok=True)
 
 
 def write_json(path: Path, value: object) -> None:
-    """Write `value` as readable strict JSON, whole or not at all.
+    """Write `value` as indented strict JSON, whole or not at all.
 
     Raises:
-        MadocError: `value` holds something JSON has no word for (NaN, an object), or the disk refuses.
+        MadocError: JSON cannot express `value` (NaN, an object), or writing failed.
     """
     content = json_text(value, what=path.name, indent=2) + "\n"
     with replacing(path) as stream:
@@ -57,7 +57,7 @@ def json_text(value: object, *, what: str, indent: int | None = None) -> str:
     """Strict JSON on one line, or indented.
 
     Raises:
-        MadocError: `value` holds something JSON has no word for; the sentence names the place inside `what`.
+        MadocError: JSON cannot express `value`; the sentence names the place inside `what`.
     """
     try:
         return json.dumps(value, allow_nan=False, indent=indent, ensure_ascii=False)
@@ -81,7 +81,7 @@ def read_json(path: Path) -> Any:
 
 
 def _unwritable(value: object, place: str) -> str | None:
-    """Where in a nested value, and what, JSON cannot express."""
+    """The first part of a nested value that JSON cannot express, with its place; None if there is none."""
     if value is None or isinstance(value, bool | int | str):
         return None
     if isinstance(value, float):
@@ -99,7 +99,7 @@ def _unwritable(value: object, place: str) -> str | None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Put a renamed entry of a folder on the disk; Windows has no such call and needs none."""
+    """Force a renamed entry of a folder to the disk; Windows has no such call and needs none."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)

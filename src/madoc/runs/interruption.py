@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a wish to stop, heard between two steps."""
+"""Ctrl-C and SIGTERM as a request to stop, which is obeyed between two steps."""
 
 import signal
 import threading
@@ -8,7 +8,7 @@ from types import FrameType
 
 
 class Interruption:
-    """The user's wish to stop: asked for once, the step ends; asked for again, it breaks off."""
+    """A request to stop: after the first one the current step still ends, a second one breaks it off."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -16,7 +16,7 @@ class Interruption:
 
     @contextmanager
     def breakable(self) -> Iterator[None]:
-        """A block that a second wish leaves with KeyboardInterrupt; files are never written in one."""
+        """A block that a second request leaves with KeyboardInterrupt; no files may be written in it."""
         self._breakable = True
         try:
             yield
@@ -32,7 +32,7 @@ class Interruption:
 
 @contextmanager
 def interruptible() -> Iterator[Interruption]:
-    """Take over SIGINT and SIGTERM, and give them back. Only the main thread may; others do nothing."""
+    """Handle SIGINT and SIGTERM in the block, if it runs in the main thread; other threads may not."""
     interruption = Interruption()
     previous = {}
     if threading.current_thread() is threading.main_thread():

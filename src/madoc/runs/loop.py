@@ -12,9 +12,10 @@ from jaxtyping import PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.runs import checkpoint
+from madoc.runs.budget import Budget, Seconds, read_budget
 from madoc.runs.interruption import interruptible
 from madoc.runs.progress import Moment, display
-from madoc.runs.run_folder import RunFolder, RunLog, count_name
+from madoc.runs.run_folder import RunFolder, RunLog
 from madoc.types import Epoch, Method, Metrics, Problem, State, Unit
 
 Status = Literal["finished", "converged", "interrupted", "diverged"]
@@ -25,16 +26,7 @@ PREPARATION = 0.1
 
 @dataclass(frozen=True)
 class Tally:
-    """What the epochs of a run add up to; part of every checkpoint.
-
-    Attributes:
-        control_steps: Simulated control steps.
-        unbudgeted: Those of them that the budget does not count.
-        updates: Gradient updates.
-        stage: Of the last epoch.
-        prepared: Share of the preparation that is done; None where there was none.
-        converged: Why the method stopped by itself.
-    """
+    """The sums over the epochs of a run, and the stage, share of preparation and convergence of the last one."""
 
     control_steps: int = 0
     unbudgeted: int = 0
@@ -44,7 +36,7 @@ class Tally:
     converged: str | None = None
 
     def plus(self, epoch: Epoch) -> "Tally":
-        """With one more epoch."""
+        """The tally after one more epoch."""
         return Tally(
             self.control_steps + epoch.control_steps,
             self.unbudgeted + epoch.unbudgeted,
@@ -55,7 +47,7 @@ class Tally:
         )
 
     def spent(self, unit: Unit) -> int:
-        """What the budget counts."""
+        """The count that is compared with the budget."""
         return self.updates if unit == "updates" else self.control_steps - self.unbudgeted
 
     def fraction(self, spent_share: float) -> float:
@@ -69,18 +61,20 @@ class Finished(Generic[State]):
     """How a run ended.
 
     Attributes:
-        state: The last state; the bad one if the run diverged.
-        status: "finished" (budget spent), "converged", "interrupted" (by the user) or "diverged" (NaN).
+        state: The last state, even if the run diverged.
+        status: `finished` (the budget is spent), `converged`, `interrupted` (by the user) or `diverged` (a NaN).
         sentence: The status in words.
-        control_steps: Simulated control steps spent.
-        spent: What the budget counts.
-        seconds: Wall-clock time, that before a resume included.
+        control_steps: Simulated control steps.
+        updates: Gradient updates of the result.
+        spent: How much of the budget was spent, in its unit; in the method's unit where the budget is a time.
+        seconds: Wall-clock time, including that before a resume.
     """
 
     state: State
     status: Status
     sentence: str
     control_steps: int
+    updates: int
     spent: int
     seconds: float
 
@@ -90,7 +84,7 @@ def run(
     problem: Problem,
     *,
     key: PRNGKeyArray,
-    budget: int,
+    budget: Budget | str,
     folder: RunFolder | None = None,
     resume: bool = False,
     quiet: bool = False,
@@ -106,30 +100,31 @@ def run(
     ends the run after the current step, with a checkpoint; a second one abandons the step.
 
     Args:
-        method: What to run.
-        problem: What to run it on.
-        key: The only source of randomness; on resume, the same key again.
-        budget: In `unit`; the step that reaches it is the last.
-        folder: Where to write logs, checkpoints and `result.json`; None to write nothing.
-        resume: Go on from the folder's checkpoint, or from the start if it was killed before the first one.
-            A run that had ended comes back as it is, unless `budget` grew.
+        method: The method.
+        problem: The problem that its functions are given.
+        key: The only source of randomness; a resumed run needs the same key.
+        budget: A count in `unit`, or a time as `Seconds(300)` or "300s"; the step that reaches it is the last. A run
+            under a time budget that is killed and resumed has the time that was left at the checkpoint, and its result
+            depends on the machine's speed.
+        folder: The folder for logs, checkpoints and `result.json`; None to write nothing.
+        resume: Continue from the folder's checkpoint, or from the start if there is none yet. A run that had ended
+            is returned as it is, unless `budget` grew.
         quiet: Show no progress.
-        description: What the progress bar is called.
-        shown: Metrics shown beside the bar, at most three; the first three if none is named.
+        description: Title of the progress bar.
+        shown: Metrics to show beside the bar, at most three; if empty, the first three.
         checkpoint_every: Seconds between two checkpoints.
-        unit: What the budget counts.
-        trace: More finite scalars of a state, for the log alone.
+        unit: The unit of the budget.
+        trace: A function of the state that gives more finite scalars for the log.
 
     Raises:
         MadocError: The budget is not positive, there is no folder to resume, the folder holds a run and
             `resume` is false, the checkpoint is damaged or another method's, or the state cannot be saved.
     """
-    if budget < 1:
-        raise MadocError(f"expected a budget of at least 1 {unit.removesuffix('s')}, got {budget}")
+    budget = read_budget(budget, unit)
     _check_folder(folder, resume)
     with ExitStack() as stack:
         interruption = stack.enter_context(interruptible())
-        session = _Session(method, method.init(problem, key), budget, unit, folder, resume, trace)
+        session = _Session(method.init(problem, key), budget, unit, folder, resume, trace)
         if session.ended(interruption.asked) and session.resumed:
             return session.finish()
         session.begin(stack)
@@ -152,13 +147,12 @@ def run(
 
 
 class _Session(Generic[State]):
-    """A run under way: its state, what its epochs add up to, and what of it is on the disk."""
+    """A run in progress: its state, its tally, and its files."""
 
     def __init__(
         self,
-        method: object,
         state: State,
-        budget: int,
+        budget: Budget,
         unit: Unit,
         folder: RunFolder | None,
         resume: bool,
@@ -169,7 +163,6 @@ class _Session(Generic[State]):
         self.outcome: tuple[Status, str] | None = None
         self._tally = Tally()
         self._trace = trace
-        self._method_name = type(method).__name__
         self._budget, self._unit = budget, unit
         self._folder = folder
         self._layout = checkpoint.layout(state) if folder else {}
@@ -188,8 +181,25 @@ class _Session(Generic[State]):
     def spent(self) -> int:
         return self._tally.spent(self._unit)
 
+    @property
+    def _share(self) -> float:
+        """Share of the budget spent."""
+        if isinstance(self._budget, Seconds):
+            return self._seconds() / self._budget.seconds
+        return self.spent / self._budget
+
+    @property
+    def _allowed(self) -> str:
+        """The budget in words."""
+        return str(self._budget) if isinstance(self._budget, Seconds) else f"{self._budget:,} {self._unit}"
+
+    @property
+    def _used(self) -> str:
+        """What of the budget is spent, as a number in words."""
+        return f"{self._seconds():.0f}" if isinstance(self._budget, Seconds) else f"{self.spent:,}"
+
     def begin(self, stack: ExitStack) -> None:
-        """Open the logs; write the first checkpoint, which refuses a bad state before any budget is spent."""
+        """Open the logs, and write the first checkpoint, so that a bad state is refused before any budget is spent."""
         self._started = time.monotonic()
         if self._folder:
             self._folder.result.unlink(missing_ok=True)
@@ -199,23 +209,22 @@ class _Session(Generic[State]):
             self.save()
 
     def ended(self, interrupted: bool) -> bool:
-        """Whether there is a reason to stop; the first one found stays the reason."""
+        """Whether there is a reason to stop; the first reason is kept."""
         if self.outcome is None:
-            spent = self.spent
             if self._tally.converged is not None:
                 self.outcome = "converged", self._tally.converged
-            elif spent >= self._budget:
-                self.outcome = "finished", f"the budget of {self._budget:,} {self._unit} is spent"
+            elif self._share >= 1.0:
+                self.outcome = "finished", f"the budget of {self._allowed} is spent"
             elif interrupted:
-                self.outcome = "interrupted", f"interrupted at {spent:,} of {self._budget:,} {self._unit}"
+                self.outcome = "interrupted", f"interrupted at {self._used} of {self._allowed}"
         return self.outcome is not None
 
     def moment(self, metrics: Metrics) -> Moment:
-        """Where the run stands, for the progress bar."""
-        return Moment(self._tally.fraction(self.spent / self._budget), self.spent, self._tally.stage, metrics)
+        """The progress of the run, for the bar."""
+        return Moment(self._tally.fraction(self._share), self.spent, self._tally.stage, metrics)
 
     def take(self, state: State, epoch: Epoch) -> Metrics:
-        """Accept the result of a step, log it, and look at its metrics."""
+        """Accept the result of a step, log it, and check that its metrics are finite."""
         self.state, self._tally = state, self._tally.plus(epoch)
         metrics = {name: float(value) for name, value in epoch.metrics.items()}
         if self._log:
@@ -228,7 +237,7 @@ class _Session(Generic[State]):
         return metrics
 
     def save(self) -> None:
-        """Write a checkpoint; never a bad one."""
+        """Write a checkpoint, unless the state holds a NaN or an infinity."""
         if self.outcome is None or self.outcome[0] != "diverged":
             bad = checkpoint.first_non_finite(self.state)
             if bad:
@@ -236,24 +245,24 @@ class _Session(Generic[State]):
             elif self._folder and self._log:
                 problem = checkpoint.difference(checkpoint.layout(self.state), self._layout)
                 if problem:
-                    raise MadocError(f"{self._method_name} changed the layout of its state: {problem}")
+                    raise MadocError(f"the method changed the layout of its state: {problem}")
                 self._write_state(self._folder.checkpoint, self._log.sync())
 
     def abandon(self) -> None:
-        """Stop inside a step. What it may have left half-changed is not saved: the last checkpoint stays."""
-        sentence = f"interrupted inside a step, at {self.spent:,} of {self._budget:,} {self._unit}"
+        """Stop inside a step. Its unfinished state is not saved: the last checkpoint stays."""
+        sentence = f"interrupted inside a step, at {self._used} of {self._allowed}"
         self.outcome = "interrupted", sentence
 
     def finish(self) -> Finished[State]:
-        """The result, also as `result.json`; one of a run that had ended before is left as it is."""
+        """The result; also written as `result.json`, unless an earlier run has written it."""
         if self.outcome is None:
             raise RuntimeError("finish() before the run has ended")
         status, sentence = self.outcome
-        control_steps, seconds = self._tally.control_steps, self._seconds()
+        tally, seconds = self._tally, self._seconds()
         if self._folder and not self._folder.result.exists():
-            counts = {count_name(self._unit): self.spent, "control_steps": control_steps, "seconds": seconds}
+            counts = {"control_steps": tally.control_steps, "updates": tally.updates, "seconds": seconds}
             self._folder.write_json("result.json", {"status": status, "sentence": sentence} | counts)
-        return Finished(self.state, status, sentence, control_steps, self.spent, seconds)
+        return Finished(self.state, status, sentence, tally.control_steps, tally.updates, self.spent, seconds)
 
     def _diverge(self, what: str) -> None:
         where = ""

@@ -44,15 +44,9 @@ def display(description: str, *, unit: str, quiet: bool = False) -> Iterator[Sho
     """
     if quiet:
         yield lambda moment: None
-    elif sys.stderr.isatty():
-        with _bar(description, unit) as show:
-            yield show
     else:
-        lines = _Lines(description, unit)
-        try:
-            yield lines.show
-        finally:
-            lines.finish()
+        with (_bar if sys.stderr.isatty() else _lines)(description, unit) as show:
+            yield show
 
 
 @contextmanager
@@ -73,66 +67,55 @@ def bar(description: str, *, total: int, unit: str, quiet: bool = False) -> Iter
 
 
 class _Pace:
-    """The rate and the time left, computed from the most recent moments."""
+    """The rate of the work and the time left, from the moments of the last `_WINDOW_SECONDS`."""
 
     def __init__(self, unit: str) -> None:
         self._unit = unit
         self._started = time.monotonic()
         self._seen: deque[tuple[float, Moment]] = deque()
 
-    def see(self, moment: Moment) -> None:
+    def words(self, moment: Moment) -> tuple[str, str, str]:
+        """The rate, the time elapsed, and the time left, at a moment."""
         now = time.monotonic()
         self._seen.append((now, moment))
         while len(self._seen) > 2 and self._seen[1][0] < now - _WINDOW_SECONDS:
             self._seen.popleft()
-
-    def rate(self) -> str:
-        (then, before), (now, moment) = self._seen[0], self._seen[-1]
-        per_second = (moment.done - before.done) / (now - then) if now > then else 0.0
-        return f"{per_second:,.0f} {self._unit}/s" if per_second > 0 else f"- {self._unit}/s"
-
-    def left(self) -> str:
-        (then, before), (now, moment) = self._seen[0], self._seen[-1]
-        gained = moment.fraction - before.fraction
-        return _clock((1.0 - moment.fraction) * (now - then) / gained) if gained > 0 else "-:--"
-
-    def elapsed(self) -> str:
-        return _clock(time.monotonic() - self._started)
+        then, before = self._seen[0]
+        seconds, done, fraction = now - then, moment.done - before.done, moment.fraction - before.fraction
+        rate = f"{done / seconds:,.0f}" if seconds > 0 and done > 0 else "-"
+        left = _clock((1.0 - moment.fraction) * seconds / fraction) if fraction > 0 else "-:--"
+        elapsed = _clock(now - self._started)
+        return f"{rate} {self._unit}/s", f"{elapsed} elapsed", f"{left} left"
 
 
-class _Lines:
+@contextmanager
+def _lines(description: str, unit: str) -> Iterator[Show]:
     """Plain lines for a log file: one when a stage begins, one every `LINE_SECONDS`, one at the end."""
+    pace = _Pace(unit)
+    stage: str | None = None
+    printed = 0.0
+    line = ""
 
-    def __init__(self, description: str, unit: str) -> None:
-        self._description = description
-        self._unit = unit
-        self._pace = _Pace(unit)
-        self._stage: str | None = None
-        self._printed = 0.0
-        self._unprinted: Moment | None = None
+    def show(moment: Moment) -> None:
+        nonlocal stage, printed, line
+        head = " ".join(word for word in (description, moment.stage) if word)
+        done = [f"{100 * moment.fraction:.0f}%", f"{moment.done:,} {unit}"]
+        parts = ", ".join([*done, *pace.words(moment), *_metrics(moment)])
+        line = f"{head}: {parts}" if head else parts
+        if moment.stage != stage or time.monotonic() - printed >= LINE_SECONDS:
+            stage, printed = moment.stage, time.monotonic()
+            print_line()
 
-    def show(self, moment: Moment) -> None:
-        self._pace.see(moment)
-        self._unprinted = moment
-        if moment.stage != self._stage or time.monotonic() - self._printed >= LINE_SECONDS:
-            self._print(moment)
+    def print_line() -> None:
+        nonlocal line
+        print(line, file=sys.stderr, flush=True)
+        line = ""
 
-    def finish(self) -> None:
-        if self._unprinted is not None:
-            self._print(self._unprinted)
-
-    def _print(self, moment: Moment) -> None:
-        self._stage, self._printed, self._unprinted = moment.stage, time.monotonic(), None
-        parts = [
-            f"{100 * moment.fraction:.0f}%",
-            f"{moment.done:,} {self._unit}",
-            self._pace.rate(),
-            f"{self._pace.elapsed()} elapsed",
-            f"{self._pace.left()} left",
-            *_metrics(moment),
-        ]
-        head = " ".join(word for word in (self._description, moment.stage) if word)
-        print(f"{head}: {', '.join(parts)}" if head else ", ".join(parts), file=sys.stderr, flush=True)
+    try:
+        yield show
+    finally:
+        if line:
+            print_line()
 
 
 @contextmanager
@@ -145,29 +128,16 @@ def _bar(description: str, unit: str) -> Iterator[Show]:
         return TextColumn(f"{{task.fields[{name}]}}", markup=False)
 
     pace = _Pace(unit)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        text("stage"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f}%"),
-        text("rate"),
-        TimeElapsedColumn(),
-        text("left"),
-        text("metrics"),
-    )
+    percentage = TextColumn("{task.percentage:>3.0f}%")
+    after = (text("rate"), TimeElapsedColumn(), text("left"), text("metrics"))
+    columns = (TextColumn("{task.description}", markup=False), text("stage"), BarColumn(), percentage, *after)
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(description, total=1.0, stage="", rate="", left="", metrics="")
 
         def show(moment: Moment) -> None:
-            pace.see(moment)
-            progress.update(
-                task,
-                completed=moment.fraction,
-                stage=moment.stage,
-                rate=pace.rate(),
-                left=f"{pace.left()} left",
-                metrics="  ".join(_metrics(moment)),
-            )
+            metrics = "  ".join(_metrics(moment))
+            rate, _, left = pace.words(moment)
+            progress.update(task, completed=moment.fraction, stage=moment.stage, rate=rate, left=left, metrics=metrics)
 
         yield show
 

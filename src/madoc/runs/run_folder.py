@@ -16,30 +16,27 @@ from madoc.runs.files import json_text, read_json, remove_leftovers, write_json
 from madoc.types import Metrics, Unit
 
 _FREE = ("budget", "versions")
-"""The keys of a spec that may differ when a run is resumed."""
+"""Keys of a spec that may differ when a run is resumed."""
 
 
 class RunFolder:
     """A locked run folder; as a context manager it unlocks the folder at the end.
 
     It holds `spec.json` (the settings and versions), `metrics.jsonl` (one line for each epoch), `tensorboard/`,
-    `checkpoint.npz` (all that is needed to resume), `result.json` (once the run has ended), and `diverged.npz` (the
-    last state, if it held a NaN). All files but the logs, which grow, are written whole or not at all.
+    `checkpoint.npz` (the last good state), `result.json` (how the run ended; missing until then), and `diverged.npz`
+    (the last state, if it held a NaN). All files but the logs, which grow, are written whole or not at all.
+
+    Call `create` or `open` to make one.
     """
 
     def __init__(self, path: Path, spec: Mapping[str, object], lock: filelock.BaseFileLock) -> None:
-        """Call `create` or `open` instead."""
-        self.path = path
-        self.spec = spec
-        self._lock = lock
+        self.path, self.spec, self._lock = path, spec, lock
+        self.checkpoint, self.diverged = path / "checkpoint.npz", path / "diverged.npz"
+        self.result = path / "result.json"
 
     @classmethod
     def create(cls, path: str | Path, spec: Mapping[str, object]) -> "RunFolder":
-        """Make the folder of a new run.
-
-        Args:
-            path: The folder; made if missing.
-            spec: The run's settings as JSON: method, hyperparameters, data, seed, budget. Versions are added.
+        """Make the folder of a new run, and write its spec: the run's settings as JSON, and the versions.
 
         Raises:
             MadocError: The folder already holds a run, is locked, or cannot be written.
@@ -61,14 +58,11 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path, spec: Mapping[str, object] | None = None) -> "RunFolder":
-        """Lock the folder of an earlier run, to go on with it or to add to it.
-
-        Args:
-            path: The folder.
-            spec: The settings now, which must be those of the run but for `budget`; None compares nothing.
+        """Lock the folder of an earlier run, to resume it or to add to it.
 
         Raises:
-            MadocError: The folder is missing, holds no run, is locked, or holds a run with another spec.
+            MadocError: The folder is missing, holds no run, or is locked; or a spec is given that differs from that
+                of the run in more than the budget.
         """
         path = Path(path)
         if not (path / "spec.json").exists():
@@ -93,31 +87,16 @@ class RunFolder:
         """Unlock the folder."""
         self._lock.release()
 
-    @property
-    def checkpoint(self) -> Path:
-        """The file of the last good state."""
-        return self.path / "checkpoint.npz"
-
-    @property
-    def diverged(self) -> Path:
-        """The file of the state that made a run stop on a NaN."""
-        return self.path / "diverged.npz"
-
-    @property
-    def result(self) -> Path:
-        """The file that says how the run ended; it is missing until then."""
-        return self.path / "result.json"
-
     def write_json(self, name: str, value: object) -> None:
         """Write a JSON file of this folder, whole or not at all."""
         write_json(self.path / name, value)
 
     def log(self, offset: int, spent: int, *, unit: Unit = "control steps") -> "RunLog":
-        """The logs, cut back to the `offset` in bytes and the count `spent` of a checkpoint; 0 and 0 for a new run."""
+        """The logs, cut back to a checkpoint's `offset` in bytes and count `spent`; both are 0 for a new run."""
         return RunLog(self.path, offset, spent, unit)
 
     def _agree_on(self, spec: Mapping[str, object]) -> None:
-        """Refuse other settings, warn of other versions, and take over a new budget."""
+        """Refuse other settings, warn of other versions, and adopt a new budget."""
         before, now = (_flat({key: asked[key] for key in asked if key not in _FREE}) for asked in (self.spec, spec))
         for key in [*before, *now]:
             if before.get(key) != now.get(key):
@@ -128,11 +107,8 @@ class RunFolder:
                 )
         recorded = self.spec.get("versions")
         then = recorded if isinstance(recorded, dict) else {}
-        changed = [
-            f"{name} {then.get(name)} (now {version})"
-            for name, version in versions().items()
-            if then.get(name) != version
-        ]
+        differing = {name: version for name, version in versions().items() if then.get(name) != version}
+        changed = [f"{name} {then.get(name)} (now {version})" for name, version in differing.items()]
         if changed:
             warnings.warn(
                 f"{self.path} was started with {', '.join(changed)}; the result may differ in its last bits",
@@ -144,22 +120,20 @@ class RunFolder:
 
 
 class RunLog:
-    """The growing logs of a run, `metrics.jsonl` and TensorBoard events; as a context manager it closes them."""
+    """The logs of a run, `metrics.jsonl` and TensorBoard events; as a context manager it closes them.
+
+    Call `RunFolder.log` to open them.
+    """
 
     def __init__(self, path: Path, offset: int, spent: int, unit: Unit) -> None:
-        """Call `RunFolder.log` instead."""
         from tensorboardX import SummaryWriter  # slow to import, and only runs with a folder need it
 
         self._count = count_name(unit)
         self._lines = _cut(path / "metrics.jsonl", offset).open("ab")
         events = path / "tensorboard"
         events.mkdir(exist_ok=True)
-        self._events = SummaryWriter(
-            str(events),
-            purge_step=spent + 1,
-            # Two writers in one second would share, and so overwrite, a file.
-            filename_suffix=f".{len(list(events.iterdir()))}",
-        )
+        suffix = f".{len(list(events.iterdir()))}"  # two writers in one second would overwrite the same file
+        self._events = SummaryWriter(str(events), purge_step=spent + 1, filename_suffix=suffix)
 
     def __enter__(self) -> "RunLog":
         return self
@@ -179,7 +153,7 @@ class RunLog:
                 self._events.add_scalar(f"{stage}/{name}", value, spent)
 
     def sync(self) -> int:
-        """Put all lines on the disk; the length of `metrics.jsonl` in bytes, for the checkpoint."""
+        """Force all lines to the disk, and return the length of `metrics.jsonl` in bytes for the checkpoint."""
         self._lines.flush()
         os.fsync(self._lines.fileno())
         self._events.flush()
@@ -187,12 +161,12 @@ class RunLog:
 
 
 def count_name(unit: Unit) -> str:
-    """The key in JSON of a count in that unit: `control_steps` or `updates`."""
+    """The unit as a key in JSON: `control_steps` or `updates`."""
     return unit.replace(" ", "_")
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that decide the bits of a run, by name."""
+    """Versions of Python and of the packages on which the results of a run depend, by name."""
     installed = {"python": platform.python_version()}
     for name, package in {"madoc": "madoc-calibration", "jax": "jax", "mujoco": "mujoco"}.items():
         try:
@@ -203,7 +177,7 @@ def versions() -> dict[str, str]:
 
 
 def _lock(path: Path) -> filelock.BaseFileLock:
-    """Lock a folder, and delete what a killed writer left half-written."""
+    """Lock a folder, and delete the half-written files of a killed process."""
     lock = filelock.FileLock(path / ".lock", timeout=0, thread_local=False)
     try:
         lock.acquire()
@@ -216,7 +190,7 @@ def _lock(path: Path) -> filelock.BaseFileLock:
 
 
 def _cut(path: Path, offset: int) -> Path:
-    """Drop the lines after a checkpoint, which the resumed run writes again."""
+    """Cut off the lines after a checkpoint, which the resumed run writes again."""
     size = path.stat().st_size if path.exists() else 0
     if size < offset:
         raise MadocError(f"{path} has {size} bytes, its checkpoint says {offset}; restore it or start a new run")
@@ -226,16 +200,13 @@ def _cut(path: Path, offset: int) -> Path:
 
 
 def _flat(spec: object, prefix: str = "") -> dict[str, str]:
-    """Nested dictionaries as one, with dotted keys and JSON values."""
+    """A nested dictionary as a flat one, with dotted keys and values as JSON."""
     if isinstance(spec, Mapping) and spec:
-        return {
-            key: value
-            for name, child in spec.items()
-            for key, value in _flat(child, f"{prefix}.{name}" if prefix else name).items()
-        }
+        children = (_flat(child, f"{prefix}.{name}" if prefix else name) for name, child in spec.items())
+        return {key: value for child in children for key, value in child.items()}
     return {prefix: json_text(spec, what=prefix)}
 
 
 def _shortened(text: str) -> str:
-    """A value short enough for a sentence, which a robot's whole model is not."""
+    """A value cut to 80 characters, because a robot's whole model does not fit into a sentence."""
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -15,10 +15,7 @@ from madoc.tasks.base import Task
 class System(Protocol):
     """Dynamics at fixed parameters: `count` systems, each with any number of rows."""
 
-    @property
-    def count(self) -> int:
-        """Number of systems, the first axis of every state."""
-        ...
+    count: int
 
     def step(
         self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
@@ -41,31 +38,23 @@ class System(Protocol):
 
 @runtime_checkable
 class Simulator(Protocol):
-    """The source domain: a robot whose parameters can be chosen. A backend is this class and its `System`."""
+    """The source domain: a robot whose parameters can be chosen. A backend is this class and its `System`.
 
-    @property
-    def task(self) -> Task:
-        """The robot and its functions of state."""
-        ...
+    Attributes:
+        task: The robot and its functions of state.
+        parameters: The parameters that can be bound, in order.
+        action_size: Number of values per action.
+        control_step: Time between two actions in s.
+    """
 
-    @property
-    def parameters(self) -> ParameterSpace:
-        """The parameters that can be bound, in order."""
-        ...
+    task: Task
+    parameters: ParameterSpace
+    action_size: int
+    control_step: float
 
     @property
     def initial_state(self) -> Float[np.ndarray, " state"]:
         """State at the start of an episode, before the noise of a reset."""
-        ...
-
-    @property
-    def action_size(self) -> int:
-        """Number of values per action."""
-        ...
-
-    @property
-    def control_step(self) -> float:
-        """Time between two actions in s."""
         ...
 
     def bind(self, parameters: Float[np.ndarray, "*systems parameters"] | Mapping[str, float]) -> System:

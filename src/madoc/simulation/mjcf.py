@@ -2,8 +2,7 @@
 
 import ctypes
 import re
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from jaxtyping import Float
 from madoc.errors import MadocError
 from madoc.runs.files import replacing
 from madoc.simulation.base import Simulator
+from madoc.tasks.physics import write_inertia
 
 DIGITS = 17
 """Number of significant digits that determine a float64; MuJoCo by itself writes 6."""
@@ -22,18 +22,17 @@ DIGITS = 17
 ASSETS = "assets"
 """Folder of meshes, height fields and textures beside a written model."""
 
+_NOT_COMPARED = ("_", "bvh", "cam_", "geom_rgba", "light_", "mat_", "mesh_", "oct_", "site_rgba", "skin_", "tex_")
+"""Beginnings of the names of a model's arrays that only matter for rendering or for finding contacts faster."""
+
 _LONG_NUMBER = re.compile(r'(?<=["\s])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?=["\s])')
 
 
 @dataclass(frozen=True)
 class Change:
-    """One attribute in which a bound model differs from the robot's own.
+    """One attribute of MJCF in which a bound model (`new`) differs from the robot's own (`old`).
 
-    Attributes:
-        element: Kind and name, as `joint foot_joint`; `option` for the options of the model.
-        attribute: The attribute's name in MJCF.
-        old: Its value or values in the robot's own model.
-        new: Its value or values in the bound model.
+    The element is its kind and name, as `joint foot_joint`; `option` for the options of the model.
     """
 
     element: str
@@ -42,27 +41,11 @@ class Change:
     new: list[float]
 
 
-def spec_at(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> tuple[mujoco.MjSpec, list[Change]]:
-    """The robot's spec with physical values written into it, and the attributes that this changed.
-
-    Where an inertia changes, all inertias are made explicit, so that compiling the spec does not infer them again from
-    geoms, total masses or bounds.
-
-    Raises:
-        MadocError: A value changes a part of the model that cannot be written.
-    """
-    spec = simulator.task.spec()
-    nominal = _compiled(spec)
-    bound = simulator.model(values)
-    changes: list[Change] = []
-    for group, write in _GROUPS.items():
-        changes += write(spec, group, nominal, bound)
-    _refuse_difference(bound, _compiled(spec), "written into its spec")
-    return spec, changes
-
-
 def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], path: Path) -> list[Change]:
     """Write the calibrated model as MJCF, its assets in a folder beside it, and check it by loading it again.
+
+    Where an inertia changes, all inertias are made explicit, so that compiling the file does not infer them again from
+    geoms, total masses or bounds.
 
     Args:
         simulator: The robot.
@@ -75,9 +58,14 @@ def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], pa
     Raises:
         MadocError: The file cannot be written, an asset is missing, or the written model is not the bound one.
     """
-    spec, changes = spec_at(simulator, values)
+    spec, bound = simulator.task.spec(), simulator.model(values)
+    nominal = _compiled(spec)
+    changes = [*_write_gravity(spec, nominal, bound), *_write_inertia(spec, nominal, bound)]
+    for kind, attribute, array in _ROWS:
+        changes += _write_rows(spec, nominal, bound, kind=kind, attribute=attribute, array=array)
     _gather_assets(spec, path.parent)
-    _compiled(spec)  # MuJoCo writes what was compiled last
+    # MuJoCo writes what was compiled last.
+    _refuse_difference(bound, _compiled(spec), "written into its spec")
     with _precision(DIGITS):
         text = shortest_numbers(spec.to_xml())
     with replacing(path) as stream:
@@ -86,7 +74,7 @@ def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], pa
         read_back = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise MadocError(f"MuJoCo does not read back the model it wrote to {path}: {error}") from error
-    _refuse_difference(simulator.model(values), read_back, f"read back from {path}")
+    _refuse_difference(bound, read_back, f"read back from {path}")
     return changes
 
 
@@ -109,8 +97,10 @@ def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 def _refuse_difference(wanted: mujoco.MjModel, got: mujoco.MjModel, where: str) -> None:
     """Refuse a model that differs from the bound one in a number, but for rounding of derived constants."""
-    for name in _float_fields(wanted):
-        ours, theirs = np.asarray(getattr(wanted, name)), np.asarray(getattr(got, name))
+    for name in dir(wanted):
+        ours, theirs = getattr(wanted, name), getattr(got, name)
+        if name.startswith(_NOT_COMPARED) or not isinstance(ours, np.ndarray) or ours.dtype.kind != "f":
+            continue
         if ours.shape != theirs.shape:
             raise MadocError(f"the model {where} has {name} of shape {theirs.shape}, the bound one {ours.shape}")
         tolerance = 1e-12 * max(1.0, float(np.abs(ours).max(initial=0.0)))
@@ -125,14 +115,6 @@ def _refuse_difference(wanted: mujoco.MjModel, got: mujoco.MjModel, where: str) 
             raise MadocError(f"the model {where} differs from the bound one in the option {name}")
 
 
-def _float_fields(model: mujoco.MjModel) -> list[str]:
-    """Names of a model's arrays of floats, without those that only matter for rendering."""
-    drawn = ("bvh", "cam_", "geom_rgba", "light_", "mat_", "mesh_", "oct_", "site_rgba", "skin_", "tex_")
-    names = [name for name in dir(model) if not name.startswith(("_", *drawn))]
-    arrays = {name: getattr(model, name) for name in names}
-    return [name for name, value in arrays.items() if isinstance(value, np.ndarray) and value.dtype.kind == "f"]
-
-
 @contextmanager
 def _precision(digits: int) -> Iterator[None]:
     """Make MuJoCo write numbers with this number of digits.
@@ -140,9 +122,8 @@ def _precision(digits: int) -> Iterator[None]:
     Its library exports the setting without a binding in Python. A build without it writes rounded numbers, and the
     check after every writing refuses them.
     """
-    files = sorted(Path(mujoco.__file__).parent.glob(f"*mujoco*{mujoco.__version__}*")) or sorted(
-        Path(mujoco.__file__).parent.glob("mujoco*.dll")
-    )
+    folder = Path(mujoco.__file__).parent
+    files = sorted([*folder.glob(f"*mujoco*{mujoco.__version__}*"), *folder.glob("mujoco*.dll")])
     library = ctypes.CDLL(str(files[0])) if files else None
     setter = getattr(library, "_mjPRIVATE__set_xml_precision", None)
     getter = getattr(library, "_mjPRIVATE__get_xml_precision", None)
@@ -159,48 +140,41 @@ def _precision(digits: int) -> Iterator[None]:
 
 def _gather_assets(spec: mujoco.MjSpec, folder: Path) -> None:
     """Copy the files that a model refers to into the folder beside it, and refer to the copies."""
-    files: dict[str, str] = {}
+    copies: dict[str, str] = {}
     owners = [*spec.meshes, *spec.hfields, *spec.textures, *spec.skins]
     for owner in owners:
         own_folder = owner.compiler.texturedir if isinstance(owner, mujoco.MjsTexture) else owner.compiler.meshdir
         if owner.file:
-            owner.file = _gathered(spec, owner.file, own_folder, folder, files)
+            owner.file = _copied(spec, owner.file, own_folder, folder / ASSETS, copies)
         for side, file in enumerate(getattr(owner, "cubefiles", ())):
             if file:
-                owner.cubefiles[side] = _gathered(spec, file, own_folder, folder, files)
-    if files:
-        for owner in owners:
-            owner.compiler.meshdir = owner.compiler.texturedir = ASSETS
-        spec.compiler.meshdir = spec.compiler.texturedir = ASSETS
+                owner.cubefiles[side] = _copied(spec, file, own_folder, folder / ASSETS, copies)
+    if copies:
+        for compiler in (spec.compiler, *(owner.compiler for owner in owners)):
+            compiler.meshdir = compiler.texturedir = ASSETS
         spec.modelfiledir = str(folder)
 
 
-def _gathered(spec: mujoco.MjSpec, file: str, own_folder: str, folder: Path, files: dict[str, str]) -> str:
-    """Name of the copy of a file in the folder of assets; copied at the first call."""
+def _copied(spec: mujoco.MjSpec, file: str, own_folder: str, folder: Path, copies: dict[str, str]) -> str:
+    """Name of the copy of a file in a folder; `copies` has those made so far, by the path of the original."""
     wanted = str(Path(own_folder) / file)
-    if wanted not in files:
+    if wanted not in copies:
         name = Path(file).name
-        taken = set(files.values())
-        while name in taken:
+        inside = spec.assets.get(wanted, spec.assets.get(file, spec.assets.get(name)))
+        while name in copies.values():
             name = f"_{name}"
-        (folder / ASSETS).mkdir(exist_ok=True)
-        inside = spec.assets.get(wanted, spec.assets.get(file, spec.assets.get(Path(file).name)))
-        if inside is not None:
-            (folder / ASSETS / name).write_bytes(inside if isinstance(inside, bytes) else inside.encode())
-        else:
-            source = Path(spec.modelfiledir or ".") / wanted
-            try:
-                shutil.copyfile(source, folder / ASSETS / name)
-            except OSError as error:
-                raise MadocError(f"could not copy {source}, which the model needs: {error.strerror}") from error
-        files[wanted] = name
-    return files[wanted]
+        source = Path(spec.modelfiledir or ".") / wanted
+        folder.mkdir(exist_ok=True)
+        try:
+            content = source.read_bytes() if inside is None else inside
+        except OSError as error:
+            raise MadocError(f"could not copy {source}, which the model needs: {error.strerror}") from error
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        copies[wanted] = name
+    return copies[wanted]
 
 
-_Writer = Callable[[mujoco.MjSpec, str, mujoco.MjModel, mujoco.MjModel], list[Change]]
-
-
-def _write_gravity(spec: mujoco.MjSpec, _: str, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
+def _write_gravity(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
     old, new = nominal.opt.gravity, bound.opt.gravity
     if np.array_equal(old, new):
         return []
@@ -208,7 +182,7 @@ def _write_gravity(spec: mujoco.MjSpec, _: str, nominal: mujoco.MjModel, bound: 
     return [Change("option", "gravity", old.tolist(), new.tolist())]
 
 
-def _write_inertia(spec: mujoco.MjSpec, _: str, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
+def _write_inertia(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
     names = {"body_mass": "mass", "body_inertia": "diaginertia", "body_ipos": "pos", "body_iquat": "quat"}
     changes = [
         Change(f"inertial of body {_body_name(bound, index)}", attribute, _row(nominal, name, index), new)
@@ -217,39 +191,29 @@ def _write_inertia(spec: mujoco.MjSpec, _: str, nominal: mujoco.MjModel, bound: 
         if (new := _row(bound, name, index)) != _row(nominal, name, index)
     ]
     if changes:
-        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
         spec.compiler.settotalmass = -1.0
         spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
         spec.compiler.balanceinertia = False
-        for body in spec.bodies[1:]:
-            body.explicitinertial = bool(bound.body_mass[body.id] > 0.0)
-            body.mass = bound.body_mass[body.id]
-            body.ipos = bound.body_ipos[body.id]
-            body.iquat = bound.body_iquat[body.id]
-            body.inertia = bound.body_inertia[body.id]
-            body.fullinertia = np.full(6, np.nan)
+        write_inertia(spec, bound)
     return changes
 
 
-def _write_rows(spec: mujoco.MjSpec, group: str, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
-    """Write attributes of elements that are equal to a row of an array of the model."""
-    kind, attribute, array = group.split()
+def _write_rows(
+    spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel, *, kind: str, attribute: str, array: str
+) -> list[Change]:
+    """Write an attribute of all elements of a kind, which is equal to their rows of an array of the model."""
     changes = []
-    for element in getattr(spec, f"{kind}s" if kind != "body" else "bodies"):
-        index = bound.jnt_dofadr[element.id] if array.startswith("dof_") else element.id
+    for element in spec.bodies if kind == "body" else getattr(spec, f"{kind}s"):
+        index = int(bound.jnt_dofadr[element.id]) if array.startswith("dof_") else element.id
         old, new = _row(nominal, array, index), _row(bound, array, index)
-        if old != new:
-            _assign(element, attribute, new)
-            changes.append(Change(f"{kind} {element.name or element.id}", attribute, old, new))
+        if old == new:
+            continue
+        if np.ndim(getattr(element, attribute)):
+            getattr(element, attribute)[: len(new)] = new
+        else:
+            setattr(element, attribute, new[0])
+        changes.append(Change(f"{kind} {element.name or element.id}", attribute, old, new))
     return changes
-
-
-def _assign(element: mujoco.MjsBody | mujoco.MjsJoint, attribute: str, new: list[float]) -> None:
-    """Set an attribute of an element: a number, or the first numbers of an array."""
-    if np.ndim(getattr(element, attribute)):
-        getattr(element, attribute)[: len(new)] = new
-    else:
-        setattr(element, attribute, new[0])
 
 
 def _row(model: mujoco.MjModel, array: str, index: int) -> list[float]:
@@ -263,21 +227,19 @@ def _body_name(model: mujoco.MjModel, index: int) -> str:
     return body.name or (model.joint(joint).name if joint >= 0 else "") or str(index)
 
 
-_GROUPS: dict[str, _Writer] = {
-    "option gravity": _write_gravity,
-    "inertia": _write_inertia,
-    "body pos body_pos": _write_rows,
-    "body quat body_quat": _write_rows,
-    "joint damping dof_damping": _write_rows,
-    "joint armature dof_armature": _write_rows,
-    "joint frictionloss dof_frictionloss": _write_rows,
-    "joint stiffness jnt_stiffness": _write_rows,
-    "joint pos jnt_pos": _write_rows,
-    "geom friction geom_friction": _write_rows,
-    "geom size geom_size": _write_rows,
-    "geom pos geom_pos": _write_rows,
-    "site pos site_pos": _write_rows,
-    "actuator gainprm actuator_gainprm": _write_rows,
-    "actuator biasprm actuator_biasprm": _write_rows,
-}
-"""Parts of a model that a parameter may change (kind, attribute and array), and how each is written into a spec."""
+_ROWS = (
+    ("body", "pos", "body_pos"),
+    ("body", "quat", "body_quat"),
+    ("joint", "damping", "dof_damping"),
+    ("joint", "armature", "dof_armature"),
+    ("joint", "frictionloss", "dof_frictionloss"),
+    ("joint", "stiffness", "jnt_stiffness"),
+    ("joint", "pos", "jnt_pos"),
+    ("geom", "friction", "geom_friction"),
+    ("geom", "size", "geom_size"),
+    ("geom", "pos", "geom_pos"),
+    ("site", "pos", "site_pos"),
+    ("actuator", "gainprm", "actuator_gainprm"),
+    ("actuator", "biasprm", "actuator_biasprm"),
+)
+"""What a parameter may change, besides gravity and inertias: kind of element, attribute in MJCF, array of the model."""

@@ -1,7 +1,7 @@
 """Closed-loop rollouts: a policy acts in systems, rows that end start again, failed rows are counted."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import equinox as eqx
@@ -75,6 +75,12 @@ def begin(starts: Starts, key: PRNGKeyArray, *, systems: int, rows: int) -> Walk
     return Walkers(state, np.zeros((systems, rows), dtype=np.int64))
 
 
+def out_of_step(walkers: Walkers, time_limit: int) -> Walkers:
+    """The same rows with evenly spread ages, so that they do not all reach the time limit together."""
+    count = walkers.age.size
+    return replace(walkers, age=(np.arange(count) * time_limit // count).reshape(walkers.age.shape))
+
+
 def roll(
     system: System,
     task: Task,
@@ -88,17 +94,8 @@ def roll(
 ) -> tuple[Rollout, Walkers]:
     """Act for `steps` control steps in every row.
 
-    A row that terminates, fails, or reaches the task's time limit starts again at a state from `starts`.
-
-    Args:
-        system: The systems to act in.
-        task: The robot's functions of state.
-        policy: The policy; sampled with `key`, deterministic where `key` is None.
-        walkers: The states of the rows.
-        steps: Control steps per row.
-        starts: The states at which ended rows start again.
-        key: Randomness of the actions.
-        restart_key: Randomness of the restarts.
+    A row that terminates, fails, or reaches the task's time limit starts again at a state from `starts`. Actions are
+    sampled with `key`, or deterministic where it is None.
 
     Returns:
         Transitions with axes (steps, systems, rows), and the states of the rows afterwards.
@@ -114,15 +111,8 @@ def roll(
         terminated = task.terminated(safe) & valid
         truncated = (age + 1 >= task.max_episode_steps) & ~terminated & valid
         following = system.observe(safe)
-        frame = (
-            observation,
-            action,
-            task.reward(state, action, safe),
-            following,
-            terminated,
-            truncated,
-        )
-        frames.append((*frame, valid))
+        reward = task.reward(state, action, safe)
+        frames.append((observation, action, reward, following, terminated, truncated, valid))
         state, age, observation = safe, age + 1, following
         ended = terminated | truncated | ~valid
         if ended.any():
@@ -139,7 +129,7 @@ def act(
     policy: Policy,
     observation: Float[Array | np.ndarray, "*rows observation"],
     key: PRNGKeyArray | None,
-    step: np.int32,
+    step: Int[Array | np.ndarray, ""] | np.int32,
 ) -> Array:
     """Actions of a policy, jitted: sampled with the key of this step, deterministic without a key."""
     return policy(jnp.asarray(observation), None if key is None else jax.random.fold_in(key, step))
@@ -166,12 +156,6 @@ def replay_actions(
     valid = np.isfinite(next_state).all(-1)
     safe = np.where(valid[..., None], next_state, state)
     terminated = task.terminated(safe) & valid
-    seen = Transitions(
-        system.observe(state),
-        action,
-        task.reward(state, action, safe),
-        system.observe(safe),
-        terminated,
-        np.zeros_like(terminated),
-    )
+    reward, ended = task.reward(state, action, safe), np.zeros_like(terminated)
+    seen = Transitions(system.observe(state), action, reward, system.observe(safe), terminated, ended)
     return Rollout(jax.tree.map(lambda column: column[None], seen), valid[None])

@@ -18,32 +18,22 @@ def insensitive(
 ) -> tuple[list[str], int]:
     """Parameters that change no bit of any next state or observation at either end of their range.
 
-    All other parameters stay at mid-range. A row counts only where both simulations succeeded.
-
-    Args:
-        simulator: The simulator.
-        states: States to step from, typically logged ones.
-        actions: The actions taken there.
-        key: Randomness of the rows.
-        rows: Number of rows drawn without repetition; all where there are fewer.
+    All other parameters stay at mid-range. At most `rows` logged rows are drawn without repetition, and a row counts
+    only where both simulations succeeded. No rows, or rows that all fail at mid-range, are refused.
 
     Returns:
         The names, in the order of the parameters, and the control steps spent: rows · (2 d + 1).
-
-    Raises:
-        MadocError: There are no rows, or every one fails at mid-range.
     """
-    if not len(states) or len(states) != len(actions):
-        raise MadocError(f"expected as many states as actions, at least one, got {len(states)} and {len(actions)}")
+    if not len(states):
+        raise MadocError("expected at least one logged state to test the parameters at, got none")
     count = min(rows, len(states))
     chosen = np.asarray(jax.random.choice(key, len(states), (count,), replace=False))
-    ends = _ends(simulator)
-    shape = (len(ends), count, -1)
+    # Mid-range, then each parameter in turn at its low and at its high end.
+    space = simulator.parameters
+    ends = space.to_physical(np.vstack([np.zeros(len(space)), np.kron(np.eye(len(space)), [[-1.0], [1.0]])]))
+    state, action = (np.repeat(logged[chosen][None], len(ends), axis=0) for logged in (states, actions))
     system = simulator.bind(ends)
-    next_states = system.step(
-        system.unbiased(np.broadcast_to(states[chosen], (len(ends), *states[chosen].shape)).reshape(shape)),
-        np.broadcast_to(actions[chosen], (len(ends), *actions[chosen].shape)).reshape(shape),
-    )
+    next_states = system.step(system.unbiased(state), action)
     following = np.concatenate([next_states, system.observe(next_states)], axis=-1)
     middle, moved = following[0], following[1:]
     if not np.isfinite(middle).all(-1).any():
@@ -53,7 +43,7 @@ def insensitive(
         )
     comparable = np.isfinite(moved).all(-1) & np.isfinite(middle).all(-1)
     changed = ((moved != middle).any(-1) & comparable).any(-1).reshape(-1, 2).any(-1)
-    names = [name for name, felt in zip(simulator.parameters.names, changed, strict=True) if not felt]
+    names = [name for name, felt in zip(space.names, changed, strict=True) if not felt]
     return names, len(ends) * count
 
 
@@ -76,12 +66,3 @@ def refuse_insensitive(
         remedy = "remove it or widen its range" if len(names) == 1 else "remove them or widen their ranges"
         raise MadocError(f"{what} no next state in {min(rows, len(states))} logged rows; {remedy}")
     return control_steps
-
-
-def _ends(simulator: Simulator) -> Float[np.ndarray, "systems parameters"]:
-    """Mid-range, then each parameter in turn at its low and at its high end."""
-    space = simulator.parameters
-    unit = np.zeros((1 + 2 * len(space), len(space)))
-    for column in range(len(space)):
-        unit[1 + 2 * column : 3 + 2 * column, column] = -1.0, 1.0
-    return space.to_physical(unit)

@@ -14,14 +14,7 @@ def velocities_between(
     after: Float[np.ndarray, "rows state"],
     steps: Float[np.ndarray, " rows"],
 ) -> Float[np.ndarray, "rows velocity"]:
-    """The constant velocities that lead from the positions of one state to those of another.
-
-    Args:
-        task: The robot.
-        before: Earlier states, of which only the positions are used.
-        after: Later states, of which only the positions are used.
-        steps: Control steps between them, at least 1.
-    """
+    """The constant velocities that lead from the positions of `before` to those of `after`, `steps` >= 1 later."""
     model = task.model
     seconds = steps * task.frame_skip * model.opt.timestep
     start, end = before[:, : model.nq], after[:, : model.nq]
@@ -60,17 +53,12 @@ def unseen_positions(task: Task) -> tuple[str, ...]:
         state = np.concatenate([model.qpos0, np.zeros(model.nv)])
         moved = state + 1e-3 * np.eye(len(state))[: model.nq]
         blind |= (np.asarray(task.observe(moved)) == np.asarray(task.observe(state))).all(-1)
-    starts = [*model.jnt_qposadr, model.nq]
-    names = [model.joint(index).name or f"joint {index}" for index in range(model.njnt)]
-    return tuple(name for name, *span in zip(names, starts, starts[1:], strict=False) if blind[slice(*span)].any())
+    joints = np.add.reduceat(blind.astype(int), model.jnt_qposadr).nonzero()[0]
+    return tuple(model.joint(index).name or f"joint {index}" for index in joints.tolist())
 
 
 def refuse_unseen_positions(task: Task) -> None:
-    """Refuse velocities from positions where some positions are not observed.
-
-    Raises:
-        MadocError: Names the joints.
-    """
+    """Raise a `MadocError` that names the joints whose position, and so whose velocity, is not observed."""
     joints = unseen_positions(task)
     if joints:
         raise MadocError(

@@ -14,13 +14,14 @@ MASS_FLOOR = 1e-3
 INERTIA_FLOOR = 1e-9
 """Smallest moment of inertia of a body in kg·m²; smaller values are raised to it for the same reason."""
 
-_OBJECTS = {
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "joint": mujoco.mjtObj.mjOBJ_JOINT,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
+_KINDS = {
+    "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
+    "joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
+    "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
+    "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
+    "sensor": (mujoco.mjtObj.mjOBJ_SENSOR, "nsensor"),
 }
+"""By kind of element, MuJoCo's object type and the attribute of a model that counts them."""
 
 _INERTIAL_FRAMES = (mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA, mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT)
 
@@ -30,22 +31,20 @@ def write_parameters(
 ) -> None:
     """Write physical values (d,) into a model in place, then recompute the constants derived from them (`mj_setConst`).
 
-    Raises:
-        MadocError: A parameter names an element that the model does not have, or scales a mass of 0.
+    A parameter that names an element the model does not have, or that scales a mass of 0, is refused.
     """
     for parameter, value in zip(parameters, values, strict=True):
         if FIELDS[parameter.field].in_model:
             for element in find_elements(model, parameter):
-                _write(model, parameter.field, element, float(value))
+                if parameter.field in _WRITERS:
+                    _WRITERS[parameter.field](model, element, float(value))
+                else:
+                    _NUMBERS[parameter.field](model, element)[:] = value
     mujoco.mj_setConst(model, data)
 
 
 def nominal_values(model: mujoco.MjModel, parameter: Parameter) -> tuple[float, ...]:
-    """The values in a model that a parameter would replace, one for each element; 0 for a delay and for biases.
-
-    Raises:
-        MadocError: The model has no such element.
-    """
+    """The values in a model that a parameter would replace, one for each element; 0 for a delay and for biases."""
     if not FIELDS[parameter.field].in_model:
         return tuple(0.0 for _ in parameter.elements or (0,))
     return tuple(
@@ -53,29 +52,14 @@ def nominal_values(model: mujoco.MjModel, parameter: Parameter) -> tuple[float, 
     )
 
 
-def _write(model: mujoco.MjModel, field: str, element: int, value: float) -> None:
-    if field in _WRITERS:
-        _WRITERS[field](model, element, value)
-    else:
-        _NUMBERS[field](model, element)[:] = max(value, MASS_FLOOR) if field == "body_mass" else value
-
-
 def find_elements(model: mujoco.MjModel, parameter: Parameter) -> list[int]:
-    """Indices of a parameter's elements in the model; one -1 for gravity.
-
-    A body may be named by a joint of its own.
-
-    Raises:
-        MadocError: The model has no such element; the message lists the nearest names.
-    """
+    """Indices of a parameter's elements in the model; one -1 for gravity. A body may be named by a joint of its own."""
     kind = FIELDS[parameter.field].element
-    if kind is None:
-        return [-1]
-    return [_find_element(model, parameter.name, kind, element) for element in parameter.elements]
+    return [-1] if kind is None else [_find_element(model, parameter.name, kind, one) for one in parameter.elements]
 
 
 def _find_element(model: mujoco.MjModel, parameter_name: str, kind: str, element: str) -> int:
-    index = mujoco.mj_name2id(model, _OBJECTS[kind], element)
+    index = mujoco.mj_name2id(model, _KINDS[kind][0], element)
     if index < 0 and kind == "body":
         joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, element)
         index = int(model.jnt_bodyid[joint]) if joint >= 0 else -1
@@ -87,8 +71,8 @@ def _find_element(model: mujoco.MjModel, parameter_name: str, kind: str, element
 
 def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
     """Names of the elements of a kind (`body`, `joint`, `geom`, `actuator`, `sensor`) that have one."""
-    count = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "actuator": "nu", "sensor": "nsensor"}[kind]
-    names = (mujoco.mj_id2name(model, _OBJECTS[kind], index) for index in range(getattr(model, count)))
+    object_type, count = _KINDS[kind]
+    names = (mujoco.mj_id2name(model, object_type, index) for index in range(getattr(model, count)))
     return [name for name in names if name]
 
 
@@ -97,13 +81,17 @@ def _dofs(model: mujoco.MjModel, joint: int) -> slice:
     return slice(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + len(model.joint(joint).damping))
 
 
+def _write_mass(model: mujoco.MjModel, body: int, value: float) -> None:
+    model.body_mass[body] = max(value, MASS_FLOOR)
+
+
 def _write_mass_and_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
-    mass = max(value, MASS_FLOOR)
-    if model.body_mass[body] == 0.0:
+    before = float(model.body_mass[body])
+    if before == 0.0:
         name = model.body(body).name
         raise MadocError(f"body_mass_and_inertia: body {name!r} has no mass to scale; use body_mass instead")
-    model.body_inertia[body] *= mass / model.body_mass[body]
-    model.body_mass[body] = mass
+    _write_mass(model, body, value)
+    model.body_inertia[body] *= model.body_mass[body] / before
 
 
 def _write_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
@@ -167,9 +155,10 @@ _NUMBERS: dict[str, Callable[[mujoco.MjModel, int], np.ndarray]] = {
 own is written into all of them."""
 
 _WRITERS: dict[str, Callable[[mujoco.MjModel, int, float], None]] = {
+    "body_mass": _write_mass,
     "body_mass_and_inertia": _write_mass_and_inertia,
     "body_inertia": _write_inertia,
     "body_com": _write_centre_of_mass,
     "actuator_gain": _write_gain,
 }
-"""Fields whose value changes other numbers of the model too."""
+"""Fields whose value has a floor, or changes other numbers of the model too."""

@@ -3,7 +3,7 @@
 from functools import partial
 
 from madoc.tasks.base import Batch, Task
-from madoc.tasks.walking import Span, healthy_reward, uniform_and_normal_noise, walking_task
+from madoc.tasks.walking import Span, forward_reward, uniform_and_normal_noise, walking_task
 
 HEALTHY_HEIGHT = (0.2, 1.0)
 """Range of the torso's height in m; the task ends outside it."""
@@ -39,7 +39,7 @@ def ant(physics: str = "legacy") -> Task:
         root=2,
         clipped=False,
         frame_skip=5,
-        reward=partial(healthy_reward, terminated=terminated, dt=0.05, cost=0.5),
+        reward=partial(forward_reward, terminated=terminated, dt=0.05, cost=0.5),
         terminated=terminated,
         reset_noise=partial(uniform_and_normal_noise, positions=15, velocities=14, scale=0.1),
         groups=6,

@@ -43,6 +43,11 @@ def scaled_friction(spec: Callable[[], mujoco.MjSpec], factor: float) -> mujoco.
     return changed
 
 
+def never_terminated(next_state: Batch) -> Batch:
+    """False for every row."""
+    return next_state.__array_namespace__().zeros(next_state.shape[:-1], dtype=bool)
+
+
 @dataclass(frozen=True)
 class ActionChannel:
     """One value of an action: its actuator, and the values that -1 and 1 stand for.
@@ -141,11 +146,7 @@ class Task:
         return copy.copy(self.model)
 
     def with_level(self, level: str) -> "Task":
-        """The same task searched in its `easy`, `normal` or `hard` ranges (the paper's appendix D).
-
-        Raises:
-            MadocError: No such level.
-        """
+        """The same task searched in its `easy`, `normal` or `hard` ranges (appendix D, Jiang et al. 2024)."""
         if level not in self.ranges:
             raise MadocError(f"no range level {level!r} for {self.name}; there are: {', '.join(self.ranges)}")
         return replace(self, parameters=self.ranges[level])

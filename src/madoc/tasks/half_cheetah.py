@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from madoc.tasks.base import Batch, Task
+from madoc.tasks.base import Task, never_terminated
 from madoc.tasks.walking import forward_reward, uniform_and_normal_noise, walking_task
 
 # Table 6, Jiang et al. 2024: gravity, masses 1-7, damping 3-8.
@@ -38,8 +38,3 @@ def half_cheetah(physics: str = "legacy") -> Task:
         reference_returns=(-280.178953, 12135.0),
         total_mass=14.0,
     )
-
-
-def never_terminated(next_state: Batch) -> Batch:
-    """False for every row."""
-    return next_state[..., 0] != next_state[..., 0]

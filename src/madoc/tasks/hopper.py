@@ -3,7 +3,7 @@
 from functools import partial
 
 from madoc.tasks.base import Batch, Task
-from madoc.tasks.walking import healthy_reward, uniform_noise, walking_task
+from madoc.tasks.walking import forward_reward, uniform_noise, walking_task
 
 HEALTHY_STATE = 100.0
 """Bound of every coordinate but x; the task ends beyond it."""
@@ -34,7 +34,7 @@ def hopper(physics: str = "legacy") -> Task:
         root=1,
         clipped=True,
         frame_skip=4,
-        reward=partial(healthy_reward, terminated=terminated, dt=0.008, cost=1e-3),
+        reward=partial(forward_reward, terminated=terminated, dt=0.008, cost=1e-3),
         terminated=terminated,
         reset_noise=partial(uniform_noise, size=12, scale=5e-3),
         groups=4,

@@ -17,13 +17,7 @@ def load_robot(file: str, physics: str, total_mass: float | None = None) -> mujo
     cylinder of length 2h + r. In both physics the floor's margin is 0: since MuJoCo 3.5.0 margins add, before
     the larger counted, and the robots' geoms carry theirs already.
 
-    Args:
-        file: A file of Gymnasium's MuJoCo assets.
-        physics: `legacy` or `modern`.
-        total_mass: Masses and inertias are scaled to this sum, in kg.
-
-    Raises:
-        MadocError: `physics` is neither.
+    Masses and inertias are scaled so that the masses sum to `total_mass` in kg, where it is given.
     """
     if physics not in PHYSICS:
         raise MadocError(f"unknown physics {physics!r}; expected one of {', '.join(PHYSICS)}")
@@ -58,7 +52,8 @@ def _use_legacy_inertia(spec: mujoco.MjSpec) -> None:
     densities = [geom.density for body in spec.bodies for geom in body.geoms]
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     for body in spec.bodies[1:]:
-        parts = [_geom_inertia(model, geom, densities[geom]) for geom in _geoms_of(model, body.id)]
+        geoms = model.body_geomadr[body.id] + np.arange(model.body_geomnum[body.id])
+        parts = [_geom_inertia(model, geom, densities[geom]) for geom in geoms.tolist()]
         if not parts:
             body.mass = 0.0
             continue
@@ -70,11 +65,6 @@ def _use_legacy_inertia(spec: mujoco.MjSpec) -> None:
         body.ipos = centre
         body.iquat = [1.0, 0.0, 0.0, 0.0]
         body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-
-
-def _geoms_of(model: mujoco.MjModel, body: int) -> range:
-    start = model.body_geomadr[body]
-    return range(start, start + model.body_geomnum[body])
 
 
 def _geom_inertia(model: mujoco.MjModel, geom: int, density: float) -> tuple[float, np.ndarray, np.ndarray]:
@@ -102,11 +92,18 @@ def _scale_mass(spec: mujoco.MjSpec, total_mass: float) -> None:
     """Make the inertia of every body explicit, scaled so that the masses sum to `total_mass`."""
     model = spec.compile()
     factor = total_mass / model.body_mass.sum()
+    model.body_mass *= factor
+    model.body_inertia *= factor
+    write_inertia(spec, model)
+
+
+def write_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Give every body of a spec the inertia that it has in a model, instead of one inferred from its geoms."""
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     for body in spec.bodies[1:]:
-        body.explicitinertial = True
-        body.mass = model.body_mass[body.id] * factor
+        body.explicitinertial = bool(model.body_mass[body.id] > 0.0)
+        body.mass = model.body_mass[body.id]
         body.ipos = model.body_ipos[body.id]
         body.iquat = model.body_iquat[body.id]
-        body.inertia = model.body_inertia[body.id] * factor
+        body.inertia = model.body_inertia[body.id]
         body.fullinertia = np.full(6, np.nan)

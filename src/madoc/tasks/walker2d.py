@@ -3,7 +3,7 @@
 from functools import partial
 
 from madoc.tasks.base import Batch, Task
-from madoc.tasks.walking import Span, healthy_reward, uniform_noise, walking_task
+from madoc.tasks.walking import Span, forward_reward, uniform_noise, walking_task
 
 HEALTHY_HEIGHT = (0.8, 2.0)
 """Range of the torso's height in m; the task ends outside it."""
@@ -39,7 +39,7 @@ def walker2d(physics: str = "legacy") -> Task:
         root=1,
         clipped=True,
         frame_skip=4,
-        reward=partial(healthy_reward, terminated=terminated, dt=0.008, cost=1e-3),
+        reward=partial(forward_reward, terminated=terminated, dt=0.008, cost=1e-3),
         terminated=terminated,
         reset_noise=partial(uniform_noise, size=18, scale=5e-3),
         groups=6,

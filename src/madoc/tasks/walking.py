@@ -40,18 +40,12 @@ def walking_task(
     reference_returns: tuple[float, float],
     total_mass: float | None = None,
 ) -> Task:
-    """A robot of the paper, from Gymnasium's model file.
+    """A robot of the paper, from a file of Gymnasium's MuJoCo assets.
 
-    Args as the attributes of `Task`, and:
-        file: A file of Gymnasium's MuJoCo assets.
-        bodies: Bodies whose mass is calibrated.
-        joints: Joints whose damping is calibrated.
-        ranges: The box by level; `normal` is the task's own.
-        positions: Number of positions in a state.
-        velocities: Number of velocities in a state.
-        root: Number of leading positions that an observation leaves out.
-        clipped: Whether observed velocities are clipped.
-        total_mass: The model's masses are scaled to this sum in kg.
+    The masses of `bodies` and the damping of `joints` are calibrated, by level within `ranges`, of which `normal` is
+    the task's own. A state has `positions` and `velocities`; an observation leaves out the first `root` positions, and
+    its velocities are `clipped` or not. The model's masses are scaled to `total_mass` in kg where it is given. The
+    other arguments are attributes of `Task`.
     """
     spaces = {level: _space(bodies, joints, spans) for level, spans in ranges.items()}
     seen = positions - root
@@ -61,7 +55,7 @@ def walking_task(
         spec=partial(load_robot, file, physics, total_mass),
         frame_skip=frame_skip,
         observation_size=seen + velocities,
-        observe=partial(_observe_clipped if clipped else _observe, root=root, positions=positions),
+        observe=partial(_observe, root=root, positions=positions, clipped=clipped),
         reward=reward,
         terminated=terminated,
         reset_noise=reset_noise,
@@ -76,17 +70,19 @@ def walking_task(
     )
 
 
-def forward_reward(state: Batch, action: Batch, next_state: Batch, *, dt: float, cost: float) -> Batch:
-    """Velocity along the first coordinate (m/s), less `cost` times the squared action."""
-    return (next_state[..., 0] - state[..., 0]) / dt - cost * (action**2).sum(-1)
-
-
-def healthy_reward(
-    state: Batch, action: Batch, next_state: Batch, *, terminated: Callable[[Batch], Batch], dt: float, cost: float
+def forward_reward(
+    state: Batch,
+    action: Batch,
+    next_state: Batch,
+    *,
+    dt: float,
+    cost: float,
+    terminated: Callable[[Batch], Batch] | None = None,
 ) -> Batch:
-    """Velocity along the first coordinate (m/s), plus 1 where healthy, less `cost` times the squared action."""
+    """Velocity along the first coordinate (m/s), plus 1 where not `terminated`, less `cost` · the squared action."""
     speed = (next_state[..., 0] - state[..., 0]) / dt
-    return speed + ~terminated(next_state) - cost * (action**2).sum(-1)
+    healthy = speed if terminated is None else speed + ~terminated(next_state)
+    return healthy - cost * (action**2).sum(-1)
 
 
 def uniform_noise(key: PRNGKeyArray, count: int, *, size: int, scale: float) -> jax.Array:
@@ -115,13 +111,10 @@ def _space(bodies: Sequence[str], joints: Sequence[str], ranges: Ranges) -> Para
     )
 
 
-def _observe(state: Batch, *, root: int, positions: int) -> Batch:
-    """Every position but the root's, then the velocities."""
-    return state[..., root:]
-
-
-def _observe_clipped(state: Batch, *, root: int, positions: int) -> Batch:
-    """Every position but the root's, then the velocities, clipped."""
+def _observe(state: Batch, *, root: int, positions: int, clipped: bool) -> Batch:
+    """Every position but the root's, then the velocities, clipped or not."""
+    if not clipped:
+        return state[..., root:]
     namespace = state.__array_namespace__()
     velocity = namespace.clip(state[..., positions:], -VELOCITY_CLIP, VELOCITY_CLIP)
     return namespace.concat([state[..., root:positions], velocity], axis=-1)

@@ -1,27 +1,28 @@
-"""An estimate judged on rows that no method has seen, without any truth: `assess` is the whole of it."""
+"""An estimate judged on rows that no method has seen, without any truth: `assess` does all of it."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration import CalibrationProblem, CalibrationResult
-from madoc.calibration.holdout import HoldOut, Verdict
+from madoc.calibration.holdout import HoldOut, ToldApart, Verdict
 from madoc.data import Dataset
 from madoc.errors import MadocError
+from madoc.identification.noise import difference_noise
 from madoc.simulation.base import Simulator
 from madoc.verdict.adequacy import with_widened_intervals
-from madoc.verdict.bench import Bench
+from madoc.verdict.bench import Bench, judged
 from madoc.verdict.fitted import fitted
 from madoc.verdict.judge import judge
 from madoc.verdict.predicted import predicted
-from madoc.verdict.told_apart import told_apart
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """What rows held out say of an estimate. Printing it shows the verdict.
+    """How well an estimate explains the hold-out. Printing it shows the verdict.
 
     Attributes:
         verdict: What to make of the estimate: a word and a sentence.
@@ -75,17 +76,20 @@ def assess(
 
 
 def measured(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None = None) -> HoldOut:
-    """What the hold-out says of an estimate and its 95 % intervals in physical units.
+    """The hold-out's numbers for an estimate and its 95 % intervals in physical units, by the measure its states allow.
 
     Raises:
         MadocError: No state of the hold-out can be rebuilt though the robot's observations determine it.
     """
-    unit = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
+    point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
     if bench.states_known:
-        return predicted(bench, unit, interval)
+        return predicted(bench, point, interval)
     if bench.fitted is not None:
-        return fitted(bench, bench.fitted, unit, interval)
-    return told_apart(bench, unit, interval)
+        return fitted(bench, bench.fitted, point, interval)
+    noise = difference_noise(bench.problem.dataset) / bench.change
+    areas = bench.area_at_mid_range, bench.area_of_rollouts(point)
+    record = partial(ToldApart, area_at_mid_range=areas[0], area_at_estimate=areas[1])
+    return judged(record, bench, point, interval, at=point, residual=noise, by_model=(), noise=noise, control_steps=0)
 
 
 def _problem_of(result: CalibrationResult, training: Dataset | None, simulator: Simulator | None) -> CalibrationProblem:
@@ -94,8 +98,8 @@ def _problem_of(result: CalibrationResult, training: Dataset | None, simulator: 
         return CalibrationProblem(training or problem.dataset, simulator or problem.simulator)
     if training is None or simulator is None:
         raise MadocError(
-            "this result was read from a file, so what was calibrated is not known; give training=, the rows that were "
-            "calibrated to, and simulator=, the simulator that was calibrated, too"
+            "this result was read from a file, which does not hold the data and the simulator it was calibrated with; "
+            "give training=, the rows that were calibrated to, and simulator=, the simulator that was calibrated, too"
         )
     return CalibrationProblem(training, simulator)
 

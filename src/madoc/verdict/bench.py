@@ -1,8 +1,9 @@
-"""What estimates of one problem are judged on: rows calibrated to, rows held out, and ways to replay the latter."""
+"""What estimates of one problem are judged on: the training rows, the hold-out, and ways to replay the latter."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypedDict
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from sklearn.neighbors import NearestNeighbors
 
 from madoc.calibration import CalibrationProblem
-from madoc.calibration.holdout import AgainstChance, Area
+from madoc.calibration.holdout import AgainstChance, Area, Judged
 from madoc.data import Dataset
 from madoc.diagnosis.channels import signal_names
 from madoc.errors import MadocError
@@ -19,7 +20,7 @@ from madoc.identification.missing_terms import MissingTerm, missing_terms
 from madoc.identification.noise import difference_noise
 from madoc.identification.states import logged_states
 from madoc.identification.windows import consecutive_rows, evenly
-from madoc.learning.dynamics_ratio import Scaling
+from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
@@ -27,7 +28,7 @@ from madoc.verdict.adequacy import widening
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
-from madoc.verdict.two_sample import WindowView, behaviour, rolled, tell_apart
+from madoc.verdict.two_sample import WindowView, behaviour, classify, rolled
 
 AT_END = 0.98
 """Position in [-1, 1] of its range; past it, to either side, a parameter counts as pinned to the end."""
@@ -36,17 +37,19 @@ _MOST_TERMS = 5
 FEWEST_HELD = 10
 """Smallest number of rows held out, at least 1. With fewer, even perfect predictions could be chance."""
 _NEIGHBOURS = 5000
-"""Largest number of training rows among which the nearest neighbour of a held-out row is looked for."""
+"""Largest number of training rows among which the nearest neighbour of a row held out is searched."""
 _LONGEST_ROLLOUT = 1000
-"""Largest length of a rollout in control steps; longer episodes of the log are not imitated to their end."""
+"""Largest length of a rollout in control steps, also where the episodes of the log are longer."""
+
+Measure = TypeVar("Measure", bound=Judged)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What estimates of one problem are judged on. What they share is computed once, when it is first needed.
+    """What estimates of one problem are judged on. What all of them need is computed once, at its first use.
 
     Attributes:
-        problem: What methods are given: the rows to calibrate to, and the simulator.
+        problem: What methods are given: the training rows and the simulator.
         held_out: Rows that no method has seen.
         key: Randomness of the cloned policy and of its rollouts.
         split: How the rows were held out, in a sentence.
@@ -75,12 +78,12 @@ class Bench:
 
     @property
     def scaling(self) -> Scaling:
-        """Scaling of observations and actions by the rows calibrated to."""
+        """Scaling of observations and actions by the training rows."""
         return self.problem.features.standardised
 
     @property
     def change(self) -> Float[np.ndarray, " observation"]:
-        """Typical change of each signal in one step, of the rows calibrated to: the unit of residuals."""
+        """Typical change of each signal in one step of the training rows: residuals are multiples of it."""
         return self.problem.typical_change
 
     @property
@@ -90,12 +93,12 @@ class Bench:
 
     @cached_property
     def replays(self) -> Replays:
-        """Windows of the hold-out to replay from logged states, where those are known."""
+        """Windows of the hold-out to replay from logged states, where states can be rebuilt."""
         return replays_of(self.held_out, self.simulator, self.change)
 
     @cached_property
     def fitted(self) -> FittedReplays | None:
-        """Windows of the hold-out whose starting states are to be fitted; None where they cannot be."""
+        """Windows of the hold-out whose initial states are to be fitted; None where they cannot be."""
         if self.problem.states.kind != "approximate" or self.held_out.disturbance.shuffled != "none":
             return None
         return fitted_replays_of(self.held_out, self.simulator, self.change)
@@ -107,17 +110,17 @@ class Bench:
 
     @cached_property
     def view(self) -> WindowView:
-        """The features of rows that the classifier gets where states cannot be rebuilt."""
+        """The features of rows that a classifier gets where states cannot be rebuilt."""
         return WindowView.of(self.problem.dataset, self.scaling)
 
     @cached_property
-    def mid_range_apart(self) -> Area:
-        """How well a classifier tells rollouts at mid-range from the hold-out, where states cannot be rebuilt."""
-        return self.rollouts_apart(np.zeros(len(self.simulator.parameters)))
+    def area_at_mid_range(self) -> Area:
+        """`area_of_rollouts` at mid-range."""
+        return self.area_of_rollouts(np.zeros(len(self.simulator.parameters)))
 
     @cached_property
     def judged_rows(self) -> Int[np.ndarray, " rows"]:
-        """Rows of the hold-out whose single steps are judged: pairs of consecutive rows, if there are any."""
+        """Rows of the hold-out whose single steps are judged: pairs of consecutive rows, where there are any."""
         held = self.held_out
         if not self.states_known:
             return evenly(np.arange(len(held)), MOST_WINDOWS)
@@ -127,7 +130,7 @@ class Bench:
 
     @cached_property
     def model_free(self) -> tuple[AgainstChance, ...]:
-        """Predictions of next observations without a model: the present observation, or the next of a row nearby."""
+        """Predictions of next observations without a model: that nothing moves, and what followed the nearest row."""
         held, kept = self.held_out.transitions, self.problem.dataset.transitions
         rows, near = self.judged_rows, evenly(np.arange(len(kept)), _NEIGHBOURS)
         wanted, candidates = self.scaling.features(held.take(rows))[0], self.scaling.features(kept.take(near))[0]
@@ -145,39 +148,25 @@ class Bench:
         followed, episodes = np.asarray(held.next_observation)[rows], self.held_out.episode_of(rows)
         return AgainstChance(prediction, *better_than_chance(predicted / spread, followed / spread, episodes))
 
-    def rollouts_apart(self, unit: Float[np.ndarray, " d"]) -> Area:
-        """How well a classifier tells rollouts of the cloned policy, with noise on the sensors, from the hold-out."""
+    def area_of_rollouts(self, point: Float[np.ndarray, " d"]) -> Area:
+        """How well a classifier separates rollouts of the cloned policy, with sensor noise, from the hold-out."""
         held = self.held_out
         length = int(np.clip(np.median(held.episode_ends - held.episode_starts), 2, _LONGEST_ROLLOUT))
         simulated = rolled(
             self.clone,
             self.simulator,
-            self.simulator.parameters.to_physical(unit),
+            self.simulator.parameters.to_physical(point),
             length=length,
             key=jax.random.fold_in(self.key, 1),
             noise=difference_noise(self.problem.dataset),
         )
-        return tell_apart(self.view.sample(held), self.view.sample(simulated), overlap=True)
+        return classify(self.view.sample(held), self.view.sample(simulated), overlap=True)
 
 
-class CommonFields(TypedDict):
-    """What the records of all measures hold; see `madoc.calibration.holdout.Judged`."""
-
-    split: str
-    rows: int
-    episodes: int
-    estimate: dict[str, float]
-    interval_shares: dict[str, float]
-    against_chance: tuple[AgainstChance, ...]
-    noise: dict[str, float]
-    control_steps: int
-    missing_terms: tuple[MissingTerm, ...]
-    at_end: tuple[str, ...]
-
-
-def common_fields(
+def judged(
+    record: Callable[..., Measure],
     bench: Bench,
-    unit: Float[np.ndarray, " d"],
+    point: Float[np.ndarray, " d"],
     interval: Float[np.ndarray, "d 2"] | None,
     *,
     at: Float[np.ndarray, " d"],
@@ -185,18 +174,11 @@ def common_fields(
     by_model: tuple[AgainstChance, ...],
     noise: Float[np.ndarray, " channels"],
     control_steps: int,
-) -> CommonFields:
-    """What every measure says of an estimate.
+) -> Measure:
+    """Complete a measure's record by the fields that all measures have.
 
-    Args:
-        bench: The hold-out.
-        unit: The estimate in [-1, 1].
-        interval: Its 95 % intervals in physical units, if known.
-        at: Parameters in [-1, 1] at which the best possible intervals are computed.
-        residual: Standard deviation of what those intervals take for noise, in typical changes of a step.
-        by_model: Simulated next observations against chance.
-        noise: Standard deviation of the sensors' noise, in typical changes of a step.
-        control_steps: Simulated so far.
+    The best possible intervals are computed for parameters `at`, as if `residual` were the standard deviation of noise.
+    That and the sensors' `noise` are in typical changes of a step.
     """
     space, problem = bench.simulator.parameters, bench.problem
     residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
@@ -204,15 +186,15 @@ def common_fields(
     own = half if interval is None else np.maximum((interval[:, 1] - interval[:, 0]) / (space.high - space.low), 1e-9)
     terms: tuple[MissingTerm, ...] = ()
     if problem.states.kind != "unknown" and problem.dataset.disturbance.shuffled == "none":
-        terms, searching = missing_terms(problem.dataset, problem.states, problem.simulator, unit, own, bench.change)
+        terms, searching = missing_terms(problem.dataset, problem.states, problem.simulator, point, own, bench.change)
         spent += searching
     shares = np.minimum(np.maximum(half, own * (1.0 + widening(terms, space.names))), 1.0)
     signals = signal_names(bench.simulator.task)[: len(noise)]
-    return CommonFields(
+    return record(
         split=bench.split,
         rows=len(bench.held_out),
         episodes=len(bench.held_out.episode_starts),
-        estimate=dict(zip(space.names, unit.tolist(), strict=True)),
+        estimate=dict(zip(space.names, point.tolist(), strict=True)),
         interval_shares=dict(zip(space.names, shares.tolist(), strict=True)),
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
@@ -220,7 +202,7 @@ def common_fields(
         missing_terms=terms[:_MOST_TERMS],
         at_end=tuple(
             row.name
-            for row, value in zip(space.parameters, unit, strict=True)
+            for row, value in zip(space.parameters, point, strict=True)
             if abs(value) > AT_END and not (value < 0.0 and row.low <= FIELDS[row.field].minimum)
         ),
     )

@@ -12,24 +12,20 @@ from madoc.runs.files import replacing
 from madoc.verdict.bench import Bench
 
 TRACES = 6
-"""Largest number of stretches that are drawn."""
+"""Largest number of stretches of the hold-out that are drawn."""
 TRACE_STEPS = 100
-"""Length of a stretch in control steps; less where no episode is as long."""
+"""Largest length of a stretch in control steps; it is shorter where no episode is as long."""
 
 
 def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float) -> dict[str, np.ndarray]:
-    """Arrays of the hold-out.
+    """Arrays of the hold-out by name.
 
-    Always `signals` (names), `scale` (typical change in a step, in each signal's unit), `time` (s), `episode` and `row`
-    (where each stretch begins in the hold-out) and `measured` (stretches, times, signals). Where states can be rebuilt
-    also `before` and `after`, the same stretches simulated at mid-range and at the estimate from the first measured
-    state under the logged actions (NaN once a simulation has failed), and `residual_before` and `residual_after`
-    (windows, signals), simulated minus measured after one step.
-
-    Args:
-        bench: The hold-out.
-        mean: The estimate in physical units.
-        control_step: Time between two rows, s.
+    There are always `signals` (names), `scale` (typical change in a step, in each signal's unit), `time` (s), `episode`
+    and `row` (where each stretch begins in the hold-out) and `measured` (stretches, times, signals). Where states can
+    be rebuilt there are also `before` and `after`, the same stretches simulated at mid-range and at the estimate from
+    the first measured state under the logged actions (NaN once a simulation has failed), and `residual_before` and
+    `residual_after` (windows, signals), simulated minus measured observations after one step.
+    `mean` is the estimate in physical units, `control_step` the time between two rows in s.
     """
     held, replays = bench.held_out, bench.replays if bench.states_known else None
     states, rows = logged_states(held, bench.simulator.task) if replays else (np.empty(0), np.arange(len(held)))
@@ -46,8 +42,8 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     }
     if replays is None:
         return arrays
-    unit = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
-    points = np.stack([np.zeros(len(unit)), unit])
+    point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
+    points = np.stack([np.zeros(len(point)), point])
     residuals = replays.residuals(points, windows_at(held, states[chosen], first, steps)) * bench.change
     start = arrays["measured"][:, :1]
     for when, simulated in zip(("before", "after"), residuals, strict=True):

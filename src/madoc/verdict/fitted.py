@@ -1,4 +1,7 @@
-"""The hold-out predicted from fitted states: where velocities are hidden, and positions are not."""
+"""The hold-out predicted from fitted initial states, where positions are observed and velocities are hidden."""
+
+from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -8,93 +11,106 @@ from madoc.calibration.holdout import AgainstChance, Fitted
 from madoc.diagnosis.channels import signal_names
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.losses import loss_slope, scale_of
+from madoc.identification.noise import residual_noise
 from madoc.identification.replay import slopes_at
-from madoc.verdict.bench import Bench, common_fields
-from madoc.verdict.fitted_starts import FITTED, FittedReplays
+from madoc.verdict.bench import Bench, judged
+from madoc.verdict.fitted_starts import AHEAD, FITTED, FittedReplays
+from madoc.verdict.prediction import magnitudes
 from madoc.verdict.statistics import best_of, better_than_chance, prediction_errors
 from madoc.verdict.systematic import explained_at_end
 
 NEARBY_STEPS = 6
-"""Number of Gauss-Newton steps from an estimate, at least 1: enough to reach the nearest minimum."""
+"""Largest number of Gauss-Newton steps from an estimate, at least 1: enough to reach the nearest local minimum."""
 _CANDIDATES = 2
-"""Number of last steps whose predictions are compared: an earlier one may be better where the last went too far."""
+"""Number of last points whose predictions are compared: an earlier one may be better where the last went too far."""
 _DAMPING = 1e-6
 """Marquardt's damping of a step, relative to the squared lengths of the columns; 0 is none."""
+_HORIZONS = FITTED + np.array(AHEAD)
 
 
 def fitted(
-    bench: Bench, replays: FittedReplays, unit: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None
+    bench: Bench, replays: FittedReplays, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None
 ) -> Fitted:
-    """Prediction errors behind fitted stretches at mid-range, at the estimate, nearby, and of noise alone.
-
-    Args:
-        bench: The hold-out.
-        replays: Its windows.
-        unit: The estimate in [-1, 1].
-        interval: Its 95 % intervals in physical units, if known.
-    """
-    nearby, searching = _nearby_best(replays, unit)
-    points = np.concatenate([np.zeros((1, len(unit))), unit[None], nearby])
-    residuals = replays.residuals(points, replays.starts(points))
-    sizes = replays.magnitudes(residuals)
+    """The errors of an estimate, in [-1, 1], of mid-range, of the best parameters nearby, and of noise alone."""
+    nearby, searching = _nearby_best(replays, point)
+    points = np.concatenate([np.zeros((1, len(point))), point[None], nearby])
+    residuals = replays.residuals(points)
+    sizes = magnitudes(residuals[:, :, _HORIZONS])
     best = best_of(sizes)
-    noise = replays.deviation(residuals[best])
-    alone = replays.with_noise_alone(points[best], residuals[best], noise, jax.random.fold_in(bench.key, 2))
+    noise = residual_noise(residuals[best][:, : FITTED + 1], len(replays.readings.spread))
+    alone = _with_noise_alone(bench, replays, points[best], residuals[best], noise)
     fitting = (len(points) + 1) * replays.fit_cost
     predicting = residuals[:, :, 1:, 0].size + alone[:, :, 1:, 0].size
     observed, actions = replays.readings.observed, replays.readings.actions
     start_and_actions = np.concatenate([observed[:, 0], observed[:, 1], actions.reshape(len(actions), -1)], axis=1)
-    return Fitted(
-        **common_fields(
-            bench,
-            unit,
-            interval,
-            at=points[best],
-            residual=noise,
-            by_model=(_against_chance(replays, residuals[best]),),
-            noise=noise,
-            control_steps=searching + fitting + predicting,
-        ),
+    record = partial(
+        Fitted,
         errors=prediction_errors(
             sizes,
-            replays.magnitudes(alone)[:, 0],
+            magnitudes(alone[:, :, _HORIZONS])[:, 0],
             best,
             episodes=replays.episodes,
-            horizons=replays.horizons,
+            horizons=AHEAD,
             signals=signal_names(bench.simulator.task)[: len(noise)],
             failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
         ),
         explained=explained_at_end(start_and_actions, residuals[best]),
         fitted_steps=FITTED,
     )
+    return judged(
+        record,
+        bench,
+        point,
+        interval,
+        at=points[best],
+        residual=noise,
+        by_model=(_against_chance(replays, residuals[best]),),
+        noise=noise,
+        control_steps=searching + fitting + predicting,
+    )
 
 
-def _nearby_best(replays: FittedReplays, unit: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, "points d"], int]:
-    """Where Gauss-Newton steps on whole windows of the hold-out lead from an estimate, and their control steps.
+def _with_noise_alone(
+    bench: Bench,
+    replays: FittedReplays,
+    point: Float[np.ndarray, " d"],
+    residuals: Float[np.ndarray, "windows readings channels"],
+    deviation: Float[np.ndarray, " channels"],
+) -> Float[np.ndarray, "1 windows readings channels"]:
+    """Residuals of the same windows had the system at `point` been the robot, its sensors' noise of `deviation`."""
+    key, readings = jax.random.fold_in(bench.key, 2), replays.readings
+    noise = np.asarray(jax.random.normal(key, residuals.shape), np.float64) * deviation
+    simulated = np.where(np.isfinite(residuals), residuals, 0.0) + noise
+    drawn = replace(readings, observed=readings.observed + simulated * readings.scale)
+    return replace(replays, readings=drawn).residuals(point[None])
 
-    Starting states are unknowns too. The steps look at the rows held out, so none of the points is an estimate: they
-    show what parameters could explain at best.
+
+def _nearby_best(replays: FittedReplays, point: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, "points d"], int]:
+    """The last points of Gauss-Newton steps from an estimate on whole windows of the hold-out, and their control steps.
+
+    Initial states are unknowns too. These points have been fitted to the hold-out itself, so none is an estimate: they
+    show what parameters could reach.
     """
     simulator, readings = replays.simulator, replays.readings
-    states, points = replays.starts(unit[None])[0], []
+    states, visited = replays.starts(point[None])[0], []
     for _ in range(NEARBY_STEPS):
-        slopes = slopes_at(simulator, readings, unit[None], states[None])[0]
+        slopes = slopes_at(simulator, readings, point[None], states[None])[0]
         if not slopes.whole.any():
             break
         scale = scale_of(slopes.residuals[slopes.whole], "cauchy")
         weights = loss_slope((slopes.residuals / scale) ** 2, "cauchy")
-        left = eliminate(slopes, weights, np.full(len(readings), _DAMPING))
-        step = damped_step(*triangular_factors(left.reduced, 1.0, "linear"), unit, _DAMPING)
-        states = states + readings.in_state_units(left.states_step(step), states.shape[1])
-        unit = unit + step
-        points.append(unit)
-    columns = 1 + 2 * len(unit) + len(readings.spread)
-    spent = replays.fit_cost + len(points) * columns * len(readings) * readings.steps
-    return np.array(points[-_CANDIDATES:]).reshape(-1, len(unit)), spent
+        eliminated = eliminate(slopes, weights, np.full(len(readings), _DAMPING))
+        step = damped_step(*triangular_factors(eliminated.reduced, 1.0, "linear"), point, _DAMPING)
+        states = states + readings.in_state_units(eliminated.states_step(step), states.shape[1])
+        point = point + step
+        visited.append(point)
+    columns = 1 + 2 * len(point) + len(readings.spread)
+    spent = replays.fit_cost + len(visited) * columns * len(readings) * readings.steps
+    return np.array(visited[-_CANDIDATES:]).reshape(-1, len(point)), spent
 
 
 def _against_chance(replays: FittedReplays, residuals: Float[np.ndarray, "windows readings channels"]) -> AgainstChance:
-    """The readings right behind the fitted stretches, as the simulator predicts them, compared with chance."""
+    """The simulator's predictions of the first observations after the fitted steps, compared with chance."""
     observed, scale = replays.readings.observed, replays.readings.scale
     spread = np.maximum(observed.std((0, 1)), 1e-8)
     followed = observed[:, FITTED + 1]

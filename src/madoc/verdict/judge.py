@@ -1,4 +1,4 @@
-"""The verdict: one word, and a sentence with the numbers behind it."""
+"""The verdict on an estimate: one word, and a sentence with the numbers behind it."""
 
 from collections.abc import Iterable, Sequence
 
@@ -26,17 +26,17 @@ WORDS: dict[Word, str] = {
     "CALIBRATED": "the hold-out is predicted better than by mid-range, about as well as parameters can",
     "NO_IMPROVEMENT": "the hold-out is predicted no better than by mid-range, or far from as well as parameters could",
     "NOT_IDENTIFIABLE": "the data leaves some parameters open",
-    "MODEL_MISMATCH": "what is left over is no noise: nothing in the ranges explains the data",
+    "MODEL_MISMATCH": "the residuals are not noise: no parameters in the ranges explain the data",
     "DATA_REJECTED": "next observations do not follow from their rows",
 }
 
 CHANCE = 0.01
-"""Probability in [0, 1] that some prediction is as good by chance; above it the data is rejected."""
+"""Significance level in [0, 1]: data is rejected where no prediction is better than chance at this level."""
 SKILL = 0.1
-"""Skill of the best prediction, at most 1; below it there is nothing to calibrate to, however certain it is."""
+"""Skill of the best prediction, at most 1; data is rejected below it, however significant the prediction is."""
 ABOVE_NOISE = 2.0
-"""Ratio of an error to that of noise alone, at least 1; above it noise does not explain the error. The noise is known
-to about ±50 % from a few hundred rows."""
+"""Ratio of an error to that of noise alone, at least 1; above it noise does not explain the error. Noise estimated from
+a few hundred rows is within about 50 % of the true one."""
 EXPLAINED = 0.1
 """Share in [0, 1] of squared residuals that state and action explain on unseen rows; above it residuals are
 systematic. Noise alone gives at most a few percent."""
@@ -48,9 +48,9 @@ GAINED = 0.75
 """Share in [0, 1] of the possible gain over mid-range on the hold-out; with less, an estimate is no improvement."""
 WORTH_GAINING = 0.05
 """Share in [0, 1] of mid-range's error that parameters can remove; below it mid-range is as good."""
-TOLD_APART = 0.65
-"""Area under the curve in [0.5, 1]; above it a classifier tells log and simulator apart. Rollouts of a cloned policy
-come to about 0.55 in the true simulator."""
+SEPARABLE = 0.65
+"""Area under the curve in [0.5, 1]; above it simulated rows differ from logged ones. Rollouts of a cloned policy in the
+true simulator have about 0.55."""
 
 
 def judge(holdout: HoldOut, *, settled: bool = True) -> Verdict:
@@ -58,7 +58,7 @@ def judge(holdout: HoldOut, *, settled: bool = True) -> Verdict:
 
     Args:
         holdout: What the hold-out says of the estimate.
-        settled: Whether the search that found it came to its end.
+        settled: Whether the search that led to it came to its end.
     """
     return (
         _rejected(holdout)
@@ -73,7 +73,7 @@ def judge(holdout: HoldOut, *, settled: bool = True) -> Verdict:
 
 
 def explains_all(holdout: HoldOut) -> bool:
-    """Whether an estimate leaves no more of the hold-out than noise does, at any horizon."""
+    """Whether an estimate's errors on the hold-out are no larger than those of noise alone, at every horizon."""
     if isinstance(holdout, ToldApart):
         return holdout.area_at_estimate.interval[0] <= 0.5
     return numerical(holdout) is not None or not _beyond_noise(holdout.errors.estimate, holdout.errors.noise)
@@ -95,16 +95,16 @@ def _missing(holdout: HoldOut) -> Verdict | None:
     term = missing_term(holdout)
     if term is None:
         return None
-    moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
-    effect = " and ".join(f"{name} by {abs(term.shifts[name]):.2g}" for name in moved)
     value = f"{term.value:.3g} ± {term.standard_error:.1g} {term.unit}".rstrip()
     if term.cause == DRIFT:
         return Verdict(
             "MODEL_MISMATCH",
             f"{term.parameter} changes over the log, by {value} between its parts (t = {abs(term.t):.0f}), which is "
-            f"{abs(term.shifts[term.parameter]):.2g} half-widths of its interval; calibrate to the runs apart",
+            f"{abs(term.shifts[term.parameter]):.2g} half-widths of its interval; calibrate to each run by itself",
             (term.parameter,),
         )
+    moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
+    effect = " and ".join(f"{name} by {abs(term.shifts[name]):.2g}" for name in moved)
     where = f" ({term.parameter})" if term.parameter else ""
     return Verdict(
         "MODEL_MISMATCH",
@@ -131,8 +131,8 @@ def _outside(holdout: HoldOut) -> Verdict | None:
         return None
     return Verdict(
         "MODEL_MISMATCH",
-        f"{_at_end(holdout.at_end)}: the true value may lie beyond it, and then the other parameters make up for it; "
-        "widen the range",
+        f"{', '.join(holdout.at_end)} at the end of the range: the true value may lie beyond it, and then the other "
+        "parameters make up for it; widen the range",
         holdout.at_end,
     )
 
@@ -140,47 +140,43 @@ def _outside(holdout: HoldOut) -> Verdict | None:
 def _mismatch(holdout: HoldOut) -> Verdict | None:
     if numerical(holdout) is not None:
         return None
-    match holdout:
-        case Predicted():
-            reasons = _systematic(holdout.explained, "state and action")
-            if holdout.autocorrelation > WHITE:
-                reasons.append(f"it is correlated from step to step ({holdout.autocorrelation:.2f})")
-            return _mismatch_of_errors(holdout.errors, reasons, _pinned(holdout), "")
-        case Fitted():
-            reasons = _systematic(holdout.explained, "readings and actions")
-            return _mismatch_of_errors(holdout.errors, reasons, _pinned(holdout), " behind a fitted start")
-        case ToldApart():
-            return _mismatch_of_areas(holdout.area_at_mid_range, holdout.area_at_estimate, _pinned(holdout))
+    pinned = tuple(name for name, value in holdout.estimate.items() if abs(value) > AT_END)
+    at_end = [f"{', '.join(pinned)} at the end of the range"] if pinned else []
+    if isinstance(holdout, ToldApart):
+        sentence = _separable(holdout.area_at_mid_range, holdout.area_at_estimate, at_end)
+    else:
+        sentence = _systematic(holdout, at_end)
+    return Verdict("MODEL_MISMATCH", sentence, pinned) if sentence else None
 
 
-def _mismatch_of_errors(
-    errors: PredictionErrors, reasons: list[str], pinned: tuple[str, ...], where: str
-) -> Verdict | None:
-    """Parameters nearby leave more than noise, and what they leave does not look like noise."""
+def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
+    """How the errors of the best parameters nearby differ from noise, in size and for a reason; else empty."""
+    errors, direct, reasons = holdout.errors, isinstance(holdout, Predicted), list[str]()
+    if holdout.explained > EXPLAINED:
+        inputs = "state and action" if direct else "readings and actions"
+        reasons.append(f"{inputs} explain {100 * holdout.explained:.0f} % of it")
+    if isinstance(holdout, Predicted) and holdout.autocorrelation > WHITE:
+        reasons.append(f"it is correlated from step to step ({holdout.autocorrelation:.2f})")
+    reasons += at_end
     beyond = _beyond_noise(errors.nearby_best, errors.noise)
-    if pinned:
-        reasons = [*reasons, _at_end(pinned)]
     if not beyond or not reasons:
-        return None
+        return ""
     left, noise = max(beyond, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
-    return Verdict(
-        "MODEL_MISMATCH",
-        f"the best parameters nearby leave {left.mean:.2g} of a step's change after {_steps(left.steps)}{where} on the "
-        f"hold-out, where noise leaves {noise.mean:.2g}, and {', '.join(reasons)}: the model cannot explain the data "
-        f"({_change(errors)} at the estimate)",
-        pinned,
+    return (
+        f"the best parameters nearby leave {left.mean:.2g} of a step's change after {_steps(left.steps)}"
+        f"{'' if direct else ' behind a fitted start'} on the hold-out, where noise leaves {noise.mean:.2g}, and "
+        f"{', '.join(reasons)}: the model cannot explain the data ({_change(errors)} at the estimate)"
     )
 
 
-def _mismatch_of_areas(before: Area, after: Area, pinned: tuple[str, ...]) -> Verdict | None:
-    if after.interval[0] <= TOLD_APART or after.area >= before.area:
-        return None
-    more = f", and {_at_end(pinned)}" if pinned else ""
-    return Verdict(
-        "MODEL_MISMATCH",
+def _separable(before: Area, after: Area, at_end: list[str]) -> str:
+    """How well a classifier separates simulated from logged rows, if better than `SEPARABLE`; else empty."""
+    if after.interval[0] <= SEPARABLE or after.area >= before.area:
+        return ""
+    return (
         f"a classifier still tells rows of the simulator from those held out, {_area(after)} after {_area(before)} at "
-        f"mid-range (0.5 is chance){more}: the model cannot move as the data does, or the search is not at its end",
-        pinned,
+        f"mid-range (0.5 is chance){', and '.join(['', *at_end])}: the model cannot move as the data does, or the "
+        "search is not at its end"
     )
 
 
@@ -222,9 +218,9 @@ def _no_better_errors(errors: PredictionErrors) -> str:
 
 def _no_better_areas(before: Area, after: Area) -> str:
     """Why an estimate is no improvement by the classifier's areas; empty if it is one."""
-    if after.interval[1] < before.area and after.area < before.interval[0] and after.area <= TOLD_APART:
+    if after.interval[1] < before.area and after.area < before.interval[0] and after.area <= SEPARABLE:
         return ""
-    if before.area <= TOLD_APART:
+    if before.area <= SEPARABLE:
         return (
             f"mid-range is as good: a classifier hardly tells its rows from those held out, {_area(before)}, nor "
             f"those of the estimate, {_area(after)} (0.5 is chance)"
@@ -255,21 +251,9 @@ def _how_small(errors: PredictionErrors) -> str:
 def _beyond_noise(
     errors: Sequence[PredictionError], noise: Iterable[PredictionError]
 ) -> list[tuple[PredictionError, PredictionError]]:
-    """The errors that noise does not explain, each with that of noise alone."""
+    """The errors that noise does not explain, each with the error of noise alone."""
     pairs = zip(errors, noise, strict=True)
     return [(left, alone) for left, alone in pairs if left.mean > max(NEGLIGIBLE, ABOVE_NOISE * alone.mean)]
-
-
-def _systematic(explained: float, inputs: str) -> list[str]:
-    return [f"{inputs} explain {100 * explained:.0f} % of it"] if explained > EXPLAINED else []
-
-
-def _pinned(holdout: HoldOut) -> tuple[str, ...]:
-    return tuple(name for name, value in holdout.estimate.items() if abs(value) > AT_END)
-
-
-def _at_end(pinned: tuple[str, ...]) -> str:
-    return f"{', '.join(pinned)} at the end of the range"
 
 
 def _change(errors: PredictionErrors) -> str:

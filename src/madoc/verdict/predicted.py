@@ -1,6 +1,7 @@
-"""The hold-out predicted from logged states: where states can be rebuilt from what was logged."""
+"""The hold-out predicted from logged states, where states can be rebuilt from what was logged."""
 
-from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -9,46 +10,31 @@ from madoc.calibration.holdout import Predicted
 from madoc.diagnosis.channels import signal_names
 from madoc.identification import noise as sensors
 from madoc.identification.states import logged_states
-from madoc.verdict.bench import Bench, common_fields
+from madoc.verdict.bench import Bench, judged
 from madoc.verdict.prediction import nearby_best
 from madoc.verdict.statistics import best_of, prediction_errors, relative_to_first
 from madoc.verdict.systematic import autocorrelation, explained, explained_at_end
-from madoc.verdict.two_sample import replayed, tell_apart
+from madoc.verdict.two_sample import classify, replayed
 
 
-def predicted(bench: Bench, unit: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
-    """Prediction errors at mid-range, at the estimate, at the best parameters nearby, and of noise alone.
-
-    Args:
-        bench: The hold-out.
-        unit: The estimate in [-1, 1].
-        interval: Its 95 % intervals in physical units, if known.
-    """
-    replays, mid_range = bench.replays, np.zeros(len(unit))
-    nearby, searching = nearby_best(replays, unit)
-    points = np.concatenate([mid_range[None], unit[None], nearby])
+def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
+    """The errors of an estimate, in [-1, 1], of mid-range, of the best parameters nearby, and of noise alone."""
+    replays, mid_range = bench.replays, np.zeros(len(point))
+    nearby, searching = nearby_best(replays, point)
+    points = np.concatenate([mid_range[None], point[None], nearby])
     residuals = replays.residuals(points)
     sizes = replays.magnitudes(residuals)
     best = best_of(sizes)
     single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
     systems = {"the simulator at mid-range": mid_range, "the simulator at the best parameters nearby": points[best]}
-    common = common_fields(
-        bench,
-        unit,
-        interval,
-        at=points[best],
-        residual=single.size,
-        by_model=tuple(bench.against_chance(name, _simulated(bench, point)) for name, point in systems.items()),
-        noise=single.noise,
-        control_steps=searching + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps,
-    )
     area_at_mid_range, area_at_estimate = (
-        tell_apart(*replayed(replays, bench.scaling, part, noisy[0]), overlap=False) for part in residuals[:2]
+        classify(*replayed(replays, bench.scaling, part, noisy[0]), overlap=False) for part in residuals[:2]
     )
     actions = replays.windows.actions.reshape(len(replays.windows), -1)
-    return Predicted(
-        **common,
+    start_and_actions = np.concatenate([replays.observation, actions], axis=1)
+    record = partial(
+        Predicted,
         errors=prediction_errors(
             sizes,
             replays.magnitudes(noisy)[:, 0],
@@ -58,20 +44,28 @@ def predicted(bench: Bench, unit: Float[np.ndarray, " d"], interval: Float[np.nd
             signals=signal_names(bench.simulator.task),
             failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
         ),
-        explained=max(
-            single.explained,
-            explained_at_end(np.concatenate([replays.observation, actions], axis=1), residuals[best]),
-        ),
+        explained=max(single.explained, explained_at_end(start_and_actions, residuals[best])),
         autocorrelation=single.autocorrelation,
         area_at_mid_range=area_at_mid_range,
         area_at_estimate=area_at_estimate,
+    )
+    return judged(
+        record,
+        bench,
+        point,
+        interval,
+        at=points[best],
+        residual=single.size,
+        by_model=tuple(bench.against_chance(name, _simulated(bench, system)) for name, system in systems.items()),
+        noise=single.noise,
+        control_steps=searching + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps,
     )
 
 
 def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
     """Standard deviation of the sensors' noise in their units, without an estimate.
 
-    Where states can be rebuilt, it is what the best parameters near mid-range leave over.
+    Where states can be rebuilt, it is computed from the residuals at the best parameters near mid-range.
     """
     if not bench.states_known:
         return sensors.difference_noise(bench.problem.dataset)
@@ -82,17 +76,8 @@ def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
     return _single_steps(bench, best).noise * bench.change
 
 
-@dataclass(frozen=True)
-class _SingleSteps:
-    """Residuals of single steps, in typical changes of a step.
-
-    Attributes:
-        size: Root mean square of each signal.
-        explained: Share of their squares that state and action explain.
-        autocorrelation: From step to step.
-        noise: Standard deviation of the sensors' noise.
-        control_steps: Simulated.
-    """
+class _SingleSteps(NamedTuple):
+    """Statistics of single steps: residuals' root mean square, the share that state and action explain, and so on."""
 
     size: Float[np.ndarray, " observation"]
     explained: float
@@ -101,15 +86,15 @@ class _SingleSteps:
     control_steps: int
 
 
-def _single_steps(bench: Bench, unit: Float[np.ndarray, " d"]) -> _SingleSteps:
+def _single_steps(bench: Bench, point: Float[np.ndarray, " d"]) -> _SingleSteps:
     held, rows, scale = bench.held_out, bench.judged_rows, bench.change
     followed = np.asarray(held.transitions.next_observation)[rows]
-    residuals = sensors.clipped((_simulated(bench, unit) - followed) / scale)
+    residuals = sensors.clipped((_simulated(bench, point) - followed) / scale)
     first = np.flatnonzero((np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts))
     share, explanation = explained(bench.scaling.features(held.transitions.take(rows))[0], residuals)
     noise, spent = np.zeros(len(scale)), len(rows)
     if len(first):
-        slopes = sensors.own_slopes(bench.simulator, held, unit, rows[first], scale)
+        slopes = sensors.own_slopes(bench.simulator, held, point, rows[first], scale)
         unexplained = residuals - explanation
         noise = sensors.consecutive_noise(unexplained[first], unexplained[first + 1], slopes)
         spent += len(first) * (1 + len(scale))
@@ -117,11 +102,11 @@ def _single_steps(bench: Bench, unit: Float[np.ndarray, " d"]) -> _SingleSteps:
     return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise, spent)
 
 
-def _simulated(bench: Bench, unit: Float[np.ndarray, " d"]) -> Float[np.ndarray, "rows observation"]:
+def _simulated(bench: Bench, point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "rows observation"]:
     """Next observations of the judged rows in the simulator."""
     held, simulator = bench.held_out, bench.simulator
     states, rows = logged_states(held, simulator.task)
     states = states[np.searchsorted(rows, bench.judged_rows)]
-    system = simulator.bind(simulator.parameters.to_physical(unit)[None])
+    system = simulator.bind(simulator.parameters.to_physical(point)[None])
     action = np.asarray(held.transitions.action)[bench.judged_rows]
     return np.asarray(system.observe(system.step(system.unbiased(states[None]), action[None]))[0])

@@ -1,4 +1,4 @@
-"""A selftest: would this data recover a truth? One is planted in the model, and the logged actions replayed in it."""
+"""A selftest: would this data recover true parameters? They are chosen, and the logged actions replayed under them."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -25,14 +25,14 @@ RECOVERABLE = 10.0
 INNER = 0.8
 """Largest |parameter| of a planted truth in [-1, 1], so that none is recovered by being at the end of its range."""
 STRETCH = 25
-"""Control steps after which a replay begins anew at a logged state: open-loop, it would leave where the robot was."""
+"""Largest number of control steps of a replay from a logged state; a longer one would leave the logged motion."""
 LONGEST = 1000
-"""Control steps of a replay from the reset, where no logged state can be rebuilt."""
+"""Largest number of control steps of a replay from a reset, where states cannot be rebuilt."""
 
 
 @dataclass(frozen=True)
 class Planted:
-    """One parameter of one planted truth, counted from 1; `interval` and `covered` where the method has intervals."""
+    """One parameter of one planted truth, counted from 1; the last two are None where a method gives no intervals."""
 
     name: str
     unit: str
@@ -46,15 +46,9 @@ class Planted:
 
 @dataclass(frozen=True)
 class Selftest:
-    """Whether calibrations to planted data recovered what was planted.
+    """Whether calibrations to planted data recovered what was planted, of every parameter and every truth in `rows`.
 
-    Attributes:
-        method: The method that was run.
-        rows: Every parameter of every planted truth.
-        recoverable: Names of the parameters that were recovered every time.
-        sentence: The same in words.
-        noise: Standard deviation of the noise on the planted data by signal, in its unit.
-        control_steps: Simulated in all runs.
+    `recoverable` parameters were recovered every time; `noise` is what was put on the planted signals, in their units.
     """
 
     method: str
@@ -88,12 +82,7 @@ def plant(
     Every replay is an episode, and ends where its simulation failed or the task ended. Where the log's velocities are
     finite differences of its positions, so are the planted ones.
 
-    Args:
-        dataset: The log whose actions are replayed.
-        simulator: The model.
-        truth: Physical values of its parameters.
-        noise: Standard deviation of the sensors' noise, in their units.
-        key: Randomness of the resets and the noise.
+    `truth` are physical parameters, `noise` is the standard deviation of the sensors' noise in their units.
 
     Raises:
         MadocError: Not one row could be simulated.
@@ -176,7 +165,7 @@ def selftest(
         method = _first_willing(methods, problem, of_method)
         result = calibrate(method, problem, key=of_method, budget=budget, quiet=quiet)
         if result.status == "interrupted":
-            raise KeyboardInterrupt  # an interrupted calibration says nothing of the data
+            raise KeyboardInterrupt  # an interrupted calibration is no test of the data
         if result.status == "diverged":
             raise MadocError(f"truth {index} could not be calibrated to: {result.sentence}")
         name, spent = result.method, spent + result.control_steps
@@ -230,6 +219,6 @@ def _sentence(worst: dict[str, float], recoverable: tuple[str, ...], truths: int
 
 
 def _of_intervals(rows: Sequence[Planted]) -> str:
-    """How many of a method's intervals hold the truth, where it has any."""
+    """How many of a method's intervals contain the truth, where it gives any."""
     covered = [row.covered for row in rows if row.covered is not None]
     return f"; {sum(covered)} of {len(covered)} 95 % intervals hold the truth" if covered else ""

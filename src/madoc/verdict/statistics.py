@@ -1,15 +1,14 @@
-"""Means with confidence intervals from resampled episodes, ranks of two samples, and predictions against chance."""
+"""Means with confidence intervals from resampled episodes, and predictions compared with chance."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.stats import rankdata
+from jaxtyping import Float, Int
 
 from madoc.calibration.holdout import PredictionError, PredictionErrors
 
 NEGLIGIBLE = 1e-3
-"""Residual in typical changes of a signal in one step. No sensor is as good, and no use of a model notices less."""
+"""Residual in typical changes of a signal in one step; no sensor is more precise, so smaller ones count as none."""
 RESAMPLES = 500
 """Number of bootstrap samples. The ends of a 95 % interval then vary by about a tenth of its width (Efron and
 Tibshirani 1993, section 13.3)."""
@@ -26,12 +25,9 @@ _CAPPING = 20
 def resampled(
     values: Float[np.ndarray, "windows *kinds"], groups: Int[np.ndarray, " windows"], *, seed: int = 0
 ) -> Float[np.ndarray, "resamples *kinds"]:
-    """Means over windows of resampled groups, all kinds under the same draws, so that they can be compared.
+    """Bootstrap samples of means over windows: whole episodes are resampled, every kind of value by the same draws.
 
-    Args:
-        values: One row a window.
-        groups: The episode of each window; with fewer than `FEWEST_EPISODES` every window is its own group.
-        seed: Of the draws.
+    With fewer than `FEWEST_EPISODES` different `groups`, the episode of each window, single windows are resampled.
     """
     if len(np.unique(groups)) < FEWEST_EPISODES:
         groups = np.arange(len(values))
@@ -63,14 +59,8 @@ def prediction_errors(
 ) -> PredictionErrors:
     """Prediction errors of several points at each horizon, with confidence intervals.
 
-    Args:
-        sizes: Absolute residuals: at mid-range, at the estimate, then at points near it.
-        floor: Absolute residuals that noise alone would leave.
-        best: The point, not mid-range, with the smallest errors.
-        episodes: The episode of each window.
-        horizons: Control steps ahead.
-        signals: Their names.
-        failed: Number of windows that failed in simulation at the estimate.
+    `sizes` are absolute residuals at mid-range, at the estimate, then at points near it, and `floor` those that noise
+    alone would cause. `best` is the point of `best_of`, and `failed` the number of windows that failed at the estimate.
     """
     means, draws = sizes.mean((0, -1)), resampled(sizes.mean(-1), episodes)
     relative = relative_to_first(means)
@@ -93,7 +83,7 @@ def prediction_errors(
 
 
 def best_of(sizes: Float[np.ndarray, "windows points horizons signals"]) -> int:
-    """The point with the smallest errors; the first, mid-range, is not one of the candidates."""
+    """Index of the point with the smallest errors; the first point, mid-range, is no candidate."""
     return 1 + int(np.argmin(relative_to_first(sizes.mean((0, -1)))[1:]))
 
 
@@ -113,41 +103,21 @@ def _by_horizon(
 def relative_to_first(errors: Float[np.ndarray, "*draws points horizons"]) -> Float[np.ndarray, "*draws points"]:
     """Each point's error over the first point's, mean over horizons; at least 1 where the first's is negligible."""
     first = errors[..., :1, :]
-    nothing = first <= NEGLIGIBLE
-    return np.asarray(
-        np.where(nothing, np.maximum(1.0, errors / NEGLIGIBLE), errors / np.where(nothing, 1.0, first))
-    ).mean(-1)
+    negligible = first <= NEGLIGIBLE
+    ratio = errors / np.where(negligible, 1.0, first)
+    return np.where(negligible, np.maximum(1.0, errors / NEGLIGIBLE), ratio).mean(-1)
 
 
 def shares_of_ranges(
     half: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None, width: Float[np.ndarray, " d"]
 ) -> Float[np.ndarray, " d"]:
-    """Share of each range that the 95 % interval covers, at most 1: the method's own, and no less than the best one.
+    """Share of each range, at most 1, that the wider of two 95 % intervals covers.
 
-    Args:
-        half: Half of the best possible interval in [-1, 1].
-        interval: The method's, in physical units, if it has one.
-        width: Of each range, in physical units.
+    `half` is half of the best possible one in [-1, 1]; the method's `interval`, if it gives one, and the `width` of
+    each range are in physical units.
     """
     share = half if interval is None else np.maximum(half, (interval[:, 1] - interval[:, 0]) / width)
     return np.minimum(share, 1.0)
-
-
-def area_under_curve(
-    scores: Float[np.ndarray, " rows"],
-    real: Bool[np.ndarray, " rows"],
-    weights: Float[np.ndarray, " rows"] | None = None,
-) -> float:
-    """Probability that a real row's score is above a simulated row's, ties counted half; rows may be weighted."""
-    if weights is None:
-        ranks, count = rankdata(scores), int(real.sum())
-        return float((ranks[real].sum() - count * (count + 1) / 2.0) / (count * (len(real) - count)))
-    order = np.argsort(scores, kind="stable")
-    ordered, mass = scores[order], np.where(real[order], 0.0, weights[order])
-    below = np.concatenate([[0.0], np.cumsum(mass)])
-    first, last = np.searchsorted(ordered, scores[real], "left"), np.searchsorted(ordered, scores[real], "right")
-    beaten = (below[first] + below[last]) / 2.0
-    return float((weights[real] * beaten).sum() / weights[real].sum() / mass.sum())
 
 
 def better_than_chance(
@@ -159,8 +129,8 @@ def better_than_chance(
 ) -> tuple[float, float]:
     """Permutation test of whether predictions belong to the rows they were made for.
 
-    Rows are exchanged within their group where groups have two rows or more on average, else among all: what tells one
-    run from another is not dynamics. The error is a mean in which each row's error is capped at the 95th percentile of
+    Rows are exchanged within their group where groups have two rows or more on average, else among all: differences
+    between runs are no dynamics. The error is a mean in which each row's error is capped at the 95th percentile of
     random pairings; a median would ignore the rows in motion where most rows are at rest.
 
     Returns:

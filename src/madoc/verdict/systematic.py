@@ -1,4 +1,4 @@
-"""Whether residuals are noise, or can be predicted from where the robot was and what it did."""
+"""Whether residuals are noise, or a function of the robot's state and action."""
 
 import numpy as np
 from jaxtyping import Float
@@ -13,15 +13,15 @@ from madoc.identification.noise import clipped
 FOLDS = 5
 """Number of folds of the cross-validation."""
 _FEWEST = 2 * FOLDS
-"""Smallest number of rows that regressions are fitted to; of fewer, nothing counts as explained."""
+"""Smallest number of rows to which regressions are fitted; with fewer, nothing counts as explained."""
 _ROUNDING = 1e-6
-"""Residual in typical changes of a step, below which it is the tolerance of MuJoCo's solver at contacts."""
+"""Residual in typical changes of a step; a smaller one is within the tolerance of MuJoCo's solver at contacts."""
 
 EXPLAINERS = {
     "a linear function": lambda: make_pipeline(StandardScaler(), RidgeCV(np.logspace(-3, 3, 7))),
     "trees": lambda: ExtraTreesRegressor(10, min_samples_leaf=3, random_state=0),
 }
-"""Regressions of residuals on state and action: a linear one for motion in the large, trees for contacts."""
+"""Regressions of residuals on state and action: a linear one for smooth motion, trees for contacts."""
 
 
 def explained(
@@ -51,7 +51,7 @@ def explained(
 def explained_at_end(
     inputs: Float[np.ndarray, "windows inputs"], residuals: Float[np.ndarray, "windows steps observation"]
 ) -> float:
-    """The share of the last residuals of windows that the inputs explain: small errors add up until there."""
+    """The share of windows' squared last residuals that the inputs explain; model errors have added up in them."""
     done = np.isfinite(residuals).all((1, 2))
     return explained(inputs[done], clipped(residuals[done, -1]))[0] if done.any() else 0.0
 
@@ -59,6 +59,6 @@ def explained_at_end(
 def autocorrelation(
     first: Float[np.ndarray, "pairs observation"], second: Float[np.ndarray, "pairs observation"]
 ) -> float:
-    """Correlation of residuals of consecutive steps over all signals: 0 if independent, -½ of pure sensor noise."""
+    """Correlation of residuals of consecutive steps over all signals: 0 if independent, -½ if they are sensor noise."""
     size = float(np.sqrt((first**2).sum() * (second**2).sum()))
     return 0.0 if size == 0.0 else float((first * second).sum()) / size

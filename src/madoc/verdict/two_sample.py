@@ -1,95 +1,82 @@
 """A classifier two-sample test of logged against simulated rows (Lopez-Paz and Oquab 2017)."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, PRNGKeyArray
 from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.linear_model import RidgeCV
+from sklearn.metrics import roc_auc_score
 from sklearn.model_selection import StratifiedKFold
 from threadpoolctl import threadpool_limits
 
 from madoc.calibration.holdout import Area
 from madoc.data import Dataset
-from madoc.data.dataset import starts_after
+from madoc.data.dataset import spread_of, starts_after
 from madoc.identification.windows import evenly
 from madoc.learning.cloning import continue_cloning, fresh_clone
-from madoc.learning.dynamics_ratio import Scaling
+from madoc.learning.features import LoggedFeatures, Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
-from madoc.learning.window_features import LoggedFeatures
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import begin, reset_states, roll
 from madoc.types import Transitions
 from madoc.verdict.prediction import Replays
-from madoc.verdict.statistics import area_under_curve, interval_of
+from madoc.verdict.statistics import interval_of
 
 MOST_ROWS = 1000
-"""Largest number of rows of either kind: the area under the curve of so many is known to ±0.025."""
+"""Largest number of rows of either kind: with so many, the area under the curve has a standard error of 0.013."""
 RESOLUTION = 0.1
 """Standard deviation of the noise put on changes of motion, in typical ones; 0 is none. Without it a classifier would
-tell parameters apart that differ by a millionth."""
+separate rows of parameters that differ by a millionth."""
 _FITTED = 5000
-"""Largest number of rows that the linear prediction is fitted to."""
+"""Largest number of rows to which the linear prediction is fitted."""
 FOLDS = 5
 TREES, LEAVES, BINS = 40, 8, 32
-"""Number of folds, of trees, of leaves and of bins of a feature: few and small, as for some hundred rows."""
+"""Numbers of folds, trees, leaves of a tree and bins of a feature: few, as for some hundred rows."""
 ODDS_LIMIT = 10.0
-"""Largest weight of a row, and one over the smallest, at least 1; past it logs and rollouts hardly overlap."""
+"""Largest weight of a row, and one over the smallest, at least 1; weights are clipped to them."""
 CLONING = (20, 200, 256, 1e-3)
-"""Number of epochs, updates in each, rows of an update, and Adam's learning rate."""
+"""Number of epochs of cloning, updates in each, rows of an update, and Adam's learning rate."""
 _RESAMPLES = 200
 """Number of bootstrap samples of the area."""
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Rows as features of a classifier.
-
-    Attributes:
-        before: Observation and action of a row, and of the row before it where one observation is not the state.
-        after: The change that followed.
-        episodes: The episode of each row.
-    """
+class Sample(NamedTuple):
+    """Rows as features of a classifier: what came `before` a change, and the change `after` it."""
 
     before: Float[np.ndarray, "rows before"]
     after: Float[np.ndarray, "rows observation"]
-    episodes: Int[np.ndarray, " rows"]
 
-    def __len__(self) -> int:
-        return len(self.before)
-
-    def take(self, rows: np.ndarray) -> "Sample":
-        """Only these."""
-        return Sample(self.before[rows], self.after[rows], self.episodes[rows])
+    def thinned(self) -> "Sample":
+        """At most `MOST_ROWS`, spread evenly."""
+        chosen = evenly(np.arange(len(self.before)), MOST_ROWS)
+        return Sample(self.before[chosen], self.after[chosen])
 
 
-def tell_apart(real: Sample, simulated: Sample, *, overlap: bool) -> Area:
+def classify(real: Sample, simulated: Sample, *, overlap: bool) -> Area:
     """Cross-validated area under the ROC curve; 0.5 with an interval from 0 to 1 where there are too few rows.
 
-    Args:
-        real: Logged rows.
-        simulated: Simulated rows.
-        overlap: Whether the two kinds are differently distributed before the change. Simulated rows are then weighted
-            by the odds, of a second classifier, that what came before is of the log, so that only changes are compared.
+    With `overlap`, the two kinds may be distributed differently before the change. Simulated rows are then weighted by
+    a second classifier's odds that `before` is of the log, so that only changes are compared.
     """
-    real, simulated = (part.take(evenly(np.arange(len(part)), MOST_ROWS)) for part in (real, simulated))
-    count = len(real) + len(simulated)
-    if not len(simulated):
-        return Area(1.0, (1.0, 1.0), count)  # every simulation failed: it is no robot at all
-    if min(len(real), len(simulated)) < FOLDS:
-        return Area(0.5, (0.0, 1.0), count)
-    label = np.repeat([True, False], [len(real), len(simulated)])
-    before = np.concatenate([real.before, simulated.before])
-    after = np.concatenate([real.after, simulated.after])
+    samples = real.thinned(), simulated.thinned()
+    rows = [len(sample.before) for sample in samples]
+    if not rows[1]:
+        return Area(1.0, (1.0, 1.0), rows[0])  # every simulation failed
+    if min(rows) < FOLDS:
+        return Area(0.5, (0.0, 1.0), sum(rows))
+    label = np.repeat([True, False], rows)
+    before, after = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     weight = None
     if overlap:
         likely = np.clip(_unseen(before, label, None), 0.01, 0.99)
         odds = np.clip(likely / (1.0 - likely), 1.0 / ODDS_LIMIT, ODDS_LIMIT)
         weight = np.where(label, 1.0, odds / odds[~label].mean())
     scores = _unseen(np.concatenate([before, after], axis=1), label, weight)
-    area = area_under_curve(scores, label, weight)
-    return Area(area, _interval(scores, label, weight), len(label))
+    area = float(roc_auc_score(label, scores, sample_weight=weight))
+    return Area(area, _interval(scores, label, weight), sum(rows))
 
 
 def replayed(
@@ -101,14 +88,9 @@ def replayed(
     """A random half of the windows as they were logged, the other half as simulated, with noise added.
 
     `before` is the first observation and the mean action of a window, `after` the change over the whole window.
-
-    Args:
-        replays: The windows.
-        scaling: Scaling of observations and actions.
-        residuals: Simulated minus logged observations, in typical changes of a step.
-        noise: Residuals that noise alone would leave, in the same unit.
+    Residuals, and the noise among them, are in typical changes of a step.
     """
-    windows, episodes = replays.windows, replays.episodes
+    windows = replays.windows
     start, end = replays.observation, windows.following[:, -1]
     simulated = end + (residuals[:, -1] + noise[:, -1]) * replays.scale
     order = np.random.default_rng(0).permutation(len(windows))
@@ -116,12 +98,12 @@ def replayed(
     other = other[np.isfinite(simulated[other]).all(-1)]
     pair = np.concatenate([start, windows.actions.mean(1)], axis=1)
     before = (pair - scaling.pair_offset) / scaling.pair_scale
-    logged, led = ((after - start) / replays.scale for after in (end, simulated))
-    return Sample(before[real], logged[real], episodes[real]), Sample(before[other], led[other], episodes[other])
+    logged, changed = ((after - start) / replays.scale for after in (end, simulated))
+    return Sample(before[real], logged[real]), Sample(before[other], changed[other])
 
 
 def behaviour(kept: Dataset, key: PRNGKeyArray) -> TanhGaussianPolicy:
-    """A clone of the policy that acted in the log, to act in the simulator where logged states cannot be rebuilt."""
+    """A clone of the policy that acted in the log, to act in the simulator where states cannot be rebuilt."""
     epochs, updates, batch, rate = CLONING
     of_policy, of_batches = jax.random.split(key)
     clone = fresh_clone(kept.transitions, (64, 64), learning_rate=rate, key=of_policy)
@@ -178,15 +160,11 @@ def rolled(
 
 @dataclass(frozen=True)
 class WindowView:
-    """Features of rows for the classifier where one observation is not the state; fitted to the rows calibrated to.
+    """Features of rows for a classifier where one observation is not the state; fitted to the training rows.
 
     `before` holds observation and action of two consecutive rows, or of one where none are consecutive. `after` holds
-    the change of motion, with noise of `RESOLUTION`, and its residual of a linear prediction from `before`.
-
-    Attributes:
-        scaling: Scaling of observations and actions.
-        spread: Standard deviation of the changes of motion.
-        line: The linear prediction of changes of motion.
+    the change of motion over its `spread`, with noise of `RESOLUTION`, and its residual of a linear prediction from
+    `before`, the `line`.
     """
 
     scaling: Scaling
@@ -195,35 +173,34 @@ class WindowView:
 
     @classmethod
     def of(cls, kept: Dataset, scaling: Scaling) -> "WindowView":
-        """The features fitted to a log."""
-        before, after, _ = _change_of_motion(kept, scaling)
-        spread = np.where(after.std(0) > 1e-8, after.std(0), 1.0)
+        """Fit the features to a log."""
+        before, after = _change_of_motion(kept, scaling)
+        spread = spread_of(after)
         chosen = evenly(np.arange(len(before)), _FITTED)
         line = RidgeCV(np.logspace(-4, 2, 7)).fit(before[chosen], after[chosen] / spread)
         return cls(scaling, spread, line)
 
     def sample(self, dataset: Dataset) -> Sample:
         """The features of the rows of a dataset."""
-        before, after, episodes = _change_of_motion(dataset, self.scaling)
+        before, after = _change_of_motion(dataset, self.scaling)
         after = after / self.spread
         after = after + RESOLUTION * np.random.default_rng(len(after)).standard_normal(after.shape)
         residual = after - np.reshape(self.line.predict(before), after.shape)
-        return Sample(before, np.concatenate([after, residual], axis=1), episodes)
+        return Sample(before, np.concatenate([after, residual], axis=1))
 
 
-def _change_of_motion(dataset: Dataset, scaling: Scaling) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What came before, the change of motion after it, and the episode of each row."""
+def _change_of_motion(dataset: Dataset, scaling: Scaling) -> tuple[np.ndarray, np.ndarray]:
+    """What came before each row's change of motion, and the change."""
     logged = dataset.transitions
     second = np.setdiff1d(np.arange(len(dataset)), dataset.episode_starts)
     rows = second if len(second) else np.arange(len(dataset))
     pair, moved = scaling.features(logged.take(rows))
-    episodes = dataset.episode_of(rows)
     if not len(second):
-        return pair.astype(np.float64), moved.astype(np.float64), episodes
+        return pair.astype(np.float64), moved.astype(np.float64)
     earlier, moved_before = scaling.features(logged.take(second - 1))
     action = earlier[:, moved.shape[1] :]
     before = np.concatenate([pair, moved_before, action], axis=1).astype(np.float64)
-    return before, moved.astype(np.float64) - moved_before, episodes
+    return before, moved.astype(np.float64) - moved_before
 
 
 def _unseen(
@@ -250,6 +227,7 @@ def _interval(scores: np.ndarray, label: np.ndarray, weight: np.ndarray | None) 
     draws = []
     for _ in range(_RESAMPLES):
         rows = np.concatenate([rng.choice(kind, len(kind)) for kind in kinds])
-        draws.append(area_under_curve(scores[rows], label[rows], None if weight is None else weight[rows]))
+        weights = None if weight is None else weight[rows]
+        draws.append(roc_auc_score(label[rows], scores[rows], sample_weight=weights))
     low, high = interval_of(np.array(draws))
     return float(low), float(high)

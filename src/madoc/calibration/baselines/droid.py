@@ -1,11 +1,11 @@
-"""DROID: replay stretches of the log under many parameters, and keep the search's own distribution.
+"""DROID: fit replayed windows of the log by CMA-ES, and keep the distribution of the search.
 
 Tsai et al. 2021, "DROID: minimizing the reality gap using single-shot human demonstration" (arXiv 2102.11003). Its
-cost adds an L1 and an L2 distance of trajectories; how they are weighed, and over which channels, is not public. Here
+cost adds an L1 and an L2 distance of trajectories; their weights and channels are not public. Here
 every channel is in units of its typical change in one step, and both distances count the same.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import jax
@@ -17,13 +17,12 @@ from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines import evolution
 from madoc.calibration.baselines.population_search import (
     SearchState,
-    draw_windows,
+    begin_search,
     estimate_from_search,
     mean_with_failures,
     next_generation,
+    replay_residuals,
 )
-from madoc.identification.replay import window_residuals
-from madoc.identification.windows import first_rows
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
 
 
@@ -36,18 +35,18 @@ def trajectory_cost(
 
 @dataclass(frozen=True)
 class Droid:
-    """CMA-ES on the distance between logged stretches and their replay from the logged state.
+    """CMA-ES on the distance between logged windows and their replay from the logged state.
 
-    The authors replay one demonstration; from a long log, a few short stretches are drawn anew for every generation.
-    None reaches over the end of an episode.
+    The authors replay one demonstration; from a long log, a few short windows are drawn anew for every generation.
+    None of them goes beyond the end of an episode.
 
     Attributes:
-        horizon: Control steps of a stretch.
-        windows: Stretches a generation.
+        horizon: Window length in control steps.
+        windows: Windows in a generation.
         absolute: Weight of the L1 distance.
         squared: Weight of the squared L2 distance.
-        population: Candidates a generation; None takes 4 + ⌊3 ln d⌋.
-        tolerance: Share of each range; it stops once the search is narrower in all of them. 0 never stops.
+        population: Candidates in a generation; None takes 4 + ⌊3 ln d⌋.
+        tolerance: Largest deviation of the search, as a share of each range, at which it stops; 0 never stops.
     """
 
     horizon: Count = 5
@@ -61,27 +60,23 @@ class Droid:
         check_hyperparameters(self)
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
-        """The search about mid-range.
-
-        Raises:
-            MadocError: No state can be rebuilt, no episode is long enough, or the next observations are shuffled.
-        """
-        problem.require_pairs()
-        first_rows(problem.dataset, problem.states.exact()[1], self.horizon)
-        return SearchState(evolution.begin(np.zeros(len(problem.simulator.parameters))), key, 0)
+        """The search about mid-range, see `begin_search`."""
+        return begin_search(problem, key, steps=self.horizon)
 
     def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
         """One generation, all candidates in one batch."""
         of_candidates, of_windows, key = jax.random.split(state.key, 3)
         candidates = evolution.ask(state.search, of_candidates, self.population)
-        windows = draw_windows(problem, self.horizon, self.windows, of_windows)
-        scale = problem.typical_change
-        residuals = window_residuals(problem.simulator, windows, candidates, scale)
+        residuals = replay_residuals(problem, candidates, of_windows, steps=self.horizon, windows=self.windows)
         by_window = trajectory_cost(residuals, absolute=self.absolute, squared=self.squared)
-        costs = mean_with_failures(by_window)
-        state = replace(state, key=key, failures=state.failures + int(np.isnan(by_window).sum()))
         return next_generation(
-            state, candidates, costs, control_steps=by_window.size * self.horizon, tolerance=self.tolerance
+            state,
+            candidates,
+            mean_with_failures(by_window),
+            key,
+            control_steps=by_window.size * self.horizon,
+            failures=int(np.isnan(by_window).sum()),
+            tolerance=self.tolerance,
         )
 
     def estimate(self, problem: CalibrationProblem, state: SearchState) -> Estimate:

@@ -1,7 +1,7 @@
-"""CMA-ES in the box [-1, 1]^d, one generation at a time, its whole memory in arrays that a checkpoint can hold.
+"""CMA-ES in the box [-1, 1]^d, one generation at a time, with its whole state in arrays that a checkpoint can hold.
 
-Hansen 2016, "The CMA evolution strategy: a tutorial". The equations are those of the library `cmaes`; it is built
-anew from the arrays in every generation, so a search that was stopped and resumed is the same search.
+Hansen 2016, "The CMA evolution strategy: a tutorial". The library `cmaes` computes its equations; an optimiser is made
+of the arrays in every generation, so that a resumed search is the same search.
 """
 
 from dataclasses import dataclass
@@ -12,15 +12,21 @@ from cmaes import CMA
 from jaxtyping import Float, PRNGKeyArray
 
 FIRST_DEVIATION = 0.5
-"""Of the first draws in [-1, 1]: a quarter of each range."""
+"""Deviation of the first candidates, in [-1, 1]: a quarter of each range."""
 LARGEST_DEVIATION = 2.0
-"""A cost without a slope lets the step size wander off; past the width of the box it would only hit its walls."""
+"""Largest deviation of a candidate, the width of the box. The step size of a flat cost grows without limit; beyond this
+candidates would only be put on the walls."""
+
+Candidates = Float[np.ndarray, "population d"]
+"""Parameters of each candidate of a generation, in [-1, 1]."""
+Costs = Float[np.ndarray, " population"]
+"""Cost of each candidate of a generation."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Evolution:
-    """A normal distribution of candidates, and what CMA-ES remembers of how it moved.
+    """A normal distribution of candidates, and the evolution paths of CMA-ES.
 
     Attributes:
         mean: Centre of the next candidates, in [-1, 1].
@@ -40,30 +46,23 @@ class Evolution:
 
 
 def begin(mean: Float[np.ndarray, " d"], deviation: float = FIRST_DEVIATION) -> Evolution:
-    """Round draws of a given size about a given centre."""
+    """A distribution with equal and independent deviations about a given centre."""
     nothing = np.zeros(len(mean))
     return Evolution(np.array(mean, np.float64), deviation, np.eye(len(mean)), nothing, nothing, 0)
 
 
-def population_of(dimensions: int) -> int:
-    """Candidates a generation: 4 + ⌊3 ln d⌋ (Eq. 48 of the tutorial)."""
-    return 4 + int(3.0 * np.log(dimensions))
+def ask(evolution: Evolution, key: PRNGKeyArray, population: int | None = None) -> Candidates:
+    """The candidates of a generation, by default 4 + ⌊3 ln d⌋ of them (Eq. 48 of the tutorial).
 
-
-def ask(evolution: Evolution, key: PRNGKeyArray, population: int | None = None) -> Float[np.ndarray, "population d"]:
-    """The candidates of a generation, `population_of` the dimensions where no number is given.
-
-    One that leaves the box is drawn again, a hundred times at most; then it is put on the wall.
+    A candidate outside the box is drawn again, a hundred times at most; then it is put on the wall.
     """
-    population = population or population_of(len(evolution.mean))
+    population = population or 4 + int(3.0 * np.log(len(evolution.mean)))
     optimiser = _optimiser(evolution, population, seed=int(jax.random.randint(key, (), 0, 2**31 - 1)))
     return np.stack([optimiser.ask() for _ in range(population)])
 
 
-def tell(
-    evolution: Evolution, candidates: Float[np.ndarray, "population d"], costs: Float[np.ndarray, " population"]
-) -> Evolution:
-    """The distribution after a generation; only the order of the costs matters, and the lowest is the best."""
+def tell(evolution: Evolution, candidates: Candidates, costs: Costs) -> Evolution:
+    """The distribution after a generation. Only the order of the costs matters, and the lowest is the best."""
     optimiser = _optimiser(evolution, len(candidates))
     optimiser.tell(list(zip(candidates, costs.tolist(), strict=True)))
     widest = float(np.sqrt(np.diag(optimiser._C).max()))
@@ -88,7 +87,7 @@ def widest_deviation(evolution: Evolution) -> float:
 
 
 def settled(evolution: Evolution, tolerance: float) -> str | None:
-    """A sentence once no coordinate's deviation reaches the tolerance, as a share of the range; 0 never does."""
+    """A sentence once every coordinate's deviation, as a share of its range, is below the tolerance; else None."""
     widest = widest_deviation(evolution)
     if widest / 2.0 >= tolerance:
         return None
@@ -96,7 +95,7 @@ def settled(evolution: Evolution, tolerance: float) -> str | None:
 
 
 def _optimiser(evolution: Evolution, population: int, seed: int = 0) -> CMA:
-    """The library's search, where ours stands. It has no public way to set the three things set last."""
+    """The library's optimiser in this state. It has no public way to set the last three attributes."""
     optimiser = CMA(
         mean=np.clip(evolution.mean, -1.0, 1.0),
         sigma=evolution.deviation,

@@ -1,6 +1,6 @@
-"""What methods that search by CMA-ES share: state, replayed windows, cost of failed simulations, estimate."""
+"""What calibrators that search by CMA-ES share: state, replayed windows, cost of failed simulations, estimate."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import numpy as np
@@ -8,8 +8,9 @@ from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines import evolution
-from madoc.calibration.baselines.evolution import Evolution
+from madoc.calibration.baselines.evolution import Candidates, Costs, Evolution
 from madoc.calibration.cautions import at_end_of_range
+from madoc.identification.replay import window_residuals
 from madoc.identification.windows import Windows, first_rows, windows_at
 from madoc.types import Epoch
 
@@ -17,18 +18,31 @@ from madoc.types import Epoch
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SearchState:
-    """A search under way, its randomness, and how many simulated rows have exploded."""
+    """The distribution of the search, the random key, and the number of simulated rows that have exploded."""
 
     search: Evolution
     key: PRNGKeyArray
     failures: int
 
 
-def draw_windows(problem: CalibrationProblem, steps: int, count: int, key: PRNGKeyArray) -> Windows:
-    """Logged stretches drawn anew, with repetition.
+def begin_search(
+    problem: CalibrationProblem, key: PRNGKeyArray, *, steps: int, dimensions: int | None = None
+) -> SearchState:
+    """A search about the middle of the box, by default of the parameters, whose cost replays windows of the log.
 
-    All candidates of a generation replay the same ones, the next generation others: so few are enough for an order of
-    candidates, and over the whole search none of them can be fitted at the cost of the rest.
+    Raises:
+        MadocError: No state can be rebuilt, no episode has `steps` rows, or the next observations are shuffled.
+    """
+    problem.require_pairs()
+    first_rows(problem.dataset, problem.states.exact()[1], steps)
+    return SearchState(evolution.begin(np.zeros(dimensions or len(problem.simulator.parameters))), key, 0)
+
+
+def draw_windows(problem: CalibrationProblem, steps: int, count: int, key: PRNGKeyArray) -> Windows:
+    """Windows of the log drawn with replacement.
+
+    All candidates of a generation replay the same windows, the next generation replays others. A few windows suffice
+    to rank candidates, and over the whole search the estimate cannot be overfitted to any of them.
 
     Raises:
         MadocError: No state can be rebuilt, or no episode is long enough.
@@ -39,10 +53,23 @@ def draw_windows(problem: CalibrationProblem, steps: int, count: int, key: PRNGK
     return windows_at(problem.dataset, states[chosen], rows[chosen], steps)
 
 
-def mean_with_failures(costs: Float[np.ndarray, "candidates windows"]) -> Float[np.ndarray, " candidates"]:
-    """Mean cost of each candidate, failures (NaN) included.
+def replay_residuals(
+    problem: CalibrationProblem,
+    candidates: Float[np.ndarray, "candidates d"],
+    key: PRNGKeyArray,
+    *,
+    steps: int,
+    windows: int,
+) -> Float[np.ndarray, "candidates windows values"]:
+    """Residuals of random windows under each candidate, in typical changes of a step; NaN where a simulation failed."""
+    drawn = draw_windows(problem, steps, windows, key)
+    return window_residuals(problem.simulator, drawn, candidates, problem.typical_change)
 
-    A failure costs the worst seen, and as much more as that is above the best: a candidate gains nothing by failing.
+
+def mean_with_failures(costs: Float[np.ndarray, "candidates windows"]) -> Float[np.ndarray, " candidates"]:
+    """Mean cost of each candidate, where a failed simulation (NaN) costs 2 worst - best of all that did not fail.
+
+    So no candidate can lower its cost by failing.
     """
     failed = np.isnan(costs)
     if failed.all():
@@ -53,17 +80,19 @@ def mean_with_failures(costs: Float[np.ndarray, "candidates windows"]) -> Float[
 
 def next_generation(
     state: SearchState,
-    candidates: Float[np.ndarray, "population d"],
-    costs: Float[np.ndarray, " population"],
+    candidates: Candidates,
+    costs: Costs,
+    key: PRNGKeyArray,
     *,
     control_steps: int,
+    failures: int,
     tolerance: float,
 ) -> tuple[SearchState, Epoch]:
-    """Update the search with the candidates' costs; also the epoch that evaluated them."""
+    """The state after a generation, given its costs and the next random key, and the epoch that evaluated it."""
     search = evolution.tell(state.search, candidates, costs)
     metrics = {"cost": float(costs.min()), "deviation": evolution.widest_deviation(search)}
     epoch = Epoch(metrics, control_steps, converged=evolution.settled(search, tolerance))
-    return replace(state, search=search), epoch
+    return SearchState(search, key, state.failures + failures), epoch
 
 
 def estimate_from_search(problem: CalibrationProblem, state: SearchState) -> Estimate:
@@ -77,4 +106,19 @@ def estimate_from_search(problem: CalibrationProblem, state: SearchState) -> Est
         failures=state.failures,
         warnings=at_end_of_range(state.search.mean, space.names),
         covariance=covariance,
+    )
+
+
+def independent_estimate(
+    problem: CalibrationProblem, mean: Float[np.ndarray, " d"], std: Float[np.ndarray, " d"], failures: int
+) -> Estimate:
+    """Independent parameters of this mean and standard deviation in [-1, 1]."""
+    space = problem.simulator.parameters
+    physical = std * (space.high - space.low) / 2.0
+    return Estimate(
+        mean=space.to_physical(mean),
+        std=physical,
+        failures=failures,
+        warnings=at_end_of_range(mean, space.names),
+        covariance=np.diag(physical**2),
     )

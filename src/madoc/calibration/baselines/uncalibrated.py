@@ -1,8 +1,7 @@
-"""Baselines that simulate nothing: the middle of every range, and a uniform distribution over the ranges."""
+"""Baselines without simulation: the middle of every range, and a uniform distribution over the ranges."""
 
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
@@ -10,34 +9,26 @@ from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.types import Epoch
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class UncalibratedState:
-    """Nothing but the random key that every state carries."""
-
-    key: PRNGKeyArray
-
-
 @dataclass(frozen=True)
 class Uncalibrated:
-    """The estimate without any data. It simulates nothing and converges in its first epoch.
+    """An estimate that uses no data and converges in its first epoch.
 
     Attributes:
-        randomised: False is `nominal`: mid-range without a spread, the simulator as it comes. True is `uniform`:
-            mid-range with the deviation of a uniform distribution over each range, (high - low) / √12.
+        randomised: False is `nominal`: the middle of every range with standard deviation 0. True is `uniform`: the
+            same with the standard deviation of a uniform distribution over each range, (high - low) / √12.
     """
 
     randomised: bool = False
 
-    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> UncalibratedState:
-        """Nothing to begin with."""
-        return UncalibratedState(key)
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> PRNGKeyArray:
+        """The random key, which never changes."""
+        return key
 
-    def step(self, problem: CalibrationProblem, state: UncalibratedState) -> tuple[UncalibratedState, Epoch]:
-        """It has converged, as there is nothing to do."""
+    def step(self, problem: CalibrationProblem, state: PRNGKeyArray) -> tuple[PRNGKeyArray, Epoch]:
+        """An epoch that has converged."""
         return state, Epoch(converged="there is nothing to simulate")
 
-    def estimate(self, problem: CalibrationProblem, state: UncalibratedState) -> Estimate:
+    def estimate(self, problem: CalibrationProblem, state: PRNGKeyArray) -> Estimate:
         """The middle of every range, whatever the data says."""
         space = problem.simulator.parameters
         std = (space.high - space.low) / np.sqrt(12.0) if self.randomised else np.zeros(len(space))

@@ -1,4 +1,4 @@
-"""Least squares: a search from logged states, one with unknown initial states, or first the one and then the other."""
+"""Least squares from logged states, with unknown initial states, or first the one and then the other."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -31,29 +31,30 @@ from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
 InitialStates = Literal["logged", "estimated"]
 Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening"]
 LOGGED_HORIZON = 1
-"""Control steps of a window from a logged state: a state that is taken for true is best left at once."""
+"""Length in control steps of a window from a logged state: noise of the state disturbs the first step least."""
 WINDOWS: dict[InitialStates, int] = {"logged": 1000, "estimated": 100}
-"""Windows refined on, at most."""
+"""Largest number of windows in the end."""
 SEARCH_WINDOWS: dict[InitialStates, int] = {"logged": 64, "estimated": 24}
-"""Windows searched on, at most."""
+"""Largest number of windows while searching."""
 NOISY = 0.25
-"""Alternation of residuals, from -1 to 1, above which logged states are noisy: noise alone has about a half."""
+"""Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class LeastSquaresState:
-    """Everything least squares carries.
+    """The state of least squares.
 
     Attributes:
         known: The search from logged states; None where they cannot be rebuilt.
-        unknown: Searches with unknown initial states on longer and longer windows; none if it never comes to that.
-        stage: `logged`: from logged states, to the end. `undecided`: from logged states, until residuals tell whether
-            they are noisy. `starting`: from logged states, until a start for unknown ones is found. `estimated`: with
-            unknown ones on the shortest windows. `lengthening`: the same on longer ones.
-        length: Which of the unknown searches is under way.
-        best: Which of them has the estimate.
-        finished: 1 once the next step would change nothing worth a simulation, else 0.
+        unknown: Searches with unknown initial states, from the shortest windows to the longest; none are needed with
+            stage `logged`.
+        stage: `logged`: from logged states, to the end. `undecided`: from logged states, until residuals show whether
+            these are noisy. `starting`: from logged states, to find parameters for `estimated` to begin at.
+            `estimated`: with unknown initial states on the shortest windows. `lengthening`: the same on longer ones.
+        length: Index of the unknown search in progress.
+        best: Index of the unknown search that has the estimate.
+        finished: 1 once the next step would be too small to matter, else 0.
     """
 
     known: SearchState | None
@@ -65,7 +66,7 @@ class LeastSquaresState:
 
     @property
     def estimates_starts(self) -> bool:
-        """Whether a search with unknown initial states has begun; then the estimate is its."""
+        """Whether the estimate is that of a search with unknown initial states."""
         return self.stage in ("estimated", "lengthening")
 
 
@@ -73,27 +74,26 @@ class LeastSquaresState:
 class LeastSquares:
     """Damped Gauss-Newton on differences between simulated and logged observations, over windows of the log.
 
-    Residuals are in units of each channel's typical change in one step. From `logged` initial states it is exact where
-    they are clean and complete, and biased by noise in them, as it takes them for true. With `estimated` ones each
-    window's initial state is an unknown besides the parameters, the first reading is a reading like the others, and
-    channels weigh by the noise that the fit finds in them. Once nothing moves, windows become three times as long, and
-    again, for as long as they narrow the intervals and leave noise alone: where a robot moves smoothly, long windows
-    tell more, and model errors show in them. By default states are estimated where they cannot be rebuilt, where the
-    data is known to be noisy, and where residuals of consecutive rows alternate as noise makes them: a reading that is
-    too high makes the step to it look too long and the step from it too short.
+    Residuals are in typical changes of a channel in one step. With `logged` initial states, which are assumed to be
+    exact, noise in them biases the estimate. With `estimated` ones each window's initial state is a further unknown,
+    its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
+    has settled, windows become three times as long, and again, while that narrows the intervals and residuals remain
+    noise: where motion is smooth, long windows hold more information, and they show model errors. By default states are
+    estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of consecutive rows
+    alternate as noise makes them: a reading that is too high makes the step to it look too long and the step from it
+    too short.
 
     Attributes:
-        initial_states: `logged`, `estimated`, or None for the data to choose.
-        horizon: Control steps of a window; the observation after every one of them counts. None takes 1 from logged
-            states; with estimated ones as many as it takes the robot to move from one pose to another (`horizon_of`),
-            then 3 and 9 times as many.
+        initial_states: `logged`, `estimated`, or None to choose by the data.
+        horizon: Length of a window in control steps; the observation after each of them counts. None is 1 from logged
+            states, and with estimated ones `horizon_of` the data, then 3 and 9 times as many.
         loss: `linear`, or a robust one (`huber`, `soft-l1`, `cauchy`) whose scale follows the residuals.
-        windows: Windows, at most; all there are if fewer. None takes 1000 from logged states, 100 with estimated ones.
-        searches: The first begins at mid-range, the others at random places. The best goes on.
-        search_windows: Windows while searching; None takes 64 from logged states, 24 with estimated ones.
-        search_epochs: Epochs of searching, at most; it ends once the best search has settled.
-        tolerance: Share of each range; a step that moves no parameter by more, nor by a tenth of its standard error,
-            is the last.
+        windows: Largest number of windows. None is 1000 from logged states, 100 with estimated ones.
+        searches: Number of points to search from: mid-range, then random ones. The best goes on.
+        search_windows: Largest number of windows while searching. None is 64 from logged states, else 24.
+        search_epochs: Largest number of epochs of searching, which ends once the best search has settled.
+        tolerance: Share of each range; the search ends with a step that moves no parameter by more than this, nor by a
+            tenth of its standard error.
     """
 
     initial_states: InitialStates | None = None
@@ -109,10 +109,10 @@ class LeastSquares:
         check_hyperparameters(self)
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> LeastSquaresState:
-        """Draw windows, and put the searches at their starts.
+        """Draw the windows, and the points at which the searches begin.
 
         Raises:
-            MadocError: No state can be rebuilt and no position is known, no episode is long enough, there are fewer
+            MadocError: No state can be rebuilt and no position is observed, no episode is long enough, there are fewer
                 values than unknowns, or the data's next observations are shuffled.
         """
         problem.require_pairs()
@@ -127,7 +127,7 @@ class LeastSquares:
         )
 
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
-        """One damped step of the search under way, and what follows from it."""
+        """Take one damped step of the current search, and decide which search goes on."""
         if state.estimates_starts:
             search, epoch = self._unknown(problem, state.length).step(problem, state.unknown[state.length])
             state = self._after_unknown(problem, _with(state, state.length, search))
@@ -143,7 +143,7 @@ class LeastSquares:
         return state, replace(epoch, converged=converged)
 
     def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:
-        """Where the best search stands, with the sandwich covariance and Student's t intervals around it."""
+        """The best search's point, with its sandwich covariance and intervals of Student's t."""
         space = problem.simulator.parameters
         if state.estimates_starts:
             best = state.unknown[state.best]
@@ -152,10 +152,10 @@ class LeastSquares:
             assert state.known is not None
             best = state.known
             windows, settled = self._known(problem).window_count(best), bool(state.finished)
-        unit = best.unit[0 if best.refining else int(np.argmin(best.cost))]
+        point = best.point[0 if best.refining else int(np.argmin(best.cost))]
         uncertainty = sandwich(best.bread, best.meat)
         half = (space.high - space.low) / 2.0
-        mean = space.to_physical(unit)
+        mean = space.to_physical(point)
         covariance = half[:, None] * uncertainty.covariance * half
         width = half * half_width(uncertainty.covariance, windows)
         interval = np.clip(np.stack([mean - width, mean + width], axis=-1), space.low[:, None], space.high[:, None])
@@ -167,7 +167,7 @@ class LeastSquares:
             failures=sum(search.failures for search in searches),
             warnings=(
                 *identifiability(uncertainty, space.names),
-                *at_end_of_range(unit, space.names),
+                *at_end_of_range(point, space.names),
                 *(() if settled else (sentences.NOT_SETTLED,)),
                 *self._about_states(problem, state),
             ),
@@ -177,7 +177,7 @@ class LeastSquares:
         )
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:
-        """About how many control steps a run from the beginning takes, as far as the data has chosen already."""
+        """About how many control steps a whole run takes, counting the stages that the data is known to need so far."""
         steps = 0
         if state.known is not None:
             epochs = 0 if state.stage == "starting" else refining_epochs
@@ -197,25 +197,25 @@ class LeastSquares:
         return "starting" if noisy or self.initial_states == "estimated" else "undecided"
 
     def _known(self, problem: CalibrationProblem) -> Search:
-        """The search from logged states; where it only finds a start for the other, short windows mislead least."""
+        """The search from logged states; its windows are shortest where it only finds where the other begins."""
         starting = self._first_stage(problem) == "starting"
         horizon = LOGGED_HORIZON if starting else self.horizon or LOGGED_HORIZON
-        return self._search(KnownStarts(self.loss), "logged", horizon, self.searches)
+        return self._search(KnownStarts, "logged", horizon, self.searches)
 
     def _unknown(self, problem: CalibrationProblem, length: int = 0) -> Search:
-        """The search with unknown initial states; it starts where one from logged states ended, if there was one."""
+        """The search with unknown initial states; after one from logged states it needs to begin at one point only."""
         searches = self.searches if self._first_stage(problem) == "estimated" else 1
         horizon = self.horizon or LENGTHS[length] * horizon_of(problem.dataset)
-        return self._search(UnknownStarts(self.loss), "estimated", horizon, searches)
+        return self._search(UnknownStarts, "estimated", horizon, searches)
 
     def _search(
-        self, starts: KnownStarts | UnknownStarts, states: InitialStates, horizon: int, searches: int
+        self, starts: type[KnownStarts] | type[UnknownStarts], states: InitialStates, horizon: int, searches: int
     ) -> Search:
         windows, search_windows = self.windows or WINDOWS[states], self.search_windows or SEARCH_WINDOWS[states]
-        return Search(starts, horizon, windows, searches, search_windows, self.search_epochs, self.tolerance)
+        return Search(starts, self.loss, horizon, windows, searches, search_windows, self.search_epochs, self.tolerance)
 
     def _all_lengths(self, problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[SearchState, ...]:
-        """Searches on all lengths of windows that the data has room for; on one where the length is given."""
+        """Searches on every length of windows that the episodes are long enough for; on one if `horizon` is given."""
         searches = [self._unknown(problem).init(problem, key)]
         for length in range(1, len(LENGTHS) if self.horizon is None else 1):
             most = READINGS * len(searches[0].rows) // LENGTHS[length]
@@ -226,9 +226,9 @@ class LeastSquares:
         return tuple(searches)
 
     def _after_known(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, int]:
-        """On to unknown initial states where logged ones are noisy, and the control steps spent on that question.
+        """Go on to unknown initial states where logged ones are noisy; also the control steps simulated to decide that.
 
-        Asked once the search refines and, as model errors may hide noise, again once nothing moves.
+        That is decided once the search refines and, as model errors may hide noise, again once it has settled.
         """
         known, asking = state.known, 0
         assert known is not None
@@ -237,17 +237,17 @@ class LeastSquares:
             return _begun(state, known), asking
         if state.stage == "undecided" and (settled or (known.refining and not known.epochs)):
             if np.sqrt(known.cost[0]) >= sentences.EXACT:
-                pairs, asking = consecutive_residuals(problem, known.unit[0], known.rows)
+                pairs, asking = consecutive_residuals(problem, known.point[0], known.rows)
                 if alternation(*pairs) > NOISY:
                     return _begun(state, known), asking
             state = replace(state, stage="logged" if settled else "undecided")
         return replace(state, finished=int(settled and state.stage == "logged")), asking
 
     def _after_unknown(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
-        """On to longer windows once nothing moves, while those tell more.
+        """Go on to longer windows once a search has settled, while they narrow the intervals.
 
-        Back to the shortest if longer ones leave more than noise: model errors move the estimate by about as much
-        for all lengths, and wide intervals may count them.
+        If longer windows show model errors, the estimate of the shortest is kept: model errors bias the estimate by
+        about as much for all lengths, and only wide intervals may cover that.
         """
         searches, length = state.unknown, state.length
         search = searches[length]
@@ -266,12 +266,12 @@ class LeastSquares:
         return replace(longer, stage="lengthening", best=length, length=length + 1)
 
     def _noise_alone(self, problem: CalibrationProblem, state: LeastSquaresState, length: int) -> bool:
-        """Whether windows of this length leave what the shortest did."""
+        """Whether residuals of windows of this length are the noise that those of the shortest windows are."""
         readings = self._unknown(problem, length).horizon + 1
         return noise_alone(state.unknown[length], state.unknown[0], readings)
 
     def _about_states(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
-        """That states were estimated, where the data has chosen so, and what came of it."""
+        """Sentences on estimated initial states, unless the user asked for them."""
         if not state.estimates_starts or self.initial_states is not None:
             return ()
         best, horizon = state.unknown[state.best], self._unknown(problem, state.best).horizon
@@ -288,8 +288,8 @@ class LeastSquares:
 
 
 def _begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
-    """With unknown initial states from where the best search from logged ones stands."""
-    first = replace(state.unknown[0], unit=known.unit[:1].copy())
+    """The stage of unknown initial states, begun at the best point of the search from logged ones."""
+    first = replace(state.unknown[0], point=known.point[:1].copy())
     return replace(_with(state, 0, first), stage="estimated")
 
 
@@ -298,5 +298,5 @@ def _finished(state: LeastSquaresState, best: int) -> LeastSquaresState:
 
 
 def _with(state: LeastSquaresState, length: int, search: SearchState) -> LeastSquaresState:
-    """The state with the search of this length in its place."""
+    """The state with this search in place of the one of its length."""
     return replace(state, unknown=(*state.unknown[:length], search, *state.unknown[length + 1 :]))

@@ -1,10 +1,11 @@
-"""Windows that begin at logged states, which are taken for true.
+"""Windows that begin at logged states, which are assumed to be exact.
 
-The robust standard deviation of all residuals is the scale of the loss, and a window whose simulation fails counts as
-the worst that does not.
+The loss is scaled by the robust standard deviation of all residuals, and a window whose simulation fails counts as the
+worst that does not.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,59 +23,51 @@ from madoc.identification.windows import Windows, disjoint_windows, first_rows, 
 
 @dataclass(frozen=True)
 class KnownStarts:
-    """Windows begin at logged states, which are taken for true; attributes as of `UnknownStarts`."""
+    """Windows that begin at logged states, which are assumed to be exact; class variables as of `UnknownStarts`."""
 
+    problem: CalibrationProblem
+    windows: Windows
     loss: Loss
-    failed_cost: float = ALL_FAILED
-    stuck: float = 0.0
-    waiting: int = 0
+    unknown: ClassVar[bool] = False
+    failed_cost: ClassVar[float] = ALL_FAILED
+    stuck: ClassVar[float] = 0.0
+    waiting: ClassVar[int] = 0
 
-    def possible_rows(self, problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
-        """Rows at which windows can begin. Those that share readings are not independent, but intervals take them so.
+    @classmethod
+    def at(
+        cls, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int, loss: Loss
+    ) -> "KnownStarts":
+        """The windows that begin at the given rows."""
+        states = problem.states.states[np.searchsorted(problem.states.rows, rows)]
+        return cls(problem, windows_at(problem.dataset, states, rows, horizon), loss)
+
+    @staticmethod
+    def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
+        """Rows at which windows can begin that do not overlap: intervals assume that windows are independent.
 
         Raises:
             MadocError: No state can be rebuilt, no episode is long enough, or there are fewer values than parameters.
         """
         pick = first_rows if horizon == 1 else disjoint_windows
-        possible = pick(problem.dataset, problem.states.exact()[1], horizon)
+        rows = problem.states.exact()[1]
+        rows = rows[pick(problem.dataset, rows, horizon)]
         count, values = len(problem.simulator.parameters), problem.simulator.task.observation_size
-        windows = min(most, len(possible))
+        windows = min(most, len(rows))
         if windows * horizon * values < count:
             raise MadocError(
                 f"expected at least as many logged values as parameters, got {windows} windows of {horizon} rows "
                 f"with {values} values for {count} parameters; give it more rows or fewer parameters"
             )
-        return problem.states.exact()[1][possible]
+        return rows
 
-    def guesses(self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"]) -> Float[np.ndarray, "0 0"]:
-        """None: there is nothing to guess."""
-        return np.zeros((0, 0))
-
-    def columns(self, problem: CalibrationProblem) -> int:
-        """Systems simulated an epoch: central differences, and the steps tried."""
+    @staticmethod
+    def columns(problem: CalibrationProblem) -> int:
+        """Number of systems simulated in an epoch: central differences, and the steps tried."""
         return 1 + 2 * len(problem.simulator.parameters) + len(TRIALS)
-
-    def windows(self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int) -> "KnownWindows":
-        """The windows that begin at the given rows."""
-        states = problem.states.exact()[0][np.searchsorted(problem.states.exact()[1], rows)]
-        return KnownWindows(problem, windows_at(problem.dataset, states, rows, horizon), self.loss)
-
-
-@dataclass(frozen=True)
-class KnownWindows:
-    """Windows to be simulated from logged states."""
-
-    problem: CalibrationProblem
-    windows: Windows
-    loss: Loss
-
-    def in_state_units(self, steps: Float[np.ndarray, "0 0"], size: int) -> Float[np.ndarray, "0 0"]:
-        """No steps of initial states, of which there are none."""
-        return steps
 
     def plans(
         self,
-        unit: Float[np.ndarray, "searches d"],
+        points: Float[np.ndarray, "searches d"],
         states: Float[np.ndarray, "searches 0 0"],
         damping: Float[np.ndarray, " searches"],
         state_damping: Float[np.ndarray, "searches 0"],
@@ -82,13 +75,13 @@ class KnownWindows:
         refining: bool,
     ) -> list[Plan]:
         """Central differences around every search's point, in one batch."""
-        points = np.stack([difference_points(point) for point in unit])
-        around = self._residuals(points)
-        return [self._plan(*each) for each in zip(points, around, damping.tolist(), strict=True)]
+        around = np.stack([difference_points(point) for point in points])
+        residuals = self._residuals(around)
+        return [self._plan(*each) for each in zip(around, residuals, damping.tolist(), strict=True)]
 
     def outcomes(self, plans: list[Plan], states: Float[np.ndarray, "searches 0 0"]) -> list[Outcome]:
         """Costs after every step of every search, in one batch."""
-        tried = np.stack([plan.unit + plan.steps[:-1] for plan in plans])
+        tried = np.stack([plan.point + plan.steps[:-1] for plan in plans])
         outcomes = []
         for plan, residuals in zip(plans, self._residuals(tried), strict=True):
             before = mean_cost(plan.residuals, plan.scale, self.loss)
@@ -108,18 +101,16 @@ class KnownWindows:
         factors = triangular_factors(around, scale, self.loss)
         steps = [damped_step(*factors, points[0], damping * trial) for trial in TRIALS]
         return Plan(
-            unit=points[0],
+            point=points[0],
             residuals=residuals[0],
             kept=np.isfinite(residuals).all((0, 2)),
             steps=np.stack([*steps, np.zeros_like(points[0])]),
             state_steps=np.zeros((len(TRIALS) + 1, 0, 0)),
+            spread=np.zeros(0),
             scale=scale,
             deviation=np.ones(self.problem.states.measured),
             bread=bread(around, scale, self.loss),
             meat=meat(around, scale, self.loss),
-            autocorrelation=0.0,
-            exact=True,
-            left_out=0.0,
             failures=int((~np.isfinite(residuals).all(-1)).sum()),
         )
 

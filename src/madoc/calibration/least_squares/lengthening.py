@@ -1,11 +1,13 @@
-"""Longer windows: where a robot moves smoothly they tell more of the parameters for each reading they spend on states.
+"""Longer windows: where motion is smooth they narrow the intervals, as fewer readings serve to fit initial states.
 
-They begin where shorter ones do, whose initial states have been found, so a search on them starts near its end.
+They begin where shorter ones do, whose initial states are estimated already, so a search on them starts near its end.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.search import SearchState
@@ -14,29 +16,32 @@ from madoc.identification.information import half_width, sandwich
 from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
 LENGTHS = (1, 3, 9)
-"""Windows' lengths, in those of the first."""
+"""Lengths of windows, relative to the first."""
 SHORTEST, LONGEST = 3, 20
-"""Control steps of the first windows: shorter ones tell little besides their initial state, longer ones are slow."""
+"""Smallest and largest length of the first windows in control steps: shorter ones hold little information besides their
+initial state, longer ones are slow. A robot's own length is clipped to them."""
 READINGS = 2
-"""Readings of all windows of a length, over those of the first: at most, but for `FEWEST` windows."""
+"""Largest number of readings in all windows of a length, relative to the first; more only for `FEWEST` windows."""
 FEWEST = 10
-"""Windows more than parameters, at least; with fewer, intervals grow by Student's t."""
+"""Smallest number of windows beyond that of parameters; with fewer, Student's t would widen the intervals."""
 AS_WELL = 1.2
-"""Noise of a channel over what the first windows find: with more, model errors have grown with the windows' length."""
+"""Ratio of a channel's noise to that of the first windows, at least 1; above it longer windows show model errors."""
 HOPELESS = 2.0
-"""The same while still searching, from the second step on: the first begins at states that noise has moved."""
+"""Ratio as of `AS_WELL`; above it a search ends before it has settled, but not at its first step, whose states are
+still inexact."""
 LEFT_OUT = 0.1
-"""Share of windows, from 0 to 1, by which more may be left unexplained."""
+"""Share in [0, 1] of windows; longer windows are refused if more than this share of them is newly unexplained."""
 CHANCE = 3.0
-"""Standard errors by which white noise may seem to be correlated."""
+"""Autocorrelation in its standard errors under white noise; above it residuals are not white."""
 _SMALLEST = 1e-100
 
 
 def horizon_of(dataset: Dataset) -> int:
-    """Control steps in which a channel changes by as much as it differs between any two rows, the median over channels.
+    """A channel's standard deviation over that of its change in a control step, the median over channels.
 
-    In shorter windows little happens; in longer ones small errors grow until simulated and logged motion have nothing
-    to do with each other. Within `SHORTEST` and `LONGEST`, and no longer than the episode that the median row is in.
+    In so many control steps the robot goes from one pose to another. In shorter windows little moves; in longer ones
+    small errors grow until simulated and logged motion are unrelated. The length is within `SHORTEST` and `LONGEST`,
+    and no longer than the episode that the median row is in.
     """
     logged = dataset.transitions
     change = np.asarray(logged.next_observation - logged.observation).std(0)
@@ -47,25 +52,20 @@ def horizon_of(dataset: Dataset) -> int:
 
 
 def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, most: int) -> SearchState | None:
-    """A search yet to begin on windows of `horizon` rows that share no reading, at rows where shorter ones begin.
+    """A search on at most `most` windows of `horizon` rows that share no reading, at rows where shorter ones begin.
 
-    Args:
-        problem: Data and simulator.
-        shorter: The search before it, as it was drawn.
-        horizon: Control steps of a window.
-        most: Windows, but for `FEWEST`.
-
-    Returns:
-        The search, its states at their first guess; None where too few windows fit.
+    It has not begun: its initial states are those of the shorter windows. None where too few windows fit.
     """
-    rows, fewest = np.sort(shorter.rows), FEWEST + shorter.unit.shape[1]
+    rows, fewest = np.sort(shorter.rows), FEWEST + shorter.point.shape[1]
     if not len(rows_that_fit(problem.dataset, rows, horizon)):
         return None
     chosen = rows[evenly(disjoint_windows(problem.dataset, rows, horizon), max(most, fewest))]
     if len(chosen) < fewest:
         return None
-    one = replace(
+    return replace(
         shorter,
+        point=shorter.point[:1].copy(),
+        states=_states_at(shorter, chosen),
         damping=shorter.damping[:1],
         state_damping=shorter.state_damping[:1, : len(chosen)],
         cost=shorter.cost[:1],
@@ -73,35 +73,35 @@ def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, 
         rows=chosen,
         refining=1,
     )
-    return continued(one, shorter)
 
 
 def continued(longer: SearchState, shorter: SearchState) -> SearchState:
-    """The longer search where the shorter one stands."""
-    same = np.argsort(shorter.rows)[np.searchsorted(np.sort(shorter.rows), longer.rows)]
-    return replace(longer, unit=shorter.unit[:1].copy(), states=shorter.states[:1, same].copy())
+    """The longer search with the parameters and initial states of the shorter one."""
+    return replace(longer, point=shorter.point[:1].copy(), states=_states_at(shorter, longer.rows))
+
+
+def _states_at(search: SearchState, rows: Int[np.ndarray, " windows"]) -> Float[np.ndarray, "1 windows state"]:
+    """The best search's initial states at some of its rows."""
+    return search.states[:1, np.argsort(search.rows)[np.searchsorted(np.sort(search.rows), rows)]].copy()
 
 
 def hopeless(longer: SearchState, first: SearchState) -> bool:
-    """Whether a search under way leaves so much more noise than the first that it need not go on."""
+    """Whether a search finds so much more noise than the first that it need not go on."""
     return longer.epochs >= 2 and bool((longer.deviation > HOPELESS * first.deviation).any())
 
 
 def noise_alone(longer: SearchState, first: SearchState, readings: int) -> bool:
-    """Whether longer windows leave no more noise in any channel than the first did, and uncorrelated.
+    """Whether the residuals of a settled search are white noise, no larger in any channel than on the first windows.
 
-    Args:
-        longer: A search that has settled.
-        first: That on the shortest windows.
-        readings: Of each of the longer windows.
+    `readings` is the number of readings of a longer window.
     """
     quiet = bool((longer.deviation <= AS_WELL * first.deviation).all())
-    return quiet and longer.autocorrelation <= CHANCE / np.sqrt(max(1, longer.explained * readings))
+    return quiet and longer.autocorrelation <= CHANCE / math.sqrt(max(1, longer.explained * readings))
 
 
 def tells_more(longer: SearchState, shorter: SearchState) -> bool:
-    """Whether longer windows are explained as often, and leave narrower intervals, on average over parameters."""
-    fewest = FEWEST + longer.unit.shape[1]
+    """Whether as many longer windows are explained, and intervals are narrower, on average over parameters."""
+    fewest = FEWEST + longer.point.shape[1]
     explained, before = (search.explained / len(search.rows) for search in (longer, shorter))
     if longer.explained < fewest or explained < before - LEFT_OUT:
         return False

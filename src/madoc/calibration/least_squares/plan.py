@@ -1,4 +1,4 @@
-"""What a search knows before and after a step: the same whether windows' initial states are known or not."""
+"""What a search computes before and after a step, in the same form for known and unknown initial states."""
 
 from dataclasses import dataclass
 
@@ -8,45 +8,47 @@ from jaxtyping import Bool, Float
 from madoc.identification.losses import ALL_FAILED
 
 TRIALS = (1e-2, 1.0, 1e2)
-"""Factors of the last damping that helped, tried at once; where none helps, the next are a thousand times larger."""
+"""Factors of the last damping that helped, tried at once; where none helps, the damping is multiplied by a thousand."""
 FIRST_DAMPING = 1e-2
-"""Relative damping of the first steps."""
+"""Damping of the first steps, relative to the squared lengths of the columns; 0 is none."""
 _SMALLEST = 1e-100
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What residuals and derivatives around a point tell.
+    """Residuals and derivatives around a point, and the steps to try from there.
 
     Attributes:
-        unit: The point, in [-1, 1].
-        residuals: Of each window there, over `deviation`.
+        point: The point, in [-1, 1].
+        residuals: The residuals of each window there, over `deviation`.
         kept: Windows that move the parameters.
-        steps: Of the parameters, one for each of `TRIALS`; the last is none.
-        state_steps: Of unknown initial states along with each of these, in units of their spread.
-        scale: c of the loss.
+        steps: Steps of the parameters, one for each of `TRIALS`; the last is zero.
+        state_steps: Steps of unknown initial states that go with each of these, in units of `spread`.
+        spread: Standard deviation of each value of (qpos, qvel) over the log; empty where initial states are known.
+        scale: The tuning constant c of the loss.
         deviation: Noise of each channel, in its typical changes.
         bread: Curvature of the cost.
-        meat: Scatter of its gradient.
-        autocorrelation: Of residuals of consecutive readings.
-        exact: Whether residuals are rounding errors, or cannot tell that initial states have yet to move.
+        meat: Scatter of the cost's gradient.
+        failures: Number of simulations that failed.
+        autocorrelation: Correlation of residuals of consecutive readings.
+        exact: Whether residuals are rounding errors, so that their size cannot show whether initial states still move.
         left_out: Share of the windows that the cost does not count.
-        failures: Simulations that failed.
     """
 
-    unit: Float[np.ndarray, " d"]
+    point: Float[np.ndarray, " d"]
     residuals: Float[np.ndarray, "windows values"]
     kept: Bool[np.ndarray, " windows"]
     steps: Float[np.ndarray, "trials d"]
     state_steps: Float[np.ndarray, "trials unknown physical"]
+    spread: Float[np.ndarray, " physical"]
     scale: float
     deviation: Float[np.ndarray, " channels"]
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
-    autocorrelation: float
-    exact: bool
-    left_out: float
     failures: int
+    autocorrelation: float = 0.0
+    exact: bool = True
+    left_out: float = 0.0
 
     def comparable(self, cost: float) -> float:
         """A cost in typical changes, by which searches are compared; a window left out adds a whole change."""
@@ -55,13 +57,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the steps tried would lead to.
+    """The costs after the steps of a plan.
 
     Attributes:
-        before: Cost where they begin.
-        totals: Cost after each step; the last is without one of the parameters.
-        followed: Share of the state's step that fits each window with an unknown one best.
-        failures: Simulations that failed.
+        before: Cost at the plan's point.
+        totals: Cost after each step; the last has no step of the parameters.
+        followed: Share of its initial state's step that fits each window best, where initial states are unknown.
+        failures: Number of simulations that failed.
     """
 
     before: float

@@ -1,6 +1,6 @@
-"""One least-squares search: several damped Gauss-Newton searches on few windows, then the best of them on all.
+"""One least-squares search: damped Gauss-Newton steps from several points on few windows, then the best of them on all.
 
-Windows' initial states are known (`known_starts`) or further unknowns (`unknown_starts`); all else is the same.
+Windows' initial states are known (`known_starts`) or further unknowns (`unknown_starts`).
 """
 
 from dataclasses import dataclass, replace
@@ -14,45 +14,45 @@ from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome, Plan
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.identification.information import SETTLED, sandwich
-from madoc.identification.losses import ALL_FAILED
+from madoc.identification.losses import ALL_FAILED, Loss
 from madoc.types import Epoch
 
 DAMPING_RANGE = (1e-10, 1e10)
-"""Relative damping of the parameters' step, lowest and highest; it is clipped to them."""
+"""Smallest and largest relative damping of the parameters' step; it is clipped to them."""
 STATE_DAMPING_RANGE = (1e-9, 1e6)
-"""Relative damping of an initial state's step, lowest and highest; it is clipped to them."""
+"""Smallest and largest relative damping of an initial state's step; it is clipped to them."""
 LITTLE = 5e-3
-"""Share of the cost, from 0 to 1: a step that saves less has found unknown initial states too."""
+"""Share in [0, 1] of the cost; after a step that saves less, unknown initial states count as settled too."""
 _SMALLEST = 1e-100
-"""Keeps a step over a tolerance of 0 finite."""
+"""Smallest tolerance, so that the ratio of a step to a tolerance of 0 is finite."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SearchState:
-    """Everything a search carries. Once it refines, only the first of the searches goes on.
+    """The state of a search. Once it refines, only the first of the points moves on.
 
     Attributes:
-        unit: Where each search stands, in [-1, 1].
+        point: The current point of each search, in [-1, 1].
         states: Initial state of every window there; without windows where they are known.
         damping: λ of each search's steps of the parameters.
         state_damping: λ of each unknown initial state's step.
         cost: Mean loss of a residual, `ALL_FAILED` before the first epoch. In squared typical changes of a step; in
             squared standard deviations of the noise where initial states are unknown and the search refines.
-        moved: The largest component of each search's last step, over one that would matter; below 1 it has settled.
+        moved: The largest component of each search's last step, relative to one that matters; below 1 it has settled.
         rows: First rows of the windows.
         deviation: Noise of each channel in its typical changes; 1 where initial states are known.
         bread: Curvature of the best search's cost where it last linearised.
         meat: Scatter of the cost's gradient there.
-        explained: Number of windows that these two are of.
-        autocorrelation: Of residuals of consecutive readings in these windows; 0 where initial states are known.
+        explained: Number of windows from which these two were computed.
+        autocorrelation: Correlation of these windows' residuals with the next reading's; 0 for known initial states.
         refining: 0 while searching on few windows, 1 on all of them.
-        waiting: Epochs on all windows in which only initial states still move.
-        epochs: Done in this stage, those of waiting not counted.
-        failures: Windows whose simulation failed.
+        waiting: Number of epochs to come in which only initial states move.
+        epochs: Number of epochs of this stage so far, those of waiting not counted.
+        failures: Number of windows whose simulation failed.
     """
 
-    unit: Float[np.ndarray, "searches d"]
+    point: Float[np.ndarray, "searches d"]
     states: Float[np.ndarray, "searches unknown state"]
     damping: Float[np.ndarray, " searches"]
     state_damping: Float[np.ndarray, "searches unknown"]
@@ -70,24 +70,15 @@ class SearchState:
     failures: int
 
 
-_OF_EACH_SEARCH = ("unit", "states", "damping", "state_damping", "cost", "moved")
+_OF_EACH_SEARCH = ("point", "states", "damping", "state_damping", "cost", "moved")
 
 
 @dataclass(frozen=True)
 class Search:
-    """The search's settings, as `LeastSquares` says.
+    """Settings of a search: how its windows begin, and those that `LeastSquares` has under the same names."""
 
-    Attributes:
-        starts: How windows begin, known or unknown.
-        horizon: Control steps of a window.
-        windows: Windows, at most.
-        searches: Searches on few windows.
-        search_windows: These windows, at most.
-        search_epochs: Epochs of searching, at most.
-        tolerance: Share of each range; a smaller step does not matter.
-    """
-
-    starts: KnownStarts | UnknownStarts
+    starts: type[KnownStarts] | type[UnknownStarts]
+    loss: Loss
     horizon: int
     windows: int
     searches: int
@@ -107,11 +98,12 @@ class Search:
         drawn = min(self.windows, len(possible))
         order = jax.random.choice(of_windows, len(possible), (drawn,), replace=False)
         rows = possible[np.asarray(order)]
-        unit = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
-        unit[0] = 0.0
-        states = self.starts.guesses(problem, rows)
+        points = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
+        points[0] = 0.0
+        logged = problem.states
+        states = logged.states[np.searchsorted(logged.rows, rows)] if self.starts.unknown else np.zeros((0, 0))
         return SearchState(
-            unit=unit,
+            point=points,
             states=np.repeat(states[None], self.searches, axis=0),
             damping=np.full(self.searches, FIRST_DAMPING),
             state_damping=np.full((self.searches, len(states)), FIRST_DAMPING),
@@ -130,33 +122,26 @@ class Search:
         )
 
     def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
-        """One damped step of every search under way: derivatives in one simulation, the steps tried in another."""
+        """One damped step of every point that still moves: derivatives in one batch, the steps tried in another."""
         running, count = self._running(state), self.window_count(state)
-        windows = self.starts.windows(problem, state.rows[:count], self.horizon)
-        unit, states = state.unit[:running], state.states[:running, :count]
-        plans = windows.plans(
-            unit,
-            states,
-            state.damping[:running],
-            state.state_damping[:running, :count],
-            refining=bool(state.refining),
-        )
+        windows = self.starts.at(problem, state.rows[:count], self.horizon, self.loss)
+        points, states = state.point[:running], state.states[:running, :count]
+        damping, state_damping = state.damping[:running], state.state_damping[:running, :count]
+        plans = windows.plans(points, states, damping, state_damping, refining=bool(state.refining))
         outcomes = windows.outcomes(plans, states)
         new = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}
         for index, (plan, outcome) in enumerate(zip(plans, outcomes, strict=True)):
             trial, factor = chosen(outcome, waiting=state.waiting > 0)
             followed = outcome.followed[trial]
-            new["unit"][index] = np.clip(unit[index] + plan.steps[trial], -1.0, 1.0)
-            change = followed[:, None] * plan.state_steps[trial]
-            new["states"][index, :count] += windows.in_state_units(change, states.shape[2])
-            new["damping"][index] = np.clip(state.damping[index] * factor, *DAMPING_RANGE)
+            new["point"][index] = np.clip(points[index] + plan.steps[trial], -1.0, 1.0)
+            change = followed[:, None] * plan.state_steps[trial] * plan.spread
+            new["states"][index, :count, : len(plan.spread)] += change
+            new["damping"][index] = np.clip(damping[index] * factor, *DAMPING_RANGE)
             state_factor = np.select([followed == 1.0, followed > 0.0], [0.1, 1.0], 10.0)
-            new["state_damping"][index, :count] = np.clip(
-                state.state_damping[index, :count] * state_factor, *STATE_DAMPING_RANGE
-            )
+            new["state_damping"][index, :count] = np.clip(state_damping[index] * state_factor, *STATE_DAMPING_RANGE)
             cost = float(outcome.totals[trial])
             new["cost"][index] = cost if state.refining else plan.comparable(cost)
-            new["moved"][index] = self._moved(plan, outcome, trial, damping=float(state.damping[index]))
+            new["moved"][index] = self._moved(plan, outcome, trial, damping=float(damping[index]))
         leader = int(np.argmin(new["cost"][:running]))
         best = plans[leader]
         following = replace(
@@ -183,16 +168,16 @@ class Search:
         return following, Epoch(metrics, self._epoch_steps(problem, state), stage=stage)
 
     def settled(self, state: SearchState) -> bool:
-        """Whether the next step would change nothing worth a simulation; not where every window fails."""
+        """Whether the last step on all windows was too small to matter; never while every window fails."""
         still = float(state.moved[0]) < 1.0 and float(state.cost[0]) < self.starts.failed_cost
         return bool(state.refining) and state.epochs > 0 and still
 
     def window_count(self, state: SearchState) -> int:
-        """Windows of the stage."""
+        """Number of windows in use."""
         return len(state.rows) if state.refining else min(self.search_windows, len(state.rows))
 
     def whole_run(self, problem: CalibrationProblem, state: SearchState, refining_epochs: int) -> int:
-        """Control steps of the longest search, where it has yet to end, and of so many epochs on all windows."""
+        """Control steps of the longest search, unless it has ended, and of `refining_epochs` on all windows."""
         searching, refining = (self._epoch_steps(problem, replace(state, refining=stage)) for stage in (0, 1))
         return searching * self.search_epochs * (1 - state.refining) + refining * refining_epochs
 
@@ -203,9 +188,10 @@ class Search:
         return self._running(state) * self.window_count(state) * self.starts.columns(problem) * self.horizon
 
     def _moved(self, plan: Plan, outcome: Outcome, trial: int, *, damping: float) -> float:
-        """The step over one that would matter: a tenth of a standard error, or the tolerance.
+        """The largest component of a step relative to one that matters: a tenth of a standard error, or the tolerance.
 
-        A step that did not help, or a short one, says that the end is near only where no longer one is tried any more.
+        While the damping is at most `starts.stuck` the least damped step counts, whether it helped or not: a damped one
+        may be small far from the minimum too.
         """
         tried = np.abs(plan.steps[0 if damping <= self.starts.stuck else min(trial, len(TRIALS) - 1)])
         error = np.sqrt(np.maximum(np.diag(sandwich(plan.bread, plan.meat).covariance), 0.0))
@@ -213,7 +199,7 @@ class Search:
         return max(float((tried / worthwhile).max()), 0.0 if plan.exact else outcome.saved(trial) / LITTLE)
 
     def _refined(self, state: SearchState, leader: int) -> SearchState:
-        """The best search alone goes on, in the first place."""
+        """Put the best search first, which alone goes on, to all windows."""
         order = np.argsort(np.arange(self.searches) != leader, kind="stable")
         searches = {name: getattr(state, name)[order] for name in _OF_EACH_SEARCH}
         if self.starts.waiting:
@@ -222,7 +208,7 @@ class Search:
 
 
 def chosen(outcome: Outcome, *, waiting: bool) -> tuple[int, float]:
-    """The step of the parameters that helps most, the last one being none, and what multiplies the damping."""
+    """Index of the step with the smallest cost, the last one for none, and the factor of the damping."""
     last = len(outcome.totals) - 1
     trial = last if waiting else int(np.argmin(outcome.totals))
     if outcome.totals[trial] < outcome.totals[last]:

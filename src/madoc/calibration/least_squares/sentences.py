@@ -1,4 +1,4 @@
-"""What least squares says of an estimate besides its numbers."""
+"""The warnings that least squares adds to an estimate."""
 
 import numpy as np
 
@@ -6,12 +6,10 @@ from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.search import SearchState
 
 LONG_TAILS = 1.1
-"""Cost of residuals, in squared standard deviations, above which they are no normal noise.
-
-That leaves 0.8 under Cauchy's loss, and 1 under squares.
-"""
+"""Cost of residuals, in squared standard deviations; above it they are not normal noise, whose cost is 0.8 with
+Cauchy's loss and 1 with squares."""
 EXACT = 1e-6
-"""Largest residual, in typical changes of a step, that states logged exactly leave."""
+"""Residual in typical changes of a step; smaller ones mean that states were logged without noise."""
 NOT_SETTLED = (
     "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"
 )
@@ -19,7 +17,7 @@ STILL_LENGTHENING = "longer windows were under way when it ended: a larger budge
 
 
 def about_estimated_states(problem: CalibrationProblem, search: SearchState, horizon: int) -> str:
-    """That initial states were estimated, why the data needed it, and the noise that was found."""
+    """A sentence that initial states were estimated, why the data needed it, and how large the noise is."""
     if problem.states.kind != "exact":
         why = "states cannot be rebuilt from the data"
     elif problem.dataset.disturbance.velocities == "differences":
@@ -27,7 +25,7 @@ def about_estimated_states(problem: CalibrationProblem, search: SearchState, hor
     elif problem.dataset.disturbance.noise:
         why = "the data is noisy"
     else:
-        why = "residuals of consecutive rows speak of noise"
+        why = "residuals of consecutive rows alternate as noise does"
     sentence = f"initial states of windows of {horizon} control steps were estimated with the parameters, as {why}"
     if not search.refining:
         return sentence
@@ -36,7 +34,7 @@ def about_estimated_states(problem: CalibrationProblem, search: SearchState, hor
 
 
 def about_residuals(search: SearchState) -> tuple[str, ...]:
-    """That windows were left out, or that residuals are no noise; nothing before the first steps on all windows."""
+    """Sentences on windows left out and on residuals with long tails; none before the first step on all windows."""
     if not (search.refining and search.epochs) or float(search.deviation.max()) < EXACT:
         return ()
     left_out, windows = len(search.rows) - search.explained, len(search.rows)
@@ -49,7 +47,7 @@ def about_residuals(search: SearchState) -> tuple[str, ...]:
 
 
 def about_model_errors(horizon: int) -> str:
-    """That longer windows show what the model does wrong."""
+    """A sentence that longer windows show model errors."""
     return (
         f"over {horizon} control steps the simulator leaves more than noise: something the model lacks, "
         "which intervals do not count"

@@ -1,4 +1,4 @@
-"""Statistics of residuals that a search decides by: which windows are outliers, and whether only noise is left."""
+"""Statistics of residuals: which windows are outliers, and whether residuals are noise."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,7 +12,7 @@ from madoc.identification.windows import consecutive_rows, windows_at
 _LARGEST = 3.0
 """Standard deviations of the noise at which residuals are clipped before they are correlated."""
 _SMALLEST = 1e-12
-"""In units of a channel's typical change; below this it is rounding."""
+"""Residual in typical changes of a channel; smaller ones are rounding errors."""
 
 Residuals = Float[np.ndarray, "pairs channels"]
 
@@ -20,24 +20,18 @@ Residuals = Float[np.ndarray, "pairs channels"]
 def outlier_limits(
     values: Float[np.ndarray, "*rows windows"], activity: Float[np.ndarray, " windows"]
 ) -> tuple[Float[np.ndarray, "*rows 1"], Float[np.ndarray, "*rows 1"]]:
-    """The median of windows' values, and how far from it a window is an outlier: `OUTLIER` robust deviations.
+    """The median of windows' values, and the distance from it beyond which a window is an outlier.
 
-    Both are weighted by how much happens in a window: those in which nothing moves are all alike and tell little.
+    That is `OUTLIER` robust standard deviations. Windows are weighted by their activity: those in which nothing moves
+    are all alike, whatever the parameters.
     """
-    weights = np.broadcast_to(activity + np.finfo(float).tiny, values.shape)
+    weights = activity + np.finfo(float).tiny
 
     def medians(part: np.ndarray) -> np.ndarray:
-        each = [
-            np.quantile(row, 0.5, weights=own, method="inverted_cdf") for row, own in zip(part, weights, strict=True)
-        ]
-        return np.array(each)[:, None]
+        return np.quantile(part, 0.5, axis=-1, weights=weights, method="inverted_cdf", keepdims=True)
 
-    rows = values.reshape(-1, values.shape[-1])
-    weights = weights.reshape(rows.shape)
-    middle = medians(rows)
-    reach = OUTLIER * NORMAL_MAD * medians(np.abs(rows - middle))
-    shape = (*values.shape[:-1], 1)
-    return middle.reshape(shape), reach.reshape(shape)
+    middle = medians(values)
+    return middle, OUTLIER * NORMAL_MAD * medians(np.abs(values - middle))
 
 
 def clipped_change(
@@ -53,12 +47,8 @@ def clipped_change(
     A window that a step takes across a contact becomes much worse until its initial state has followed, in later
     epochs; it alone does not forbid a step that helps the others. One whose simulation fails does.
 
-    Args:
-        before: Cost of each window.
-        after: The same after each of the steps tried.
-        activity: How much happens in each window.
-        least: A change up to this is never clipped.
-        failed: Cost of a window whose simulation failed.
+    The costs `before` are compared with those `after` each of the steps tried. A change up to `least` is never clipped;
+    `failed` is the cost of a window whose simulation failed.
     """
     change = after - before
     middle, reach = outlier_limits(change, activity)
@@ -78,10 +68,10 @@ def noise_ratio(
 
 
 def autocorrelation(residuals: Float[np.ndarray, "windows readings channels"]) -> float:
-    """Correlation of a reading's residual with the next one's, of the channel that has most of it.
+    """Largest correlation, over channels, of a reading's residual with the next reading's.
 
-    Noise has none, model errors have. Residuals are in standard deviations of the noise and clipped at three of them;
-    a channel with smaller residuals than its noise counts as uncorrelated.
+    It is 0 for white noise, and positive for model errors. Residuals are in standard deviations of the noise and
+    clipped at three of them; a channel with smaller residuals than its noise counts as uncorrelated.
     """
     clipped = np.clip(residuals, -_LARGEST, _LARGEST)
     power = np.maximum((clipped**2).sum((0, 1)), clipped[..., 0].size)
@@ -89,12 +79,12 @@ def autocorrelation(residuals: Float[np.ndarray, "windows readings channels"]) -
 
 
 def alternation(before: Residuals, after: Residuals) -> float:
-    """Minus the correlation of one-step residuals with the next row's, the mean over the half of channels with most.
+    """Minus the correlation of one-step residuals with the next row's, mean over the most negative half of channels.
 
-    Of noise e alone a residual is about e' - e, as the reading it starts at carries noise as well as the one it ends
-    at: the next one is e'' - e', and they correlate by -1/2. A model error has the same sign in the next row. Contacts
-    make of noise something else in some channels, so half of them decide, and residuals are clipped at five robust
-    deviations. 0 without pairs.
+    With noise e alone a residual is about e' - e, as the reading it starts at is noisy as well as the one it ends at.
+    The next one is e'' - e', so the correlation is -1/2. A model error has the same sign in the next row. Contacts
+    distort the noise of some channels, so only half of them count, and residuals are clipped at five robust standard
+    deviations. It is 0 without pairs.
     """
     if not len(before):
         return 0.0
@@ -106,21 +96,18 @@ def alternation(before: Residuals, after: Residuals) -> float:
 
 
 def consecutive_residuals(
-    problem: CalibrationProblem, unit: Float[np.ndarray, " d"], rows: Int[np.ndarray, " windows"]
+    problem: CalibrationProblem, point: Float[np.ndarray, " d"], rows: Int[np.ndarray, " windows"]
 ) -> tuple[tuple[Residuals, Residuals], int]:
-    """One-step residuals from logged states and from those a row later, and the control steps spent on them.
+    """One-step residuals from logged states and from those a row later, and the control steps simulated.
 
-    Args:
-        problem: Data and simulator.
-        unit: Parameters in [-1, 1].
-        rows: Rows with a logged state; those without one a row later are left out.
+    `point` are parameters in [-1, 1], `rows` have a logged state; those without one a row later are left out.
     """
     states, known = problem.states.exact()
     first = np.searchsorted(known, rows)
     first = first[np.isin(first, consecutive_rows(problem.dataset, known))]
     both = np.concatenate([first, first + 1])
     windows = windows_at(problem.dataset, states[both], known[both], 1)
-    residuals = window_residuals(problem.simulator, windows, unit[None], problem.typical_change)[0]
+    residuals = window_residuals(problem.simulator, windows, point[None], problem.typical_change)[0]
     whole = np.isfinite(residuals).all(-1).reshape(2, -1).all(0)
     before, after = residuals.reshape(2, len(first), -1)[:, whole]
     return (before, after), len(both)

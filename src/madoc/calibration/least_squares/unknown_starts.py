@@ -1,9 +1,10 @@
 """Windows whose initial states are unknown and estimated with the parameters: for noisy and partial observations.
 
-Channels weigh by the noise that the fit finds in them, and windows that no initial state explains are left out.
+Channels are weighted by their noise as estimated from the fit, and windows that no initial state explains are left out.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,35 +23,51 @@ from madoc.identification.windows import disjoint_windows
 from madoc.simulation.base import Simulator
 
 FOLLOWED = (1.0, 0.3, 0.0)
-"""Shares of an initial state's step, from 0 to 1, that every window chooses from: at contacts all of it is too far."""
+"""Shares in [0, 1] of an initial state's step, of which every window takes the best: at contacts 1 may be too far."""
 FAILED_WINDOW = 1e6
-"""Cost of a window that failed, in squared standard deviations of the noise."""
+"""Cost of a window whose simulation failed, in squared standard deviations of the noise; no cost is larger."""
 LIKE_NOISE = 1.5
-"""Cost of a window, in squared standard deviations, that noise alone exceeds rarely; it leaves 0.8 on average."""
+"""Cost of a window, in squared standard deviations; noise alone rarely exceeds it, as its mean is 0.8."""
 ROUNDING = 1e-8
-"""Largest noise, in a channel's typical change, of exact readings: their residuals cannot become smaller."""
+"""Noise in typical changes of a channel; smaller residuals are rounding errors."""
 _SUFFICIENT = 0.02
-"""Share of what all windows tell of a direction, from 0 to 1, that others need to tell to do without a window."""
+"""Share in [0, 1] of the information about every direction that the trusted windows need; else all are trusted."""
 _LEAST_DAMPING = 1e-9
+"""Damping of an initial state where the covariance is computed, relative to the squared lengths of the columns."""
 
 
 @dataclass(frozen=True)
 class UnknownStarts:
-    """Each window's initial state is an unknown besides the parameters, and its first reading one like the others.
+    """Windows whose initial states are unknowns besides the parameters; the first reading is a reading like the others.
 
     Attributes:
-        loss: Of residuals in standard deviations of the noise.
+        simulator: The simulator.
+        readings: Actions and observations of the windows.
+        loss: Loss of residuals in standard deviations of the noise.
+        unknown: Whether initial states are unknown.
         failed_cost: Cost at which every window fails.
-        stuck: Damping at which steps are a thousandth of undamped ones.
-        waiting: Epochs on all windows in which parameters wait: initial states of new windows are first guesses.
+        stuck: Damping at which steps are so short that their length no longer shows how far the minimum is.
+        waiting: First epochs on all windows in which only initial states move, as those of new windows are guesses.
     """
 
+    simulator: Simulator
+    readings: Readings
     loss: Loss
-    failed_cost: float = FAILED_WINDOW
-    stuck: float = 1e3
-    waiting: int = 2
+    unknown: ClassVar[bool] = True
+    failed_cost: ClassVar[float] = FAILED_WINDOW
+    stuck: ClassVar[float] = 1e3
+    waiting: ClassVar[int] = 2
 
-    def possible_rows(self, problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
+    @classmethod
+    def at(
+        cls, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int, loss: Loss
+    ) -> "UnknownStarts":
+        """The windows that begin at the given rows."""
+        readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
+        return cls(problem.simulator, readings, loss)
+
+    @staticmethod
+    def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
         """Rows at which windows can begin that share no reading.
 
         Raises:
@@ -68,41 +85,15 @@ class UnknownStarts:
             )
         return rows
 
-    def guesses(
-        self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"]
-    ) -> Float[np.ndarray, "windows state"]:
-        """Initial states to begin with, as near as the log tells."""
-        states, known = problem.states.guesses()
-        return states[np.searchsorted(known, rows)]
-
-    def columns(self, problem: CalibrationProblem) -> int:
-        """Systems simulated an epoch: differences by parameters and states, and the steps tried."""
+    @staticmethod
+    def columns(problem: CalibrationProblem) -> int:
+        """Number of systems simulated in an epoch: differences by parameters and states, and the steps tried."""
         unknown = 2 * len(problem.simulator.parameters) + problem.states.physical_size
         return 1 + unknown + len(FOLLOWED) * (len(TRIALS) + 1)
 
-    def windows(self, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int) -> "UnknownWindows":
-        """The windows that begin at the given rows."""
-        readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
-        return UnknownWindows(problem.simulator, readings, self.loss)
-
-
-@dataclass(frozen=True)
-class UnknownWindows:
-    """Windows to be simulated from estimated states."""
-
-    simulator: Simulator
-    readings: Readings
-    loss: Loss
-
-    def in_state_units(
-        self, steps: Float[np.ndarray, "windows physical"], size: int
-    ) -> Float[np.ndarray, "windows state"]:
-        """Steps of initial states, in their units."""
-        return self.readings.in_state_units(steps, size)
-
     def plans(
         self,
-        unit: Float[np.ndarray, "searches d"],
+        points: Float[np.ndarray, "searches d"],
         states: Float[np.ndarray, "searches windows state"],
         damping: Float[np.ndarray, " searches"],
         state_damping: Float[np.ndarray, "searches windows"],
@@ -110,12 +101,12 @@ class UnknownWindows:
         refining: bool,
     ) -> list[Plan]:
         """Differences around every search's point and initial states, in one batch each."""
-        slopes = slopes_at(self.simulator, self.readings, unit, states)
-        searches = zip(slopes, unit, damping.tolist(), state_damping, strict=True)
+        slopes = slopes_at(self.simulator, self.readings, points, states)
+        searches = zip(slopes, points, damping.tolist(), state_damping, strict=True)
         return [self._plan(*each, refining=refining) for each in searches]
 
     def outcomes(self, plans: list[Plan], states: Float[np.ndarray, "searches windows state"]) -> list[Outcome]:
-        """Costs after every step of every search, each window's state following as far as fits it best."""
+        """Costs after every step of every search, with the share of its state's step that fits each window best."""
         ways = np.array(FOLLOWED)[:, None, None]
         readings, size = self.readings, states.shape[2]
         starts = [
@@ -123,8 +114,8 @@ class UnknownWindows:
             for plan, state in zip(plans, states, strict=True)
         ]
         flat = np.concatenate(starts).reshape(-1, len(FOLLOWED) * len(readings), size)
-        units = np.concatenate([plan.unit + plan.steps for plan in plans])
-        residuals = readings.residuals(self.simulator, units, flat)
+        points = np.concatenate([plan.point + plan.steps for plan in plans])
+        residuals = readings.residuals(self.simulator, points, flat)
         residuals = residuals.reshape(len(plans), -1, *residuals.shape[1:])
         return [
             self._outcome(plan, part / np.tile(plan.deviation, readings.steps + 1))
@@ -146,21 +137,21 @@ class UnknownWindows:
     def _plan(
         self,
         slopes: WindowSlopes,
-        unit: Float[np.ndarray, " d"],
+        point: Float[np.ndarray, " d"],
         damping: float,
         state_damping: Float[np.ndarray, " windows"],
         *,
         refining: bool,
     ) -> Plan:
-        """While refining, channels weigh by their noise, and only windows that are `_trusted` move the parameters."""
+        """The plan of one search; while refining, channels are weighted by noise, and untrusted windows left out."""
         channels, readings = len(self.readings.scale), self.readings.steps + 1
         least = np.full(len(state_damping), _LEAST_DAMPING)
         alike = eliminate(slopes, np.ones_like(slopes.residuals), least)
         kept = slopes.whole
-        deviation = _deviation(slopes, alike.spare, channels, kept)
+        deviation = self._deviation(slopes, alike.spare, kept)
         if refining:
-            kept = self._trusted(slopes.over(np.tile(deviation, readings)), self.readings.activity)
-            deviation = _deviation(slopes, alike.spare, channels, kept)
+            kept = self._trusted(slopes.over(np.tile(deviation, readings)))
+            deviation = self._deviation(slopes, alike.spare, kept)
         else:
             deviation = np.full(channels, np.median(deviation))
         slopes = slopes.over(np.tile(deviation, readings))
@@ -168,18 +159,19 @@ class UnknownWindows:
         weights = loss_slope(z, self.loss) * slopes.whole[:, None]
         damped = eliminate(slopes, weights, state_damping)
         factors = triangular_factors(damped.reduced.where(kept), 1.0, "linear")
-        steps = [*(damped_step(*factors, unit, damping * trial) for trial in TRIALS), np.zeros_like(unit)]
+        steps = [*(damped_step(*factors, point, damping * trial) for trial in TRIALS), np.zeros_like(point)]
         exact = eliminate(slopes, weights, least).reduced.of(kept)
         share = curvature_share(z[kept], self.loss)
         curved = share * bread(exact, 1.0, "linear")
-        freedom = float(alike.spare[kept].sum()) - len(unit)
+        freedom = float(alike.spare[kept].sum()) - len(point)
         ratio = noise_ratio(slopes.residuals[kept], weights[kept], share, freedom)
         return Plan(
-            unit=unit,
+            point=point,
             residuals=slopes.residuals,
             kept=kept,
             steps=np.stack(steps),
             state_steps=np.stack([damped.states_step(step) for step in steps]),
+            spread=self.readings.spread,
             scale=TUNING[self.loss],
             deviation=deviation,
             bread=curved,
@@ -190,36 +182,32 @@ class UnknownWindows:
             failures=int((~slopes.whole).sum()),
         )
 
-    def _trusted(self, slopes: WindowSlopes, activity: Float[np.ndarray, " windows"]) -> Bool[np.ndarray, " windows"]:
-        """Windows that an initial state explains; all of them if the others tell of a direction hardly anything.
+    def _deviation(
+        self, slopes: WindowSlopes, spare: Float[np.ndarray, "windows values"], kept: Bool[np.ndarray, " windows"]
+    ) -> Float[np.ndarray, " channels"]:
+        """Each channel's noise in the windows kept."""
+        shape = (int(kept.sum()), *self.readings.observed.shape[1:])
+        return channel_noise(slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape))
 
-        At contacts a search for an initial state ends in a wrong one now and then. Such a window pulls the parameters
-        anywhere. One is explained if its cost is like most others' or near that of noise.
+    def _trusted(self, slopes: WindowSlopes) -> Bool[np.ndarray, " windows"]:
+        """Windows that an initial state explains; all of them if these hold too little information on a direction.
+
+        At contacts a search for an initial state sometimes ends in a wrong one, and such a window would bias the
+        parameters. A window is explained if its cost is no outlier among the others' or near that of noise.
         """
         whole = slopes.whole
         if self.loss == "linear" or not whole.any():
             return whole
         costs = self._costs(slopes.residuals)
-        middle, reach = outlier_limits(costs[whole], activity[whole])
+        middle, reach = outlier_limits(costs[whole], self.readings.activity[whole])
         kept = whole & (costs <= np.maximum(middle + reach, LIKE_NOISE))
         weights = loss_slope((slopes.residuals / TUNING[self.loss]) ** 2, self.loss)
         reduced = eliminate(slopes, weights, np.full(len(whole), _LEAST_DAMPING)).reduced
         return kept if least_share(reduced.of(kept), reduced.of(whole)) > _SUFFICIENT else whole
 
     def _costs(self, residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray, "*windows"]:
-        """Mean loss of each window."""
+        """Mean loss of each window, at most `FAILED_WINDOW`."""
         scale = TUNING[self.loss]
         with np.errstate(invalid="ignore", over="ignore"):
             cost = scale**2 * loss_value((residuals / scale) ** 2, self.loss).mean(-1)
         return np.where(np.isfinite(cost), np.minimum(cost, FAILED_WINDOW), FAILED_WINDOW)
-
-
-def _deviation(
-    slopes: WindowSlopes,
-    spare: Float[np.ndarray, "windows values"],
-    channels: int,
-    kept: Bool[np.ndarray, " windows"],
-) -> Float[np.ndarray, " channels"]:
-    """Each channel's noise in windows that are kept."""
-    shape = (int(kept.sum()), slopes.residuals.shape[1] // channels, channels)
-    return channel_noise(slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape))

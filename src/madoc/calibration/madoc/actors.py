@@ -1,14 +1,16 @@
-"""Calibration actors: one tanh-Gaussian a group, over its own parameters.
+"""Calibration actors: a tanh-Gaussian for each group, over the parameters of that group.
 
-Groups are disjoint and every Gaussian is diagonal, so all actors together are one mean and one log std a parameter.
+Groups are disjoint and every Gaussian is diagonal, so all actors together are a mean and a log std of each parameter.
 """
 
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from madoc.learning.networks import PerRow, Scalar
 from madoc.learning.tanh_gaussian import sample
 
 
@@ -17,12 +19,12 @@ from madoc.learning.tanh_gaussian import sample
 class Actors:
     """Means and log stds before squashing, both of shape (d,)."""
 
-    mean: Float[Array, " d"]
-    log_std: Float[Array, " d"]
+    mean: Float[Array | np.ndarray, " d"]
+    log_std: Float[Array | np.ndarray, " d"]
 
 
 def initial_actors(count: int) -> Actors:
-    """N(0, 1) before squashing: also the prior's start (appendix C)."""
+    """Actors at N(0, 1) before squashing, where the prior starts too (appendix C)."""
     return Actors(jnp.zeros(count), jnp.zeros(count))
 
 
@@ -42,26 +44,13 @@ def divergence(actors: Actors, prior: Actors) -> Float[Array, " d"]:
     return 0.5 * (variance_ratio + shift - 1.0) - actors.log_std + prior.log_std
 
 
-def prior_weight(updates: Float[Array, ""], *, time_constant: float, largest: float) -> Float[Array, ""]:
+def prior_weight(updates: Int[Array, ""], *, time_constant: float, largest: float) -> Scalar:
     """λ_t = min(largest, exp(t / time_constant)) (appendix C: 10 and 2e5)."""
     return jnp.minimum(largest, jnp.exp(updates / time_constant))
 
 
 def actor_loss(
-    value: Float[Array, " rows"],
-    log_density: Float[Array, " rows"],
-    kl: Float[Array, ""],
-    *,
-    entropy_weight: float,
-    prior_weight: Float[Array, ""],
-) -> Float[Array, ""]:
-    """Eq. (13) summed over groups: α log q - v + λ KL(q || p), averaged over draws.
-
-    Args:
-        value: Σ_g v_g(ξ^g) of each draw.
-        log_density: Σ_g log q_g(ξ^g) of each draw.
-        kl: Σ_g KL(q_g || p_g).
-        entropy_weight: α.
-        prior_weight: λ.
-    """
+    value: PerRow, log_density: PerRow, kl: Scalar, *, entropy_weight: float, prior_weight: Scalar | float
+) -> Scalar:
+    """Eq. (13): α log q - v + λ KL(q || p), averaged over draws; values, densities and KL are sums over groups."""
     return (entropy_weight * log_density - value).mean() + prior_weight * kl

@@ -1,4 +1,4 @@
-"""The networks and distributions that calibration trains, and one update of all of them."""
+"""The networks and distributions that Madoc trains, and the updates that train them."""
 
 from dataclasses import dataclass, replace
 
@@ -12,29 +12,29 @@ from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_
 from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
-from madoc.learning.networks import adam, descend, moving_average, scan_updates
+from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend, moving_average, scan_updates
 from madoc.types import Count, Layers, NotNegative, check_hyperparameters
 
 AT_BOUND = 0.95
-"""Share of the reward's bound past which a reward counts as saturated."""
+"""Share of the reward's bound above which a reward counts as saturated."""
 BLUR_RANGE = (0.01, 0.3)
-"""Limits of the blur, in units of a step's standard deviation; it starts at the upper one. Below the lower one the
+"""Range of the blur, in standard deviations of a step's change. It begins at the upper end. Below the lower end the
 networks cannot resolve differences in s'."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Agents:
-    """Everything that updates change.
+    """The networks and distributions that updates change, and the states of their optimisers.
 
     Attributes:
-        discriminators: Tell logged from simulated rows.
-        judges: Their moving average, which gives the reward: one network's passing opinions would move the actors.
-        critics: One a group.
+        discriminators: Classifiers of logged against simulated rows.
+        judges: Moving average of the discriminators, which gives the reward: that of the latest networks is noisier.
+        critics: One critic for each group.
         actors: The calibration distribution.
-        prior: Its moving average, the p of Eq. (13).
-        average: A moving average of the actors for reading the estimate.
-        log_blur: Log of the noise on s' features that both discriminators see.
+        prior: Moving average of the actors, the p of Eq. (13).
+        average: Moving average of the actors from which the estimate is read.
+        log_blur: Logarithm of the deviation of the noise on s' features that both discriminators see.
         updates: Number of updates so far.
     """
 
@@ -44,7 +44,7 @@ class Agents:
     actors: Actors
     prior: Actors
     average: Actors
-    log_blur: Float[Array, ""]
+    log_blur: Scalar
     updates: Int[Array, ""]
     discriminator_optimiser: PyTree
     critic_optimiser: PyTree
@@ -53,29 +53,30 @@ class Agents:
 
 @dataclass(frozen=True)
 class AgentSettings:
-    """How the agents learn.
+    """Hyperparameters of discriminators, critics and actors.
 
     Attributes:
         hidden: Units per layer of the discriminators.
         critic_hidden: Units per layer of each group's critic.
-        bound: Logits of f_sas are this many tanh.
-        pair_bound: Logits of f_sa are; the paper's 2 leaves (s, a) in the reward of free-running rows.
-        weigh_overlap: Rows count by how well (s, a) of both domains overlap there; in the paper all count the same.
-        dropout: In the discriminators.
-        batch: Logged rows, and simulated rows, an update.
-        actor_batch: Draws an update of the actors.
-        discriminator_rate: Adam's learning rate.
-        critic_rate: Adam's learning rate.
-        actor_rate: Adam's learning rate.
-        judge_rate: Of the judges' moving average; 1 lets the discriminators judge themselves, as in the paper.
+        bound: Bound of the logits of f_sas.
+        pair_bound: Bound of the logits of f_sa. With the paper's 2, the reward of free-running rows depends on (s, a).
+        weigh_overlap: Whether rows are weighted by the overlap of logged and simulated (s, a); not in the paper.
+        dropout: Dropout rate of the discriminators.
+        batch: Logged rows, and as many simulated rows, in an update.
+        actor_batch: Draws in an update of the actors.
+        discriminator_rate: Adam's learning rate of the discriminators.
+        critic_rate: Adam's learning rate of the critics.
+        actor_rate: Adam's learning rate of the actors.
+        judge_rate: Rate of the judges' moving average; with 1 the discriminators themselves give the reward, as in the
+            paper.
         entropy_weight: α of Eq. (13).
-        prior_time: Updates in which λ of Eq. (13) grows by e.
-        prior_largest: Where λ stops growing.
-        prior_rate: Of the prior's moving average.
+        prior_time: Number of updates in which λ of Eq. (13) grows by the factor e.
+        prior_largest: Largest λ of Eq. (13).
+        prior_rate: Rate of the prior's moving average.
         prior_every: Updates between two moves of the prior.
-        average_rate: Of the estimate's moving average.
-        reward_size: Mean |reward| that the blur is steered to; 0 for no blur, as in the paper.
-        blur_rate: How fast it is steered.
+        average_rate: Rate of the moving average from which the estimate is read.
+        reward_size: Mean |reward| to which the blur is steered; 0 for no blur, as in the paper.
+        blur_rate: Change of the logarithm of the blur in an update, for an error of the mean |reward| of 1.
     """
 
     hidden: Layers = (128, 128)
@@ -103,17 +104,10 @@ class AgentSettings:
         check_hyperparameters(self)
 
     def init(self, *, window: int, observation: int, parameters: int, groups: int, key: PRNGKeyArray) -> Agents:
-        """Fresh networks; actors and prior at N(0, 1). `window` is the size of what stands for (s, a)."""
+        """Fresh networks; actors and prior at N(0, 1). `window` is the number of features in the place of (s, a)."""
         of_discriminators, of_critics = jax.random.split(key)
-        discriminators = Discriminators(
-            observation,
-            window - observation,
-            self.hidden,
-            key=of_discriminators,
-            bound=self.bound,
-            pair_bound=self.pair_bound,
-            dropout=self.dropout,
-        )
+        bounds = {"bound": self.bound, "pair_bound": self.pair_bound, "dropout": self.dropout}
+        discriminators = Discriminators(observation, window - observation, self.hidden, key=of_discriminators, **bounds)
         critics = GroupCritics(groups, parameters, self.critic_hidden, key=of_critics)
         actors = initial_actors(parameters)
         return Agents(
@@ -135,25 +129,17 @@ class AgentSettings:
         self,
         agents: Agents,
         simulated: replay.Replay,
-        logged: tuple[Float[Array, "rows pair"], Float[Array, "rows observation"]],
+        logged: tuple[Float[Array, "rows pair"], Observations],
         members: Bool[Array, "groups d"],
         key: PRNGKeyArray,
         *,
         mixing: Mixing,
         count: int,
     ) -> tuple[Agents, dict[str, Array]]:
-        """`count` updates, one scan: Algorithm 1, lines 13 to 19.
+        """`count` updates, Algorithm 1, lines 13 to 19, and the mean of each metric.
 
-        The discriminators learn from blurred s'; the reward is read at the unblurred ones, where it is least noisy.
-
-        Args:
-            agents: What to update.
-            simulated: Rows with `pair`, `following` and `parameters` (in [-1, 1]).
-            logged: Features of the target's rows.
-            members: Which parameters belong to which group.
-            key: Randomness.
-            mixing: How credit is given.
-            count: Updates.
+        The discriminators learn from blurred s'; the reward is computed at s' without blur, where it is least noisy.
+        Simulated rows are columns `pair`, `following` and `parameters` (in [-1, 1]), logged rows are (pair, following).
         """
 
         def update(agents: Agents, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
@@ -187,10 +173,8 @@ class AgentSettings:
         judges = moving_average(agents.judges, discriminators, self.judge_rate)
         return replace(agents, discriminators=discriminators, judges=judges, discriminator_optimiser=optimiser), metrics
 
-    def _steer_blur(
-        self, agents: Agents, reward: Float[Array, " rows"], share: Float[Array, " rows"]
-    ) -> tuple[Agents, dict[str, Array]]:
-        """Widen the blur if the mean |reward| is above its set size, narrow it if below."""
+    def _steer_blur(self, agents: Agents, reward: PerRow, share: PerRow) -> tuple[Agents, dict[str, Array]]:
+        """Widen the blur where the mean |reward| is above `reward_size`, and narrow it where it is below."""
         size = (share * jnp.abs(reward)).mean()
         surplus = jnp.clip(size - self.reward_size, -1.0, 1.0)
         log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *np.log(BLUR_RANGE))

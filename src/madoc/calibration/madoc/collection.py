@@ -1,19 +1,20 @@
-"""How Madoc simulates rows: three ways to start rollouts, and the replay buffer of their features."""
+"""How Madoc simulates rows for its discriminators: starts of rollouts, window length, sensor noise, replay buffer."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.learning import replay
-from madoc.learning.window_features import WindowScaling, rolled_stretch, unbroken
+from madoc.learning.features import WindowScaling, unbroken, windows_ending
 from madoc.simulation.rollout import (
     Rollout,
     Starts,
     Walkers,
+    begin,
     chosen_states,
     replay_actions,
     reset_states,
@@ -24,89 +25,145 @@ from madoc.types import Policy
 
 StartMode = Literal["policy", "logged", "replay"]
 Features = Literal["standardised", "raw"]
+GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
+"""Number of parameter draws in an epoch, and of control steps that each row is simulated under one draw, by mode."""
+HIDDEN_WINDOW = 3
+"""Window length, in rows, where velocities are hidden: two rows give a velocity, a third an acceleration."""
 
 
-def starts_of(problem: CalibrationProblem, mode: StartMode) -> Starts:
-    """Where rollouts start, and start again: at resets of the task (`policy`), else at logged states.
+@dataclass(frozen=True)
+class Collection:
+    """Madoc's choices about simulated rows, made for one problem.
 
-    Where velocities are not observed, those of `logged` starts are finite differences of positions.
-
-    Raises:
-        MadocError: Some positions are not observed, or states to replay from are not exact.
-    """
-    if mode == "policy":
-        return reset_states(problem.simulator)
-    logged = problem.states
-    return chosen_states(logged.states if mode == "logged" and logged.starts_known else logged.exact()[0])
-
-
-def collect(
-    problem: CalibrationProblem,
-    mode: StartMode,
-    policy: Policy,
-    draws: Float[np.ndarray, "systems d"],
-    walkers: Walkers,
-    *,
-    steps: int,
-    keys: tuple[PRNGKeyArray, PRNGKeyArray],
-) -> tuple[Rollout, Walkers]:
-    """Rows under the given draws in [-1, 1], axes (steps, systems, rows).
-
-    Args:
+    Attributes:
         problem: Data and simulator.
-        mode: `replay` takes one step from logged states under the actions logged there; the others let the
-            policy act from where the walkers stand.
-        policy: The running policy.
-        draws: One system each.
-        walkers: Where rows stand, of `logged` at states rebuilt from the log; `replay` only takes their number.
-        steps: Control steps per row; 1 for `replay`.
-        keys: Randomness of the actions, and of the restarts.
+        mode: `policy` lets the clone act from resets of the task, `logged` from logged states. `replay` takes one step
+            from each logged state under the action logged there.
+        systems: Number of parameter draws in an epoch.
+        steps: Control steps of each row under one draw.
+        epoch_steps: Control steps in an epoch, of all rows together.
+        scaling: Scaling of the windows that the discriminators see.
+        logged: Features of all logged windows, and of the observations after them.
+        noise: Standard deviation of the noise that simulated observations are given.
     """
-    simulator = problem.simulator
-    system = simulator.bind(simulator.parameters.to_physical(draws))
-    if mode == "replay":
-        states, logged = problem.states.exact()
-        actions, rows = np.asarray(problem.dataset.transitions.action)[logged], walkers.age.shape[1]
-        return replay_actions(system, simulator.task, states, actions, rows=rows, key=keys[0]), walkers
-    starts = starts_of(problem, mode)
-    if mode == "logged":  # every walker stands at a logged state
-        starts, walkers = unbiased_starts(system, starts), replace(walkers, state=system.unbiased(walkers.state))
-    return roll(system, simulator.task, policy, walkers, steps=steps, starts=starts, key=keys[0], restart_key=keys[1])
+
+    problem: CalibrationProblem
+    mode: StartMode
+    systems: int
+    steps: int
+    epoch_steps: int
+    scaling: WindowScaling
+    logged: tuple[Float[Array, "windows window"], Float[Array, "windows observation"]]
+    noise: Float[np.ndarray, " observation"]
+
+    @property
+    def starts(self) -> Starts:
+        """Where rollouts start and start again; hidden velocities of `logged` starts are finite differences.
+
+        Raises:
+            MadocError: Some positions are not observed, or states to replay from are not exact.
+        """
+        if self.mode == "policy":
+            return reset_states(self.problem.simulator)
+        logged = self.problem.states
+        known = self.mode == "logged" and logged.starts_known
+        return chosen_states(logged.states if known else logged.exact()[0])
+
+    def begin(self, systems: int, key: PRNGKeyArray) -> Walkers:
+        """Rows at fresh starts, as many for each system as the control steps of an epoch allow."""
+        rows = max(1, self.epoch_steps // (systems * self.steps))
+        return begin(self.starts, key, systems=systems, rows=rows)
+
+    def roll(
+        self,
+        policy: Policy,
+        draws: Float[np.ndarray, "systems d"],
+        walkers: Walkers,
+        keys: tuple[PRNGKeyArray, PRNGKeyArray],
+    ) -> tuple[Rollout, Walkers]:
+        """Rows with axes (steps, systems, rows), one system for each draw in [-1, 1], with noise on observations.
+
+        The keys are those of the actions and of the restarts. Under `replay`, only the number of walkers matters.
+        """
+        simulator = self.problem.simulator
+        system = simulator.bind(simulator.parameters.to_physical(draws))
+        if self.mode == "replay":
+            states, logged = self.problem.states.exact()
+            actions, rows = np.asarray(self.problem.dataset.transitions.action)[logged], walkers.age.shape[1]
+            rollout = replay_actions(system, simulator.task, states, actions, rows=rows, key=keys[0])
+        else:
+            starts = self.starts
+            if self.mode == "logged":  # every walker stands at a logged state
+                starts = unbiased_starts(system, starts)
+                walkers = replace(walkers, state=system.unbiased(walkers.state))
+            rollout, walkers = roll(
+                system,
+                simulator.task,
+                policy,
+                walkers,
+                steps=self.steps,
+                starts=starts,
+                key=keys[0],
+                restart_key=keys[1],
+            )
+        return with_sensor_noise(rollout, self.noise, jax.random.fold_in(keys[0], 1)), walkers
+
+    def empty_rows(self, capacity: int) -> replay.Replay:
+        """A buffer of features, of the draw each row was simulated under, and of the parameter that was varied."""
+        window, following = self.scaling.sizes
+        parameters = len(self.problem.simulator.parameters)
+        return replay.empty(capacity, pair=(window,), following=(following,), parameters=(parameters,), identity=())
+
+    def remember(
+        self,
+        rows: replay.Replay,
+        rollout: Rollout,
+        draws: Float[np.ndarray, "systems d"],
+        identity: Int[np.ndarray, " systems"],
+    ) -> replay.Replay:
+        """Add the windows of a rollout to the buffer, with the draw and the varied parameter of their system."""
+        seen, length = rollout.transitions, self.scaling.length
+        window, following = self.scaling.features(windows_ending(seen, np.arange(length - 1, len(seen)), length))
+        whole = unbroken(rollout.valid, np.asarray(seen.terminated) | np.asarray(seen.truncated), length)
+        columns = {
+            "pair": window,
+            "following": following,
+            "parameters": np.broadcast_to(draws[:, None], (*whole.shape, draws.shape[1])),
+            "identity": np.broadcast_to(identity[:, None], whole.shape),
+        }
+        flat = {name: replay.flatten_rows(column, 3) for name, column in columns.items()}
+        return replay.add(rows, flat, whole.reshape(-1))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Assumptions behind the estimate where observations are partial or noisy, one sentence each."""
+        sentences = []
+        if self.problem.states.kind != "exact":
+            length = self.scaling.length
+            sentences.append(f"states cannot be rebuilt from the data: discriminators see windows of {length} rows")
+            if self.mode == "logged":
+                sentences.append(
+                    "rollouts start at states whose velocities were taken from positions, which is not exact"
+                )
+        if self.noise.any():
+            share = 100.0 * np.median(self.noise / self.problem.typical_change)
+            sentences.append(f"simulated observations were given sensor noise of {share:.2g} % of a step's change")
+        return tuple(sentences)
 
 
-def empty_rows(problem: CalibrationProblem, scaling: WindowScaling, capacity: int) -> replay.Replay:
-    """A buffer of features, the draw each row was simulated under, and which parameter was moved for it."""
-    window, following = scaling.sizes
-    return replay.empty(
-        capacity, pair=(window,), following=(following,), parameters=(len(problem.simulator.parameters),), identity=()
-    )
+def noise_deviation(
+    problem: CalibrationProblem, share: float | Literal["estimated"] | None
+) -> Float[np.ndarray, " observation"]:
+    """Standard deviation of the noise put on simulated observations; by default the data declares its share."""
+    if share == "estimated":
+        return problem.estimated_noise
+    share = problem.dataset.disturbance.noise if share is None else float(share)
+    # The logged change holds the noise of two readings; the share is that of the change without noise.
+    return share / np.sqrt(1.0 + 2.0 * share**2) * problem.typical_change
 
 
-def remember(
-    rows: replay.Replay,
-    scaling: WindowScaling,
-    rollout: Rollout,
-    *,
-    draws: Float[np.ndarray, "systems d"],
-    identity: Int[np.ndarray, " systems"],
-) -> replay.Replay:
-    """Add a rollout's windows, each with its system's draw and moved parameter."""
-    seen = rollout.transitions
-    window, following = scaling.features(rolled_stretch(seen, scaling.length))
-    ended = np.asarray(seen.terminated) | np.asarray(seen.truncated)
-    whole = unbroken(rollout.valid, ended, scaling.length)
-    columns = {
-        "pair": window,
-        "following": following,
-        "parameters": np.broadcast_to(draws[:, None], (*whole.shape, draws.shape[1])),
-        "identity": np.broadcast_to(identity[:, None], whole.shape),
-    }
-    flat = {name: replay.flatten_rows(column, 3) for name, column in columns.items()}
-    return replay.add(rows, flat, whole.reshape(-1))
-
-
-def sensed(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:
-    """The rollout with sensor noise on its observations; each observation is the same at the end and start of rows.
+def with_sensor_noise(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:
+    """The rollout with noise on its observations; the end of a step and the start of the next have the same noise.
 
     The policy acted on observations without noise.
     """

@@ -1,4 +1,4 @@
-"""Which parameters act alike: a VAE embeds each parameter's identity by its effect, k-means groups the embeddings."""
+"""Groups of parameters with similar effects: a VAE embeds parameters by their effects, k-means groups them."""
 
 import equinox as eqx
 import jax
@@ -10,18 +10,19 @@ from sklearn.cluster import KMeans
 from sklearn.decomposition import PCA
 
 from madoc.learning import replay
-from madoc.learning.networks import Network, descend, scan_updates
+from madoc.learning.networks import Network, Observations, Scalar, minimise
 
 LATENT = 16
-"""Width of the embedding, and how often the parameter's value is repeated beside it (appendix C)."""
+"""Width of the embedding, and number of repetitions of the parameter's value beside it (appendix C)."""
 PROJECTED = 3
+"""Number of principal components in which the embeddings are clustered."""
 
 
 class GroupingVAE(eqx.Module):
     """Encoder: identity -> embedding. Decoder: (s, a, ξ_i, embedding) -> s'.
 
-    Eq. (10) without its KL term, as the paper trains it (appendix C): the embedding only has to distinguish
-    parameters, nothing is generated from it, so it is the encoder's mean.
+    Eq. (10) without its KL term, as the paper trains it (appendix C): nothing is generated from the embedding, which
+    only has to distinguish parameters, so it is the encoder's mean.
     """
 
     encoder: Network
@@ -34,24 +35,19 @@ class GroupingVAE(eqx.Module):
         self.encoder = Network(parameters, LATENT, hidden, key=of_encoder)
         self.decoder = Network(pair + 2 * LATENT, observation, hidden, key=of_decoder)
 
-    @property
-    def parameters(self) -> int:
-        """How many identities there are."""
-        return int(self.encoder.layers[0].in_features)
-
     def embeddings(self) -> Float[Array, "d latent"]:
-        """One embedding a parameter."""
-        return self.encoder(jnp.eye(self.parameters))
+        """The embedding of each parameter."""
+        return self.encoder(jnp.eye(int(self.encoder.layers[0].in_features)))
 
-    def __call__(self, pair: Array, value: Array, identity: Array) -> Float[Array, "rows observation"]:
-        """The predicted s' features, given whose value (in [-1, 1]) was moved."""
+    def __call__(self, pair: Array, value: Array, identity: Array) -> Observations:
+        """The predicted features of s', given the value (in [-1, 1]) of the varied parameter, and its index."""
         repeated = jnp.repeat(value[:, None], LATENT, axis=1)
         return self.decoder(jnp.concatenate([pair, repeated, self.embeddings()[identity]], axis=-1))
 
 
 def reconstruction_loss(
     vae: GroupingVAE, pair: Array, following: Array, value: Array, identity: Int[Array, " rows"]
-) -> Float[Array, ""]:
+) -> Scalar:
     """The first term of Eq. (10) with a unit-variance decoder: mean squared error of s'."""
     return jnp.mean((vae(pair, value, identity) - following) ** 2)
 
@@ -66,47 +62,37 @@ def train(
     optimiser: optax.GradientTransformation,
     batch: int,
     count: int,
-) -> tuple[GroupingVAE, PyTree, dict[str, Array]]:
-    """`count` updates on simulated rows."""
+) -> tuple[GroupingVAE, PyTree, Scalar]:
+    """`count` updates on simulated rows; also the mean loss."""
 
-    def update(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, dict[str, Array]]:
-        vae, optimiser_state = carry
+    def loss_of(vae: GroupingVAE, key: PRNGKeyArray) -> Scalar:
         drawn = replay.sample(rows, key, batch)
         identity = drawn["identity"].astype(jnp.int32)
         value = jnp.take_along_axis(drawn["parameters"], identity[:, None], axis=1)[:, 0]
-        loss, gradients = eqx.filter_value_and_grad(reconstruction_loss)(
-            vae, drawn["pair"], drawn["following"], value, identity
-        )
-        return descend(optimiser, gradients, optimiser_state, vae), {"grouping_loss": loss}
+        return reconstruction_loss(vae, drawn["pair"], drawn["following"], value, identity)
 
-    (vae, optimiser_state), metrics = scan_updates(update, (vae, optimiser_state), key, count)
-    return vae, optimiser_state, metrics
+    return minimise(loss_of, vae, optimiser_state, key, optimiser=optimiser, count=count)
 
 
 def one_at_a_time(key: PRNGKeyArray, count: int) -> Float[np.ndarray, "d d"]:
-    """Draws in [-1, 1], one a parameter: that parameter uniform, all others at mid-range."""
+    """A draw in [-1, 1] for each parameter: that parameter uniform, all others at mid-range."""
     values = jax.random.uniform(key, (count,), minval=-1.0, maxval=1.0)
     return np.diag(np.asarray(values, dtype=np.float64))
 
 
-def cluster(embeddings: Float[Array, "d latent"], groups: int, seed: int) -> Int[np.ndarray, " d"]:
-    """Group labels of parameters: PCA to three dimensions, then k-means; labels in order of first appearance."""
+def cluster(embeddings: Float[Array | np.ndarray, "d latent"], groups: int, seed: int) -> Int[np.ndarray, " d"]:
+    """Group labels of parameters, in order of first appearance: k-means of the first three principal components."""
     if groups == 1:
         return np.zeros(len(embeddings), dtype=np.int64)
-    projected = project(embeddings)
+    rows = np.asarray(embeddings, dtype=np.float64)
+    projected = PCA(min(PROJECTED, *rows.shape), svd_solver="full").fit_transform(rows)
     labels = KMeans(groups, n_init=10, random_state=seed).fit_predict(projected)
     order = {label: rank for rank, label in enumerate(dict.fromkeys(labels.tolist()))}
     return np.array([order[label] for label in labels.tolist()])
 
 
-def project(embeddings: Float[Array, "d latent"]) -> Float[np.ndarray, "d projected"]:
-    """The embeddings' first principal components, at most three."""
-    rows = np.asarray(embeddings, dtype=np.float64)
-    return PCA(min(PROJECTED, *rows.shape), svd_solver="full").fit_transform(rows)
-
-
 def vote(schemes: Int[np.ndarray, "votes d"]) -> Int[np.ndarray, " d"]:
-    """The scheme proposed most often; the earliest of equals."""
+    """The most frequent scheme; of equally frequent ones the earliest."""
     distinct, first, counts = np.unique(schemes, axis=0, return_index=True, return_counts=True)
     return distinct[np.lexsort((first, -counts))[0]]
 

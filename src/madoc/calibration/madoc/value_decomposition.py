@@ -1,47 +1,43 @@
-"""Credit: one critic a group, mixed into one value of the whole draw (DOP, VDN), or each on its own (ISAC)."""
+"""Value decomposition: a critic for each group, mixed into the value of a draw (DOP, VDN), or independent (ISAC)."""
 
 from typing import Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from madoc.learning.networks import Network
+from madoc.learning.networks import Network, PerRow, Scalar, stack
 
 Mixing = Literal["dop", "sum", "independent"]
 
 
 class GroupCritics(eqx.Module):
-    """One value network a group, each seeing its own parameters; the groups' axis is vectorised.
+    """A value network for each group, which sees the parameters of that group only.
 
     Attributes:
-        networks: Leaves stacked over groups.
-        weight: k of Eq. (11), shape (groups,); 1 at first.
-        bias: b of Eq. (11).
+        networks: A stack of networks over groups.
+        weight: k of Eq. (11), which starts at 1.
+        bias: b of Eq. (11), which starts at 0.
     """
 
     networks: Network
     weight: Float[Array, " groups"]
-    bias: Float[Array, ""]
+    bias: Scalar
 
     def __init__(self, groups: int, parameters: int, hidden: tuple[int, ...], *, key: PRNGKeyArray) -> None:
-        keys = jax.random.split(key, groups)
-        self.networks = eqx.filter_vmap(lambda key: Network(parameters, 1, hidden, key=key))(keys)
+        self.networks = stack(groups, lambda key: Network(parameters, 1, hidden, key=key), key)
         self.weight = jnp.ones(groups)
         self.bias = jnp.zeros(())
 
     def values(
         self, parameters: Float[Array, "rows d"], members: Bool[Array, "groups d"]
     ) -> Float[Array, "rows groups"]:
-        """v_g(ξ^g) of every group; a parameter of another group is shown as 0."""
+        """v_g(ξ^g) of every group; the parameters of other groups are replaced by 0."""
         own = jnp.where(members[:, None], parameters[None], 0.0)
         return eqx.filter_vmap(lambda network, rows: network(rows)[:, 0])(self.networks, own).T
 
 
-def total_value(
-    values: Float[Array, "rows groups"], weight: Float[Array, " groups"], bias: Float[Array, ""]
-) -> Float[Array, " rows"]:
+def total_value(values: Float[Array, "rows groups"], weight: Float[Array, " groups"], bias: Scalar) -> PerRow:
     """Eq. (11): V_tot = Σ_g |k_g| v_g + b."""
     return values @ jnp.abs(weight) + bias
 
@@ -49,14 +45,14 @@ def total_value(
 def value_loss(
     values: Float[Array, "rows groups"],
     weight: Float[Array, " groups"],
-    bias: Float[Array, ""],
-    reward: Float[Array, " rows"],
-    share: Float[Array, " rows"],
+    bias: Scalar,
+    reward: PerRow,
+    share: PerRow,
     mixing: Mixing,
-) -> Float[Array, ""]:
+) -> Scalar:
     """Eq. (12): half the mean of (V_tot - R)². A bandit: there is no next value.
 
-    Each row counts by its `share`, of mean 1; the paper's are all 1.
+    Rows are weighted by `share`, whose mean is 1; in the paper every share is 1.
     `sum` (VDN) has k = 1 and b = 0; `independent` (ISAC) regresses every critic on the shared reward alone.
     """
     if mixing == "independent":

@@ -1,4 +1,4 @@
-"""Madoc monitors itself, without the truth: whether the reward is saturated, and which estimate was the best."""
+"""Monitoring of Madoc without the truth: the best estimate so far, a stopping rule, and warnings."""
 
 from dataclasses import dataclass, replace
 
@@ -12,17 +12,17 @@ from madoc.types import Metrics
 SMOOTHING = 0.1
 """Weight of the newest epoch in the exponential moving averages."""
 PROGRESS = 0.02
-"""Relative decrease of the mismatch that counts as progress; smaller ones lead to a stop once patience is over."""
+"""Relative decrease of the mismatch that counts as progress. Madoc stops after `patience` epochs without any."""
 SETTLING = 30
-"""Epochs until discriminators and blur have settled; the mismatch of earlier ones is not compared."""
-TELLING = 0.7
-"""Least ratio of the reward's size to its set value at which the mismatch of an epoch is used."""
+"""Number of epochs in which discriminators and blur settle; mismatches of those epochs are not compared."""
+LEAST_REWARD = 0.7
+"""Smallest ratio of the mean |reward| to its set value at which the mismatch of an epoch is used."""
 CLOSE = 0.25
-"""Relative excess over the lowest mismatch that still counts as equally good; of equals the latest is taken."""
+"""Relative excess over the lowest mismatch up to which an estimate is as good as the best; the latest one is kept."""
 AT_END = 0.95
-"""Absolute value in [-1, 1] past which a warning names the parameter; entropy keeps estimates from the end itself."""
+"""Absolute value in [-1, 1] above which a warning names the parameter; entropy keeps estimates below 1."""
 SATURATED = 0.5
-"""Share of rows whose reward is at its bound past which a warning is given."""
+"""Share of rows whose reward is at its bound above which a warning is given."""
 
 
 @jax.tree_util.register_dataclass
@@ -31,14 +31,13 @@ class Watch:
     """Running averages over epochs, and the best estimate so far.
 
     Attributes:
-        epochs: Calibration epochs watched.
-        mismatch: How far simulated rows are from logged ones: the blur at which the discriminators would be as
-            unsure as they are steered to be (its size times |reward| over what that is steered to), or the mean
-            |reward| where there is no blur.
-        at_bound: Share of rows whose reward stands at its bound.
-        best_mismatch: The lowest `mismatch` since it has been compared.
-        milestone: The mismatch when it last made progress.
-        milestone_epoch: The epoch in which it did.
+        epochs: Number of calibration epochs so far.
+        mismatch: Distance of simulated from logged rows, in the unit of the blur: the blur times the mean |reward| over
+            its set value. Without a blur it is the mean |reward|.
+        at_bound: Share of rows whose reward is at its bound.
+        best_mismatch: The lowest mismatch since they are compared.
+        milestone: The mismatch at the last progress.
+        milestone_epoch: The epoch of the last progress.
         best: The actors' moving average when the mismatch was last close to its lowest.
     """
 
@@ -52,18 +51,18 @@ class Watch:
 
 
 def begin_watch(actors: Actors) -> Watch:
-    """Before the first epoch."""
+    """The watch before the first epoch."""
     return Watch(0, 0.0, 0.0, 0.0, 0.0, 0, actors)
 
 
 def observe(
     watch: Watch, metrics: Metrics, average: Actors, *, steered_to: float, blur_range: tuple[float, float]
 ) -> Watch:
-    """Take in one epoch; keep its estimate unless the mismatch has been clearly lower.
+    """The watch after one more epoch, whose estimate is kept unless an earlier mismatch was clearly lower.
 
-    The blur measures the mismatch once the discriminators have settled and it is below its upper limit, provided that
-    the mean |reward| is near the size it is `steered_to` (0 without a blur), or the blur is at its lower limit.
-    Before that, and without a blur, the latest estimate is the best.
+    Mismatches are compared once the discriminators have settled and the blur is below its upper limit, provided that
+    the mean |reward| is near `steered_to`, its set value, or the blur is at its lower limit. Before that, and without
+    a blur (`steered_to` is then 0), the latest estimate is kept.
     """
     blur, size, at_bound = metrics["blur"], metrics["reward_size"], metrics["reward_at_bound"]
     mismatch = blur * size / steered_to if steered_to else size
@@ -74,7 +73,7 @@ def observe(
     smallest, largest = blur_range
     if not steered_to or watch.epochs <= SETTLING or blur > 0.99 * largest:
         return _mark(replace(watch, best=average, best_mismatch=mismatch))
-    if size < TELLING * steered_to and blur > 1.01 * smallest:
+    if size < LEAST_REWARD * steered_to and blur > 1.01 * smallest:
         return watch
     lowest = min(mismatch, watch.best_mismatch)
     best = average if mismatch <= (1.0 + CLOSE) * lowest else watch.best
@@ -91,13 +90,11 @@ def stalled(watch: Watch, patience: int) -> str | None:
     waited = watch.epochs - watch.milestone_epoch
     if waited < patience:
         return None
-    return (
-        f"the reward has nothing left to say: the mismatch has stayed at {watch.best_mismatch:.3g} for {waited} epochs"
-    )
+    return f"the mismatch of simulated and logged rows has stayed at {watch.best_mismatch:.3g} for {waited} epochs"
 
 
 def warnings(watch: Watch, scaled: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
-    """What a user should know of the estimate `scaled` (d,) in [-1, 1], one sentence each."""
+    """Warnings about the estimate `scaled` (d,) in [-1, 1], one sentence each."""
     sentences = []
     if watch.epochs < SETTLING:
         sentences.append(

@@ -4,24 +4,18 @@ Each format has one reader, which returns runs of named columns; `assembly.py` m
 """
 
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from madoc.data.dataset import Dataset
 from madoc.data.findings import Finding
-from madoc.data.logs import (
-    csv_reader,
-    hdf5_reader,
-    lerobot_reader,
-    mcap_reader,
-    minari_runs,
-    npz_reader,
-    parquet_reader,
-)
+from madoc.data.logs import csv_reader, hdf5_reader, lerobot_reader, mcap_reader, minari_runs, parquet_reader
 from madoc.data.logs.assembly import assemble, wanted_columns
-from madoc.data.logs.tables import Run, Table
+from madoc.data.logs.tables import Run, Table, tables_of
 from madoc.data.minari_reader import recognises as is_minari
+from madoc.data.npz import read_arrays
 from madoc.data.validation import require_file, validate
 from madoc.errors import MadocError, listed
 from madoc.robots import Robot
@@ -32,7 +26,8 @@ class LogFormat:
     """A layout of logs.
 
     Attributes:
-        read: (path, wanted columns) -> runs.
+        read: (path, wanted columns) -> runs, with other columns too. A file that is damaged or of another layout raises
+            a MadocError, as does a library that is not installed.
         suffixes: Endings of its files; empty where it is a folder.
         description: A short description of the layout, for lists.
     """
@@ -42,9 +37,15 @@ class LogFormat:
     description: str
 
 
+def _read_npz(path: Path, wanted: Collection[str]) -> list[Run]:
+    return [Run(path.name, tables_of(read_arrays(path)))]
+
+
 LOG_FORMATS: dict[str, LogFormat] = {
     "csv": LogFormat(csv_reader.read, (".csv", ".tsv", ".txt"), "a header, then one line for each row"),
-    "npz": LogFormat(npz_reader.read, (".npz",), "one array for each column"),
+    "npz": LogFormat(
+        _read_npz, (".npz",), "an array is a column; a matrix `position` is the columns `position[0]`, ..."
+    ),
     "hdf5": LogFormat(
         hdf5_reader.read, (".h5", ".hdf5", ".hdf"), "one dataset for each column; numbered groups are runs"
     ),
@@ -54,10 +55,12 @@ LOG_FORMATS: dict[str, LogFormat] = {
     "lerobot": LogFormat(lerobot_reader.read, (), "a LeRobot directory: each episode is a run"),
 }
 
-_BY_SUFFIX = {suffix: name for name, entry in LOG_FORMATS.items() for suffix in entry.suffixes}
+_BY_SUFFIX = {suffix: entry for entry in LOG_FORMATS.values() for suffix in entry.suffixes}
 _SUFFIX_LIST = ", ".join(_BY_SUFFIX)
 _NOT_LOGS = frozenset((".yaml", ".yml", ".xml", ".urdf", ".md", ".json", ".pdf", ".png", ".jpg", ".stl", ".obj", ""))
-"""Endings of files that lie beside logs; they are skipped without a note."""
+"""Endings of files that are often kept beside logs; they are skipped without a note."""
+_PROSE = frozenset(("readme", "license", "notes", "changelog"))
+"""Names, without their endings, of files that are no logs even where their endings are those of logs."""
 _OF_A_RUN = ("metrics.jsonl", "result.json")
 """Files that, beside spec.json, mark a run folder of Madoc."""
 
@@ -68,7 +71,7 @@ def read(
     """Read logs of a robot from files and folders; each file, or each episode in one, is a run.
 
     Observations are the spec's signals in its order and units, actions are scaled to [-1, 1] by their ranges, rewards
-    are 0 and nothing terminates. The dataset's `findings` tell what was cut or resampled.
+    are 0 and nothing terminates. The dataset's `findings` say what was cut or resampled.
 
     Args:
         paths: A file or folder, or several.
@@ -78,19 +81,16 @@ def read(
     Raises:
         MadocError: One sentence: the file, the row and column, what was expected, what is there, what to do.
     """
-    given = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    given = [paths] if isinstance(paths, str | os.PathLike) else paths
     sources = [Path(path).expanduser() for path in given]
     if not sources:
         raise MadocError("expected at least one file or folder of logs, got none")
     wanted = set(wanted_columns(robot).values())
-    runs: list[Run] = []
-    ignored: list[str] = []
-    for source in sources:
-        of_source, others = _runs(source, wanted)
-        runs += of_source
-        ignored += others
+    contents = [_runs(source, wanted) for source in sources]
+    runs = _distinct([run for of_source, _ in contents for run in of_source])
+    ignored = [file for _, others in contents for file in others]
     origin = str(sources[0]) + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
-    dataset = validate(assemble(_distinct(runs), robot, origin=origin, clip_actions=clip_actions), robot.task)
+    dataset = validate(assemble(runs, robot, origin=origin, clip_actions=clip_actions), robot.task)
     if ignored:
         finding = Finding("note", f"{listed(ignored, 3)} were not read: no reader knows them", dataset.origin)
         dataset = replace(dataset, findings=(finding, *dataset.findings))
@@ -98,10 +98,13 @@ def read(
 
 
 def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
-    """The runs of a file or folder, and the files in it that no reader knows."""
+    """The runs of a file or folder, and the files in it that no reader reads."""
     if not source.is_dir():
         require_file(source)
-        return _entry(source).read(source, wanted), []
+        entry = _BY_SUFFIX.get(source.suffix.lower())
+        if entry is None:
+            raise MadocError(f"expected a log that ends in {_SUFFIX_LIST}, got {source}; convert it to CSV, say")
+        return entry.read(source, wanted), []
     if lerobot_reader.recognises(source):
         return LOG_FORMATS["lerobot"].read(source, wanted), []
     if is_minari(source):
@@ -110,49 +113,40 @@ def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
         file
         for file in source.rglob("*")
         if file.is_file()
+        and file.stem.lower() not in _PROSE
         and not any(part.startswith(".") for part in file.relative_to(source).parts)
         and not _is_of_a_run_folder(file, source)
     )
-    known = [file for file in files if file.suffix.lower() in _BY_SUFFIX and not _is_prose(file)]
-    others = [file for file in files if file not in known and file.suffix.lower() not in _NOT_LOGS]
-    if not known:
+    runs: list[Run] = []
+    ignored: list[str] = []
+    for file in files:
+        name, suffix = file.relative_to(source).as_posix(), file.suffix.lower()
+        if suffix in _BY_SUFFIX:
+            require_file(file)
+            read_runs = _BY_SUFFIX[suffix].read(file, wanted)
+            runs += [replace(run, name=run.name.replace(file.name, name, 1)) for run in read_runs]
+        elif suffix not in _NOT_LOGS:
+            ignored.append(name)
+    if not runs:
         raise MadocError(f"expected logs in the folder {source} (files that end in {_SUFFIX_LIST}), got none")
-    runs = []
-    for file in known:
-        require_file(file)
-        name = file.relative_to(source).as_posix()
-        of_file = _entry(file).read(file, wanted)
-        runs += [replace(run, name=run.name.replace(file.name, name, 1)) for run in of_file]
-    return runs, [file.relative_to(source).as_posix() for file in others if not _is_prose(file)]
+    return runs, ignored
 
 
 def _is_of_a_run_folder(file: Path, source: Path) -> bool:
-    """Whether a file is in a run folder of Madoc, which holds arrays too."""
+    """Whether a file is in a run folder of Madoc, whose arrays are no logs."""
     folders = (folder for folder in file.parents if folder.is_relative_to(source))
     return any(
         (folder / "spec.json").is_file() and any((folder / name).is_file() for name in _OF_A_RUN) for folder in folders
     )
 
 
-def _is_prose(file: Path) -> bool:
-    return file.stem.lower() in ("readme", "license", "notes", "changelog")
-
-
-def _entry(file: Path) -> LogFormat:
-    suffix = file.suffix.lower()
-    if suffix not in _BY_SUFFIX:
-        raise MadocError(f"expected a log that ends in {_SUFFIX_LIST}, got {file}; convert it to CSV, say")
-    return LOG_FORMATS[_BY_SUFFIX[suffix]]
-
-
 def _distinct(runs: list[Run]) -> list[Run]:
-    """Runs of equal names, from files of equal names in several folders, numbered."""
-    seen: dict[str, int] = {}
+    """The runs, of which those of equal names, from files in several folders, are numbered."""
+    seen: Counter[str] = Counter()
     named = []
     for run in runs:
-        seen[run.name] = seen.get(run.name, 0) + 1
-        count = seen[run.name]
-        named.append(run if count == 1 else replace(run, name=f"{run.name} ({count})"))
+        seen[run.name] += 1
+        named.append(run if seen[run.name] == 1 else replace(run, name=f"{run.name} ({seen[run.name]})"))
     return named
 
 

@@ -1,9 +1,8 @@
 """CSV, TSV and similar files: a line of names, then one line for each row."""
 
 import csv
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
@@ -17,17 +16,15 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
     """One run. A comma, semicolon or tab separates, whichever the header has most of; `#` begins a comment.
 
     A header may itself begin with `#`, as NumPy writes it. Cells stay text where not all of the file is numbers.
-
-    Raises:
-        MadocError: No text, no header, names twice, no rows, or a line of another number of cells.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            names, separator, first = _header(file, path)
+            lines = list(file)
+        names, separator, first = _header(lines, path)
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise MadocError(f"expected each column of {path.name} named once, got {twice!r} twice; rename one of them")
-        table = _all_numbers(path, names, separator, first) or _cells(path, names, separator, first)
+        table = _all_numbers(lines, names, separator, first) or _cells(lines, names, separator, first, path)
     except UnicodeDecodeError as error:
         raise MadocError(f"{path.name} is not text in UTF-8 ({error.reason}); save it as CSV again") from error
     except csv.Error as error:
@@ -35,10 +32,10 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
     return [Run(path.name, (table,))]
 
 
-def _header(file: TextIO, path: Path) -> tuple[list[str], str, int]:
+def _header(lines: Sequence[str], path: Path) -> tuple[list[str], str, int]:
     """Names, the separator, and the line after the header, counted from 0."""
     comment = ""
-    for line, text in enumerate(file):
+    for line, text in enumerate(lines):
         bare = text.strip()
         if not bare:
             continue
@@ -70,52 +67,39 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _all_numbers(path: Path, names: list[str], separator: str, first: int) -> Table | None:
+def _all_numbers(lines: Sequence[str], names: list[str], separator: str, first: int) -> Table | None:
     """The table of a file that has only numbers, read by NumPy; None for others, and for files without rows."""
-    with path.open(encoding="utf-8-sig") as file:
-        lines = [number for number, text in enumerate(file, 1) if number > first and _is_row(text)]
-    if not lines:
+    rows = [row for row in range(first, len(lines)) if (bare := lines[row].strip()) and not bare.startswith("#")]
+    if not rows:
         return None
     try:
-        values = np.loadtxt(
-            path, delimiter=separator, skiprows=first, ndmin=2, encoding="utf-8-sig", comments="#", quotechar='"'
-        )
+        values = np.loadtxt([lines[row] for row in rows], delimiter=separator, ndmin=2, quotechar='"')
     except ValueError:
         return None
-    if values.shape != (len(lines), len(names)):
+    if values.shape != (len(rows), len(names)):
         return None
-    return Table(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), lines=np.array(lines))
+    return Table(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), lines=1 + np.array(rows))
 
 
-def _is_row(text: str) -> bool:
-    bare = text.strip()
-    return bool(bare) and not bare.startswith("#")
-
-
-def _cells(path: Path, names: list[str], separator: str, first: int) -> Table:
+def _cells(lines: Sequence[str], names: list[str], separator: str, first: int, path: Path) -> Table:
     """Cells as text."""
-    rows, lines = [], []
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        for line, cells in _rows(file, separator):
-            if line <= first:
-                continue
-            if len(cells) != len(names):
-                raise MadocError(
-                    f"expected {len(names)} cells in every line of {path.name}, as in its header, got {len(cells)} in "
-                    f"line {line}; was the file cut short there?"
-                )
-            rows.append(cells)
-            lines.append(line)
+    rows: dict[int, list[str]] = {}
+    reader = csv.reader(lines, delimiter=separator)
+    for cells in reader:
+        line = reader.line_num
+        empty = not any(cell.strip() for cell in cells)
+        if line <= first or empty or cells[0].lstrip().startswith("#"):
+            continue
+        if len(cells) != len(names):
+            raise MadocError(
+                f"expected {len(names)} cells in every line of {path.name}, as in its header, got {len(cells)} in "
+                f"line {line}; was the file cut short there?"
+            )
+        rows[line] = cells
     if not rows:
         raise MadocError(f"expected rows below the header of {path.name}, got none; record it again")
     columns = {
-        name: np.array(column, dtype=object) for name, column in zip(names, zip(*rows, strict=True), strict=True)
+        name: np.array(column, dtype=object)
+        for name, column in zip(names, zip(*rows.values(), strict=True), strict=True)
     }
-    return Table(columns, lines=np.array(lines))
-
-
-def _rows(file: TextIO, separator: str) -> Iterator[tuple[int, list[str]]]:
-    reader = csv.reader(file, delimiter=separator)
-    for cells in reader:
-        if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#"):
-            yield reader.line_num, cells
+    return Table(columns, lines=np.array(list(rows)))

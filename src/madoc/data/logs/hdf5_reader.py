@@ -17,9 +17,6 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
     """The runs of a file: its numbered groups (`demo_0`, `demo_1`, ...) where they hold equal names, else one.
 
     A dataset in a group is called by its path in the run: `obs/position[0]`.
-
-    Raises:
-        MadocError: No HDF5, or damaged.
     """
     try:
         with h5py.File(path, "r") as file:
@@ -34,21 +31,20 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
 
 
 def _runs(file: h5py.File) -> list[tuple[h5py.Group, bool]]:
-    """The groups that are runs, and whether they are numbered groups."""
+    """The groups that are runs, or the whole file, and whether they are numbered groups."""
     group: h5py.Group = file
     while True:
         children = [child for child in group.values() if isinstance(child, h5py.Group)]
         alike = [child for child in children if _NUMBERED.fullmatch(child.name.rsplit("/", 1)[-1])]
         if alike and len(alike) == len(group) and len({frozenset(_names(child)) for child in alike}) == 1:
-            return [(child, True) for child in sorted(alike, key=_number)]
+            return [(child, True) for child in sorted(alike, key=_by_number)]
         if len(children) != 1 or len(group) != 1:
             return [(file, False)]
         (group,) = children
 
 
-def _number(group: h5py.Group) -> tuple[int, str]:
-    digits = re.findall(r"\d+", group.name)
-    return int(digits[-1]), group.name
+def _by_number(group: h5py.Group) -> tuple[int, str]:
+    return int(re.findall(r"\d+", group.name)[-1]), group.name
 
 
 def _names(group: h5py.Group) -> list[str]:
@@ -58,7 +54,7 @@ def _names(group: h5py.Group) -> list[str]:
 
 
 def _arrays(group: h5py.Group) -> dict[str, np.ndarray]:
-    """Datasets by name; pictures are not read, only their shape is."""
+    """Datasets by name; pictures are empty arrays of their shape."""
     arrays = {}
     for name in _names(group):
         dataset = group[name]

@@ -22,12 +22,9 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
     """One run for each episode. Elements of `observation.state` are `observation.state[0]`, ...
 
     Where meta/info.json names them, they are `observation.state[shoulder]` as well.
-
-    Raises:
-        MadocError: pyarrow is missing, no data, damaged, or a file without episode_index.
     """
-    information = read_json(path / "meta" / "info.json")
-    features = information.get("features") if isinstance(information, dict) else None
+    about = read_json(path / "meta" / "info.json")
+    features = about.get("features") if isinstance(about, dict) else None
     files = sorted((path / "data").rglob("*.parquet"))
     if not isinstance(features, dict) or not files:
         what = "no features in meta/info.json" if files else "no Parquet file in its folder data"
@@ -46,14 +43,15 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
 
 
 def _run(path: Path, episode: int, parts: list[dict[str, np.ndarray]], features: Mapping[str, object]) -> Run:
-    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    named: dict[str, np.ndarray] = {}
-    for name, values in arrays.items():
-        elements = _element_names(features.get(name))
-        named[name] = values
-        if values.ndim == 2 and len(elements) == values.shape[1]:
-            named.update({f"{name}[{element}]": values[:, at] for at, element in enumerate(elements)})
-    return Run(f"{path.name}/episode_{episode}", tables_of(named, clock=CLOCK))
+    shared = [name for name in parts[0] if all(name in part for part in parts)]
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in shared}
+    named = {
+        f"{name}[{element}]": column
+        for name, values in arrays.items()
+        if len(elements := _element_names(features.get(name))) == values.shape[-1] and values.ndim == 2
+        for element, column in zip(elements, values.T, strict=True)
+    }
+    return Run(f"{path.name}/episode_{episode}", tables_of(arrays | named, clock=CLOCK))
 
 
 def _element_names(feature: object) -> list[str]:

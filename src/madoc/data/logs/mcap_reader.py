@@ -18,15 +18,19 @@ CLOCK = "log_time"
 EXTRA = 'pip install "madoc-calibration[logs]"'
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Topic:
-    """Messages of one topic, flattened: one dictionary a message."""
+    """Messages of one topic.
 
-    log_times: list[int] = field(default_factory=list)
-    publish_times: list[int] = field(default_factory=list)
-    stamps: list[int | None] = field(default_factory=list)
+    Attributes:
+        decode: The decoder of its messages.
+        rows: The numbers of each message by path.
+        times: Times in ns at which each message was logged, published and measured; None for one without a stamp.
+    """
+
+    decode: Callable[[bytes], object]
     rows: list[dict[str, float]] = field(default_factory=list)
-    decode: Callable[[bytes], object] | None = None
+    times: list[tuple[int, int, int | None]] = field(default_factory=list)
 
 
 def read(path: Path, wanted: Collection[str]) -> list[Run]:
@@ -34,41 +38,36 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
 
     Where a message names its elements, as sensor_msgs/JointState does in `name`, the names are in the brackets:
     `/joints.position[shoulder]`. Each topic has `log_time`, `publish_time` and, where it is stamped, `header.stamp`, in
-    s since the first message of the file. Topics with a wanted column are decoded completely; of the others one message
-    is, so that their columns are known.
-
-    Raises:
-        MadocError: The library is missing, the file is damaged or cut short, or no topic can be decoded.
+    s since the first message of the file. All messages of topics with a wanted column are decoded, and one message of
+    every other topic, for the names of its columns.
     """
     topics: dict[str, _Topic] = {}
     unknown: dict[str, str] = {}
     for channel, schema, message in _messages(path):
-        topic = topics.get(channel.topic)
-        if topic is None:
+        name = channel.topic
+        if name not in topics:
             decode = _decoder(channel, schema)
             if decode is None:
-                unknown[channel.topic] = channel.message_encoding or "no"
+                unknown[name] = channel.message_encoding or "no"
                 continue
-            topic = topics[channel.topic] = _Topic(decode=decode)
-        if topic.rows and not any(_of_topic(name, channel.topic) for name in wanted):
+            topics[name] = _Topic(decode)
+        topic = topics[name]
+        if topic.rows and not any(f"{column}.".startswith((f"{name}.", f"{name}[")) for column in wanted):
             continue
-        assert topic.decode is not None
         try:
             content = topic.decode(message.data)
         except Exception as error:  # decoders raise anything from KeyError to struct.error on a damaged message
             raise MadocError(
-                f"cannot decode message {len(topic.rows)} of {channel.topic} in {path.name} ({error}); it is damaged, "
+                f"cannot decode message {len(topic.rows)} of {name} in {path.name} ({error}); it is damaged, "
                 "record it again"
             ) from error
-        topic.rows.append(dict(_flat(channel.topic, content)))
-        topic.log_times.append(message.log_time)
-        topic.publish_times.append(message.publish_time)
-        topic.stamps.append(_stamp(content))
+        topic.rows.append(dict(_flat(name, content)))
+        topic.times.append((message.log_time, message.publish_time, _stamp(content)))
     if not topics:
         what = ", ".join(f"{topic} ({encoding} encoding)" for topic, encoding in unknown.items()) or "no messages"
         raise MadocError(f"expected topics of JSON or ROS 2 messages in {path.name}, got {what}; convert it to CSV")
     others = {topic: f"a topic of {encoding} encoding" for topic, encoding in unknown.items()}
-    origin = min(topic.log_times[0] for topic in topics.values())
+    origin = min(topic.times[0][0] for topic in topics.values())
     return [Run(path.name, tuple(_table(name, topic, origin, others) for name, topic in topics.items()))]
 
 
@@ -82,8 +81,6 @@ def _messages(path: Path) -> Iterator[tuple["Channel", "Schema | None", "Message
         with path.open("rb") as file:
             for schema, channel, message in make_reader(file).iter_messages():
                 yield channel, schema, message
-    except MadocError:
-        raise
     except (McapError, OSError, ValueError, EOFError, KeyError, RuntimeError) as error:
         raise MadocError(
             f"cannot read {path.name} as MCAP ({type(error).__name__}: {error}); it is damaged or was cut short, "
@@ -104,10 +101,6 @@ def _decoder(channel: "Channel", schema: "Schema | None") -> Callable[[bytes], o
     return None
 
 
-def _of_topic(column: str, topic: str) -> bool:
-    return column.startswith((f"{topic}.", f"{topic}[")) or column == topic
-
-
 def _flat(name: str, value: object, elements: list[str] | None = None) -> Iterator[tuple[str, float]]:
     """Numbers in a message by path; text and empty fields are left out."""
     if isinstance(value, bool | int | float):
@@ -119,11 +112,11 @@ def _flat(name: str, value: object, elements: list[str] | None = None) -> Iterat
     elif not isinstance(value, str | bytes):
         parts = _parts(value)
         names = parts.get("name")
-        known = names if isinstance(names, list) and all(isinstance(text, str) for text in names) else None
+        inner = names if isinstance(names, list) and all(isinstance(text, str) for text in names) else None
         for key, part in parts.items():
             if key == "stamp" and {"sec", "nanosec"} <= _parts(part).keys():
                 continue  # in whole nanoseconds, by `_stamp`
-            yield from _flat(f"{name}.{key}", part, known)
+            yield from _flat(f"{name}.{key}", part, inner)
 
 
 def _parts(value: object) -> dict[str, object]:
@@ -150,13 +143,7 @@ def _table(name: str, topic: _Topic, origin: int, others: Mapping[str, str]) -> 
     """Messages as columns, NaN where a message lacks a field, in the order of logging."""
     names = list(dict.fromkeys(key for row in topic.rows for key in row))
     columns = {key: np.array([row.get(key, np.nan) for row in topic.rows]) for key in names}
-    clocks: dict[str, Sequence[int | None]] = {
-        CLOCK: topic.log_times,
-        "publish_time": topic.publish_times,
-        "header.stamp": topic.stamps,
-    }
-    for clock, times in clocks.items():
-        known = [time for time in times if time is not None]
-        if len(known) == len(times):
-            columns[clock] = (np.array(known, dtype=np.int64) - origin) / 1e9
+    for clock, times in zip((CLOCK, "publish_time", "header.stamp"), zip(*topic.times, strict=True), strict=True):
+        if None not in times:
+            columns[clock] = (np.array(times, dtype=np.int64) - origin) / 1e9
     return Table(columns, CLOCK, others=others)

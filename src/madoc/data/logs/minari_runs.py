@@ -3,6 +3,7 @@
 from collections.abc import Collection
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from madoc.data.logs.tables import Run, tables_of
@@ -13,29 +14,25 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
     """One run for each episode, with columns `observations[0]`, `actions[0]`, ...; or `observations/key[0]`, ....
 
     The last row of an episode has an observation and no action.
-
-    Raises:
-        MadocError: Minari is not installed, or the dataset is damaged.
     """
     episodes, _ = read_episodes(local_directory(path))
     return [
         Run(
             f"{path.name}/episode_{episode.id}",
-            tables_of(_flat("observations", episode.observations) | _flat("actions", episode.actions, padded=True)),
+            tables_of(_arrays("observations", episode.observations) | _arrays("actions", episode.actions, padded=True)),
             timed=False,
         )
         for episode in episodes
     ]
 
 
-def _flat(name: str, values: object, *, padded: bool = False) -> dict[str, np.ndarray]:
-    if isinstance(values, dict):
-        parts = (_flat(f"{name}/{key}", value, padded=padded) for key, value in values.items())
-    elif isinstance(values, tuple):
-        parts = (_flat(f"{name}/{index}", value, padded=padded) for index, value in enumerate(values))
-    else:
-        array = np.asarray(values)
+def _arrays(name: str, values: object, *, padded: bool = False) -> dict[str, np.ndarray]:
+    """The arrays in dictionaries and tuples, by path; a row of NaN is added to padded ones."""
+    leaves = jax.tree_util.tree_leaves_with_path(
+        {name: values}, is_leaf=lambda part: not isinstance(part, dict | tuple)
+    )
+    arrays = {jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(leaf) for path, leaf in leaves}
+    for path, array in arrays.items():
         if padded and array.dtype.kind in "fiub":
-            array = np.concatenate([array.astype(np.float64), np.full((1, *array.shape[1:]), np.nan)])
-        return {name: array}
-    return {key: value for part in parts for key, value in part.items()}
+            arrays[path] = np.concatenate([array.astype(np.float64), np.full((1, *array.shape[1:]), np.nan)])
+    return arrays

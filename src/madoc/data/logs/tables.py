@@ -8,11 +8,8 @@ from jaxtyping import Float, Int
 
 from madoc.errors import MadocError
 
-Column = np.ndarray
-"""One value per row: numbers, flags, times (datetime64), or text that may be numbers."""
-
 WIDEST = 1000
-"""Largest number of values per row; an array with more is taken for a picture and not read."""
+"""Number of values per row; an array with more is taken for a picture and not read."""
 
 _MISSING = frozenset(("", "nan", "na", "n/a", "none", "null", "-"))
 
@@ -22,13 +19,13 @@ class Table:
     """Columns that were written together, row by row.
 
     Attributes:
-        columns: By name, all equally long.
+        columns: By name, all equally long: numbers, flags, times (datetime64), or text that may be numbers.
         clock: The column with the format's own time, in s; None where the format has none.
         lines: The line of each row in a text file; None for other formats.
-        others: Columns that are not one number per row, with their kind.
+        others: The kind of each array that is not one number per row, by name.
     """
 
-    columns: Mapping[str, Column]
+    columns: Mapping[str, np.ndarray]
     clock: str | None = None
     lines: Int[np.ndarray, " rows"] | None = None
     others: Mapping[str, str] = field(default_factory=dict)
@@ -64,24 +61,21 @@ class Run:
 def tables_of(arrays: Mapping[str, np.ndarray], *, clock: str | None = None) -> tuple[Table, ...]:
     """Arrays as tables, one for each length; a matrix becomes columns `name[0]`, `name[1]`, ...
 
-    Of scalars, pictures and objects only the name is kept.
+    Scalars, pictures and objects are left out, but for their names.
     """
-    grouped: dict[int, dict[str, Column]] = {}
+    grouped: dict[int, dict[str, np.ndarray]] = {}
     others: dict[str, str] = {}
     for name, array in arrays.items():
-        flat = array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else array
-        what = _unreadable(flat)
+        what = _unreadable(array)
         if what:
             others[name] = what
-            continue
-        columns = grouped.setdefault(len(flat), {})
-        if flat.ndim == 1:
-            columns[name] = flat
+        elif array.ndim == 1 or array.shape[1] == 1:
+            grouped.setdefault(len(array), {})[name] = array.reshape(-1)
         else:
-            columns.update({f"{name}[{index}]": flat[:, index] for index in range(flat.shape[1])})
-    tables = [
+            grouped.setdefault(len(array), {}).update({f"{name}[{at}]": column for at, column in enumerate(array.T)})
+    tables = (
         Table(columns, clock if clock in columns else None, others=others) for columns in grouped.values() if columns
-    ]
+    )
     return tuple(tables) or (Table({}, others=others),)
 
 
@@ -95,11 +89,7 @@ def _unreadable(array: np.ndarray) -> str:
 
 
 def as_numbers(table: Table, name: str, run: str) -> Float[np.ndarray, " rows"]:
-    """A column as float64; an empty cell, `nan` or `null` is NaN, times are s since the first row.
-
-    Raises:
-        MadocError: A cell holds text; the sentence names its place.
-    """
+    """A column as float64; an empty cell, `nan` or `null` is NaN, times are s since the first row; text is refused."""
     values = table.columns[name]
     if values.dtype.kind in "fiub":
         return values.astype(np.float64)
@@ -111,10 +101,9 @@ def as_numbers(table: Table, name: str, run: str) -> Float[np.ndarray, " rows"]:
 def _seconds(values: np.ndarray) -> Float[np.ndarray, " rows"]:
     """Times as s since the first one; whole nanoseconds are subtracted before anything is rounded."""
     kind = "datetime64[ns]" if values.dtype.kind == "M" else "timedelta64[ns]"
-    known = ~np.isnat(values)
+    missing = np.isnat(values)
     whole = values.astype(kind).astype(np.int64)
-    first = whole[known][0] if known.any() else 0
-    return np.where(known, (whole - first) / 1e9, np.nan)
+    return np.where(missing, np.nan, (whole - whole[missing.argmin()]) / 1e9)
 
 
 def _number(cell: object, table: Table, name: str, run: str, row: int) -> float:

@@ -1,10 +1,10 @@
 """Time in a log: whether rows are a control step apart, where it has gaps, and resampling where it is asked for."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from madoc.data.findings import Finding
 from madoc.data.logs.tables import Table
@@ -13,29 +13,33 @@ from madoc.errors import MadocError
 Resample = Literal["hold", "linear"]
 
 GAP = 3.0
-"""Longest time between two rows of a resampled log, in median time steps; anything longer is a gap."""
+"""Time between two rows of a resampled log, in median time steps; a longer one is a gap."""
 _FACTORS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}
 _ROUNDING = 1e-6
-"""Largest difference between equal times, as a share of a control step."""
+"""Difference of two times as a share of a control step; with a smaller one they count as equal."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """Columns of one run that share their rows, without those whose time is unknown.
+    """Columns of one table of a run.
 
     Attributes:
         time: Time of each row in s.
-        values: The signals, then the actions, of this table, in the robot's order.
+        values: Signals and actions by row.
         table: The table that the columns are from.
-        rows: The row in that table for each row here.
+        rows: The index of each row in that table.
         run: Name of the run.
     """
 
     time: Float[np.ndarray, " rows"]
     values: Float[np.ndarray, "rows columns"]
     table: Table
-    rows: np.ndarray
+    rows: Int[np.ndarray, " rows"]
     run: str
+
+    def take(self, kept: Bool[np.ndarray, " rows"]) -> "Series":
+        """Only the rows that are kept."""
+        return replace(self, time=self.time[kept], values=self.values[kept], rows=self.rows[kept])
 
     def place(self, row: int) -> str:
         """The name of a row in an error."""
@@ -43,11 +47,7 @@ class Series:
 
 
 def check_ascending(series: Series) -> None:
-    """Refuse time that stands still or goes back.
-
-    Raises:
-        MadocError: It does; the sentence names the first place.
-    """
+    """Refuse time that stands still or goes back; the sentence names the first such place."""
     back = np.flatnonzero(np.diff(series.time) <= 0)
     if not len(back):
         return
@@ -66,10 +66,9 @@ def check_ascending(series: Series) -> None:
 def steady_links(
     series: Series, control_step: float, tolerance: float
 ) -> tuple[Bool[np.ndarray, " links"], list[Finding]]:
-    """Whether each row is one control step after the one before it, and a warning where it is not.
+    """Whether each row is one control step after the row before it, and a warning where it is not.
 
-    Raises:
-        MadocError: Most rows are not: the log has another rate, or its time another unit.
+    Where most rows are not, the log has another rate, or its time another unit, and is refused.
     """
     steps = np.diff(series.time)
     steady = np.abs(steps - control_step) <= tolerance * control_step + _ROUNDING * control_step
@@ -91,14 +90,14 @@ def steady_links(
 
 
 def _wrong_rate(series: Series, control_step: float, tolerance: float) -> MadocError:
-    usual = float(np.median(np.diff(series.time)))
+    steps = np.diff(series.time)
+    usual, mean = float(np.median(steps)), float(np.mean(steps))
     for factor, unit in _FACTORS.items():
         if abs(usual / control_step / factor - 1.0) < 0.3:
             return MadocError(
                 f"expected time in s in {series.run}, got steps of {usual:g} where the control step is "
                 f"{control_step:g} s; is it in {unit}? divide it by {factor:g}"
             )
-    mean = float(np.mean(np.diff(series.time)))
     if min(abs(usual / control_step - 1.0), abs(mean / control_step - 1.0)) <= tolerance:
         return MadocError(
             f"most time steps of {series.run} are more than {100 * tolerance:g} % off the control step of "
@@ -112,11 +111,7 @@ def _wrong_rate(series: Series, control_step: float, tolerance: float) -> MadocE
 
 
 def common_grid(parts: list[Series], control_step: float) -> Float[np.ndarray, " grid"]:
-    """Times a control step apart, over the time in which all parts have rows.
-
-    Raises:
-        MadocError: There is no such stretch of two steps.
-    """
+    """Times a control step apart, over the period in which all parts have rows; one too short is refused."""
     start, end = max(part.time[0] for part in parts), min(part.time[-1] for part in parts)
     count = int(np.floor((end - start) / control_step + _ROUNDING)) + 1
     if count < 2:
@@ -134,14 +129,13 @@ def on_grid(
 
     `hold` takes the last row before a time, `linear` interpolates between two rows.
     """
-    steps = np.diff(series.time)
-    before = np.searchsorted(series.time, grid + _ROUNDING * (grid[1] - grid[0]), side="right") - 1
+    steps, equal = np.diff(series.time), _ROUNDING * (grid[1] - grid[0])
+    before = np.searchsorted(series.time, grid + equal, side="right") - 1
     before = np.clip(before, 0, len(series.time) - 1)
     if how == "hold":
         values = series.values[before]
     else:
         values = np.stack([np.interp(grid, series.time, column) for column in series.values.T], axis=-1)
     usual = max(float(np.median(steps)), grid[1] - grid[0]) if len(steps) else np.inf
-    wide = np.append(steps > GAP * usual, False)
-    exact = np.abs(series.time[before] - grid) < _ROUNDING * (grid[1] - grid[0])
-    return values, ~wide[before] | exact
+    in_gap = np.append(steps > GAP * usual, False)[before]
+    return values, ~in_gap | (np.abs(series.time[before] - grid) < equal)

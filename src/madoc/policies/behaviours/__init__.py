@@ -1,7 +1,7 @@
-"""The behaviour policies that `madoc record` replays: SAC's own ladder in each target, shipped as float16.
+"""The behaviour policies of `madoc record`: SAC at several stages of its training in each target, shipped as float16.
 
-`benchmarks/train_behaviours.py` trained them, `benchmarks/select_behaviours.py` picked the rungs. A quality is
-one rung or several in equal shares: D4RL's `medium` (a third of expert), `medium-replay` (the way up to it),
+`benchmarks/train_behaviours.py` trained them, `benchmarks/select_behaviours.py` chose the stages. A quality is
+one stage or several in equal shares: D4RL's `medium` (a third of expert), `medium-replay` (the way up to it),
 `medium-expert` (half and half); NeoRL's `neorl-low`, `neorl-medium`, `neorl-high` (25, 50, 75 % of expert).
 """
 
@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.data import Dataset
-from madoc.data.record import join, record
+from madoc.data.dataset import join
+from madoc.data.record import record
 from madoc.data.targets import paper_truth
 from madoc.errors import MadocError, unknown_name
 from madoc.numpy_policy import NumpyPolicy
@@ -27,13 +28,13 @@ QUALITIES = ("medium", "medium-replay", "medium-expert", "neorl-low", "neorl-med
 
 @dataclass(frozen=True)
 class Ladder:
-    """The shipped policies of a robot, weakest training first.
+    """The shipped policies of a robot, the least trained first.
 
     Attributes:
         saved: The policies.
-        control_steps: How long each was trained.
-        returns: Mean sampled return of each in the target.
-        qualities: Which of them make which quality, in equal shares.
+        control_steps: Control steps of training of each.
+        returns: Mean return of each in the target, with sampled actions.
+        qualities: By quality, the indices of its policies.
     """
 
     saved: tuple[NumpyPolicy, ...]
@@ -43,11 +44,7 @@ class Ladder:
 
 
 def ladder(task_name: str) -> Ladder:
-    """All shipped policies of a robot.
-
-    Raises:
-        MadocError: Nothing is shipped for that robot.
-    """
+    """All shipped policies of a robot; MadocError if there are none."""
     file = importlib.resources.files(__package__) / f"{task_name}.npz"
     if not file.is_file():
         raise MadocError(f"no behaviour policies are shipped for {task_name!r}")
@@ -56,17 +53,9 @@ def ladder(task_name: str) -> Ladder:
         weights = [arrays[f"weight_{layer}"].astype(np.float32) for layer in range(about["layers"])]
         biases = [arrays[f"bias_{layer}"].astype(np.float32) for layer in range(about["layers"])]
     size = weights[0].shape[1]
-    saved = (
-        NumpyPolicy(
-            task_name,
-            tuple(layer[index] for layer in weights),
-            tuple(layer[index] for layer in biases),
-            np.zeros(size),
-            np.ones(size),
-        )
-        for index in range(len(weights[0]))
-    )
-    return Ladder(tuple(saved), tuple(about["control_steps"]), tuple(about["returns"]), about["qualities"])
+    networks = zip(zip(*weights, strict=True), zip(*biases, strict=True), strict=True)
+    saved = tuple(NumpyPolicy(task_name, *network, np.zeros(size), np.ones(size)) for network in networks)
+    return Ladder(saved, tuple(about["control_steps"]), tuple(about["returns"]), about["qualities"])
 
 
 def record_quality(
@@ -77,14 +66,9 @@ def record_quality(
     key: PRNGKeyArray,
     advance: Callable[[int], None] = lambda rows: None,
 ) -> Dataset:
-    """Record one of the paper's datasets in the target with the paper's truth.
+    """Record one of the paper's datasets, of one of the `QUALITIES`, in the target with the paper's true parameters.
 
-    Args:
-        simulator: The robot.
-        quality: One of `QUALITIES`.
-        transitions: Rows wanted.
-        key: Randomness.
-        advance: Told how many rows have come.
+    `advance` is called with the number of further rows.
 
     Raises:
         MadocError: The quality is unknown, or nothing is shipped for the robot.

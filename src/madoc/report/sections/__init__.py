@@ -1,28 +1,30 @@
-"""The sections of a page: each takes a run, and gives what its template shows or a sentence on what is missing."""
+"""The sections of a page: a function takes a run and returns what its template shows, or a sentence on what is missing.
 
-from collections.abc import Callable
+The macro of `templates/parts.html` with the section's name draws it.
+"""
+
+from collections.abc import Callable, Mapping
 
 from madoc.report.reading import Run
-from madoc.report.sections.base import NOT_ENDED, TONES, Section, Shown
 from madoc.report.sections.course import curves, trace
 from madoc.report.sections.estimates import correlations, estimates, grouping
 from madoc.report.sections.holdout import holdout, methods, residuals, signals
 from madoc.report.sections.outcome import asked, cost, policies
 
-ALL: tuple[Callable[[Run], Section], ...] = (
-    estimates,
-    holdout,
-    signals,
-    residuals,
-    trace,
-    grouping,
-    curves,
-    correlations,
-    methods,
-    policies,
-    cost,
-    asked,
-)
-"""In the order of the page."""
+SECTIONS: Mapping[str, tuple[str, Callable[[Run], dict[str, object] | str]]] = {
+    "estimates": ("Estimates", estimates),
+    "holdout": ("On data it has not seen", holdout),
+    "signals": ("Measured and simulated", signals),
+    "residuals": ("Residual by signal", residuals),
+    "trace": ("The way there", trace),
+    "grouping": ("What acts alike", grouping),
+    "curves": ("While it learnt", curves),
+    "correlations": ("What makes up for what", correlations),
+    "methods": ("Methods compared", methods),
+    "policies": ("Policies in the target", policies),
+    "cost": ("Cost", cost),
+    "asked": ("What was asked", asked),
+}
+"""Title and function of each section by name, in the order of the page."""
 
-__all__ = ["ALL", "NOT_ENDED", "TONES", "Section", "Shown"]
+__all__ = ["SECTIONS"]

@@ -1,4 +1,4 @@
-"""How the run went: the trace of the estimates, the method's own curves."""
+"""The course of the run: the trace of the estimates, and the curves of the method's own metrics."""
 
 from dataclasses import dataclass
 
@@ -6,13 +6,12 @@ import numpy as np
 
 from madoc.report.charts import Level, Line, line_chart, thinned
 from madoc.report.reading import MetricLog, Run
-from madoc.report.sections.base import Section, Shown, group_colour
 from madoc.report.words import metric_title, parameter_title, short_count
 
 
 @dataclass(frozen=True)
 class Panel:
-    """Metrics that belong in one chart."""
+    """Metrics that are shown in one chart."""
 
     title: str
     metrics: tuple[str, ...]
@@ -34,24 +33,22 @@ _PANELS = (
     Panel("Rows that count, rows at the reward's bound", ("overlap", "reward_at_bound"), (0.0, 1.0)),
     Panel("Spread of the actors, as a share of half the range", ("actor_std",)),
 )
-"""Metrics shown together, in this order; all others have a chart each, folded away."""
+"""The charts of known metrics, in this order; every other metric has a chart of its own, folded away."""
 
 
-def trace(run: Run) -> Section:
+def trace(run: Run) -> dict[str, object] | str:
     """The estimate of every parameter over the run."""
-    title, lede = "The way there", "Each estimate over the run, its spread around it; the axis is the searched range."
     log, ranges = run.log, _ranges(run)
     names = [] if log is None else [name for name in ranges if f"estimate/{name}" in log.metrics]
     if log is None or not names:
-        return Section("trace", title, lede, None, "This run wrote no estimates into its log while it went.")
+        return "This run wrote no estimates into its log while it went."
     charts = [chart for name in names if (chart := _trace_chart(run, log, name, *ranges[name]))]
     if not charts:
-        return Section("trace", title, lede, None, "The run had too few epochs to draw a trace of.")
-    legend = [("truth", "truth")] if run.truth else []
-    return Section("trace", title, lede, {"charts": charts, "legend": legend})
+        return "The run had too few epochs to draw a trace of."
+    return {"charts": charts, "legend": [("truth", "truth")] if run.truth else []}
 
 
-def _trace_chart(run: Run, log: MetricLog, name: str, low: float, high: float, unit: str) -> Shown | None:
+def _trace_chart(run: Run, log: MetricLog, name: str, low: float, high: float, unit: str) -> dict[str, object] | None:
     """One parameter's estimate and its standard deviation; None where it has fewer than two points."""
     estimate = log.metrics[f"estimate/{name}"]
     known = np.isfinite(estimate)
@@ -61,9 +58,8 @@ def _trace_chart(run: Run, log: MetricLog, name: str, low: float, high: float, u
     x, mean, _, _ = thinned(spent, estimate[known])
     std = log.metrics.get(f"std/{name}", np.full(len(estimate), np.nan))[known]
     spread = thinned(spent, std)[1]
-    line = Line(
-        "estimate", mean, group_colour(run, name), np.maximum(mean - spread, low), np.minimum(mean + spread, high)
-    )
+    ends = np.maximum(mean - spread, low), np.minimum(mean + spread, high)
+    line = Line("estimate", mean, run.colour(name), *ends)
     chart = line_chart(
         x,
         [line],
@@ -77,37 +73,27 @@ def _trace_chart(run: Run, log: MetricLog, name: str, low: float, high: float, u
 
 
 def _ranges(run: Run) -> dict[str, tuple[float, float, str]]:
-    """Range and unit of each parameter; while there is no result, from what was asked."""
+    """Range and unit of each parameter; the range alone, from what was asked, while there is no result."""
     if run.parameters:
         return {name: (row.low, row.high, row.unit) for name, row in run.parameters.items()}
-    return {name: (*span, "") for name, span in run.spec.parameters.items()}
+    return {name: (*span, "") for name, span in run.spec.parameters.items() if isinstance(span, tuple)}
 
 
-def curves(run: Run) -> Section:
+def curves(run: Run) -> dict[str, object] | str:
     """What the method measured of itself."""
-    title, lede = (
-        "While it learnt",
-        (
-            "What the method measured of itself. Discriminators that can no longer do better than chance "
-            "have nothing left to tell the simulator from the log by."
-        ),
-    )
     log = run.log
     if log is None:
-        return Section("curves", title, lede, None, "The run kept no log of its metrics.")
-    known = {panel_metric for panel in _PANELS for panel_metric in panel.metrics}
+        return "The run kept no log of its metrics."
+    in_panels = {name for panel in _PANELS for name in panel.metrics}
     charts = [drawn for panel in _PANELS if (drawn := _panel(log, panel))]
-    rest = [name for name in log.metrics if name not in known and not name.startswith(("estimate/", "std/"))]
+    rest = [name for name in log.metrics if name not in in_panels and not name.startswith(("estimate/", "std/"))]
     others = [drawn for name in rest if (drawn := _panel(log, Panel(metric_title(name), (name,))))]
-    if not charts:
-        charts, others = others, []
-        lede = "What the method measured of itself."
-    if not charts:
-        return Section("curves", title, lede, None, "The run had too few epochs to draw a curve of.")
-    return Section("curves", title, lede, {"charts": charts, "others": others})
+    if not charts and not others:
+        return "The run had too few epochs to draw a curve of."
+    return {"charts": charts, "others": others}
 
 
-def _panel(log: MetricLog, panel: Panel) -> Shown | None:
+def _panel(log: MetricLog, panel: Panel) -> dict[str, object] | None:
     """A chart of some metrics; None where the run has fewer than two points of each."""
     present = [name for name in panel.metrics if name in log.metrics]
     known = np.zeros(len(log), dtype=bool)

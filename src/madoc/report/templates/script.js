@@ -19,8 +19,8 @@
     line.append(swatch, name, number);
     return line;
   };
-  for (const chart of document.querySelectorAll("svg[data-told]")) {
-    const told = JSON.parse(chart.dataset.told);
+  for (const chart of document.querySelectorAll("svg[data-values]")) {
+    const drawn = JSON.parse(chart.dataset.values);
     const pointer = chart.querySelector(".pointer");
     const hide = () => {
       box.hidden = true;
@@ -31,15 +31,15 @@
       const frame = chart.getBoundingClientRect();
       const across = ((event.clientX - frame.left) / frame.width) * chart.viewBox.baseVal.width;
       let nearest = 0;
-      told.at.forEach((at, index) => {
-        if (Math.abs(at - across) < Math.abs(told.at[nearest] - across)) nearest = index;
+      drawn.at.forEach((at, index) => {
+        if (Math.abs(at - across) < Math.abs(drawn.at[nearest] - across)) nearest = index;
       });
-      pointer.setAttribute("x1", told.at[nearest]);
-      pointer.setAttribute("x2", told.at[nearest]);
+      pointer.setAttribute("x1", drawn.at[nearest]);
+      pointer.setAttribute("x2", drawn.at[nearest]);
       pointer.style.visibility = "visible";
       const head = document.createElement("small");
-      head.textContent = `${told.title}: ${words(told.x[nearest])}`;
-      box.replaceChildren(head, ...told.lines.map(([name, colour, y]) => row(colour, name, words(y[nearest]))));
+      head.textContent = `${drawn.title}: ${words(drawn.x[nearest])}`;
+      box.replaceChildren(head, ...drawn.lines.map(([name, colour, y]) => row(colour, name, words(y[nearest]))));
       box.hidden = false;
       const left = Math.min(event.clientX + 14, innerWidth - box.offsetWidth - 8);
       box.style.left = `${Math.max(8, left)}px`;

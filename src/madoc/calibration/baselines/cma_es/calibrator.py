@@ -1,8 +1,8 @@
-"""CMA-ES, assembled: a black-box search of parameters, by one of two objectives.
+"""CMA-ES: a black-box search for parameters, by one of two objectives.
 
 `one-step` compares each logged next observation with the simulated one. `distribution` compares clouds of
 observations whose order is unknown, the idea of "Simulator adaptation for sim-to-real learning of legged locomotion
-via proprioceptive distribution matching" (arXiv 2604.11090); its distance and its search are our choice.
+via proprioceptive distribution matching" (arXiv 2604.11090); the distance and the search are our choice.
 """
 
 from dataclasses import dataclass, replace
@@ -16,33 +16,35 @@ from pydantic import Field
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines import evolution
 from madoc.calibration.baselines.cma_es.mean_embedding import CosineFeatures, adjusted, cosine_features, discrepancies
+from madoc.calibration.baselines.evolution import Candidates, Costs
 from madoc.calibration.baselines.population_search import (
     SearchState,
-    draw_windows,
     estimate_from_search,
     mean_with_failures,
     next_generation,
+    replay_residuals,
 )
-from madoc.identification.replay import window_residuals
 from madoc.identification.windows import first_rows
 from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
-from madoc.simulation.rollout import Walkers, begin, reset_states, roll
+from madoc.simulation.rollout import Walkers, begin, out_of_step, reset_states, roll
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
+Evaluation = tuple[Costs, int, int]
+"""Cost of each candidate, control steps spent, and number of simulations that failed."""
 ROWS = {"one-step": 100, "distribution": 500, "policy": 50}
-"""Logged rows, or walkers, under each candidate."""
+"""Default number under each candidate of logged rows (`one-step`, `distribution`) or of walkers (`policy`)."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Clouds:
-    """What clouds are compared by.
+    """The features by which clouds are compared, and their means over the log.
 
     Attributes:
-        of_pairs: Features of observations and actions: what `policy` starts are compared by.
-        of_observations: Features whose change is compared for `logged` starts.
-        pair: Mean of the first over logged rows; zeros until the log has been read.
-        change: How the mean of the second changes in a step, over logged rows.
+        of_pairs: Features of observations and actions, compared for `policy` starts.
+        of_observations: Features of observations, whose change is compared for `logged` starts.
+        pair: Mean of the features of pairs over logged rows; zeros until the log has been read.
+        change: Change in a step of the mean of the features of observations, over logged rows.
         read: 1 once the log has been read.
     """
 
@@ -56,7 +58,7 @@ class Clouds:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Actor:
-    """A clone of the behaviour, and where its rollouts stand."""
+    """A clone of the behaviour policy, and the rows that it acts in."""
 
     clone: Clone
     walkers: Walkers
@@ -65,7 +67,7 @@ class Actor:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CmaEsState:
-    """The search; for `distribution` the clouds it compares, and who acts in them where someone does."""
+    """The search, the clouds that `distribution` compares, and the actor of its `policy` starts."""
 
     inner: SearchState
     clouds: Clouds | None
@@ -78,22 +80,22 @@ class CmaEs:
 
     Attributes:
         objective: `one-step`: the mean squared error of next observations, each channel in units of its typical
-            change. `distribution`: the maximum mean discrepancy of clouds; see `starts`.
-        starts: Of `distribution`; None takes `logged` where states are exact, else `policy`.
-            `logged`: one control step from logged states under their actions; the cloud of
-            next observations should differ from that of observations as it does in the log, whichever belongs to
-            which. `policy`: a clone acts from resets on, and its observations and actions should be distributed as
-            the logged ones; no state needs to be rebuilt. All candidates go on from where the last best one stood.
+            change. `distribution`: the maximum mean discrepancy of clouds of observations; see `starts`.
+        starts: Rollouts of `distribution`; None takes `logged` where states are exact, else `policy`.
+            `logged`: one control step from logged states under their actions; the cloud of next observations is to
+            differ from that of observations as it does in the log, whichever belong together. `policy`: a clone acts
+            from resets on, and its observations and actions are to be distributed as the logged ones; no state needs
+            to be rebuilt. All candidates go on from where the best one of the last generation stopped.
         rows: Logged rows, or walkers, under each candidate; None takes 100 for `one-step`, 500 and 50 for the starts.
-        horizon: Control steps each walker takes in a generation.
-        features: Random features of a cloud.
+        horizon: Control steps of each walker in a generation.
+        features: Number of random features of a cloud.
         hidden: Units per layer of the clone.
         cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
-        cloning_updates: Updates in each.
+        cloning_updates: Updates in each epoch of cloning.
         batch: Logged rows in an update.
-        learning_rate: Adam's.
-        population: Candidates a generation; None takes 4 + ⌊3 ln d⌋.
-        tolerance: Share of each range; it stops once the search is narrower in all of them. 0 never stops.
+        learning_rate: Adam's learning rate.
+        population: Candidates in a generation; None takes 4 + ⌊3 ln d⌋.
+        tolerance: Largest deviation of the search, as a share of each range, at which it stops; 0 never stops.
     """
 
     objective: Literal["one-step", "distribution"] = "one-step"
@@ -130,7 +132,7 @@ class CmaEs:
         return CmaEsState(SearchState(search, key, 0), clouds, actor)
 
     def step(self, problem: CalibrationProblem, state: CmaEsState) -> tuple[CmaEsState, Epoch]:
-        """One generation; before the first, epochs of cloning and one of reading the log."""
+        """One generation. Before the first there are epochs of cloning, and one in which the log is read."""
         inner, clouds, actor = state.inner, state.clouds, state.actor
         if actor is not None and actor.clone.epochs < self.cloning_epochs:
             return self._clone(problem, state, actor)
@@ -143,17 +145,18 @@ class CmaEs:
         elif actor is None:
             costs, spent, failures = self._replay(problem, clouds, candidates, of_rows)
         else:
-            costs, spent, failures, actor = self._act(problem, clouds, actor, candidates, of_rows)
-        inner = replace(inner, key=key, failures=inner.failures + failures)
-        inner, epoch = next_generation(inner, candidates, costs, control_steps=spent, tolerance=self.tolerance)
+            (costs, spent, failures), actor = self._act(problem, clouds, actor, candidates, of_rows)
+        inner, epoch = next_generation(
+            inner, candidates, costs, key, control_steps=spent, failures=failures, tolerance=self.tolerance
+        )
         return CmaEsState(inner, clouds, actor), epoch
 
     def estimate(self, problem: CalibrationProblem, state: CmaEsState) -> Estimate:
-        """Centre and covariance of the search. The covariance is the search's, no measure of uncertainty."""
+        """Centre and covariance of the search; the covariance does not measure uncertainty."""
         return estimate_from_search(problem, state.inner)
 
     def _acts(self, problem: CalibrationProblem) -> bool:
-        """Whether a clone acts from resets on."""
+        """Whether rollouts are those of a clone from resets."""
         starts = self.starts or ("logged" if problem.states.kind == "exact" else "policy")
         return self.objective == "distribution" and starts == "policy"
 
@@ -174,10 +177,7 @@ class CmaEs:
         clone = fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy)
         rows = self.rows or ROWS["policy"]
         walkers = begin(reset_states(simulator), of_start, systems=1, rows=rows)
-        # Ages spread evenly: time limits that fell together would show one age of episodes at a time.
-        ages = np.arange(rows)[None] * simulator.task.max_episode_steps // rows
-        walkers = replace(walkers, age=ages)
-        return Actor(clone, walkers)
+        return Actor(clone, out_of_step(walkers, simulator.task.max_episode_steps))
 
     def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Epoch]:
         of_batches, key = jax.random.split(state.inner.key)
@@ -200,41 +200,34 @@ class CmaEs:
         return (rows - scaling.pair_offset[:size]) / scaling.pair_scale[:size]
 
     def _read(self, problem: CalibrationProblem, clouds: Clouds) -> Clouds:
-        """Mean features of logged (s, a), and how those of s change. Neither needs an order of rows.
+        """Mean features of logged (s, a), and the change of those of s. Neither depends on the order of rows.
 
-        For `logged` starts they are those of the rows that can be rebuilt. Where it is not known which s' these have,
-        the change is that of all rows.
+        For `logged` starts, these are means over the rows whose state can be rebuilt. Where next observations are
+        shuffled, it is not known which belong to those rows, and the change is that of all rows.
         """
         whole = problem.dataset.transitions
         rows = whole if self._acts(problem) else whole.take(problem.states.exact()[1])
-        loose = problem.dataset.disturbance.shuffled == "next_observations"
+        changing = whole if problem.dataset.disturbance.shuffled == "next_observations" else rows
         before, after = (
             clouds.of_observations.mean(self._standardised(problem, np.asarray(part)))
-            for part in ((whole if loose else rows).observation, (whole if loose else rows).next_observation)
+            for part in (changing.observation, changing.next_observation)
         )
         pairs = np.concatenate([rows.observation, rows.action], axis=-1)
         return replace(
             clouds, pair=clouds.of_pairs.mean(self._standardised(problem, pairs)), change=after - before, read=1
         )
 
-    def _one_step(
-        self, problem: CalibrationProblem, candidates: Float[np.ndarray, "population d"], key: PRNGKeyArray
-    ) -> tuple[Float[np.ndarray, " population"], int, int]:
-        windows = draw_windows(problem, 1, self.rows or ROWS["one-step"], key)
-        scale = problem.typical_change
-        squared = (window_residuals(problem.simulator, windows, candidates, scale) ** 2).mean(-1)
+    def _one_step(self, problem: CalibrationProblem, candidates: Candidates, key: PRNGKeyArray) -> Evaluation:
+        residuals = replay_residuals(problem, candidates, key, steps=1, windows=self.rows or ROWS["one-step"])
+        squared = (residuals**2).mean(-1)
         return mean_with_failures(squared), squared.size, int(np.isnan(squared).sum())
 
     def _replay(
-        self,
-        problem: CalibrationProblem,
-        clouds: Clouds,
-        candidates: Float[np.ndarray, "population d"],
-        key: PRNGKeyArray,
-    ) -> tuple[Float[np.ndarray, " population"], int, int]:
-        """Clouds one step after logged rows, compared by how their features change from the rows themselves.
+        self, problem: CalibrationProblem, clouds: Clouds, candidates: Candidates, key: PRNGKeyArray
+    ) -> Evaluation:
+        """Clouds one step after drawn logged rows, compared by the change of their features from those rows.
 
-        So the draw of rows matters little; what of it still shows in the features of (s, a) is taken off as well.
+        The change depends little on which rows were drawn; the part that features of (s, a) explain is removed.
         """
         simulator = problem.simulator
         states, logged = problem.states.exact()
@@ -255,14 +248,9 @@ class CmaEs:
         return mean_with_failures(costs[:, None]), failed.size, int(failed.sum())
 
     def _act(
-        self,
-        problem: CalibrationProblem,
-        clouds: Clouds,
-        actor: Actor,
-        candidates: Float[np.ndarray, "population d"],
-        key: PRNGKeyArray,
-    ) -> tuple[Float[np.ndarray, " population"], int, int, Actor]:
-        """Clouds that the clone visits under each candidate, from where the last best one left it."""
+        self, problem: CalibrationProblem, clouds: Clouds, actor: Actor, candidates: Candidates, key: PRNGKeyArray
+    ) -> tuple[Evaluation, Actor]:
+        """Clouds that the clone visits under each candidate, from where the best one of the last generation stopped."""
         simulator = problem.simulator
         of_actions, of_restarts = jax.random.split(key)
         rollout, after = roll(
@@ -276,10 +264,10 @@ class CmaEs:
             restart_key=of_restarts,
         )
         seen = np.concatenate([rollout.transitions.observation, rollout.transitions.action], axis=-1)
-        seen = np.where(rollout.valid[..., None], seen, np.nan)[1:]  # the first observation is where all were put
+        seen = np.where(rollout.valid[..., None], seen, np.nan)[1:]  # all candidates share the first observation
         rows = np.swapaxes(seen, 0, 1).reshape(len(candidates), -1, seen.shape[-1])
         costs = discrepancies(clouds.of_pairs(self._standardised(problem, rows)), clouds.pair)
         costs = mean_with_failures(costs[:, None])
         best = int(np.argmin(costs))
         walkers = jax.tree.map(lambda part: part[best : best + 1], after)
-        return costs, rollout.valid.size, rollout.failures, replace(actor, walkers=walkers)
+        return (costs, rollout.valid.size, rollout.failures), replace(actor, walkers=walkers)

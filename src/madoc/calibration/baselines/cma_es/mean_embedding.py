@@ -11,19 +11,21 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 WIDTHS = (0.5, 1.0, 2.0)
-"""Of the kernels, in units of √dimensions: half, once and twice the typical distance of standardised rows."""
+"""Widths of the kernels, in units of √dimensions, which is about the typical distance of standardised rows."""
 _ROWS_AT_ONCE = 10_000
+"""Largest number of rows whose features are in memory at a time."""
 RIDGE = 1e-3
-"""Of the mean variance of a feature, added to all of them."""
+"""Ridge of the covariance of features, as a share of their mean variance."""
 _SMALLEST_VARIANCE = 1e-12
+"""Smallest ridge of the covariance of features, for features that do not vary."""
 _SLOPE_RIDGE = 1e-6
-"""Added to the mean squares of covariates, which are cosines: those that hardly vary explain nothing."""
+"""Ridge of the mean squares of covariates, which are cosines: those that hardly vary then explain nothing."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CosineFeatures:
-    """φ(x) = cos(x W + b), with rows standardised first by whoever calls it."""
+    """φ(x) = cos(x W + b) of standardised rows x."""
 
     frequencies: Float[np.ndarray, "dimensions features"]
     phases: Float[np.ndarray, " features"]
@@ -33,7 +35,7 @@ class CosineFeatures:
         return np.cos(rows @ self.frequencies + self.phases)
 
     def mean(self, rows: Float[np.ndarray, "rows dimensions"]) -> Float[np.ndarray, " features"]:
-        """Mean feature of many rows, a part at a time."""
+        """Mean features of many rows."""
         parts = np.array_split(rows, max(1, len(rows) // _ROWS_AT_ONCE))
         return np.sum([self(part).sum(0) for part in parts], axis=0) / len(rows)
 
@@ -50,10 +52,10 @@ def cosine_features(key: PRNGKeyArray, dimensions: int, count: int) -> CosineFea
 def discrepancies(
     features: Float[np.ndarray, "clouds rows features"], wanted: Float[np.ndarray, " features"]
 ) -> Float[np.ndarray, " clouds"]:
-    """Squared distance of each cloud's mean feature m from the wanted w: n (m - w)ᵀ S⁻¹ (m - w), in standard errors.
+    """Squared Mahalanobis distance n (m - w)ᵀ S⁻¹ (m - w) of the mean m of each cloud of n rows from the wanted w.
 
-    S is the covariance of rows about their cloud's mean, pooled over clouds, with a small ridge: features that hardly
-    vary from row to row weigh most. Rows that failed (NaN) are left out; NaN for a cloud in which all did.
+    S is the covariance of rows about the mean of their cloud, pooled over clouds, with a small ridge. Rows that failed
+    (NaN) are left out; the distance of a cloud in which all rows failed is NaN.
     """
     valid = np.isfinite(features).all(-1)
     count = valid.sum(1)
@@ -69,11 +71,11 @@ def discrepancies(
 def adjusted(
     features: Float[np.ndarray, "clouds rows features"], covariates: Float[np.ndarray, "rows covariates"]
 ) -> Float[np.ndarray, "clouds rows features"]:
-    """Features of drawn rows, less the part by which the draw differs from the whole log.
+    """Features of drawn rows, corrected for the chance difference between the draw and the whole log.
 
-    Covariates are known of all logged rows and have mean 0 there; their mean in a draw, times the slopes of features
-    on them, is chance. This is the regression estimator of survey sampling (Särndal et al. 1992, section 6.4). Slopes
-    are each cloud's own, from rows that failed in none.
+    The mean of the covariates over the whole log is 0, so that their mean in a draw, times the slopes of features on
+    them, is chance. This is the regression estimator of survey sampling (Särndal et al. 1992, section 6.4). Each cloud
+    has its own slopes, from the rows that failed in no cloud.
     """
     whole = np.isfinite(features).all((0, 2))
     if not whole.any():

@@ -1,20 +1,19 @@
-"""DROPO's objective by equation: draws of parameters, the next states they make, how likely the logged ones are.
+"""The equations of DROPO's objective: draws of parameters, and the likelihood of logged next states under them.
 
 Tiboni et al. 2023, "DROPO: sim-to-real transfer with offline domain randomization" (arXiv 2201.08434).
 """
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 TRUNCATION = 2.0
-"""Deviations at which the parameter distribution is cut off."""
+"""Number of standard deviations at which the parameter distribution is truncated."""
 
 
 def truncated_noise(key: PRNGKeyArray, pairs: int, dimensions: int) -> Float[np.ndarray, "draws d"]:
-    """Standard normal draws cut off at ±2, in antithetic pairs: the second half mirrors the first."""
-    noise: Array = jax.random.truncated_normal(key, -TRUNCATION, TRUNCATION, (pairs, dimensions))
-    half = np.asarray(noise, np.float64)
+    """Standard normal draws truncated at ±2, in antithetic pairs: the second half mirrors the first."""
+    half = np.asarray(jax.random.truncated_normal(key, -TRUNCATION, TRUNCATION, (pairs, dimensions)), np.float64)
     return np.concatenate([half, -half])
 
 
@@ -28,10 +27,7 @@ def parameter_draws(
 def moments(
     residuals: Float[np.ndarray, "candidates draws rows values"],
 ) -> tuple[Float[np.ndarray, "candidates rows values"], Float[np.ndarray, "candidates rows values values"]]:
-    """Mean and covariance over draws, for every row; draws whose simulation failed (NaN) are left out.
-
-    NaN for a row with fewer than two draws left.
-    """
+    """Mean and covariance over the draws whose simulation did not fail (NaN), for every row; NaN for fewer than two."""
     valid = np.isfinite(residuals).all(-1, keepdims=True)
     count = valid.sum(1)
     enough = np.where(count > 1, count, np.nan)

@@ -1,4 +1,4 @@
-"""The bandit: a Gaussian over parameters, what each draw earns, and the gradient that follows."""
+"""The bandit: a Gaussian distribution of parameters, the reward of each draw, and the policy gradient."""
 
 from dataclasses import dataclass
 
@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 LOG_STD_RANGE = (-6.0, 0.5)
+"""Range of the log standard deviation of a parameter before tanh; steps beyond it are clipped."""
 REWARD_BOUND = 10.0
-"""Log ratios beyond this say no more than that the discriminator is sure."""
+"""Largest absolute log ratio of a pair; larger ones are clipped, as the discriminator is then certain anyway."""
 
 
 @jax.tree_util.register_dataclass
@@ -21,7 +22,7 @@ class Distribution:
 
 
 def antithetic_noise(key: PRNGKeyArray, pairs: int, count: int) -> Float[np.ndarray, "draws d"]:
-    """Standard normal draws, each with its mirror image: what is odd in the reward is seen without the even part."""
+    """Standard normal draws, each with its mirror image, so that the even part of the reward cancels."""
     half = np.asarray(jax.random.normal(key, (pairs, count)), np.float64)
     return np.concatenate([half, -half])
 
@@ -32,8 +33,8 @@ def mean_rewards(
     """Reward of each draw: the mean of log p_data / p_sim over the pairs it visited.
 
     Its mean over draws is -KL(sim || data), and the part of the gradient that goes through p_sim is 0 on average, so
-    the bandit climbs down the divergence itself. The choice of this KL is ours. A draw of which no row survived gets
-    the lowest reward there is.
+    that the bandit minimises this divergence. The choice of this KL is ours. A draw whose rows all failed gets the
+    lowest reward of all draws.
     """
     count = valid.sum((0, 2))
     total = np.where(valid, np.clip(log_ratio, -REWARD_BOUND, REWARD_BOUND), 0.0).sum((0, 2))
@@ -43,7 +44,7 @@ def mean_rewards(
 
 
 def advantages(rewards: Float[np.ndarray, " draws"]) -> Float[np.ndarray, " draws"]:
-    """Rewards less their mean, over their deviation: the size of a step is that of its rate, whatever the units."""
+    """Standardised rewards, so that the size of a step does not depend on their unit."""
     return (rewards - rewards.mean()) / (rewards.std() + 1e-8)
 
 

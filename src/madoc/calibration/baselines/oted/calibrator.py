@@ -1,8 +1,8 @@
-"""OTED, assembled: a distribution over parameters whose rollouts visit the data's states and actions.
+"""OTED: a distribution of parameters under which rollouts visit the states and actions of the data.
 
-Gur, Nachum and Faust 2021, "Offline tuning of simulators". Only its abstract and appendix D.2 of Jiang et al. 2024
-could be had: a distribution over simulator parameters, a divergence between the (s, a) of data and simulator, and a
-bandit's policy gradient. Everything else is our choice, and marked as such where it is made.
+Gur, Nachum and Faust 2021, "Offline tuning of simulators". We had its abstract and appendix D.2 of Jiang et al. 2024:
+a distribution of simulator parameters, a divergence between the (s, a) of data and simulator, and a bandit's policy
+gradient. Everything else is our choice, and marked as such where it is made.
 """
 
 from dataclasses import dataclass, replace
@@ -24,10 +24,10 @@ from madoc.calibration.baselines.oted.bandit import (
     natural_step,
 )
 from madoc.calibration.baselines.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
-from madoc.calibration.cautions import at_end_of_range
+from madoc.calibration.baselines.population_search import independent_estimate
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
-from madoc.learning.networks import Network, adam, scalars
+from madoc.learning.networks import Network, adam, moving_average
 from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll, unbiased_starts
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
@@ -35,7 +35,7 @@ from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hy
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class OtedState:
-    """Everything OTED carries. `average` follows `distribution` slowly; the estimate is read from it."""
+    """Everything OTED carries; the estimate is read from `average`, a moving average of `distribution`."""
 
     clone: Clone
     discriminator: Network
@@ -53,23 +53,23 @@ class Oted:
     """Match the (s, a) distribution of a cloned policy's rollouts to that of the data.
 
     Attributes:
-        starts: `logged` rolls out from logged states anew in every epoch; `policy` lets walkers run on from resets.
+        starts: `logged` starts rollouts anew at logged states in every epoch; with `policy`, rows go on from resets.
             None takes `logged` where states are exact, else `policy`.
-        draws: Parameter draws an epoch, in antithetic pairs.
-        rows: Walkers under each draw.
-        horizon: Control steps each walks under it.
-        updates: Discriminator updates an epoch.
-        batch: Logged rows, and as many simulated ones, in an update.
+        draws: Parameter draws in an epoch, in antithetic pairs.
+        rows: Rows under each draw.
+        horizon: Control steps of each row under its draw.
+        updates: Updates of the discriminator in an epoch.
+        batch: Logged rows, and as many simulated rows, in an update.
         mean_rate: Natural-gradient step of the distribution's mean, in its standard deviations.
-        std_rate: The same of the logarithm of its deviation.
-        first_std: Deviation it begins with, before tanh.
-        smallest_std: It stops once the mean deviation has shrunk to this.
-        average_rate: Of the slow average that is the estimate.
+        std_rate: Natural-gradient step of the logarithm of its standard deviation.
+        first_std: Initial standard deviation, before tanh.
+        smallest_std: Mean standard deviation, before tanh, at which OTED stops.
+        average_rate: Rate of the moving average from which the estimate is read.
         hidden: Units per layer of clone and discriminator.
         cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
-        cloning_updates: Updates in each.
-        learning_rate: Adam's, of both networks.
-        replay_capacity: Simulated rows kept for the discriminator.
+        cloning_updates: Updates in each epoch of cloning.
+        learning_rate: Adam's learning rate of both networks.
+        replay_capacity: Number of simulated rows kept for the discriminator.
     """
 
     starts: Literal["logged", "policy"] | None = None
@@ -93,7 +93,7 @@ class Oted:
         check_hyperparameters(self)
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> OtedState:
-        """Fresh networks, the distribution around mid-range, walkers at their starts.
+        """Fresh networks, the distribution about mid-range, rows at their starts.
 
         Raises:
             MadocError: Rollouts are to start at logged states, but those cannot be rebuilt, or no episode is as long
@@ -118,28 +118,20 @@ class Oted:
         )
 
     def step(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
-        """One epoch of whichever stage is due."""
+        """One epoch of cloning, or of calibration once the clone is trained."""
         return (self._clone if state.clone.epochs < self.cloning_epochs else self._calibrate)(problem, state)
 
     def estimate(self, problem: CalibrationProblem, state: OtedState) -> Estimate:
-        """The averaged distribution through tanh: its centre, and its deviation to first order."""
-        space, average = problem.simulator.parameters, state.average
-        scaled = np.tanh(average.mean)
-        std = (1.0 - scaled**2) * np.exp(average.log_std) * (space.high - space.low) / 2.0
-        return Estimate(
-            mean=space.to_physical(scaled),
-            std=std,
-            failures=state.failures,
-            warnings=at_end_of_range(scaled, space.names),
-            covariance=np.diag(std**2),
-        )
+        """Mean of the averaged distribution through tanh, and its standard deviation to first order."""
+        scaled = np.tanh(state.average.mean)
+        return independent_estimate(problem, scaled, (1.0 - scaled**2) * np.exp(state.average.log_std), state.failures)
 
     @property
     def _systems(self) -> int:
         return 2 * (self.draws // 2)
 
     def _starts(self, problem: CalibrationProblem) -> tuple[Starts, Int[np.ndarray, " rows"]]:
-        """Where rollouts start, and how often each logged row is visited by the true system from there."""
+        """Where rollouts start, and how often the true system visits each logged row from there."""
         if not self._anew(problem):
             return reset_states(problem.simulator), np.ones(len(problem.dataset), dtype=np.int64)
         states, rows = problem.states.exact()
@@ -147,7 +139,7 @@ class Oted:
         return chosen_states(states[chosen]), visits(problem.dataset, rows[chosen], self.horizon)
 
     def _anew(self, problem: CalibrationProblem) -> bool:
-        """Whether every epoch starts anew at logged states."""
+        """Whether rollouts start anew at logged states in every epoch."""
         return (self.starts or ("logged" if problem.states.kind == "exact" else "policy")) == "logged"
 
     def _clone(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
@@ -165,30 +157,30 @@ class Oted:
 
     def _calibrate(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
-        simulator, distribution = problem.simulator, state.distribution
+        simulator, distribution, anew = problem.simulator, state.distribution, self._anew(problem)
         noise = antithetic_noise(of_draws, self._systems // 2, len(distribution.mean))
         draws = np.tanh(distribution.mean + np.exp(distribution.log_std) * noise)
-        starts, reached = self._starts(problem)
-        fresh = begin(starts, of_start, systems=self._systems, rows=self.rows)
-        anew = self._anew(problem)
         system = simulator.bind(simulator.parameters.to_physical(draws))
+        starts, reached = self._starts(problem)
+        walkers = state.walkers
         if anew:
-            starts, fresh = unbiased_starts(system, starts), replace(fresh, state=system.unbiased(fresh.state))
-        rollout, walkers = roll(
+            fresh = begin(starts, of_start, systems=self._systems, rows=self.rows)
+            starts, walkers = unbiased_starts(system, starts), replace(fresh, state=system.unbiased(fresh.state))
+        rollout, following = roll(
             system,
             simulator.task,
             state.clone.policy,
-            fresh if anew else state.walkers,
+            walkers,
             steps=self.horizon,
             starts=starts,
             key=of_action,
             restart_key=of_restart,
         )
-        # The first pair of a row is where it was put: the draw had no part in it.
+        # The first pair of a row is its start, which does not depend on the draw.
         pairs = problem.features.standardised.features(rollout.transitions)[0][1:]
         valid = (first_lives(rollout.transitions, rollout.valid) if anew else rollout.valid)[1:]
         rows = replay.add(state.rows, {"pair": replay.flatten_rows(pairs, 3)}, valid.reshape(-1))
-        discriminator, optimiser_state, metrics = learn(
+        discriminator, optimiser_state, loss = learn(
             state.discriminator,
             state.discriminator_optimiser,
             problem.features.windows("standardised", 1)[1][0],
@@ -202,21 +194,21 @@ class Oted:
         ratio = np.asarray(log_ratio(discriminator, jnp.asarray(pairs)), np.float64)
         rewards = mean_rewards(ratio, valid)
         moved = natural_step(distribution, noise, advantages(rewards), mean_rate=self.mean_rate, std_rate=self.std_rate)
-        following = replace(
+        std = float(np.exp(moved.log_std).mean())
+        shrunk = f"the distribution has shrunk to a deviation of {std:.3g} before tanh"
+        state = replace(
             state,
             discriminator=discriminator,
             discriminator_optimiser=optimiser_state,
             rows=rows,
-            walkers=state.walkers if anew else walkers,
+            walkers=state.walkers if anew else following,
             distribution=moved,
-            average=jax.tree.map(lambda slow, fast: slow + self.average_rate * (fast - slow), state.average, moved),
+            average=moving_average(state.average, moved, self.average_rate),
             key=key,
             failures=state.failures + rollout.failures,
         )
-        std = float(np.exp(moved.log_std).mean())
-        shrunk = f"the distribution has shrunk to a deviation of {std:.3g} before tanh"
-        return following, Epoch(
-            scalars(metrics) | {"reward": float(rewards.mean()), "std": std},
+        return state, Epoch(
+            {"discriminator_loss": float(loss), "reward": float(rewards.mean()), "std": std},
             control_steps=rollout.valid.size,
             converged=shrunk if std <= self.smallest_std else None,
         )

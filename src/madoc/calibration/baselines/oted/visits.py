@@ -1,4 +1,4 @@
-"""Which pairs (s, a) data and simulator visit, made comparable, and the discriminator that compares them."""
+"""The pairs (s, a) that data and simulator visit from the same starts, and the discriminator that compares them."""
 
 import equinox as eqx
 import jax
@@ -10,20 +10,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from madoc.data import Dataset
 from madoc.identification.windows import first_rows
 from madoc.learning import replay
-from madoc.learning.networks import Network, descend, scan_updates
+from madoc.learning.networks import Network, minimise
 from madoc.types import Transitions
 
 
 def comparable_starts(dataset: Dataset, rows: Int[np.ndarray, " states"], horizon: int) -> Int[np.ndarray, " starts"]:
-    """Which of the given rows a rollout of `horizon` steps may start at: the record goes on as long, or to a fall.
-
-    Args:
-        dataset: The log.
-        rows: Rows whose state can be rebuilt.
-        horizon: Control steps of a rollout.
-
-    Returns:
-        Positions in `rows`.
+    """Positions in `rows` at which a rollout may start: the log goes on for `horizon` steps, or until a fall.
 
     Raises:
         MadocError: No episode is long enough.
@@ -38,20 +30,17 @@ def comparable_starts(dataset: Dataset, rows: Int[np.ndarray, " states"], horizo
 def visits(dataset: Dataset, starts: Int[np.ndarray, " starts"], horizon: int) -> Int[np.ndarray, " rows"]:
     """How often each row of the log is visited 1 to `horizon` - 1 steps after one of the starts, in its episode.
 
-    Rows drawn by these counts are what the true system visits from the starts; drawn evenly they are not, as the
-    beginnings of episodes are seldom reached from within.
+    Rows drawn in proportion to these counts are distributed as the true system's visits from the starts. Rows drawn
+    uniformly are not: the beginning of an episode is seldom reached from another start.
     """
-    begun = np.zeros(len(dataset), dtype=np.int64)
-    begun[starts] = 1
-    episode = np.repeat(np.arange(len(dataset.episode_starts)), dataset.episode_ends - dataset.episode_starts)
-    first = dataset.episode_starts[episode]
-    before = np.append(0, np.cumsum(begun))
+    before = np.append(0, np.cumsum(np.bincount(starts, minlength=len(dataset))))
     row = np.arange(len(dataset))
+    first = dataset.episode_starts[dataset.episode_of(row)]
     return before[row] - before[np.maximum(first, row - horizon + 1)]
 
 
 def first_lives(seen: Transitions, valid: Bool[np.ndarray, "steps *rows"]) -> Bool[np.ndarray, "steps *rows"]:
-    """Steps that a rollout took before anything ended in its row: after that the row stands at a fresh start."""
+    """Valid steps of each row before its first end or failure; later steps began at another start."""
     ended = np.asarray(seen.terminated) | np.asarray(seen.truncated) | ~valid
     earlier = np.concatenate([np.zeros_like(ended[:1]), ended[:-1]])
     return valid & ~np.logical_or.accumulate(earlier, axis=0)
@@ -66,7 +55,7 @@ def discriminator_loss(
 
 @eqx.filter_jit
 def log_ratio(discriminator: Network, pairs: Float[Array, "*rows pair"]) -> Float[Array, "*rows"]:
-    """Log p_data(s, a) / p_sim(s, a), as the discriminator has it."""
+    """The discriminator's estimate of log p_data(s, a) / p_sim(s, a)."""
     return discriminator(pairs)[..., 0]
 
 
@@ -82,19 +71,16 @@ def learn(
     optimiser: optax.GradientTransformation,
     batch: int,
     count: int,
-) -> tuple[Network, PyTree, dict[str, Array]]:
-    """`count` updates of the discriminator on logged and simulated pairs.
+) -> tuple[Network, PyTree, Float[Array, ""]]:
+    """`count` updates of the discriminator on logged and simulated pairs; also the mean loss.
 
-    `reached` is the running sum of how often each logged pair is to be drawn.
+    `reached` is the running sum of the weights with which logged pairs are drawn.
     """
 
-    def update(carry: tuple[Network, PyTree], key: PRNGKeyArray) -> tuple[tuple[Network, PyTree], dict[str, Array]]:
+    def loss_of(discriminator: Network, key: PRNGKeyArray) -> Float[Array, ""]:
         of_logged, of_simulated = jax.random.split(key)
         drawn = jax.random.randint(of_logged, (batch,), 0, reached[-1])
         chosen = logged[jnp.searchsorted(reached, drawn, side="right")]
-        simulated = replay.sample(rows, of_simulated, batch)["pair"]
-        loss, gradients = eqx.filter_value_and_grad(discriminator_loss)(carry[0], chosen, simulated)
-        return descend(optimiser, gradients, carry[1], carry[0]), {"discriminator_loss": loss}
+        return discriminator_loss(discriminator, chosen, replay.sample(rows, of_simulated, batch)["pair"])
 
-    (discriminator, optimiser_state), metrics = scan_updates(update, (discriminator, optimiser_state), key, count)
-    return discriminator, optimiser_state, metrics
+    return minimise(loss_of, discriminator, optimiser_state, key, optimiser=optimiser, count=count)

@@ -1,0 +1,88 @@
+"""A finished calibration, read back from its files."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from madoc.calibration import CalibrationResult
+from madoc.errors import MadocError
+from madoc.parameters import Parameter, ParameterSpace
+from madoc.pipeline.data_stage import Machine
+from madoc.pipeline.folders import ENDED
+from madoc.pipeline.orders import Reading, Source
+from madoc.report.records import SpecRecord, read_spec, restored_path
+from madoc.runs.files import read_json
+from madoc.tasks import Task
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration read back from its files.
+
+    Attributes:
+        machine: The robot with all of its parameters at their normal ranges.
+        task: The robot with the calibrated parameters and their ranges.
+        result: The estimate.
+        spec: What the run was asked to do; the defaults for a result outside its run folder.
+        folder: The folder of the result.
+    """
+
+    machine: Machine
+    task: Task
+    result: CalibrationResult
+    spec: SpecRecord
+    folder: Path
+
+    @property
+    def source(self) -> Source | None:
+        """The data, where the run folder names it."""
+        data = self.spec.data
+        if data is None:
+            return None
+        reading = Reading(data.format, data.clip_actions, data.disturbance)
+        return Source(tuple(restored_path(path, self.folder) for path in data.paths), data.max_transitions, reading)
+
+
+def read_calibration(path: str | Path, *, physics: str | None = None) -> Calibrated:
+    """A finished calibration: a run folder of `madoc calibrate` or `madoc run`, or a `result.json` alone.
+
+    Args:
+        path: The folder or file.
+        physics: Physics of the simulator, for a result outside its run folder; None is `legacy`.
+
+    Raises:
+        MadocError: There is no calibration, or it has not ended.
+    """
+    path = Path(path)
+    folder = path if path.is_dir() else path.parent
+    if path.is_dir() and (folder / "calibration" / "spec.json").exists():
+        folder = folder / "calibration"
+    file = folder / "result.json" if path.is_dir() else path
+    spec = read_spec(folder)
+    if path.is_dir() and spec.command == "calibrate" and not calibration_ended(folder):
+        raise MadocError(f"the calibration in {folder} has not ended; go on with it with --resume first")
+    if not file.exists():
+        raise MadocError(f"there is no calibration at {path}; name a run folder or its result.json")
+    result = CalibrationResult.from_json(read_json(file))
+    machine = Machine.restored(replace(spec, task=result.task, physics=spec.physics or physics))
+    task = replace(machine.task, parameters=_calibrated_space(result, machine.task.parameters))
+    return Calibrated(machine, task, result, spec, folder)
+
+
+def calibration_ended(folder: Path) -> bool:
+    """Whether the result is complete: the loop leaves one without parameters, and then one without verdict, before."""
+    if not (folder / "result.json").exists():
+        return False
+    result = read_json(folder / "result.json")
+    judged = read_spec(folder).holdout is None or result["status"] not in ENDED or "verdict" in result
+    return "parameters" in result and judged
+
+
+def _calibrated_space(result: CalibrationResult, whole: ParameterSpace) -> ParameterSpace:
+    """The parameters of a result with their ranges."""
+    of_robot = {row.name: row for row in whole.parameters}
+    rows = []
+    for name, row in result.parameters.items():
+        field_name, _, element = name.partition(".")
+        parameter = of_robot.get(name) or Parameter(field_name, element, row.low, row.high)
+        rows.append(replace(parameter, low=row.low, high=row.high))
+    return ParameterSpace(tuple(rows))

@@ -1,0 +1,27 @@
+"""Budgets as people write them."""
+
+import pytest
+
+from madoc.errors import MadocError
+from madoc.runs.budget import Seconds, read_budget
+
+
+@pytest.mark.parametrize(
+    ("written", "budget"),
+    [
+        (300, 300),
+        ("300_000", 300_000),
+        ("300s", Seconds(300.0)),
+        ("0.5 min", Seconds(30.0)),
+        ("2h", Seconds(7200.0)),
+        (Seconds(3.0), Seconds(3.0)),
+    ],
+)
+def test_a_budget_is_a_count_or_a_time(written, budget):
+    assert read_budget(written) == budget
+
+
+@pytest.mark.parametrize("written", ["soon", "3 days", "1.5", "0s", 0, "1.2.3s", Seconds(-1.0)])
+def test_what_is_no_budget_is_refused(written):
+    with pytest.raises(MadocError, match="expected a budget"):
+        read_budget(written)
