@@ -217,7 +217,10 @@ def _write_rows(
 
 
 def _row(model: mujoco.MjModel, array: str, index: int) -> list[float]:
-    return [float(value) for value in np.atleast_1d(getattr(model, array)[index])]
+    """The numbers of an element; those of a joint's damping are followed by its quadratic and cubic ones, if any."""
+    row = [float(value) for value in np.atleast_1d(getattr(model, array)[index])]
+    higher = model.dof_dampingpoly[index].tolist() if array == "dof_damping" else []
+    return [*row, *higher] if any(higher) else row
 
 
 def _body_name(model: mujoco.MjModel, index: int) -> str:
