@@ -219,7 +219,8 @@ class Poison:
 
 
 def test_the_truth_is_never_read(method, dataset, simulator, monkeypatch):
-    poisoned = replace(dataset, true_parameters=Poison())
+    poisoned = replace(dataset, true_parameters=None)
+    object.__setattr__(poisoned, "true_parameters", Poison())  # past the suite's type checker, which would read it
     monkeypatch.setattr(madoc.data.targets, "PAPER_TRUTH", Poison())
     monkeypatch.setattr(madoc.data.targets, "paper_truth", Poison())
     monkeypatch.setattr("madoc.evaluation.calibration_error", Poison())

@@ -86,8 +86,8 @@ def slopes_of_windows(
 
 def _central(
     points: Float[np.ndarray, "points d"], residuals: Float[np.ndarray, "points windows values"]
-) -> Float[np.ndarray, "d windows values"]:
-    """Differences of residuals divided by those of the points; d is 0 for a point without neighbours."""
+) -> Float[np.ndarray, "derivatives windows values"]:
+    """Differences of residuals divided by those of the points: d of them, or none for a point without neighbours."""
     count = len(points) // 2
     width = np.diagonal(points[1 : count + 1] - points[count + 1 :])
     return (residuals[1 : count + 1] - residuals[count + 1 :]) / width[:, None, None]

@@ -8,6 +8,7 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
@@ -150,7 +151,7 @@ def descend(optimiser, gradients: PyTree, optimiser_state: PyTree, parameters: C
 def moving_average(slow: Carry, fast: Carry, rate: float | Array) -> Carry:
     """Polyak averaging: slow + rate (fast - slow), leaf by leaf."""
 
-    def blend(old: Array, new: Array) -> Array:
+    def blend(old: Array | np.ndarray, new: Array | np.ndarray) -> Array | np.ndarray:
         return old + rate * (new - old) if eqx.is_inexact_array(old) else old
 
     return jax.tree.map(blend, slow, fast)
