@@ -35,6 +35,7 @@ def everything():
         Parameter("body_com", "foot", 0.05, 0.2),
         Parameter("dof_damping", "leg_joint", 0.0, 3.0),
         Parameter("dof_armature", "leg_joint", 0.5, 2.0),
+        Parameter("dof_drag", "leg_joint", 0.1, 1.0),
         Parameter("dof_frictionloss", "foot_joint", 0.0, 1.0),
         Parameter("jnt_stiffness", "thigh_joint", 0.0, 5.0),
         Parameter("geom_friction", "foot_geom", 0.5, 3.0),

@@ -17,6 +17,7 @@ WRITTEN = {
     "body_inertia": lambda model, body: model.body_inertia[body].max(),
     "body_com": lambda model, body: np.linalg.norm(model.body_ipos[body]),
     "dof_damping": lambda model, joint: model.dof_damping[model.jnt_dofadr[joint]],
+    "dof_drag": lambda model, joint: model.dof_dampingpoly[model.jnt_dofadr[joint], 0],
     "dof_armature": lambda model, joint: model.dof_armature[model.jnt_dofadr[joint]],
     "dof_frictionloss": lambda model, joint: model.dof_frictionloss[model.jnt_dofadr[joint]],
     "jnt_stiffness": lambda model, joint: model.jnt_stiffness[joint],
@@ -64,6 +65,7 @@ def test_only_the_named_element_changes(everything, field):
         "geom_friction": "geom_friction",
         "actuator_gain": "actuator_gainprm",
         "body_com": "body_ipos",
+        "dof_drag": "dof_dampingpoly",
     }
     if field == "gravity":
         np.testing.assert_array_equal(model.opt.gravity, [0.0, 0.0, parameter.high])

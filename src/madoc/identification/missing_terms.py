@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float
 
 from madoc import simulation
 from madoc.data.dataset import Dataset
-from madoc.identification.gauss_newton import eliminate
+from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.linearisation import DIFFERENCE, WindowSlopes, difference_points, slopes_of_windows
+from madoc.identification.losses import loss_slope, scale_of
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.states import LoggedStates
@@ -38,8 +39,10 @@ _CHANGE = 1e-3
 """Change of a candidate, as a share of what would balance the joint's typical torque, for its one-sided difference."""
 _STATE_DAMPING = 1e-9
 """Relative damping of initial states, far below the rounding of their differences."""
+_DAMPING = 1e-6
+"""Relative damping of a step of the parameters."""
 _FITS = 4
-"""Gauss-Newton steps of the initial states, which begin at logged or differenced ones."""
+"""Gauss-Newton steps of parameters and of initial states, which begin at the estimate and at logged states."""
 _OUTLYING = 3.0
 """Mean squared residual of a window over the median window's; above it the window holds an event of its own."""
 _DISTINCT = 1e-3
@@ -120,13 +123,15 @@ def missing_terms(
         dataset: The log that was calibrated to.
         logged: What it says of states; those must not be `unknown`.
         simulator: The model with its calibrated parameters.
-        point: The estimate in [-1, 1].
+        point: The estimate in [-1, 1]. An estimate that is not at the minimum is led there first, as residuals of wrong
+            parameters would pass for missing terms.
         half_widths: Half of each parameter's 95 % interval in [-1, 1].
         scale: Typical change of each signal in a step.
     """
     readings, states, before = _windows(dataset, logged, scale)
     if len(readings) < _FEWEST + len(point):
         return (), 0
+    point = _refitted(simulator, readings, states, point)
     added = list(_candidates(dataset, logged, simulator, point, scale))
     wide = simulation.make(replace(simulator.task, parameters=_widened_space(simulator.parameters, added)))
     at_nominal = np.concatenate([point, -np.ones(len(added))])
@@ -140,7 +145,8 @@ def missing_terms(
     names, effects = _effects(simulator, wide, readings, before, at_nominal, states, added)
     slopes = replace(parameters, by_parameters=np.concatenate([parameters.by_parameters, effects], axis=-1))
     finite = slopes.whole & np.isfinite(effects).all((1, 2))
-    spent = (2 * _FITS * (2 + len(readings.spread)) + 1 + 2 * len(point) + len(names)) * len(readings) * readings.steps
+    columns = 1 + 2 * len(point) + len(readings.spread)
+    spent = (_FITS * (2 * columns + 2) + columns + len(names)) * len(readings) * readings.steps
     reduced = _without_states(slopes, readings, finite)
     if reduced is None:
         return (), spent
@@ -158,6 +164,31 @@ def _windows(
     chosen = evenly(disjoint_windows(dataset, rows, steps), WINDOWS) if len(rows) else np.zeros(0, np.int64)
     readings = Readings.at(dataset, logged, rows[chosen], steps, scale)
     return readings, states[chosen], np.asarray(dataset.transitions.action, np.float64)[rows[chosen] - 1]
+
+
+def _refitted(
+    simulator: Simulator,
+    readings: Readings,
+    states: Float[np.ndarray, "windows state"],
+    point: Float[np.ndarray, " d"],
+) -> Float[np.ndarray, " d"]:
+    """The nearest parameters that explain the windows best; those given if no step of the search helps."""
+    damping, best, least = np.full(len(readings), _STATE_DAMPING), point, np.inf
+    for _ in range(_FITS):
+        (around,) = slopes_at(simulator, readings, point[None], states[None])
+        if not around.whole.any():
+            break
+        fixed = eliminate(around, np.ones_like(around.residuals), damping).reduced.residuals[around.whole]
+        cost = float(np.median((fixed**2).mean(-1)))
+        if cost < least:
+            best, least = point, cost
+        scale = scale_of(around.residuals[around.whole], "cauchy")
+        weights = loss_slope((around.residuals / scale) ** 2, "cauchy") * around.whole[:, None]
+        left = eliminate(around, weights, damping)
+        step = damped_step(*triangular_factors(left.reduced, 1.0, "linear"), point, _DAMPING)
+        states = states + readings.in_state_units(left.states_step(step), states.shape[1])
+        point = point + step
+    return best
 
 
 def _candidates(
@@ -278,7 +309,7 @@ def _costs(residuals: Float[np.ndarray, "windows values"]) -> Float[np.ndarray, 
 
 def _without_states(
     slopes: WindowSlopes, readings: Readings, whole: Bool[np.ndarray, " windows"]
-) -> tuple[Float[np.ndarray, "windows values"], Float[np.ndarray, "windows values columns"]] | None:
+) -> tuple[Float[np.ndarray, "kept values"], Float[np.ndarray, "kept values columns"]] | None:
     """Residuals and derivatives in units of the noise that no initial state explains; None if there is nothing left.
 
     Windows with an event of their own, as a contact that begins, are left out.
