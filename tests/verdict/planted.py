@@ -72,7 +72,7 @@ def bench(log, task, seed=0):
     return Bench(problem, split.held, jax.random.key(seed), split.sentence)
 
 
-def verdict(log, task, method=None, *, budget=60_000, seed=0):
+def verdict(log, task, method=None, *, budget=200_000, seed=0):
     """Calibrate to what is kept, and judge: the verdict and what it is made of."""
     judged = bench(log, task, seed)
     result = calibrate(method or LeastSquares(), judged.problem, key=jax.random.key(seed), budget=budget)
