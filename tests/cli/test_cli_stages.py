@@ -11,7 +11,7 @@ from madoc.data.targets import paper_truth
 from madoc.numpy_policy import NumpyPolicy
 
 RESULT = {
-    *("method", "task", "status", "sentence", "control_steps", "seconds", "seed", "groups", "parameters"),
+    *("method", "task", "status", "sentence", "control_steps", "seconds", "seed", "groups", "parameters", "settled"),
     *("warnings", "error"),
 }
 
