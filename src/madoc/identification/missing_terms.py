@@ -6,9 +6,9 @@ Standard errors are robust to residuals that are correlated within a window or l
 (Liang and Zeger 1986), so that contacts and process noise do not pass for a term.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,9 +25,6 @@ from madoc.identification.windows import disjoint_windows, evenly, longest_fit
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.simulation.write import nominal_values
-
-if TYPE_CHECKING:
-    import mujoco
 
 WINDOWS = 120
 """Largest number of windows that are simulated; their standard errors vary by about 10 % with so many."""
@@ -204,6 +201,7 @@ def _candidates(
     """
     values = simulator.parameters.to_physical(point)
     model, task = simulator.model(values), simulator.task
+    nominal_of = partial(nominal_values, model)
     calibrated = {(each.field, element) for each in simulator.parameters.parameters for element in each.elements}
     position, speed = (logged.states[:, : model.nq], logged.states[:, model.nq : model.nq + model.nv])
     change = np.diff(speed, axis=0)[np.diff(logged.rows) == 1]
@@ -225,23 +223,25 @@ def _candidates(
         }
         for field, reference in references.items():
             if (field, view.name) not in calibrated:
-                yield _candidate(model, field, view.name, reference)
+                yield _candidate(nominal_of, field, view.name, reference)
     for channel in task.actions:
         if ("actuator_gain", channel.actuator) not in calibrated:
             gain = abs(float(model.actuator(channel.actuator).gainprm[0])) or 1.0
-            yield _candidate(model, "actuator_gain", channel.actuator, gain)
+            yield _candidate(nominal_of, "actuator_gain", channel.actuator, gain)
     if not any(each.field == "gravity" for each in simulator.parameters.parameters) and abs(model.opt.gravity[2]) > 0:
-        yield _candidate(model, "gravity", "", float(abs(model.opt.gravity[2])))
+        yield _candidate(nominal_of, "gravity", "", float(abs(model.opt.gravity[2])))
     if task.source is not None:
         for signal, typical in zip(task.signals[: logged.measured], scale, strict=False):
             if ("signal_bias", signal) not in calibrated:
-                yield _candidate(model, "signal_bias", signal, float(typical))
+                yield _candidate(nominal_of, "signal_bias", signal, float(typical))
 
 
-def _candidate(model: "mujoco.MjModel", field: str, element: str, reference: float) -> tuple[_Candidate, Parameter]:
+def _candidate(
+    nominal_of: Callable[[Parameter], tuple[float, ...]], field: str, element: str, reference: float
+) -> tuple[_Candidate, Parameter]:
     """A term, and the parameter whose range begins at its value in the model and is `reference` wide."""
     parameter = Parameter(field, element, 0.0, reference)
-    nominal = nominal_values(model, parameter)[0]
+    nominal = nominal_of(parameter)[0]
     parameter = replace(parameter, low=nominal, high=nominal + reference)
     kind = FIELDS[field]
     return _Candidate(CAUSES[field], parameter.name, kind.unit, nominal, reference, kind.minimum), parameter
