@@ -130,7 +130,8 @@ def missing_terms(
         return (), 0
     point = _refitted(simulator, readings, states, point)
     added = list(_candidates(dataset, logged, simulator, point, scale))
-    wide = simulation.make(replace(simulator.task, parameters=_widened_space(simulator.parameters, added)))
+    space = ParameterSpace((*simulator.parameters.parameters, *(parameter for _, parameter in added)))
+    wide = simulation.make(replace(simulator.task, parameters=space))
     at_nominal = np.concatenate([point, -np.ones(len(added))])
     for _ in range(_FITS):
         (around,) = slopes_at(wide, readings, at_nominal[None], states[None], parameters=False)
@@ -245,10 +246,6 @@ def _candidate(
     parameter = replace(parameter, low=nominal, high=nominal + reference)
     kind = FIELDS[field]
     return _Candidate(CAUSES[field], parameter.name, kind.unit, nominal, reference, kind.minimum), parameter
-
-
-def _widened_space(space: ParameterSpace, added: list[tuple[_Candidate, Parameter]]) -> ParameterSpace:
-    return ParameterSpace((*space.parameters, *(parameter for _, parameter in added)))
 
 
 def _by_calibrated(
