@@ -4,14 +4,24 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 RUNS := $(VENV)/runs
+SEED ?= 0
 TESTS := $(VENV)/tests
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test test-slow check docs lock clean
+.PHONY: demo test test-slow check figures docs lock clean
 
-demo: $(RUNS)  ## the main job on Hopper, small: record, calibrate, learn, evaluate
-	rm -rf runs/demo
-	$(BIN)/madoc run hopper-medium --out runs/demo --transitions 50000 --budget 80000 --policy-budget 60s --episodes 10
+DEMO := examples/reach
+demo: $(RUNS)  ## the main job on an arm with an unknown load: logs, calibration, policies, evaluation; SEED=1 is another
+	rm -rf runs/demo runs/demo-logs
+	$(BIN)/python examples/record_logs.py $(DEMO)/reach.yaml $(DEMO)/truth.json runs/demo-logs --seed $(SEED)
+	$(BIN)/madoc run $(DEMO)/reach.yaml --data runs/demo-logs --truth $(DEMO)/truth.json --out runs/demo --seed $(SEED) \
+	  --episodes 50 --policy-budget 250000 --policy-set hidden=[64,64] environments=32 epoch_steps=1024 \
+	  steps_per_update=4 warmup_steps=5000 learning_rate=0.001 judge_every=5000 judge_episodes=50
+	@echo
+	@echo "The policies at work, and which error matters to them: open runs/demo/report.html"
+	@echo "Another estimate, another policy:  $(BIN)/madoc learn runs/demo --at distribution --width 3 --budget 60s"
+	@echo "Your own robot, from its model:    $(BIN)/madoc init robot.xml, then docs/how-to/own-policy.md"
+	@echo "The paper's robots:                $(BIN)/madoc run hopper-medium --policy-budget 300s"
 
 test: $(TESTS)  ## every test that takes seconds
 	$(BIN)/python -m pytest -n 2 -rs
@@ -24,6 +34,10 @@ check: $(TESTS)  ## format, lint, types, layers
 	$(BIN)/ruff check src tests benchmarks examples docs/hooks.py
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+figures: $(TESTS)  ## every measured table of the README and of the documentation, from committed results
+	$(BIN)/python benchmarks/tables.py > $(VENV)/figures.txt
+	$(BIN)/python benchmarks/paper.py > $(VENV)/figures.txt
 
 docs: $(TESTS)  ## the site, in build/site; opens from there without a server or a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --clean

@@ -124,6 +124,7 @@ def run(problem: Problem, *, limit: float, check: bool, first_answer: bool) -> d
         "causes": verdict.get("causes", []),
         "status": result.get("status"),
         "warnings": result.get("warnings", []),
+        "missing_terms": (result.get("holdout") or {}).get("missing_terms", []),
         "parameters": {
             name: compared(result.get("parameters", {}).get(name, {}), truth) for name, truth in problem.truth.items()
         },

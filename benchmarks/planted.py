@@ -23,7 +23,7 @@ from ruamel.yaml import YAML
 from calibration import commit
 from madoc import robots
 from madoc.pipeline import CalibrationOrder, Search, Source, calibrate_in
-from madoc.pipeline.calibration_stage import CANDIDATES
+from madoc.pipeline.methods import CANDIDATES
 from madoc.pipeline.preparation import AUTO_BUDGET
 from madoc.robots.document import yaml_text
 

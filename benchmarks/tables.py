@@ -1,6 +1,8 @@
 """Medians of what was measured, as Markdown, beside the paper's figures where it prints them.
 
-python benchmarks/tables.py            # prints, and writes results/README.md
+python benchmarks/tables.py            # prints, and writes results/README.md and the tables of the README
+
+`make figures` writes all that is made of committed results.
 """
 
 import json
@@ -9,43 +11,20 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+import paper
+import readme
 
 RESULTS = Path(__file__).parent / "results"
 
-# Table 10, Jiang et al. 2024: mean absolute calibration error on D4RL medium after 1e6 control steps.
-PAPER_ERROR = {
-    ("halfcheetah", "madoc"): 0.06,
-    ("halfcheetah", "madoc-s"): 0.13,
-    ("hopper", "dropo"): 1.20,
-    ("halfcheetah", "dropo"): 0.78,
-    ("hopper", "droid"): 0.74,
-    ("halfcheetah", "droid"): 1.13,
-    ("hopper", "oted"): 0.42,
-    ("halfcheetah", "oted"): 0.28,
-    ("hopper", "madoc"): 0.33,
-    ("hopper", "madoc-s"): 0.34,
-    ("walker2d", "madoc"): 0.18,
-    ("walker2d", "madoc-s"): 0.26,
-    ("ant", "madoc"): 0.16,
-    ("ant", "madoc-s"): 0.25,
-}
-
-# Table 1, Jiang et al. 2024: normalized return on D4RL medium, and its 95 % interval over 6 seeds.
-PAPER_RETURN = {
-    ("halfcheetah", "sac", "calibrated"): "91.9 ± 7.7",
-    ("halfcheetah", "h2o", "midrange"): "57.3 ± 3.7",
-    ("halfcheetah", "dr-bc", "-"): "31.9 ± 14.5",
-    ("halfcheetah", "cql", "-"): "52.0 ± 3.0",
-    ("halfcheetah", "morec", "-"): "73.9 ± 3.0",
-    ("hopper", "sac", "calibrated"): "76.0 ± 13.9",
-    ("hopper", "h2o", "midrange"): "83.7 ± 19.0",
-    ("hopper", "dr-bc", "-"): "43.2 ± 24.7",
-    ("hopper", "cql", "-"): "50.3 ± 18.8",
-    ("hopper", "morec", "-"): "105.0 ± 1.0",
-}
-
 
 def main() -> None:
+    (RESULTS / "README.md").write_text(measured())
+    readme.README.write_text(readme.rewritten(readme.README.read_text(), calibrations(), learnt()))
+    print(measured())
+
+
+def measured() -> str:
+    """All tables but the paper's, as Markdown."""
     parts = ["# Measured\n\nMade by `python benchmarks/tables.py` from the files beside it.\n"]
     parts += [
         calibration(),
@@ -59,9 +38,7 @@ def main() -> None:
         speed(),
         not_run(),
     ]
-    text = "\n".join(part for part in parts if part)
-    (RESULTS / "README.md").write_text(text)
-    print(text)
+    return "\n".join(part for part in parts if part)
 
 
 def calibrations() -> list[dict]:
@@ -95,11 +72,11 @@ def calibration() -> str:
         percent = np.median([row["error"]["mean_percent_of_range"] for row in rows])
         steps = int(np.median([row["control_steps"] for row in rows]))
         seconds = np.median([row["wall_seconds"] for row in rows])
-        paper = PAPER_ERROR.get((robot, method), "")
+        printed = paper.printed("table-10", f"{robot}-{quality}", method)
         commits = ", ".join(sorted({row["commit"] for row in rows}))
         lines.append(
             f"| {robot} | {quality} | {method} | {starts} | {steps:,} | {len(rows)} | {shown(errors)} "
-            f"| {percent:.2f} | {paper} | {seconds:.0f} | {commits} |"
+            f"| {percent:.2f} | {printed[0] if printed else ''} | {seconds:.0f} | {commits} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -167,8 +144,7 @@ def _cell(rows: list[dict]) -> str:
 def policies() -> str:
     """Return in the target of every learner, where it learnt and how, over seeds."""
     cells = defaultdict(list)
-    for path in sorted((RESULTS / "policies").glob("*.json")):
-        row = json.loads(path.read_text())
+    for row in learnt():
         cells[row["robot"], row["method"], row["at"], row["budget"], row["unit"], " ".join(row["set"])].append(row)
     if not cells:
         return ""
@@ -187,9 +163,21 @@ def policies() -> str:
         lines.append(
             f"| {robot} | {method} | {at} | {budget:,} {unit} | {settings} | {len(rows)} | {np.median(returns):.0f} "
             f"({min(returns):.0f} to {max(returns):.0f}) | {np.mean(normalized):.1f}{spread} "
-            f"| {PAPER_RETURN.get((robot, method, at), '')} | {np.median([row['seconds'] for row in rows]):.0f} |"
+            f"| {_printed_return(robot, method, at)} | {np.median([row['seconds'] for row in rows]):.0f} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def learnt() -> list[dict]:
+    """Every policy that was learnt and evaluated."""
+    return [json.loads(path.read_text()) for path in sorted((RESULTS / "policies").glob("*.json"))]
+
+
+def _printed_return(robot: str, method: str, at: str) -> str:
+    """The normalized return that the paper prints for a learner on medium data."""
+    system = "madoc" if (method, at) == ("sac", "calibrated") else method
+    printed = paper.printed("table-1", f"{robot}-medium", system) if system != "sac" else None
+    return f"{printed[0]:.1f} ± {printed[1]:.1f}" if printed else ""
 
 
 def speed() -> str:
@@ -310,8 +298,9 @@ POLICIES = [
 
 def policies_not_run() -> list[str]:
     """Of every learner, robot and place, the seeds that the table should hold and does not."""
-    rows = [json.loads(path.read_text()) for path in (RESULTS / "policies").glob("*.json")]
-    done = {(row["robot"], row["method"], row["at"], row["budget"], " ".join(row["set"]), row["seed"]) for row in rows}
+    done = {
+        (row["robot"], row["method"], row["at"], row["budget"], " ".join(row["set"]), row["seed"]) for row in learnt()
+    }
     lines = []
     for (method, places, budgets, settings), (index, robot) in product(POLICIES, enumerate(ROBOTS)):
         budget, chosen = budgets[index], settings[robot]

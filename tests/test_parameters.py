@@ -112,9 +112,9 @@ def test_a_range_below_the_physical_bound_is_refused(field):
         Parameter(field, element, -0.1, 1.0)
 
 
-def test_only_gravity_gain_and_bias_may_be_negative():
+def test_only_gravity_gain_zeros_and_bias_may_be_negative():
     found = [name for name, kind in FIELDS.items() if kind.minimum == -np.inf]
-    assert found == ["gravity", "actuator_gain", "signal_bias"]
+    assert found == ["gravity", "jnt_ref", "actuator_gain", "signal_bias"]
 
 
 def test_a_value_shared_by_elements():

@@ -2,9 +2,12 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from math import pi
 from typing import Literal
 
 NONE: Mapping[str, float] = {}
+ENCODER = 2 * pi / 4096
+"""rad, one count of a 12-bit encoder."""
 
 
 @dataclass(frozen=True)

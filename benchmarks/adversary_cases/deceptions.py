@@ -1,6 +1,8 @@
 """Problems whose model lacks something, or whose spec or log says something wrong, and the words that name it."""
 
-from adversary_cases.case import Case, Log, Plant, Spec
+from collections.abc import Mapping
+
+from adversary_cases.case import ENCODER, Case, Log, Plant, Robot, Spec
 from adversary_cases.robots import ARM, BALL, BOX, CART, HULL, LEG, PENDULUM
 
 FRICTION = "friction"
@@ -26,9 +28,29 @@ BASE = r"\bbase\b|accelerat|periodic"
 
 POSITIONS = Log(velocities="none")
 NOISY = Log(noise=0.02)
+COUNTED = Log(noise=0.0, quantum=ENCODER, velocities="none")
+SHORT = Log(runs=4, seconds=4.0)
 THREE = ("length", "damping", "gain")
 
+
+def in_all_conditions(robot: Robot, name: str, values: Mapping[str, float], cause: str) -> tuple[Case, ...]:
+    """The same lack of the model under the conditions in which machines are logged and steered."""
+    return (
+        Case(robot, f"{name}-500hz", Plant(values), SHORT, Spec(rate=500), cause),
+        Case(robot, f"{name}-encoder", Plant(values), COUNTED, cause=cause),
+        Case(robot, f"{name}-closed-loop", Plant(values, closed_loop=True), cause=cause),
+        Case(robot, f"{name}-process", Plant(values, process=0.01), cause=cause),
+        Case(robot, f"{name}-fine", Plant(values, fine=5), cause=cause),
+    )
+
+
 _PENDULUM = (
+    *in_all_conditions(PENDULUM, "friction-0.1", {"friction": 0.1}, FRICTION),
+    Case(PENDULUM, "drag-0.1-positions", Plant(drag=0.1), POSITIONS, cause=DRAG),
+    Case(PENDULUM, "lag-10ms-positions", Plant(lag=0.01), POSITIONS, cause=LATE),
+    Case(PENDULUM, "lag-10ms-process", Plant(lag=0.01, process=0.01), cause=LATE),
+    Case(PENDULUM, "delay-0.5-closed-loop", Plant(delay=0.5, closed_loop=True), cause=LATE),
+    Case(PENDULUM, "range-closed-loop", Plant({"damping": 0.6}, closed_loop=True), cause=RANGE),
     *(Case(PENDULUM, f"friction-{size}", Plant({"friction": size}), cause=FRICTION) for size in (0.02, 0.05, 0.1, 0.2)),
     *(
         Case(PENDULUM, f"friction-{size}-noisy", Plant({"friction": size}), NOISY, cause=FRICTION)
@@ -94,6 +116,10 @@ _PENDULUM = (
 )
 
 _ARM = (
+    *in_all_conditions(ARM, "friction-0.1", {"friction_shoulder": 0.1, "friction_elbow": 0.05}, FRICTION),
+    Case(ARM, "drag-noisy", Plant(drag=0.03), NOISY, cause=DRAG),
+    Case(ARM, "delay-0.5", Plant(delay=0.5), cause=LATE),
+    Case(ARM, "rate-9", Plant(spacing=1.09), cause=RATE),
     *(
         Case(ARM, f"friction-{size}", Plant({"friction_shoulder": size, "friction_elbow": size / 2}), cause=FRICTION)
         for size in (0.05, 0.2)
@@ -173,6 +199,10 @@ _LEG = (
 )
 
 _CART = (
+    *in_all_conditions(CART, "friction-0.2", {"friction": 0.2}, FRICTION),
+    *(Case(CART, f"rate-{share}", Plant(spacing=1 + share / 100), cause=RATE) for share in (5, 9)),
+    Case(CART, "lag-10ms", Plant(lag=0.01), cause=LATE),
+    Case(CART, "range-far", Plant({"mass": 4.0}), cause=RANGE),
     Case(CART, "friction-0.2", Plant({"friction": 0.2}), cause=FRICTION),
     Case(CART, "friction-0.2-noisy", Plant({"friction": 0.2}), NOISY, cause=FRICTION),
     Case(CART, "drag", Plant(drag=1.0), cause=DRAG),

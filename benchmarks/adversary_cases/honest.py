@@ -1,12 +1,8 @@
 """Problems whose model is right, in the conditions under which machines are logged."""
 
-from math import pi
-
-from adversary_cases.case import Case, Log, Plant, Robot, Spec
+from adversary_cases.case import ENCODER, Case, Log, Plant, Robot, Spec
 from adversary_cases.robots import ARM, BALL, BOX, CART, HULL, LEG, PENDULUM
 
-ENCODER = 2 * pi / 4096
-"""rad, one count of a 12-bit encoder."""
 NO_NOISE = Log(noise=0.0)
 
 

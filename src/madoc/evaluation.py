@@ -43,19 +43,23 @@ def evaluate(
     key: PRNGKeyArray,
     episodes: int = 10,
     deterministic: bool = True,
+    common_starts: bool = False,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> Returns:
     """Returns of whole episodes, simulated at the same time; an episode whose simulation fails ends there.
 
     The parameters are physical values of one system, by name or as a vector, or of several, one in each row. Every
-    system gets the same number of episodes, in sum at least `episodes`. `advance` is called with the number of further
+    system gets the same number of episodes, in sum at least `episodes`; with `common_starts`, from the same starts, so
+    that differences between systems are not those of starts. `advance` is called with the number of further
     control steps, of the task's `max_episode_steps`, that are done.
     """
     task = simulator.task
     of_start, of_action = jax.random.split(key)
     system = simulator.bind(np.atleast_2d(simulator.parameters.vector(parameters)))
     rows = -(-episodes // system.count)
-    state = reset_states(simulator)(of_start, system.count * rows).reshape(system.count, rows, -1)
+    starts = reset_states(simulator)(of_start, rows if common_starts else system.count * rows)
+    state = np.broadcast_to(starts, (system.count, *starts.shape)) if common_starts else starts
+    state = state.reshape(system.count, rows, -1)
     alive = np.ones((system.count, rows), dtype=bool)
     total, length = np.zeros(alive.shape), np.zeros(alive.shape)
     for step in range(task.max_episode_steps):

@@ -49,7 +49,7 @@ class Episodes:
     def __init__(
         self, task: Task | str | Path, parameters: Parameters, physics: str | None, *, rows: int, threads: int | None
     ) -> None:
-        self.task = task if isinstance(task, Task) else robots.resolve(task, physics)
+        self.task = (task if isinstance(task, Task) else robots.resolve(task, physics)).for_policies
         self._simulator = simulation.make(self.task, threads=threads)
         space, values, self._distribution = self.task.parameters, self.task.parameters.middle, None
         if isinstance(parameters, ParameterDistribution):

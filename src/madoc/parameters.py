@@ -39,8 +39,10 @@ FIELDS: dict[str, Field] = {
     "dof_armature": Field("joint", "kg·m²", 0.0),
     "dof_frictionloss": Field("joint", "N·m", 0.0),
     "jnt_stiffness": Field("joint", "N·m/rad", 0.0),
+    "jnt_ref": Field("joint", "rad"),
     "geom_friction": Field("geom", "1", 0.0),
     "actuator_gain": Field("actuator", "1"),
+    "actuator_kv": Field("actuator", "N·m·s/rad", 0.0),
     "action_delay": Field(None, "s", 0.0, in_model=False),
     "signal_bias": Field("signal", "1", in_model=False),
 }
@@ -49,8 +51,10 @@ FIELDS: dict[str, Field] = {
 `body_mass` leaves the inertia as it is (the paper's meaning), `body_mass_and_inertia` scales the inertia with the mass.
 `body_inertia` is the largest moment of inertia about the centre of mass, the others keep their ratio to it; `body_com`
 is how far the centre of mass is from the body's origin, in the direction it has. `actuator_gain` of a position or
-velocity servo is its kp or kv, and moves the servo's bias with it. `action_delay` is the time from an action to its
-effect, `signal_bias` what a sensor reads too much. `dof_drag` is damping that grows with the square of the speed.
+velocity servo is its kp or kv, and moves the servo's bias with it; `actuator_kv` is the damping of a position servo.
+`jnt_ref` is what a hinge or slide reads, and is commanded to, where the model as drawn has its zero. `action_delay` is
+the time from an action to its effect, `signal_bias` what a sensor reads too much. `dof_drag` is damping that grows with
+the square of the speed.
 """
 
 

@@ -118,7 +118,7 @@ class MethodEntry(Generic[Made]):
         recognised_by: Names of the settings that distinguish it from other entries of its class; None means all.
         shown: Metrics to show beside the progress bar.
         unit: What its budget counts.
-        usual_budget: A policy learner's budget where none is given.
+        usual_budget: The budget where none is given: a count in `unit`, or a time such as "300s".
         simulates: Whether it spends control steps.
         needs_data: Whether it uses logged data.
         needs_parameters: Whether the parameters of a policy problem make a difference to it.
@@ -133,7 +133,7 @@ class MethodEntry(Generic[Made]):
     recognised_by: tuple[str, ...] | None = None
     shown: tuple[str, ...] = ()
     unit: Unit = "control steps"
-    usual_budget: int = 300_000
+    usual_budget: int | str = 300_000
     simulates: bool = True
     needs_data: bool = True
     needs_parameters: bool = True

@@ -42,6 +42,7 @@ def test_windows_left_out_make_a_search_worse_than_its_cost_says():
     plan = Plan(
         point=np.zeros(0),
         residuals=np.zeros((0, 0)),
+        relative=np.zeros(0),
         kept=np.zeros(0, bool),
         steps=np.zeros((0, 0)),
         state_steps=np.zeros((0, 0, 0)),
@@ -80,11 +81,24 @@ def test_one_search_finds_a_clean_spring_from_known_and_unknown_states(starts):
     assert spent <= search.whole_run(problem, longest, refining_epochs=25)
 
 
+@pytest.mark.parametrize(("free", "expected"), [(30, 0.02), (3, 1.0)])
+def test_windows_with_contacts_weigh_less_where_they_are_explained_worse(free, expected):
+    log = recorded(SPRING, SPRING_TRUTH, 100, jax.random.key(0))
+    problem, rows = CalibrationProblem(log, simulation.make(SPRING, threads=1)), np.arange(100)
+    touching = rows >= free
+    starts = KnownStarts.at(problem, rows, touching, 1, "cauchy")
+    noise = np.random.default_rng(0).standard_normal((100, 2))
+    weights = starts._relative(np.where(touching, 50.0, 1.0)[:, None] * noise)
+    assert (weights[~touching] == 1.0).all()
+    assert weights[touching] == pytest.approx(expected, rel=0.5)
+    assert not KnownStarts.touched(problem, rows, 1).any()  # nothing touches a spring
+
+
 def test_known_windows_leave_the_residuals_of_a_replay():
     log = recorded(SPRING, SPRING_TRUTH, 50, jax.random.key(0))
     problem, rows = CalibrationProblem(log, simulation.make(SPRING, threads=1)), np.array([3, 30])
     point = np.zeros((1, len(SPRING.parameters)))
-    starts = KnownStarts.at(problem, rows, 4, "linear")
+    starts = KnownStarts.at(problem, rows, np.zeros(2, bool), 4, "linear")
     (plan,) = starts.plans(point, np.zeros((1, 0, 0)), np.ones(1), np.ones((1, 0)), refining=True)
     windows = windows_at(log, log.transitions.observation[rows], rows, 4)
     expected = window_residuals(problem.simulator, windows, point, problem.typical_change)[0]

@@ -113,7 +113,7 @@ def test_where_motion_is_smooth_they_make_noise_matter_less(pendulum):
     problem, space = problem_of(pendulum), pendulum.parameters
     truth = space.vector(dict(zip(space.names, TRUTH, strict=True)))
     widths = []
-    for horizon in (horizon_of(problem.dataset), None):
+    for horizon in (horizon_of(problem.dataset, 26), None):
         method = LeastSquares(horizon=horizon)
         state, _ = ended(method, problem)
         interval = method.estimate(problem, state).interval

@@ -25,9 +25,13 @@ LEARNING = ["--budget", "1000", "--quiet", "--set", *LEARNER]
 
 WHOLE = [
     *("run", "hopper-medium", "--transitions", "1000", "--policy-budget", "1000", "--episodes", "2"),
+    *("--draws", "4"),
     *CALIBRATION,
     *("--policy-set", *FAST_LEARNER),
 ]
+
+JUDGED = (0, 10, 11, 12)
+"""Exit codes of a calibration that ended, by its verdict."""
 
 
 def arguments(line, **paths):

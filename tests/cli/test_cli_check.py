@@ -33,7 +33,8 @@ def test_json_and_a_forecast(arm, capsys):
     files = [str(arm / "logs" / f"{seed}.csv") for seed in (0, 1)]
     assert main(["check", str(arm / "arm.yaml"), "--json", "--data", *files]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert (told["rows"], told["runs"], told["fatal"], told["findings"]) == (298, 2, False, [])
+    assert (told["rows"], told["runs"], told["fatal"]) == (298, 2, False)
+    assert [finding["level"] for finding in told["findings"]] == ["note"]
     assert set(told["parameters"]) == {"body_mass.upper", "body_mass.fore", "dof_damping.shoulder", "dof_damping.elbow"}
     assert told["explanation"]["horizons"] == [1, 5, 20]
     quick, madoc = told["forecast"]

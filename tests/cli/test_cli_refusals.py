@@ -40,7 +40,7 @@ def places(recorded, whole, tmp_path):
         ("", "Expected one of"),
         ("calibrat hopper", "Unrecognized options: calibrat"),
         (CALIBRATE + "--budgt 3", "--budget"),
-        (CALIBRATE + "--budget many", "--budget"),
+        (CALIBRATE + "--budget many", "expected a budget such as 300000, 300s"),
         ("calibrate hopper", "--data"),
         (f"calibrate hopper --data {'x' * 300}.npz --out {{out}}", "File name too long; check the path"),
         ("record hoper-medium --out {out}", "did you mean hopper?"),

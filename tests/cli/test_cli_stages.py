@@ -6,6 +6,7 @@ import pytest
 from command_line import CALIBRATION, LEARNING, asked_for_json, without_seconds
 
 from madoc.calibration import CalibrationResult
+from madoc.commands.answer import EXIT_CODES
 from madoc.commands.main import main
 from madoc.data.targets import paper_truth
 from madoc.numpy_policy import NumpyPolicy
@@ -22,20 +23,19 @@ def read(path):
 
 def test_calibrate_prints_what_it_leaves(recorded, whole, tmp_path, capsys):
     out = tmp_path / "calibration"
-    answer, code = asked_for_json(capsys, ["calibrate", "hopper", "--data", recorded, "--out", out, *CALIBRATION])
-    assert code == 0
+    words = ["calibrate", "hopper", "--data", recorded, "--out", out, *CALIBRATION, "--holdout", "0.2"]
+    answer, code = asked_for_json(capsys, words)
+    assert code == EXIT_CODES[answer["verdict"]["word"]]
     assert answer == read(out / "result.json")
-    assert answer.keys() == RESULT
+    assert answer.keys() == RESULT | {"verdict", "holdout", "combinations"}
     assert CalibrationResult.from_json(answer).to_json() == answer
     spec = read(out / "spec.json")
     assert spec["hyperparameters"]["agents"]["batch"] == 32
     assert spec["data"]["rows"] == 1000
     # Alone it does the same as within `madoc run`.
     assert without_seconds(answer) == without_seconds(read(whole / "calibration" / "result.json"))
-    again, code = asked_for_json(
-        capsys, ["calibrate", "hopper", "--data", recorded, "--out", out, *CALIBRATION, "--resume"]
-    )
-    assert (again, code) == (answer, 0)
+    again, same = asked_for_json(capsys, [*words, "--resume"])
+    assert (again, same) == (answer, code)
 
 
 def test_calibrate_some_parameters_with_a_truth_of_ones_own(recorded, tmp_path, capsys):
@@ -93,7 +93,7 @@ def test_a_run_folder_can_be_moved(whole, tmp_path, capsys):
 def test_evaluate_shows_policies_beside_the_yardsticks(whole, tmp_path, capsys):
     copy = tmp_path / "run"
     shutil.copytree(whole, copy)
-    assert main(["evaluate", str(copy), "--episodes", "2", "--quiet"]) == 0
+    assert main(["evaluate", str(copy), "--episodes", "2", "--draws", "4", "--quiet"]) == 0
     told = capsys.readouterr().out
     assert "at the calibrated parameters" in told
     assert "at the truth (yardstick)" in told

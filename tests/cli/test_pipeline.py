@@ -43,7 +43,7 @@ def test_what_the_command_line_reads_is_the_order_that_the_pipeline_carries_out(
     expected = CalibrationOrder("hopper", Source(("a.npz", "b.npz"), reading=reading), search)
     assert _parse(words.split()).order == expected
     asked = _parse(["selftest", "hopper", "--data", "a.npz"]).order
-    assert (asked.search.method, asked.search.budget, asked.truths) == ("auto", 400_000, 3)
+    assert (asked.search.method, asked.search.budget, asked.truths) == ("auto", None, 3)
     with pytest.raises(MadocError, match="--friction"):
         _parse(["calibrate", "hopper", "--data", "a.npz", "--friction", "1.2"])
 

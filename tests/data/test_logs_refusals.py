@@ -213,7 +213,41 @@ def test_most_steps_jitter(columns, tmp_path):
     with pytest.raises(MadocError, match=r"most time steps .* more than 10 % off .* raise log: tolerance, or ask"):
         logs.read(write_csv(tmp_path / "log.csv", columns | {"time": time}), arm_of(tmp_path))
     robot = arm_of(tmp_path, log="{tolerance: 0.25}")
-    assert logs.read(tmp_path / "log.csv", robot).findings == ()
+    (note,) = logs.read(tmp_path / "log.csv", robot).findings
+    assert note.level == "note"
+    assert note.what == "time steps scatter by 20 % of the control step (standard deviation)"
+
+
+@pytest.mark.parametrize(
+    ("spacing", "words"),
+    [
+        (0.0214, "got 0.0214 s on average, 7 % more: speeds and accelerations"),
+        (0.0194, "got 0.0194 s on average, 3 % less: speeds"),
+        (
+            0.02 + 4e-5 * np.arange(50),
+            r"5 % more \(0.02004 s apart at the beginning .* and 0.02196 s at its end\): speeds",
+        ),
+    ],
+)
+def test_a_mean_rate_that_would_make_every_estimate_wrong(robot, columns, tmp_path, spacing, words):
+    """Each row is within the tolerance of 10 % of a control step, and the mean is not."""
+    time = np.cumsum(np.full(50, spacing))
+    with pytest.raises(MadocError, match=words):
+        logs.read(write_csv(tmp_path / "log.csv", columns | {"time": time}), robot)
+
+
+def test_a_rate_that_is_a_little_off(robot, columns, tmp_path):
+    (warning,) = logs.read(write_csv(tmp_path / "log.csv", columns | {"time": 0.0203 * np.arange(50)}), robot).findings
+    assert warning.level == "warning"
+    assert warning.what == "rows are 0.0203 s apart on average, 1.5 % more than the control step of 0.02 s"
+
+
+def test_a_clock_that_drifts(robot, columns, tmp_path):
+    """Rows are 0.0195 s apart at first and 0.0205 s at the end, a control step on average."""
+    time = np.cumsum(np.linspace(0.0195, 0.0205, 50))
+    (warning,) = logs.read(write_csv(tmp_path / "log.csv", columns | {"time": time}), robot).findings
+    assert warning.level == "warning"
+    assert "drifts: 0.01952 s apart at the beginning of the run and 0.0205 s at its end" in warning.what
 
 
 def test_topics_that_do_not_overlap_in_time(columns, tmp_path):

@@ -15,20 +15,28 @@ from ruamel.yaml import YAML
 from madoc import robots
 from madoc.commands.main import main
 from madoc.robots.document import yaml_text
+from madoc.suites.planning import plan_of
 
 read_yaml = YAML(typ="safe").load
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PENDULUM = Path(os.environ.get("MADOC_PENDULUM", ROOT.parent / "shared" / "data" / "dfki_simple_pendulum"))
+ARM = Path(os.environ.get("MADOC_SO101", ROOT.parent / "shared" / "data" / "so101"))
 SLOW = {
+    "real-arm.md",
     "real-pendulum.md",
+    "how-to/cluster.md",
     "how-to/compare-methods.md",
     "how-to/export.md",
+    "how-to/many-robots.md",
+    "how-to/own-policy.md",
     "how-to/partial-observation.md",
     "how-to/resume.md",
 }
 
 BLOCK = re.compile(r"^```(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+EXIT_CODE = re.compile(r"# exit code (\d+)$")
+"""A comment of a command that does not end with 0."""
 PAGES = [str(page.relative_to(DOCS)) for page in sorted(DOCS.rglob("*.md")) if "```" in page.read_text()]
 
 
@@ -40,7 +48,10 @@ def test_the_blocks_run(page, tmp_path, monkeypatch):
     if "$PENDULUM" in text and not PENDULUM.is_dir():
         pytest.skip("the logs of the DFKI pendulum are not here; name their folder in MADOC_PENDULUM")
     monkeypatch.chdir(tmp_path)
+    if "$SO101" in text and not ARM.is_dir():
+        pytest.skip("the logs of the SO-101 arm are not here; name their folder in MADOC_SO101")
     monkeypatch.setenv("PENDULUM", str(PENDULUM))
+    monkeypatch.setenv("SO101", str(ARM))
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     names = {}
     for language, block in BLOCK.findall(text):
@@ -51,8 +62,9 @@ def run_shell(block, _):
     for line in block.splitlines():
         words = shlex.split(os.path.expandvars(line))
         if words[0] == "madoc":
-            given = [*words[1:], "--quiet"]
-            assert main(given) == 0, line
+            told = EXIT_CODE.search(line)
+            given = [*shlex.split(os.path.expandvars(line), comments=True)[1:], "--quiet"]
+            assert main(given) == (int(told[1]) if told else 0), line
         elif words[0] == "python":
             run_script(words[1:])
         else:
@@ -71,7 +83,17 @@ def run_python(block, names):
     exec(compile(block, "block", "exec"), names)
 
 
-def load_spec(block, _):
+def load_yaml(block, _):
+    """A suite file is left for the next command and planned, unless its logs are recorded only then."""
+    if "cells" not in read_yaml(block):
+        return load_spec(block)
+    Path("suite.yaml").write_text(block)
+    if "record:" in block:
+        plan_of(Path("suite.yaml"))
+    return None
+
+
+def load_spec(block):
     """A part of a spec takes that part's place in the arm's, whose motors make way for actuators of its own."""
     whole = read_yaml(Path("examples/arm/arm.yaml").read_text()) | read_yaml(block)
     for channel, default in zip(whole["signals"], ("shoulder", "elbow"), strict=False):
@@ -88,7 +110,7 @@ def load_spec(block, _):
     robots.load("part.yaml")
 
 
-RUN = {"shell": run_shell, "python": run_python, "yaml": load_spec}
+RUN = {"shell": run_shell, "python": run_python, "yaml": load_yaml}
 
 
 def test_measured_tables_are_there():

@@ -54,3 +54,12 @@ def test_keys_decide():
 def test_what_is_no_distribution_is_refused(mean, covariance, sentence):
     with pytest.raises(MadocError, match=sentence):
         NormalParameters(SPACE, mean, covariance)
+
+
+def test_a_share_of_the_systems_is_drawn():
+    mean = np.array([-9.81, 0.7])
+    drawn = NormalParameters(SPACE, mean, np.diag([1.0, 0.01]), share=0.25).draw(KEY, 8)
+    assert (drawn[:6] == mean).all()
+    assert (drawn[6:] != mean).all()
+    with pytest.raises(MadocError, match="a share of systems to draw between 0 and 1, got 2"):
+        NormalParameters(SPACE, mean, np.eye(2), share=2.0)

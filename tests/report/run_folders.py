@@ -1,6 +1,7 @@
 """Run folders as the stages leave them, small, and with everything in them that a page can show."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -14,6 +15,8 @@ from madoc.calibration.holdout import (
     PredictionErrors,
     Tried,
 )
+from madoc.identification.combinations import Combination
+from madoc.identification.missing_terms import Alternative, MissingTerm
 
 PARAMETERS = {
     "gravity": (-9.9, 0.2, -30.0, 0.0, "m/s²", -9.81),
@@ -21,6 +24,7 @@ PARAMETERS = {
     "body_mass.leg": (2.7, 0.1, 2.0, 4.0, "kg", 2.71),
     "dof_damping.leg_joint": (1.2, 0.3, 0.0, 3.0, "N·m·s/rad", 1.0),
 }
+COMBINED = Combination("mass·length", {"mass": 1.0, "length": 1.0}, "product", 0.5, (0.49, 0.51), "kg·m")
 SIGNALS = ("height", "speed")
 
 
@@ -68,6 +72,11 @@ def result(**changes):
         against_chance=(AgainstChance("staying in place", 0.5, 0.002),),
         noise={},
         control_steps=0,
+        missing_terms=(
+            MissingTerm("Coulomb friction", "dof_frictionloss.hip", 0.2, 0.02, "N·m", 0.3, 10.0, {"gravity": -2.0}),
+            MissingTerm("a spring", "jnt_stiffness.hip", 1.0, 0.4, "N·m/rad", 0.01, 2.5, {"gravity": 0.5}),
+        ),
+        alternatives=(Alternative(("a spring (jnt_stiffness.hip)",), True, {"gravity": 0.5}, {"gravity": 0.4}),),
         candidates=compared,
         errors=PredictionErrors(errors, errors, errors, errors, 0.04, (0.03, 0.05), 0.04, 100, 0),
         explained=0.0,
@@ -88,6 +97,7 @@ def result(**changes):
         "warnings": ["the data carries <noise> & more"],
         "error": {"mean_absolute": 0.1, "mean_percent_of_range": 4.5, "per_parameter": {}},
         "covariance": (correlation * np.outer(deviation, deviation)).tolist(),
+        "combinations": [asdict(COMBINED)],
         "verdict": {"word": "CALIBRATED", "sentence": "the hold-out is predicted", "parameters": []},
         "holdout": TypeAdapter(Predicted).dump_python(holdout, mode="json"),
     } | changes
@@ -124,6 +134,11 @@ def evidence():
     }
 
 
+def cost(above):
+    """What an error of a parameter costs a policy."""
+    return {"half_width": 0.1, "below": 1.0, "below_error": 0.5, "above": above, "above_error": 0.25}
+
+
 def whole_folder(path):
     """A run of `madoc run` that has everything."""
     write_json(path / "spec.json", {"command": "run", "name": "hopper-medium"})
@@ -143,15 +158,22 @@ def whole_folder(path):
             "episodes": 3,
             "seed": 0,
             "policies": {"calibrated": policy, "truth": policy},
+            "over_draws": {"calibrated": {"at_estimate": 890.0, "mean": 850.0, "worst_tenth": 700.0, "draws": 50}},
+            "error_costs": {"calibrated": {name: cost(2.0 * index) for index, name in enumerate(PARAMETERS)}},
         },
     )
+    ends = np.arange(24.0).reshape(2, 2, 1, 2, 3)
+    names = np.array(["calibrated", "truth"])
+    np.savez(path / "film.npz", names=names, time=np.array([0.0, 1.0]), ends=ends, radius=np.array([0.1]))
     return path
 
 
 def bare_folder(path, **changes):
     """A run that has ended, with nothing but its spec and its result."""
     kept = {
-        name: value for name, value in result().items() if name not in ("verdict", "holdout", "covariance", "error")
+        name: value
+        for name, value in result().items()
+        if name not in ("verdict", "holdout", "covariance", "combinations", "error")
     }
     write_json(path / "spec.json", spec(truth=None))
     write_json(path / "result.json", kept | {"groups": [list(PARAMETERS)], "warnings": []} | changes)

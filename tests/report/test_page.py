@@ -59,8 +59,28 @@ def test_residuals_are_shares_of_a_steps_change(whole):
     assert "50 % → <b>5 %</b>" in drawn(whole, "residuals")
 
 
+def test_the_error_that_costs_most_is_at_the_top(whole):
+    rows = content(whole, "robustness")["costs"]["calibrated"]
+    assert [row.largest for _, row in rows] == [6.0, 4.0, 2.0, 1.0]
+    told = drawn(whole, "robustness")
+    assert '<td>calibrated</td><td class="n">890</td><td class="n">850</td><td class="n">700</td>' in told
+    assert 'class="before" style="width:16.67%"></i><i class="after" style="width:100.0%"' in told
+
+
 def test_the_strongest_correlation_is_told(whole):
     assert content(whole, "correlations")["strongest"] == ["leg mass and torso mass: −0.9"]
+
+
+def test_missing_terms_are_drawn_by_how_far_they_move_the_estimates(whole):
+    friction, spring = content(whole, "lacks")["rows"]
+    assert (friction["width"], friction["certain"], friction["moves"]) == (100.0, True, "gravity by −2 half-widths")
+    assert (spring["width"], spring["certain"], spring["value"]) == (25.0, False, "1 ± 0.4 N·m/rad")
+    assert content(whole, "lacks")["alternatives"] == [("a spring (jnt_stiffness.hip)", "gravity 0.5 ± 0.4")]
+    assert "0.2 ± 0.02 N·m, <b>t = 10</b>" in drawn(whole, "lacks")
+
+
+def test_combinations_are_told_with_their_intervals(whole):
+    assert "<td>mass·length</td><td>0.5 kg·m</td><td>0.49 to 0.51</td>" in drawn(whole, "together")
 
 
 def test_a_hold_out_is_told_by_its_own_measure(whole):
@@ -71,7 +91,7 @@ def test_a_hold_out_is_told_by_its_own_measure(whole):
     stored = json.loads(file.read_text())
     of_errors, of_areas = ("errors", "explained"), ("area_at_mid_range", "area_at_estimate")
     common = {name: value for name, value in stored["holdout"].items() if name not in (*of_errors, *of_areas)}
-    common.pop("autocorrelation")
+    common = {name: value for name, value in common.items() if name not in ("autocorrelation", "persistence")}
     errors, areas = ({name: stored["holdout"][name] for name in names} for names in (of_errors, of_areas))
     hidden = common | errors | {"measure": "fitted", "fitted_steps": 10}
     write_json(file, stored | {"holdout": hidden})

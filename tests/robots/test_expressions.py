@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from madoc.errors import MadocError
-from madoc.robots.expressions import Read, parse
+from madoc.robots.expressions import Read
+from madoc.robots.grammar import Scope, parse
 
 VALUES = {"position(a)": 0.5, "velocity(a)": -2.0, "sensor(tip)[2]": 3.0, "position('left-knee')": 0.25}
 
@@ -36,6 +37,10 @@ def read(one):
         ("exp(0) + position('left-knee')", 1.25),
         ('  position("left-knee")', 0.25),
         ("1e-3 * position(a)", 5e-4),
+        ("min(position(a), 0) + max(velocity(a), -1) + tanh(0)", -1.0),
+        ("where(-3 < velocity(a) < -1 and not position(a) > 1, 10, 20)", 10.0),
+        ("where(position(a) > 1 or velocity(a) >= 0, 10, 20)", 20.0),
+        ("where(1 < 2, min(1, 2), 3) * position(a)", 0.5),
     ],
 )
 def test_values(text, value):
@@ -48,6 +53,8 @@ def test_arrays_of_either_kind(namespace):
     found = parse("abs(-2 * position(a)) ** 2 + sqrt(position(a) * 0 + 4)").value(lambda _: values, namespace)
     np.testing.assert_allclose(found, [2.25, 3.0], rtol=1e-6)
     assert isinstance(found, type(values))
+    chosen = parse("where(0.1 < position(a) < 0.4 or not position(a) < 9, min(position(a), 0.2), 7)")
+    np.testing.assert_allclose(chosen.value(lambda _: values, namespace), [0.2, 7.0], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +89,7 @@ def test_what_is_read():
 
 
 def test_names_where_names_are_allowed():
-    expression = parse("-(height - 1) ** 2", names=["height", "push"])
+    expression = parse("-(height - 1) ** 2", scope=Scope(["height", "push"], ()))
     assert expression.reads == (Read("name", "height"),)
     assert expression.value(lambda _: 3.0) == -4.0
 
@@ -102,10 +109,14 @@ def test_names_where_names_are_allowed():
         ("[1, 2]", "expected arithmetic"),
         ("position(a).real", "expected arithmetic"),
         ("position(a) if 1 else 2", "expected arithmetic"),
-        ("position(a) > 1", "expected arithmetic"),
+        ("position(a) > 1", r"expected a number, got the condition 'position\(a\) > 1'"),
+        ("1 + (position(a) > 1)", "expected a number, got the condition"),
+        ("where(position(a), 1, 2)", "expected a condition, as height < 0.2, got 'position\\(a\\)', which is a number"),
+        ("position(a) == 1", "expected < <= > or >= in a condition"),
+        ("uniform(0, 1) + position(a)", "unknown function 'uniform'"),
         ("position(a) // 2", "expected arithmetic"),
         ("position(a) % 2", "expected arithmetic"),
-        ("not position(a)", "expected arithmetic"),
+        ("not position(a)", "expected a condition"),
         ("positon(a)", "unknown function 'positon'; nearest: position"),
         ("coss(position(a))", "unknown function 'coss'; nearest: cos"),
         ("position()", r"position takes one name, as position\(NAME\)"),
@@ -141,6 +152,6 @@ def test_what_is_no_expression(text, sentence):
 
 def test_unknown_names_have_the_nearest():
     with pytest.raises(MadocError, match="unknown name 'heigth'; nearest: height"):
-        parse("heigth", names=["height", "push"])
+        parse("heigth", scope=Scope(["height", "push"], ()))
     with pytest.raises(MadocError, match="unknown function 'position'"):
-        parse("position(a)", names=["height"])
+        parse("position(a)", scope=Scope(["height"], ()))

@@ -174,7 +174,18 @@ CHANGES = [
     ("groups: 2", "log: {tolerance: 2}", "expected less than 1 in log.tolerance, got 2"),
     ("groups: 2", "log: {tme: t}", "unknown key 'tme'; nearest: time"),
     ("groups: 2", "reward: elbow_angel", "unknown name 'elbow_angel'; nearest: elbow_angle"),
-    ("groups: 2", "reward: position(elbow)", "unknown function 'position'"),
+    ("groups: 2", "reward: sensor(elbow)", "unknown function 'sensor'"),
+    ("groups: 2", "reward: position(elbo)", "the model has no joint 'elbo'; nearest: elbow"),
+    ("groups: 2", "end: elbow_angle", "expected a condition, as height < 0.2, got .elbow_angle., which is a number"),
+    ("groups: 2", "end: shoulder_motor > 0", "unknown name .shoulder_motor."),
+    ("groups: 2", "goals: [{name: shoulder_motor, drawn: 1}]", "the name .shoulder_motor. is taken already"),
+    ("groups: 2", "goals: [{name: x, drawn: y}]", "unknown name .y."),
+    (
+        "groups: 2",
+        "reset: {position(elbow) + 1: 0}",
+        r"expected position\(JOINT\) or velocity\(JOINT\) before the colon",
+    ),
+    ("groups: 2", "reset: {velocity(elbow): uniform(1)}", "uniform takes 2 values, got 1"),
 ]
 
 

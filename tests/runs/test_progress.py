@@ -65,3 +65,16 @@ def test_time_left_follows_the_recent_pace(monkeypatch, capsys):
             show(Moment(fraction, done))
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "x: 70%, 7,000 steps, 100 steps/s, 0:20 elapsed, 0:30 left"
+
+
+def test_slow_work_has_a_rate_from_its_beginning_and_the_time_left_that_is_known(monkeypatch, capsys):
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    with progress.display("suite", unit="cells") as show:
+        show(Moment(0.0, 0))
+        for hour, done in ((1, 2), (2, 3)):
+            now = 3600.0 * hour
+            show(Moment(done / 10, done))
+        now = 2.5 * 3600  # nothing was done for half an hour
+        show(Moment(0.3, 3, seconds_left=600.0))
+    assert "1.2 cells/h, 2:30:00 elapsed, 10:00 left" in capsys.readouterr().err.splitlines()[-1]

@@ -39,14 +39,17 @@ def everything():
         Parameter("dof_frictionloss", "foot_joint", 0.0, 1.0),
         Parameter("jnt_stiffness", "thigh_joint", 0.0, 5.0),
         Parameter("geom_friction", "foot_geom", 0.5, 3.0),
+        Parameter("jnt_ref", "leg_joint", 0.1, 0.3),
         Parameter("actuator_gain", "foot", 0.5, 2.0),
+        Parameter("actuator_kv", "leg", 1e-6, 1e-5),
     )
     task = madoc.tasks.make("hopper")
     spec = task.spec
 
     def named() -> mujoco.MjSpec:
         robot = spec()
-        robot.actuators[2].name = "foot"
+        robot.actuators[1].name, robot.actuators[2].name = "leg", "foot"
+        robot.actuators[1].biastype = mujoco.mjtBias.mjBIAS_AFFINE
         return robot
 
     return replace(task, spec=named, parameters=ParameterSpace(parameters))

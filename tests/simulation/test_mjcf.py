@@ -50,6 +50,8 @@ actions:
   - {name: torque, actuator: torque, low: -1, high: 1}
 parameters:
   - {field: actuator_gain, element: target, low: 10, high: 60}
+  - {field: actuator_kv, element: target, low: 1, high: 6}
+  - {field: jnt_ref, element: hinge, low: -0.5, high: 0.5}
   - {field: body_mass_and_inertia, element: block, low: 0.5, high: 3}
   - {field: body_com, element: rod, low: 0.05, high: 0.4}
   - {field: body_inertia, element: rod, low: 0.001, high: 0.02}
@@ -73,7 +75,7 @@ LIFT = """
       <joint name="rail" type="slide" axis="0 0 1"/>
       <geom type="mesh" mesh="wedge" material="grey"/>
       <body name="rod" pos="0.1 0 0">
-        <joint name="hinge" axis="0 1 0" damping="0.05"/>
+        <joint name="hinge" axis="0 1 0" damping="0.05" stiffness="0.1" springref="10" range="-90 120"/>
         <geom name="sole" type="capsule" size="0.02" fromto="0 0 0 0.1 0 -0.3"/>
       </body>
     </body>

@@ -1,5 +1,7 @@
 """Parameters into a model: found by name, written, and everything derived from them recomputed."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from madoc.errors import MadocError
 from madoc.parameters import FIELDS, Parameter
 from madoc.simulation.cpu import CpuSimulator
 from madoc.simulation.write import MASS_FLOOR, element_names, find_elements, nominal_values, write_parameters
+from robots import ARM
 
 WRITTEN = {
     "gravity": lambda model, _: model.opt.gravity[2],
@@ -22,11 +25,21 @@ WRITTEN = {
     "dof_frictionloss": lambda model, joint: model.dof_frictionloss[model.jnt_dofadr[joint]],
     "jnt_stiffness": lambda model, joint: model.jnt_stiffness[joint],
     "geom_friction": lambda model, geom: model.geom_friction[geom, 0],
+    "jnt_ref": lambda model, joint: model.qpos0[model.jnt_qposadr[joint]],
     "actuator_gain": lambda model, actuator: model.actuator_gainprm[actuator, 0],
+    "actuator_kv": lambda model, actuator: -model.actuator_biasprm[actuator, 2],
 }
 """Where each field's value stands in a model."""
 
 IN_MODEL = [name for name, field in FIELDS.items() if field.in_model]
+
+
+@pytest.fixture
+def two_link_arm():
+    """The arm with a limited shoulder."""
+    spec = mujoco.MjSpec.from_string(ARM)
+    spec.joints[0].limited, spec.joints[0].range = True, [-1.0, 1.0]
+    return spec.compile()
 
 
 def written(model, parameter, value):
@@ -63,7 +76,9 @@ def test_only_the_named_element_changes(everything, field):
         "body_mass": "body_mass",
         "body_mass_and_inertia": "body_mass",
         "geom_friction": "geom_friction",
+        "jnt_ref": "qpos0",
         "actuator_gain": "actuator_gainprm",
+        "actuator_kv": "actuator_biasprm",
         "body_com": "body_ipos",
         "dof_drag": "dof_dampingpoly",
     }
@@ -72,6 +87,25 @@ def test_only_the_named_element_changes(everything, field):
     else:
         changed = np.argwhere(getattr(model, arrays.get(field, field)) != getattr(before, arrays.get(field, field)))
         assert len({element for element, *_ in changed}) == 1
+
+
+def test_a_shifted_zero_leaves_the_arm_where_it_hangs_and_moves_what_it_reads(two_link_arm):
+    """An encoder that reads 0.3 where the drawing has 0: at 0.3 gravity pulls as it did at 0, and the limits move."""
+    model = two_link_arm
+    before = mujoco.MjData(model)
+    before.qpos[0] = 0.2
+    mujoco.mj_forward(model, before)
+    shifted = written(copy.copy(model), Parameter("jnt_ref", "shoulder", -1.0, 1.0), 0.3)
+    after = mujoco.MjData(shifted)
+    after.qpos[0] = 0.5
+    mujoco.mj_forward(shifted, after)
+    np.testing.assert_allclose(after.qfrc_bias, before.qfrc_bias, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(shifted.jnt_range[0] - model.jnt_range[0], 0.3, rtol=1e-15)
+
+
+def test_only_a_position_servo_has_a_damping_of_its_own(two_link_arm):
+    with pytest.raises(MadocError, match=r"actuator_kv: actuator 'shoulder' is not a position servo; use dof_damping"):
+        written(two_link_arm, Parameter("actuator_kv", "shoulder", 0.0, 1.0), 0.5)
 
 
 def test_body_mass_leaves_the_inertia_and_its_sibling_scales_it():

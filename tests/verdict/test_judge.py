@@ -93,6 +93,22 @@ def test_correlated_residuals_of_single_steps_are_a_mismatch():
     assert "correlated from step to step (0.50)" in verdict.sentence
 
 
+@EITHER
+def test_a_log_that_contradicts_the_spec_is_a_mismatch_however_well_it_is_predicted(good):
+    said = judge(changed(good, contradictions=("torque: it comes 1.2 rows late; add a delay",)))
+    assert (said.word, said.sentence) == (
+        "MODEL_MISMATCH",
+        "the log contradicts the spec: torque: it comes 1.2 rows late; add a delay",
+    )
+
+
+def test_residuals_that_last_are_a_mismatch():
+    verdict = judge(changed(PREDICTED, LEFT_OVER, persistence=0.5))
+    assert verdict.word == "MODEL_MISMATCH"
+    assert "it lasts over several rows (correlation 0.50), as an external force" in verdict.sentence
+    assert judge(changed(PREDICTED, persistence=0.5)).word == "CALIBRATED"  # no larger than noise
+
+
 def test_errors_behind_a_fitted_start_are_said_to_be():
     assert "after 20 steps behind a fitted start on" in judge(changed(FITTED, LEFT_OVER, explained=0.6)).sentence
     assert "after 20 steps on" in judge(changed(PREDICTED, LEFT_OVER, explained=0.6)).sentence

@@ -9,7 +9,7 @@ from planted import FEWER, ROBOTS, at_rest, bench, log_of, shuffled, verdict
 
 from calibrating import madoc
 from madoc.calibration import CmaEs, Droid, LeastSquares
-from madoc.data import Disturbance, disturb, hide_velocities
+from madoc.data import Disturbance, disturb, hide_velocities, observed_task
 from madoc.errors import MadocError
 from madoc.verdict import judge
 from madoc.verdict.assessment import measured
@@ -72,6 +72,15 @@ def test_a_search_that_stopped_early_is_no_mismatch_where_velocities_are_hidden(
     assert "the search is not at its end" in said.sentence
     assert half.errors.nearby_relative < 0.6 * half.errors.relative
     assert judge(measured(judged, true)).word == "CALIBRATED"
+
+
+def test_velocities_that_are_differences_of_noisy_positions_are_not_taken_for_states():
+    task, truth = ROBOTS["arm"]
+    task = replace(task, velocities=2)
+    wanted = Disturbance(hidden_velocities=True, velocities="differences")
+    log = disturb(log_of("arm", noise=0.1), wanted, task, jax.random.key(0))
+    said = judge(measured(bench(log, observed_task(task, log)), task.parameters.vector(truth)))
+    assert said.word == "CALIBRATED", said.sentence
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

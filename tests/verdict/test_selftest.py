@@ -7,7 +7,7 @@ from planted import ROBOTS, at_rest, log_of
 
 from madoc import simulation
 from madoc.calibration import CmaEs, LeastSquares
-from madoc.data import Disturbance, disturb, hide_velocities, observed_task
+from madoc.data import Disturbance, disturb, hide_velocities, observed_task, stride
 from madoc.errors import MadocError
 from madoc.verdict.selftest import RECOVERABLE, STRETCH, plant, selftest
 
@@ -36,7 +36,7 @@ def test_a_planted_log_is_the_robots_own_motion_where_the_truth_is_planted():
     assert len(planted) == len(log)
     assert np.array_equal(planted.transitions.action, log.transitions.action)
     assert planted.transitions.next_observation == pytest.approx(log.transitions.next_observation, abs=1e-12)
-    assert np.diff(planted.episode_starts).max() == STRETCH
+    assert np.diff(planted.episode_starts).max() == STRETCH * stride(log)
     ends = planted.transitions.terminated | planted.transitions.truncated
     assert (np.flatnonzero(ends) + 1).tolist() == planted.episode_ends.tolist()
 
@@ -51,7 +51,7 @@ def test_another_truth_moves_otherwise_and_noise_is_read_once():
     assert np.abs(clean.next_observation - log.transitions.next_observation).max() > 1e-3
     assert (noisy.observation - clean.observation).std(0) == pytest.approx([0.1, 0.2], rel=0.2)
     same = (noisy.next_observation[:-1] == noisy.observation[1:]).all(-1)
-    assert same.sum() == 200 - 200 // STRETCH
+    assert same.sum() == 200 - 200 // (STRETCH * stride(log))
 
 
 def test_hidden_velocities_start_at_resets():

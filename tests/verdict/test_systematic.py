@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from madoc.verdict.systematic import autocorrelation, explained
+from madoc.verdict.systematic import autocorrelation, explained, persistence
 
 PAIRS = np.random.default_rng(0).standard_normal((300, 3))
 NOISE = np.random.default_rng(1).standard_normal((300, 2))
@@ -45,3 +45,12 @@ def test_the_autocorrelation_by_hand():
 def test_sensor_noise_alternates():
     residuals = NOISE[:-1] - NOISE[1:]
     assert autocorrelation(residuals[:-1], residuals[1:]) == pytest.approx(-0.5, abs=0.08)
+
+
+def test_what_lasts_is_told_from_noise_and_runs_are_not_joined():
+    follows = np.arange(300) > 0
+    wave = np.cos(2.0 * np.pi * np.arange(300) / 80.0)[:, None]
+    # Six rows later, the mean of 4 to 8, a wave of 80 rows has a correlation of about cos(2π 6 / 80) = 0.89.
+    assert persistence(wave, follows) == pytest.approx(0.89, abs=0.03)
+    assert persistence(NOISE[:-1] - NOISE[1:], follows[1:]) == 0.0
+    assert persistence(wave, np.zeros(300, bool)) == 0.0

@@ -11,8 +11,10 @@ from madoc.calibration.cautions import exploded, without_repeats
 from madoc.calibration.registry import CALIBRATORS
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
+from madoc.identification.combinations import combinations
 from madoc.parameters import ParameterSpace
 from madoc.runs import loop
+from madoc.runs.budget import Budget
 from madoc.runs.files import replacing
 from madoc.runs.run_folder import RunFolder
 from madoc.simulation.sensitivity import refuse_insensitive
@@ -24,7 +26,7 @@ def calibrate(
     problem: CalibrationProblem,
     *,
     key: PRNGKeyArray,
-    budget: int,
+    budget: Budget | str | None = None,
     truth: Mapping[str, float] | Float[np.ndarray, " d"] | None = None,
     folder: RunFolder | None = None,
     resume: bool = False,
@@ -33,7 +35,8 @@ def calibrate(
 ) -> CalibrationResult:
     """Estimate the parameters, and compare the estimate with the truth where that is given.
 
-    The budget counts simulated control steps of any kind. `truth` is the target's physical values, by name or as a
+    The budget counts simulated control steps of any kind, or is a time, as `Seconds(300)` or "300s"; by default it is
+    the method's usual one. `truth` is the target's physical values, by name or as a
     vector; only the finished estimate is compared with them. The other arguments are those of `madoc.runs.loop.run`.
 
     Raises:
@@ -48,7 +51,7 @@ def calibrate(
         method,
         problem,
         key=key,
-        budget=budget,
+        budget=entry.usual_budget if budget is None else budget,
         folder=folder,
         resume=resume,
         quiet=quiet,
@@ -58,6 +61,7 @@ def calibrate(
         trace=lambda state: _trace(space, method.estimate(problem, state)),
     )
     estimate = method.estimate(problem, finished.state)
+    told = estimate.covariance if estimate.interval is not None else None
     warnings = (*estimate.warnings, *exploded(estimate.failures, finished.control_steps))
     result = CalibrationResult(
         method=entry.name,
@@ -72,6 +76,7 @@ def calibrate(
         warnings=without_repeats(warnings, problem.doubts),
         error=None if true_values is None else calibration_error(estimate.mean, true_values, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
+        combinations=[] if told is None else list(combinations(space, estimate.mean, told)),
         settled=estimate.settled,
         problem=problem,
     )

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
-from madoc.identification.missing_terms import MissingTerm
+from madoc.identification.missing_terms import Alternative, MissingTerm
 
 Word = Literal["CALIBRATED", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
 
@@ -132,7 +132,9 @@ class Judged:
         noise: Standard deviation of the sensor noise of those signals where it can be estimated, in the signal's unit.
         control_steps: Control steps that were simulated for this record.
         missing_terms: Terms that the model may lack, the most significant first.
+        alternatives: Other estimates that the log does not exclude, which the intervals cover.
         at_end: Parameters estimated at an end of their range that is no physical bound.
+        contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
         candidates: The methods that were compared on this hold-out; None where only one was run.
         chosen: The name of the method among them whose estimate was kept.
     """
@@ -146,7 +148,9 @@ class Judged:
     noise: dict[str, float]
     control_steps: int
     missing_terms: tuple[MissingTerm, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
     at_end: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
     candidates: tuple[Tried | NotRun, ...] | None = None
     chosen: str | None = None
 
@@ -191,11 +195,13 @@ class Predicted(JudgedByErrors):
 
     Attributes:
         autocorrelation: Lag-one autocorrelation of the residuals at the best parameters nearby.
+        persistence: Correlation of these residuals with those a few rows later; 0 if it is not certain.
         area_at_mid_range: How well a classifier distinguishes replays at mid-range from logged windows.
         area_at_estimate: The same for replays at the estimate.
     """
 
     autocorrelation: float
+    persistence: float = 0.0
     area_at_mid_range: Area
     area_at_estimate: Area
     measure: Literal["predicted"] = "predicted"

@@ -34,10 +34,20 @@ def _entry(
     year: int,
     settings: Mapping[str, object] | None = None,
     recognised_by: tuple[str, ...] | None = None,
+    usual_budget: int | str = 300_000,
 ) -> MethodEntry[Calibrator]:
     simulates = kind is not Uncalibrated
     return MethodEntry(
-        name, kind, summary, paper, year, settings or {}, recognised_by, _SHOWN[kind], simulates=simulates
+        name,
+        kind,
+        summary,
+        paper,
+        year,
+        settings or {},
+        recognised_by,
+        _SHOWN[kind],
+        usual_budget=usual_budget,
+        simulates=simulates,
     )
 
 
@@ -50,7 +60,14 @@ _ENTRIES = (
     _entry(
         "madoc-paper", Madoc, "Madoc with the paper's own constants", _MADOC, 2024, PAPER, ("features", "keep_cloning")
     ),
-    _entry("least-squares", LeastSquares, "damped Gauss-Newton, robust, with intervals", "Levenberg; Marquardt", 1963),
+    _entry(
+        "least-squares",
+        LeastSquares,
+        "damped Gauss-Newton, robust, with intervals",
+        "Levenberg; Marquardt",
+        1963,
+        usual_budget="300s",  # it settles by itself, mostly within seconds
+    ),
     _entry("oted", Oted, "matches (s, a) by a bandit's policy gradient", "Gur et al. (from its abstract)", 2021),
     _entry("dropo", Dropo, "distribution that makes next states likely", "Tiboni et al., DROPO", 2022),
     _entry(

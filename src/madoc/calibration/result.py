@@ -17,6 +17,7 @@ from rich.table import Table
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.holdout import HoldOut, Verdict
 from madoc.errors import MadocError
+from madoc.identification.combinations import Combination
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class CalibrationResult:
         warnings: Reasons to doubt the estimate, one sentence each.
         error: `mean_absolute`, `mean_percent_of_range` and `per_parameter`; None where the truth was not given.
         covariance: Covariance of the estimates in physical units, in the task's order; None where it is unknown.
+        combinations: Sums and products of parameters that the log tells though it leaves each of them open.
         settled: Whether the method's search came to its end; its intervals mean nothing before.
         verdict: The judgement on held-out rows; None where none were held out.
         holdout: The numbers behind the verdict.
@@ -68,6 +70,7 @@ class CalibrationResult:
     warnings: list[str] = field(default_factory=list)
     error: dict[str, Any] | None = None
     covariance: list[list[float]] | None = None
+    combinations: list[Combination] = field(default_factory=list)
     settled: bool = True
     verdict: Verdict | None = None
     holdout: HoldOut | None = None
@@ -75,14 +78,14 @@ class CalibrationResult:
         field(default=None, repr=False, compare=False)
     )
 
-    def with_intervals(self, widened: Mapping[str, float], warning: str) -> "CalibrationResult":
-        """The same result with some 95 % intervals widened, to each side, by a multiple of their half-width."""
+    def with_intervals(self, widened: Mapping[str, tuple[float, float]], warning: str) -> "CalibrationResult":
+        """The same result with ends of 95 % intervals moved out, low and high, by multiples of the half-width."""
         parameters = dict(self.parameters)
-        for name, factor in widened.items():
+        for name, (below, above) in widened.items():
             row = parameters[name]
             if row.interval is not None:
-                grown = factor * (row.interval[1] - row.interval[0]) / 2.0
-                low, high = max(row.low, row.interval[0] - grown), min(row.high, row.interval[1] + grown)
+                half = (row.interval[1] - row.interval[0]) / 2.0
+                low, high = max(row.low, row.interval[0] - below * half), min(row.high, row.interval[1] + above * half)
                 parameters[name] = replace(row, interval=[low, high])
         return replace(self, parameters=parameters, warnings=[*self.warnings, warning])
 
@@ -161,6 +164,7 @@ class CalibrationResult:
                 f"mean absolute error {self.error['mean_absolute']:.4g}, "
                 f"{self.error['mean_percent_of_range']:.2f} % of range"
             )
+        lines += [f"told in combination: {told}" for told in self.combinations]
         return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
 
     def __str__(self) -> str:

@@ -11,6 +11,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from madoc.calibration import CalibrationResult
     from madoc.calibration.holdout import HoldOut
+    from madoc.policies import ErrorCost
     from madoc.report.records import EvaluationRecord
 
 EXIT_CODES: Mapping[str, int] = {
@@ -72,23 +73,64 @@ class Command(Protocol):
 
 
 def evaluation_text(evaluation: "EvaluationRecord") -> tuple[RenderableType, ...]:
-    """Returns in the target, a row for each policy, and how near the calibrated one comes to that of the truth."""
-    title = f"{evaluation.task}: returns in the target, {evaluation.episodes} episodes"
+    """Returns where policies were evaluated, what errors of the estimate cost, and how near the truth's return is."""
+    parts: list[RenderableType] = []
+    if evaluation.policies:
+        parts.append(_returns_table("in the target", evaluation.policies, evaluation))
+    if evaluation.over_draws:
+        parts.append(_estimate_table(evaluation))
+    parts += [_costs_table(name, costs) for name, costs in evaluation.error_costs.items()]
+    share = evaluation.calibrated_percent_of_truth
+    if share is not None:
+        parts.append(f"calibrated: {share:.1f} % of the return of the policy learnt at the truth")
+    return tuple(parts)
+
+
+def _returns_table(where: str, returns: Mapping[str, Mapping[str, float]], evaluation: "EvaluationRecord") -> Table:
+    """Returns in one system, a row for each policy."""
+    title = f"{evaluation.task}: returns {where}, {evaluation.episodes} episodes"
     table = Table(title=title, title_justify="left")
     table.add_column("policy learnt")
     for heading in ("return ± std", "normalized", "length"):
         table.add_column(heading, justify="right")
-    for name, row in evaluation.policies.items():
+    for name, row in returns.items():
         table.add_row(
             PLACE_NAMES.get(name, name),
             f"{row['return']:,.1f} ± {row['return_std']:,.1f}",
             f"{row['normalized']:.1f}",
             f"{row['length']:.0f}",
         )
-    share = evaluation.calibrated_percent_of_truth
-    if share is None:
-        return (table,)
-    return table, f"calibrated: {share:.1f} % of the return of the policy learnt at the truth"
+    return table
+
+
+def _estimate_table(evaluation: "EvaluationRecord") -> Table:
+    """Returns at the estimate and over draws of it, a row for each policy."""
+    draws = next(iter(evaluation.over_draws.values())).draws
+    title = f"{evaluation.task}: returns in the calibrated simulator"
+    table = Table(title=title, title_justify="left")
+    table.add_column("policy learnt")
+    for heading in ("at the estimate", f"mean of {draws} draws", "worst tenth"):
+        table.add_column(heading, justify="right")
+    for name, drawn in evaluation.over_draws.items():
+        cells = (drawn.at_estimate, drawn.mean, drawn.worst_tenth)
+        table.add_row(PLACE_NAMES.get(name, name), *(f"{value:,.1f}" for value in cells))
+    return table
+
+
+def _costs_table(name: str, costs: "Mapping[str, ErrorCost]") -> Table:
+    """What an error of half an interval of each parameter costs a policy, the dearest first."""
+    table = Table(title=f"policy {name}: return lost where one parameter is off", title_justify="left")
+    table.add_column("parameter")
+    for heading in ("off by", "if lower ± std error", "if higher ± std error"):
+        table.add_column(heading, justify="right")
+    for parameter, cost in sorted(costs.items(), key=lambda item: -item[1].largest):
+        table.add_row(
+            parameter,
+            f"{cost.half_width:.3g}",
+            f"{cost.below:,.3g} ± {cost.below_error:.2g}",
+            f"{cost.above:,.3g} ± {cost.above_error:.2g}",
+        )
+    return table
 
 
 def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:

@@ -12,7 +12,7 @@ from madoc.pipeline.orders import EvaluationOrder
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Evaluate the policies of a run in the target, beside the yardsticks that were learnt."""
+    """Evaluate the policies of a run: in the target, if it is known, at the estimate, and where that may be wrong."""
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """A run folder with policies in it, or the folder of one policy."""

@@ -21,6 +21,8 @@ from madoc.commands.report import Report
 from madoc.commands.run import Run
 from madoc.commands.selftest import Selftest
 from madoc.commands.spec import Init, Spec
+from madoc.commands.suite import Suite
+from madoc.commands.worker import Worker
 from madoc.errors import MadocError
 from madoc.runs.files import json_text
 
@@ -28,7 +30,21 @@ WIDTH = 110
 """Width of a table in characters where standard output is no terminal."""
 
 Commands = (
-    Run | Record | Calibrate | Selftest | Learn | Evaluate | Init | Spec | Check | Report | Export | Tasks | Methods
+    Run
+    | Record
+    | Calibrate
+    | Selftest
+    | Learn
+    | Evaluate
+    | Suite
+    | Worker
+    | Init
+    | Spec
+    | Check
+    | Report
+    | Export
+    | Tasks
+    | Methods
 )
 
 

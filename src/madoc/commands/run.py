@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import RenderableType
 from tyro.conf import OmitArgPrefixes, arg
 
-from madoc.commands.answer import Answer, Output, evaluation_text, page_line
+from madoc.commands.answer import Answer, Output, calibration_status, calibration_text, evaluation_text, page_line
 from madoc.pipeline.orders import RunOrder
 
 if TYPE_CHECKING:
@@ -16,15 +16,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Run:
-    """Do all of it: record or load, calibrate, learn, and evaluate in the target beside two yardsticks.
+    """Do all of it: record or load, calibrate and judge, learn, evaluate, and export.
 
-    Leaves a folder with the data, the calibration, the policies, evaluation.json and summary.json. Killed at any
-    moment, --resume goes on to the same result.
+    Leaves a folder with the data, the calibration, the policies, evaluation.json, the exported model, report.html and
+    summary.json. Killed at any moment, --resume goes on to the same result. The exit code is the verdict's, as that of
+    madoc calibrate.
     """
 
     order: Annotated[RunOrder, arg(name="")]
     out: Path | None = None
-    """Folder. Default: runs/NAME."""
+    """Folder. Default: runs/NAME, of a robot of your own without the .yaml."""
     resume: bool = False
     """Go on with the run in the folder."""
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
@@ -34,12 +35,16 @@ class Run:
         from madoc.calibration import CalibrationResult
         from madoc.pipeline import run_all
         from madoc.report import leave_report
+        from madoc.robots import is_spec_path
 
-        out = self.out or Path("runs") / self.order.name
+        out = self.out or Path("runs") / (
+            Path(self.order.name).stem if is_spec_path(self.order.name) else self.order.name
+        )
         summary = run_all(self.order, out, resume=self.resume, quiet=self.output.quiet)
         result = CalibrationResult.from_json(summary.calibration)
-        lines = (result.table(), result.summary(), *_rest(summary, out), *page_line(leave_report(out)))
-        return Answer(summary.to_json() | {"folder": str(out)}, lines, summary.status)
+        lines = (*calibration_text(result), *_rest(summary, out), *page_line(leave_report(out)))
+        status = calibration_status(result) if summary.status == "finished" else summary.status
+        return Answer(summary.to_json() | {"folder": str(out)}, lines, status)
 
 
 def _rest(summary: "Summary", out: Path) -> tuple[RenderableType, ...]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -51,6 +52,13 @@ class Dataset:
     def episode_of(self, rows: Int[np.ndarray, "*rows"]) -> Int[np.ndarray, "*rows"]:
         """The index of the episode that each of the given rows belongs to."""
         return np.searchsorted(self.episode_starts, rows, side="right") - 1
+
+    @cached_property
+    def time_scale(self) -> int:
+        """The time in rows in which the robot goes from one pose to another, at least 1; see `data.timescale`."""
+        from madoc.data.timescale import time_scale  # which is built on this module
+
+        return time_scale(self)
 
     def take(self, rows: Int[np.ndarray, " rows"], starts: Int[np.ndarray, " episodes"]) -> "Dataset":
         """A dataset of the given rows in their order, with the episode starts that they have there.
@@ -131,12 +139,6 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
     episodes = int(np.searchsorted(filled, max_transitions)) + 1
     rows = np.concatenate([np.arange(starts[episode], ends[episode]) for episode in order[:episodes]])
     return dataset.take(rows[:max_transitions], np.append(0, filled[: episodes - 1]))
-
-
-def typical_change(dataset: Dataset) -> Float[np.ndarray, " observation"]:
-    """Standard deviation of each channel's change in a control step, in its unit; 1 for one that never moves."""
-    logged = dataset.transitions
-    return spread_of(np.asarray(logged.next_observation) - logged.observation)
 
 
 def spread_of(rows: Float[np.ndarray, "*rows values"]) -> Float[np.ndarray, " values"]:

@@ -1,7 +1,7 @@
 """Findings about a log: each with its level, a clause that says it, its place, and what to do."""
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Literal
 
 Level = Literal["fatal", "warning", "note"]
@@ -17,12 +17,14 @@ class Finding:
         what: The finding, as a clause.
         where: A file, a row, a signal or a parameter; empty where it concerns the whole log.
         do: What to do about it; empty where nothing is to be done.
+        contradicts: Whether the log contradicts the spec, so that no estimate from the two is to be trusted.
     """
 
     level: Level
     what: str
     where: str = ""
     do: str = ""
+    contradicts: bool = False
 
     @property
     def sentence(self) -> str:
@@ -32,7 +34,7 @@ class Finding:
 
     def to_json(self) -> dict[str, str]:
         """The fields for JSON."""
-        return asdict(self)
+        return {"level": self.level, "what": self.what, "where": self.where, "do": self.do}
 
 
 def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:

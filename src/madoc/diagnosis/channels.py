@@ -1,4 +1,4 @@
-"""Channels of a log: which of them never move, are at a limit, or contradict each other."""
+"""Channels of a log: which of them never move, are at a limit, or are read in coarse steps."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,6 @@ from madoc.data import Dataset
 from madoc.data.findings import Finding, Level
 from madoc.errors import MadocError
 from madoc.robots import Robot
-from madoc.simulation import Simulator
 from madoc.tasks import Task
 
 AT_LIMIT = 1.0 - 1e-6
@@ -22,17 +21,14 @@ FEW_ROWS = 100
 """Number of rows; fewer are warned of."""
 _STILL = 1e-9
 """Range of the values over the largest of them; up to it, a channel counts as one that never moves."""
-_UNIT_ERRORS = {
-    180.0 / np.pi: "one in degrees, the other in radians",
-    1000.0: "one in thousandths (mm, ms) of the other",
-    100.0: "one in cm, the other in m",
-    2.0 * np.pi: "one in turns, the other in radians",
-    30.0 / np.pi: "a speed in rpm",
-    -1.0: "one of them with its sign reversed",
-}
-"""Mistakes by the ratio, or its inverse, of a position's changes to those that its speed implies."""
-_TRUSTED = 0.5
-"""Squared correlation in [0, 1] of a position's changes with its speed; below it their ratio is not judged."""
+COARSE = 1.0
+"""Ratio of the step of a signal's readings to the standard deviation of its change in a row; from it on it is told."""
+_COUNTED = (5, 0.5)
+"""Smallest number of distinct readings, and largest as a share of the rows, between which their step is looked for."""
+_WHOLE = 0.05
+"""Largest distance of a reading from a whole number of steps, in steps: logs are written with few digits."""
+_TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "°": 360.0}
+"""A turn by the unit of an angle."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +36,8 @@ class Channel:
     """A signal or an action over the whole log, in its own unit, which is empty where the spec does not give it.
 
     `low` and `high` are the smallest and the largest value, `step` is the standard deviation of changes from row to
-    row, and `at_limits` the share of rows in which an action is at an end of its range.
+    row, `at_limits` the share of rows in which an action is at an end of its range, and `resolution` the step in which
+    a signal is read, 0 where none can be seen.
     """
 
     name: str
@@ -50,6 +47,7 @@ class Channel:
     high: float
     step: float
     at_limits: float = 0.0
+    resolution: float = 0.0
 
     @property
     def moves(self) -> bool:
@@ -77,10 +75,13 @@ def channels_of(dataset: Dataset, task: Task, robot: Robot | None = None) -> tup
     units = [signal.unit or "" for signal in robot.signals] if robot else []
     units += [""] * (task.observation_size - len(units))  # of velocities that were derived from positions too
     numbers = np.column_stack([both.min(0), both.max(0), (following - observation).std(0)]).tolist()
-    columns = zip(signal_names(task), units, numbers, strict=True)
-    signals = [Channel(name, "signal", unit, *values) for name, unit, values in columns]
+    rows = zip(signal_names(task), units, numbers, observation.T, strict=True)
+    signals = [
+        Channel(name, "signal", unit, low, high, step, resolution=resolution_of(read))
+        for name, unit, (low, high, step), read in rows
+    ]
     scaled_action = np.asarray(logged.action)
-    physical = _physical(scaled_action, task)
+    physical = physical_actions(scaled_action, task)
     within = np.ones(len(dataset), dtype=bool)
     within[dataset.episode_ends - 1] = False  # the next row is of another episode
     change = np.diff(physical, axis=0)[within[:-1]]
@@ -92,9 +93,9 @@ def channels_of(dataset: Dataset, task: Task, robot: Robot | None = None) -> tup
     return (*signals, *(Channel(name, "action", unit, *values) for name, unit, values in columns))
 
 
-def channel_findings(dataset: Dataset, simulator: Simulator, channels: tuple[Channel, ...]) -> list[Finding]:
-    """Findings on too few rows, channels that never move, actions at limits, and positions that contradict speeds."""
-    findings = _size_findings(dataset, len(simulator.parameters))
+def channel_findings(dataset: Dataset, parameters: int, channels: tuple[Channel, ...]) -> list[Finding]:
+    """Findings on too few rows, channels that never move, signals read in coarse steps, and actions at limits."""
+    findings = _size_findings(dataset, parameters)
     signals, actions = ([channel for channel in channels if channel.kind == kind] for kind in ("signal", "action"))
     nothing_moves = not any(channel.moves for channel in signals)
     for channel in (*signals, *actions):
@@ -107,7 +108,35 @@ def channel_findings(dataset: Dataset, simulator: Simulator, channels: tuple[Cha
     for channel, column in zip(actions, np.asarray(dataset.transitions.action).T, strict=True):
         if channel.moves:
             findings += _limit_findings(channel, column)
-    return findings + _speed_findings(dataset, simulator)
+    return findings + [
+        _step_finding(channel) for channel in signals if channel.resolution > COARSE * channel.step > 0.0
+    ]
+
+
+def resolution_of(readings: Float[np.ndarray, " rows"]) -> float:
+    """The step of which all differences of the readings are whole multiples, as of an encoder; 0 where none is seen."""
+    values = np.unique(readings)
+    fewest, most = _COUNTED
+    if not fewest <= len(values) <= most * len(readings):
+        return 0.0
+    gaps, span = np.diff(values), float(values[-1] - values[0])
+    gaps = gaps[gaps > 1e-7 * span]  # smaller ones are rounding errors
+    least = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
+    step = span / max(1.0, np.round(span / least))
+    counts = (values - values[0]) / step
+    return step if np.abs(counts - np.round(counts)).max() < _WHOLE else 0.0
+
+
+def _step_finding(channel: Channel) -> Finding:
+    step, unit = channel.resolution, f" {channel.unit}" if channel.unit else ""
+    counts = _TURNS.get(channel.unit, 0.0) / step
+    whole = counts > 10.0 and abs(counts / max(1.0, np.round(counts)) - 1.0) < 1e-3
+    of_turn = f", {counts:,.0f} a turn" if whole else ""
+    what = f"it is read in steps of {step:.3g}{unit}{of_turn}, and changes by {channel.step:.2g}{unit} in a row"
+    remedy = (
+        "single rows show the sensor's steps, not the motion: compare over longer windows, as --set horizon=20 does"
+    )
+    return Finding("warning", what, channel.name, remedy)
 
 
 def _size_findings(dataset: Dataset, parameters: int) -> list[Finding]:
@@ -133,63 +162,8 @@ def _limit_findings(channel: Channel, scaled_action: Float[np.ndarray, " rows"])
     return [Finding("warning", what, channel.name, remedy)]
 
 
-def _speed_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
-    """Findings on positions that do not change by speed times control step: wrong units or signs, wrapped angles."""
-    task = simulator.task
-    if task.state_from_observation is None:
-        return []
-    model = task.compile()
-    if model.nq != model.nv:
-        return []
-    logged = dataset.transitions
-    before, after = (
-        np.asarray(task.state_from_observation(np.asarray(part, np.float64)))[:, : 2 * model.nv]
-        for part in (logged.observation, logged.next_observation)
-    )
-    names = _names_of_states(task, 2 * model.nv)
-    findings = []
-    for dof in range(model.nv):
-        position, speed = names[dof], names[model.nv + dof]
-        if position is None or speed is None:
-            continue
-        change = after[:, dof] - before[:, dof]
-        expected = 0.5 * (before[:, model.nv + dof] + after[:, model.nv + dof]) * simulator.control_step
-        turned = np.abs(np.abs(change) - 2.0 * np.pi) < 0.1 * 2.0 * np.pi
-        turned &= np.abs(change - expected) > np.pi
-        if turned.any():
-            what = f"it jumps by a whole turn in {int(turned.sum())} rows"
-            findings.append(Finding("warning", what, position, "unwrap the angle where it is logged"))
-        findings += _ratio_findings(change[~turned], expected[~turned], position, speed)
-    return findings
-
-
-def _ratio_findings(change: np.ndarray, expected: np.ndarray, position: str, speed: str) -> list[Finding]:
-    power = float(expected @ expected)
-    if power == 0.0 or not np.any(change):
-        return []
-    together = float(change @ expected)
-    if together**2 < _TRUSTED * power * float(change @ change):
-        return []
-    ratio = together / power
-    if 0.8 < ratio < 1.25:
-        return []
-    factors = ((each, text) for factor, text in _UNIT_ERRORS.items() for each in (factor, 1.0 / factor))
-    mistake = next((f": {text}?" for factor, text in factors if abs(ratio / factor - 1.0) < 0.1), "")
-    what = f"it changes {ratio:.3g} times as fast as {speed} says{mistake}"
-    return [Finding("warning", what, position, "look at units and signs in the spec and at control_step")]
-
-
-def _names_of_states(task: Task, size: int) -> list[str | None]:
-    """The signal from which each value of (qpos, qvel) is rebuilt; None where there is not exactly one."""
-    assert task.state_from_observation is not None
-    names, width = signal_names(task), task.observation_size
-    base = np.asarray(task.state_from_observation(np.zeros((1, width))))[:, :size]
-    moved = np.asarray(task.state_from_observation(np.eye(width)))[:, :size] - base
-    sources = [np.flatnonzero(np.abs(moved[:, column]) > 1e-12) for column in range(size)]
-    return [names[source[0]] if len(source) == 1 else None for source in sources]
-
-
-def _physical(scaled_action: Float[np.ndarray, "rows action"], task: Task) -> Float[np.ndarray, "rows action"]:
+def physical_actions(scaled_action: Float[np.ndarray, "rows action"], task: Task) -> Float[np.ndarray, "rows action"]:
+    """Actions in the units of their channels."""
     if not task.actions:
         return scaled_action
     low, high = (np.array([getattr(channel, end) for channel in task.actions]) for end in ("low", "high"))

@@ -9,7 +9,10 @@ from madoc.data import Dataset
 from madoc.data.findings import Finding, worst_first
 from madoc.diagnosis.channels import Channel, channel_findings, channels_of
 from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, excite_unknown
-from madoc.diagnosis.explanation import Explanation, action_findings, explain, explanation_findings
+from madoc.diagnosis.explanation import Explanation, action_findings, box_draws, explain, explanation_findings
+from madoc.diagnosis.response import response_findings
+from madoc.diagnosis.scales import scale_findings
+from madoc.diagnosis.speeds import speed_findings
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.robots import Robot
 from madoc.simulation import Simulator
@@ -60,17 +63,25 @@ def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None,
     started = time.monotonic()
     of_rows, of_box, of_actions, of_windows = jax.random.split(jax.random.key(seed), 4)
     channels = channels_of(dataset, simulator.task, robot)
-    findings = [*dataset.findings, *channel_findings(dataset, simulator, channels)]
+    findings = [*dataset.findings, *channel_findings(dataset, len(simulator.parameters), channels)]
+    about_speeds, late_speeds = speed_findings(dataset, simulator)
+    findings += about_speeds
     explanation, excitation, spent = None, None, 0
     if not any(finding.level == "fatal" for finding in findings):
         logged = states_of(dataset, simulator)
         idle, spent = insensitive(simulator, *probing_rows(logged, dataset, simulator), key=of_rows)
         findings += _insensitive_findings(idle)
+        of_starts, of_draws = jax.random.split(of_box)
+        draws = box_draws(len(simulator.parameters), of_draws)
+        start = draws[0]
+        responding, steps = response_findings(dataset, simulator, logged, draws, late_speeds=late_speeds)
+        findings, spent = findings + responding, spent + steps
         if logged.kind == "exact":
-            explanation = explain(dataset, simulator, logged, key=of_box)
+            explanation = explain(dataset, simulator, logged, draws, key=of_starts)
             findings += explanation_findings(explanation, channels)
-            about_actions, steps = action_findings(dataset, simulator, logged, explanation, key=of_actions)
-            findings += about_actions
+            told = frozenset(finding.where for finding in responding)
+            acting, steps = action_findings(dataset, simulator, logged, explanation, told=told, key=of_actions)
+            findings += acting
             start = explanation.draws[explanation.best]
             excitation = excite(dataset, simulator, logged, start=start, key=of_windows)
             spent += explanation.control_steps + steps
@@ -79,6 +90,7 @@ def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None,
             excitation = excite_unknown(dataset, simulator, logged)
         spent += excitation.control_steps
         findings += excitation_findings(excitation, simulator)
+        findings += scale_findings(dataset, simulator, logged, start, only_ratios=excitation.only_ratios)
     return Diagnosis(
         rows=len(dataset),
         episodes=len(dataset.episode_starts),

@@ -5,25 +5,40 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from madoc.data import Dataset, typical_change
+from madoc.data import Dataset, stride, typical_change
 from madoc.data.findings import Finding
 from madoc.identification.gauss_newton import descend
-from madoc.identification.information import bread, correlated_pairs, half_width, identifiability, meat, sandwich
-from madoc.identification.linearisation import difference_points, linearise
+from madoc.identification.information import (
+    Uncertainty,
+    bread,
+    correlated_pairs,
+    half_width,
+    identifiability,
+    meat,
+    sandwich,
+)
+from madoc.identification.linearisation import Linearisation, difference_points, linearise
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import LoggedStates, probing_windows
 from madoc.identification.windows import disjoint_windows, drawn, longest_fit, windows_at
+from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
+from madoc.simulation.response import mass_like
 
 WINDOWS = {5: 200, 20: 60}
-"""Largest number of windows, by their length in control steps. Long ones narrow the intervals where sensors are noisy,
-short ones where the robot is chaotic."""
+"""Largest number of windows, by their length in strides (`data.timescale`). Long ones narrow the intervals where
+sensors are noisy, short ones where the robot is chaotic."""
 ROUNDS = 3
 """Number of linearisations, at least 1: from the best draw two steps reach the residuals that no parameters explain."""
 INSIDE = 0.98
 """Largest |parameter| in [-1, 1] at which derivatives are taken, as there are none at, say, a mass of 0."""
 _DAMPING = 1e-8
 """Marquardt's damping of a step, relative to the squared lengths of the columns: enough for unidentified directions."""
+HIDDEN = 1e-2
+"""Change of the residuals along a direction over the root of the sum of squares of what each parameter changes there; a
+smaller one is none. Masses that the model keeps fixed and that are 1 % of the others leave as much."""
+ALIGNED = 0.9
+"""Cosine from which on two directions count as one."""
 WIDE = 0.25
 """Share in [0, 1] of its range; a parameter whose expected interval has a larger half width is warned of."""
 
@@ -38,6 +53,7 @@ class Excitation:
         half_width: Half of the expected 95 % interval, in physical units; NaN likewise.
         pairs: Parameters whose estimates would be correlated: two names and the correlation.
         sentences: Which parameters, alone or together, cannot be determined.
+        only_ratios: Whether all masses and forces that are calibrated can be scaled alike without a trace.
         control_steps: Number of control steps simulated.
     """
 
@@ -45,6 +61,7 @@ class Excitation:
     half_width: Float[np.ndarray, " d"]
     pairs: tuple[tuple[str, str, float], ...]
     sentences: tuple[str, ...]
+    only_ratios: bool
     control_steps: int
 
 
@@ -73,14 +90,15 @@ def _excited(
 ) -> Excitation:
     """As `excite`, over windows of one length."""
     space, (states, rows) = simulator.parameters, logged.exact()
-    steps = longest_fit(dataset, rows, horizon)
+    steps = longest_fit(dataset, rows, horizon * stride(dataset))
     disjoint = disjoint_windows(dataset, rows, steps, gap=0)
     chosen, available = drawn(disjoint, WINDOWS[horizon], key), len(disjoint)
     windows = windows_at(dataset, states[chosen], rows[chosen], steps)
-    linearisations, _, spent = descend(
+    first = np.clip(start, -0.9 * INSIDE, 0.9 * INSIDE)
+    linearisations, visited, spent = descend(
         simulator,
         windows,
-        np.clip(start, -0.9 * INSIDE, 0.9 * INSIDE),
+        first,
         typical_change(dataset),
         steps=ROUNDS,
         loss="linear",
@@ -90,16 +108,19 @@ def _excited(
     if not linearisations:
         nothing = np.full(len(space), np.nan)
         sentence = f"the simulation fails in all {len(windows)} stretches tried; look at the ranges and the states"
-        return Excitation(nothing, nothing, (), (sentence,), spent)
-    best = min(linearisations, key=lambda each: (each.residuals**2).mean())
+        return Excitation(nothing, nothing, (), (sentence,), False, spent)
+    at = int(np.argmin([(each.residuals**2).mean() for each in linearisations]))
+    best, point = linearisations[at], (first, *visited)[at]
     more = max(1.0, available / len(best.residuals))  # windows of the whole log for each of these
     certainty = sandwich(more * bread(best, 1.0, "linear"), more * meat(best, 1.0, "linear"))
     noise = max(float(np.sqrt((best.residuals**2).mean())), np.finfo(float).tiny)
+    certainty, only_ratios = _without_scale(certainty, best, point, space)
     return Excitation(
         effect=np.sqrt((best.jacobian**2).mean((0, 1))) / noise,
         half_width=(space.high - space.low) / 2.0 * half_width(certainty.covariance, available),
         pairs=tuple(correlated_pairs(certainty.correlation, space.names)),
         sentences=identifiability(certainty, space.names),
+        only_ratios=only_ratios,
         control_steps=spent,
     )
 
@@ -107,19 +128,35 @@ def _excited(
 def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates) -> Excitation:
     """Which estimates would correlate, where the log's states are not exact; no intervals can be expected then."""
     space = simulator.parameters
-    steps, count = max(WINDOWS.items())
-    windows = probing_windows(logged, dataset, simulator, steps=steps, count=count)
-    points = difference_points(np.zeros(len(space)))
+    strides, count = max(WINDOWS.items())
+    windows = probing_windows(logged, dataset, simulator, steps=strides * stride(dataset), count=count)
+    middle = np.zeros(len(space))
+    points = difference_points(middle)
     around = linearise(points, window_residuals(simulator, windows, points, typical_change(dataset)))
     certainty = sandwich(bread(around, 1.0, "linear"), np.zeros((len(space), len(space))))
+    certainty, only_ratios = _without_scale(certainty, around, middle, space)
     unknown = np.full(len(space), np.nan)
     return Excitation(
         effect=unknown,
         half_width=unknown,
         pairs=tuple(correlated_pairs(certainty.correlation, space.names)),
         sentences=identifiability(certainty, space.names),
+        only_ratios=only_ratios,
         control_steps=len(points) * len(windows) * windows.steps,
     )
+
+
+def _without_scale(
+    certainty: Uncertainty, around: Linearisation, point: Float[np.ndarray, " d"], space: ParameterSpace
+) -> tuple[Uncertainty, bool]:
+    """Whether scaling all calibrated masses and forces alike changes no residual; if so, without that direction."""
+    scaled = np.array([mass_like(row.field) for row in space.parameters])
+    direction = np.where(scaled, space.to_physical(point) / (0.5 * (space.high - space.low)), 0.0)
+    parts = around.jacobian * direction
+    if (parts.sum(-1) ** 2).sum() >= HIDDEN**2 * (parts**2).sum():
+        return certainty, False
+    along = certainty.unidentified @ direction / np.linalg.norm(direction)
+    return replace(certainty, unidentified=certainty.unidentified[np.abs(along) < ALIGNED]), True
 
 
 def excitation_findings(excitation: Excitation, simulator: Simulator) -> list[Finding]:
@@ -128,7 +165,8 @@ def excitation_findings(excitation: Excitation, simulator: Simulator) -> list[Fi
     named = " ".join(excitation.sentences)
     for parameter, width in zip(simulator.parameters.parameters, excitation.half_width, strict=True):
         share = width / (parameter.high - parameter.low)
-        if share > WIDE and parameter.name not in named:
+        scaled = excitation.only_ratios and mass_like(parameter.field)  # that is a finding of its own
+        if share > WIDE and parameter.name not in named and not scaled:
             what = (
                 f"the log hardly determines it: expect ± {width:.2g} {parameter.unit} (95 %), {100 * share:.0f} % of "
                 "its range"

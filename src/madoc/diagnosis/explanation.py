@@ -1,5 +1,6 @@
 """Whether the model, anywhere in the box, predicts the log better than "nothing changes" does."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import jax
@@ -12,7 +13,7 @@ from madoc.data.findings import Finding
 from madoc.diagnosis.channels import Channel, action_names
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import LoggedStates
-from madoc.identification.windows import HORIZONS, Windows, drawn, longest_fit, rows_that_fit, windows_at
+from madoc.identification.windows import Windows, drawn, horizons, longest_fit, rows_that_fit, windows_at
 from madoc.simulation.base import Simulator
 from madoc.tasks import Task
 
@@ -55,17 +56,23 @@ class Explanation:
         return int(np.argmin(np.log(np.maximum(self.overall, 1e-12)).mean(-1)))
 
 
-def explain(dataset: Dataset, simulator: Simulator, logged: LoggedStates, *, key: PRNGKeyArray) -> Explanation:
-    """Replay windows of the log from its exact states, at mid-range, in corners and at random points of the box."""
-    of_windows, of_box = jax.random.split(key)
+def explain(
+    dataset: Dataset,
+    simulator: Simulator,
+    logged: LoggedStates,
+    draws: Float[np.ndarray, "draws d"],
+    *,
+    key: PRNGKeyArray,
+) -> Explanation:
+    """Replay windows of the log from its exact states at each of the draws, in [-1, 1]; the first is mid-range."""
     states, rows = logged.exact()
-    steps = longest_fit(dataset, rows, max(HORIZONS))
-    chosen = drawn(rows_that_fit(dataset, rows, steps), WINDOWS, of_windows)
-    horizons = tuple(horizon for horizon in HORIZONS if horizon <= steps)
+    lengths = horizons(dataset)
+    steps = longest_fit(dataset, rows, max(lengths))
+    chosen = drawn(rows_that_fit(dataset, rows, steps), WINDOWS, key)
+    compared = tuple(length for length in lengths if length <= steps) or (steps,)
     windows = windows_at(dataset, states[chosen], rows[chosen], steps)
-    draws = box_draws(len(simulator.parameters), of_box)
-    errors = _errors(dataset, simulator, windows, rows[chosen], draws, horizons)
-    return Explanation(horizons, draws, errors, len(draws) * len(windows) * steps)
+    errors = _errors(dataset, simulator, windows, rows[chosen], draws, compared)
+    return Explanation(compared, draws, errors, len(draws) * len(windows) * steps)
 
 
 def box_draws(count: int, key: PRNGKeyArray) -> Float[np.ndarray, "draws d"]:
@@ -95,11 +102,18 @@ def explanation_findings(explanation: Explanation, channels: tuple[Channel, ...]
 
 
 def action_findings(
-    dataset: Dataset, simulator: Simulator, logged: LoggedStates, explanation: Explanation, *, key: PRNGKeyArray
+    dataset: Dataset,
+    simulator: Simulator,
+    logged: LoggedStates,
+    explanation: Explanation,
+    *,
+    told: Collection[str] = (),
+    key: PRNGKeyArray,
 ) -> tuple[list[Finding], int]:
     """Findings on actions that the model explains clearly better if they are reversed, a row later or a row earlier.
 
-    The second value is the number of control steps simulated.
+    Actions that are told of already are not reversed, and with any of them none is tried later. The second value is
+    the number of control steps simulated.
     """
     task, (states, rows) = simulator.task, logged.exact()
     at = min(1, len(explanation.horizons) - 1)
@@ -119,14 +133,14 @@ def action_findings(
     changes = []
     for index, name in enumerate(action_names(task)):
         reversed_actions = _reversed(windows.actions, task, index)
-        if reversed_actions is not None:
+        if reversed_actions is not None and name not in told:
             what = "with its sign reversed the model explains the log clearly better"
             changes.append((reversed_actions, Finding("warning", what, name, "reverse it in the spec or in the log")))
     action, stretch = np.asarray(dataset.transitions.action), rows[chosen][:, None] + np.arange(horizon)
     later = "a row later than they are logged", "add the parameter action_delay"
     earlier = "a row before they are logged", "log each action with what was seen just before it"
     for shift, (when, remedy) in ((-1, later), (1, earlier)):
-        if shift > 0 or not task.pending:
+        if shift > 0 or not (task.pending or told):
             what = f"the model explains the log clearly better if actions take effect {when}"
             changes.append((action[stretch + shift], Finding("warning", what, "actions", remedy)))
     plain = error(windows.actions)
@@ -140,11 +154,11 @@ def _errors(
     windows: Windows,
     rows: Int[np.ndarray, " windows"],
     draws: Float[np.ndarray, "draws d"],
-    horizons: tuple[int, ...],
+    compared: tuple[int, ...],
 ) -> Float[np.ndarray, "draws horizons signals"]:
     width = simulator.task.observation_size
     flat = window_residuals(simulator, windows, draws, np.ones(width))
-    at = np.array(horizons) - 1
+    at = np.array(compared) - 1
     residuals = flat.reshape(len(draws), len(windows), windows.steps, width)[:, :, at]
     seen = np.asarray(dataset.transitions.observation)[rows]
     still = windows.following[:, at] - seen[:, None]

@@ -27,8 +27,7 @@ def to_json(diagnosis: Diagnosis, space: ParameterSpace) -> dict[str, object]:
     counts = ("rows", "episodes", "runs", "control_step", "fatal")
     channels = [asdict(channel) for channel in diagnosis.channels]
     for channel in channels:
-        if channel["kind"] == "signal":
-            del channel["at_limits"]
+        del channel["at_limits" if channel["kind"] == "signal" else "resolution"]
     parameters = None
     if excitation is not None:
         columns = zip(space.parameters, _finite(excitation.effect), _finite(excitation.half_width), strict=True)
@@ -76,10 +75,13 @@ def _signals(diagnosis: Diagnosis) -> list[str]:
 
 
 def _channel_table(channels: tuple[Channel, ...]) -> Table:
-    table = _table("channels", ("channel", "unit"), ("lowest", "highest", "typical change", "at limits"))
+    table = _table(
+        "channels", ("channel", "unit"), ("lowest", "highest", "typical change", "read in steps of", "at limits")
+    )
     for row in channels:
+        steps = f"{row.resolution:.3g}" if row.resolution else ""
         limits = f"{100 * row.at_limits:.1f} %" if row.kind == "action" else ""
-        table.add_row(row.name, row.unit, f"{row.low:.4g}", f"{row.high:.4g}", f"{row.step:.3g}", limits)
+        table.add_row(row.name, row.unit, f"{row.low:.4g}", f"{row.high:.4g}", f"{row.step:.3g}", steps, limits)
     return table
 
 
@@ -105,11 +107,11 @@ def _parameter_table(excitation: Excitation, space: ParameterSpace) -> Table:
 
 
 def _finding_lines(findings: tuple[Finding, ...]) -> tuple[str, ...]:
-    if not findings:
-        return ("nothing to warn of",)
     counts = Counter(finding.level for finding in findings)
     names = dict(zip(LEVELS, ("fatal", "warnings", "notes"), strict=True))
+    warned = any(finding.level != "note" for finding in findings)
     lines = [", ".join(f"{counts[level]} {name}" for level, name in names.items() if counts[level])]
+    lines = lines if warned else ["nothing to warn of"]
     alike = Counter[tuple[str, str]]()
     for finding in findings:
         kind = (finding.level, finding.do)

@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import norm
 
 from madoc.data.dataset import Dataset, spread_of
 from madoc.identification.gauss_newton import eliminate
@@ -10,11 +9,11 @@ from madoc.identification.information import BOX_VARIANCE, CONFIDENCE
 from madoc.identification.linearisation import difference_points, linearise
 from madoc.identification.replay import Readings, slopes_at, window_residuals
 from madoc.identification.states import LoggedStates, probing_windows
-from madoc.identification.windows import HORIZONS
+from madoc.identification.windows import horizons
 from madoc.simulation.base import Simulator
 
-WINDOWS = {"exact": 400, "approximate": 64, "unknown": 64}
-"""Largest number of windows that are differentiated, by the kind of states; the result is scaled up to all rows."""
+SINGLE_STEPS, WINDOWS = 400, 64
+"""Largest number of single steps, or of windows, that are differentiated; the result is scaled up to all rows."""
 _HARDLY_NARROWED = 0.25
 """Share in [0, 1] of the box's variance; above it the data has narrowed a direction by less than half."""
 _STATE_DAMPING = 1e-9
@@ -27,16 +26,22 @@ def expected_half_widths(
     simulator: Simulator,
     point: Float[np.ndarray, " d"],
     noise: Float[np.ndarray, " observation"],
+    *,
+    exact: bool,
 ) -> tuple[Float[np.ndarray, " d"], int]:
     """Half of each parameter's smallest possible 95 % interval in [-1, 1], and the control steps simulated.
 
     It is computed from the Fisher information at `point`, as if the noise of all observations were independent, plus
-    the prior information of the box: of single steps from exact states, else of windows whose initial states are
-    eliminated. `noise` is the standard deviation of a single step's residuals or of an observation, in its unit.
+    the prior information of the box: of single steps from logged states if these are `exact`, else of windows whose
+    initial states are eliminated. `noise` is the standard deviation of a single step's residuals where states are
+    exact, else of an observation, in its unit.
     """
-    exact = logged.kind == "exact"
     windows = probing_windows(
-        logged, dataset, simulator, steps=1 if exact else HORIZONS[-1], count=WINDOWS[logged.kind]
+        logged,
+        dataset,
+        simulator,
+        steps=1 if exact else horizons(dataset)[-1],
+        count=SINGLE_STEPS if exact else WINDOWS,
     )
     if exact:
         points = difference_points(point)
@@ -57,6 +62,8 @@ def expected_half_widths(
         share = len(dataset) / windows.steps / max(1, int(around.whole.sum()))
     flat = slopes.reshape(-1, len(point))
     information = flat.T @ flat * share + np.eye(len(point)) / BOX_VARIANCE
+    from scipy.stats import norm  # slow to import, and only checks need it
+
     quantile = norm.ppf(0.5 + CONFIDENCE / 2.0)
     return quantile * np.sqrt(np.diag(widened(np.linalg.inv(information)))), spent
 

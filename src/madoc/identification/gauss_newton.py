@@ -17,6 +17,7 @@ from scipy.optimize import lsq_linear
 
 from madoc.identification.linearisation import Linearisation, WindowSlopes, difference_points, linearise
 from madoc.identification.losses import Loss, loss_slope, scale_of
+from madoc.identification.qr import thin_qr, triangle
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import Windows
 from madoc.simulation.base import Simulator
@@ -36,9 +37,7 @@ def triangular_factors(
     residuals = around.residuals.reshape(-1)
     jacobian = around.jacobian.reshape(-1, count)
     root = np.sqrt(loss_slope((residuals / scale) ** 2, loss) / max(1, len(residuals)))
-    # Zero rows keep the factor square where there are fewer values than parameters.
-    stacked = np.concatenate([root[:, None] * np.column_stack([jacobian, residuals]), np.zeros((count + 1, count + 1))])
-    factor = np.asarray(np.linalg.qr(stacked, mode="r"))
+    factor = triangle(root[:, None] * np.column_stack([jacobian, residuals]))
     return factor[:count, :count], factor[:count, count]
 
 
@@ -133,7 +132,7 @@ def eliminate(
     lengths = np.maximum(lengths, np.maximum(_SHORTEST * lengths.max(-1, keepdims=True), np.finfo(float).tiny ** 0.25))
     damped = np.zeros((windows, states, states))
     damped[:, np.arange(states), np.arange(states)] = np.sqrt(damping)[:, None] * lengths
-    basis, factor = np.linalg.qr(np.concatenate([by_states, damped], axis=1))
+    basis, factor = thin_qr(np.concatenate([by_states, damped], axis=1))
     others = root * np.concatenate([slopes.residuals[..., None], slopes.by_parameters], axis=-1)
     padded = np.concatenate([others, np.zeros((windows, states, others.shape[-1]))], axis=1)
     within = np.swapaxes(basis, 1, 2) @ padded

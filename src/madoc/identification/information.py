@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import t
 
 from madoc.identification.linearisation import Linearisation
 from madoc.identification.losses import Loss, loss_curvature, loss_slope
@@ -126,24 +125,32 @@ def sandwich(bread: Float[np.ndarray, "d d"], meat: Float[np.ndarray, "d d"]) ->
 def half_width(covariance: Float[np.ndarray, "d d"], windows: int) -> Float[np.ndarray, " d"]:
     """Half of the 95 % interval: Student's t with windows - d degrees of freedom times the standard error."""
     freedom = max(1, windows - len(covariance))
+    from scipy.stats import t  # slow to import, and only results need it
+
     return t.ppf(0.5 + CONFIDENCE / 2.0, freedom) * np.sqrt(np.diag(covariance))
 
 
 def identifiability(uncertainty: Uncertainty, names: tuple[str, ...]) -> tuple[str, ...]:
-    """A sentence for each direction that the data cannot identify, and one on pairs of highly correlated estimates."""
-    sentences: list[str] = []
-    named: set[str] = set()
+    """One sentence on parameters that the data cannot identify, and one on pairs of highly correlated estimates."""
+    alone: dict[str, None] = {}
+    together: dict[str, None] = {}
     for direction in np.abs(uncertainty.unidentified):
         involved = [name for name, part in zip(names, direction, strict=True) if part > _SHARE * direction.max()]
-        named.update(involved)
-        if len(involved) == 1:
-            sentences.append(f"the data does not identify {involved[0]}; leave it out or narrow its range")
-        else:
-            sentences.append(
-                f"the data does not identify {', '.join(involved)} together: they can change jointly without changing "
-                "what is seen; leave one of them out"
-            )
-    pairs = [pair for pair in correlated_pairs(uncertainty.correlation, names) if not named.issuperset(pair[:2])]
+        (alone if len(involved) == 1 else together).update(dict.fromkeys(involved))
+    sentences: list[str] = []
+    if together:
+        sentences.append(
+            f"the data does not identify {', '.join({**together, **alone})} together: they can change jointly without "
+            "changing what is seen; leave one of them out, or keep to the combinations that the data tells"
+        )
+    elif alone:
+        several, whose = ("them", "their") if len(alone) > 1 else ("it", "its")
+        sentences.append(f"the data does not identify {', '.join(alone)}; leave {several} out or narrow {whose} range")
+    pairs = [
+        pair
+        for pair in correlated_pairs(uncertainty.correlation, names)
+        if not {*together, *alone}.issuperset(pair[:2])
+    ]
     if pairs:
         listed = ", ".join(f"{first} and {second} ({value:+.2f})" for first, second, value in pairs)
         sentences.append(f"the data can hardly tell apart (correlation of the estimates): {listed}")

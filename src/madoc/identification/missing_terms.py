@@ -1,69 +1,49 @@
-"""Which single term that the model lacks would explain its residuals: a score test of one added term at a time.
+"""Which terms the model lacks, as the residuals suggest them, and how they would move the estimate.
 
 Windows of the log are simulated at the estimate, their initial states fitted. What neither initial states nor the
-calibrated parameters can explain of the residuals is regressed on the same part of each candidate's effect (Rao 1948).
-Standard errors are robust to residuals that are correlated within a window or larger in some windows than in others
-(Liang and Zeger 1986), so that contacts and process noise do not pass for a term.
+calibrated parameters can explain of the residuals is regressed on the same part of each candidate's effect. Terms that
+would move the estimate are then fitted together with the parameters.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from madoc import simulation
 from madoc.data.dataset import Dataset
-from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
-from madoc.identification.linearisation import DIFFERENCE, WindowSlopes, difference_points, slopes_of_windows
-from madoc.identification.losses import loss_slope, scale_of
-from madoc.identification.noise import channel_noise
-from madoc.identification.replay import Readings, slopes_at
+from madoc.identification.candidate_terms import INTEGRATION, Candidate, candidates, effects
+from madoc.identification.fitted_windows import (
+    FITS,
+    products_of,
+    refitted,
+    slopes_by_calibrated,
+    windows_of,
+    with_fitted_states,
+)
+from madoc.identification.replay import Readings
+from madoc.identification.score_tests import Products, Score, deviate, joint_shift, parameter_shift, score
 from madoc.identification.states import LoggedStates
-from madoc.identification.windows import disjoint_windows, evenly, longest_fit
-from madoc.parameters import FIELDS, Parameter, ParameterSpace
+from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
-from madoc.simulation.write import nominal_values
 
-WINDOWS = 120
-"""Largest number of windows that are simulated; their standard errors vary by about 10 % with so many."""
-STEPS = 20
-"""Length of a window in control steps, 1 or more: in longer ones small errors of the model grow beyond their slopes."""
-NEGLIGIBLE = 1e-5
-"""Residual in typical changes of a step; below it there is nothing to explain."""
-_CHANGE = 1e-3
-"""Change of a candidate, as a share of what would balance the joint's typical torque, for its one-sided difference."""
-_STATE_DAMPING = 1e-9
-"""Relative damping of initial states, far below the rounding of their differences."""
-_DAMPING = 1e-6
-"""Relative damping of a step of the parameters."""
-_FITS = 4
-"""Gauss-Newton steps of parameters and of initial states, which begin at the estimate and at logged states."""
-_OUTLYING = 3.0
-"""Mean squared residual of a window over the median window's; above it the window holds an event of its own."""
-_DISTINCT = 1e-3
-"""Share of a candidate's squared effect that calibrated parameters cannot imitate; below it the two are one."""
-_FEWEST = 12
-"""Fewest windows beyond the number of parameters for which a standard error is worth anything."""
-
-CAUSES = {
-    "dof_frictionloss": "Coulomb friction",
-    "dof_drag": "drag that grows with the square of the speed",
-    "dof_damping": "viscous damping",
-    "dof_armature": "inertia that goes with the acceleration of a joint",
-    "jnt_stiffness": "a spring",
-    "actuator_gain": "another gain of the actuator",
-    "signal_bias": "an offset of the sensor",
-    "gravity": "another gravity",
-}
-"""What a candidate of each field stands for, in words."""
-DELAY = "actions that take effect later, by a delay or a lag of the actuator"
-SPACING = "rows that are farther apart in time than the spec says"
-INTEGRATION = "the error of the model's integration step"
-DRIFT = "a value that changes over the log"
 SUSPICIOUS = 2.0
 """|t| from which a term cannot be excluded: 5 % of terms that are not missing reach it by chance."""
+DISAGREEING = 3.0
+"""|t| from which parts of the log, or windows of another length, give another estimate: one in 370 does by chance."""
+TOGETHER = 4
+"""Largest number of terms whose common effect on the estimate is computed."""
+WORTH_FITTING = 0.5
+"""Shift of a parameter in half-widths of its 95 % interval, from which terms are fitted with the parameters."""
+MOST_FITTED = 2
+"""Largest number of terms that are fitted together with the parameters."""
+DRIFT = "a value that changes over the log"
+OTHER_WINDOWS = "windows of another length, which give another estimate"
+_NORMAL_95 = 1.96
+"""Half of a 95 % interval in standard errors of a normal estimate."""
+_FEWEST = 12
+"""Fewest windows beyond the number of parameters for which a standard error is worth anything."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +57,7 @@ class MissingTerm:
         standard_error: Of the value.
         unit: Unit of the value.
         explained: Share of the squared residuals that it explains, those of initial states and parameters taken away.
-        t: Its change from the model over the standard error.
+        t: Its change from the model over the standard error, as the normal deviate of the same probability.
         shifts: By how much each calibrated parameter would move if the term were included, in half-widths of its
             95 % interval.
     """
@@ -93,28 +73,46 @@ class MissingTerm:
 
 
 @dataclass(frozen=True)
-class _Candidate:
-    """A term that is tried: its value in the model, its unit change, and the least value that is physical."""
+class Alternative:
+    """Another estimate that the log does not exclude: of a model with more terms, or of other parts of the log.
 
-    cause: str
-    parameter: str
-    unit: str
-    nominal: float
-    reference: float
-    least: float
+    Attributes:
+        causes: What it rests on, in words.
+        terms: Whether these are terms that the model may lack.
+        shifts: By how much it moves each calibrated parameter, in half-widths of its 95 % interval.
+        errors: Half of the 95 % interval of each shift, in the same unit.
+    """
+
+    causes: tuple[str, ...]
+    terms: bool
+    shifts: dict[str, float]
+    errors: dict[str, float]
 
 
-def missing_terms(
+@dataclass(frozen=True)
+class Suspicions:
+    """What the log says against the model.
+
+    Attributes:
+        terms: Candidates with a physical sign, such as friction that takes energy out, the most significant first.
+        alternatives: Other estimates that it does not exclude.
+        control_steps: Control steps that were simulated to find that out.
+    """
+
+    terms: tuple[MissingTerm, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
+    control_steps: int = 0
+
+
+def suspicions(
     dataset: Dataset,
     logged: LoggedStates,
     simulator: Simulator,
     point: Float[np.ndarray, " d"],
     half_widths: Float[np.ndarray, " d"],
     scale: Float[np.ndarray, " observation"],
-) -> tuple[tuple[MissingTerm, ...], int]:
-    """Candidates that a log is consistent with, the most significant first, and the control steps spent.
-
-    Only terms are returned whose sign is physical, such as friction that takes energy out.
+) -> Suspicions:
+    """Terms that the model may lack, and what including them would do to the estimate.
 
     Args:
         dataset: The log that was calibrated to.
@@ -125,274 +123,216 @@ def missing_terms(
         half_widths: Half of each parameter's 95 % interval in [-1, 1].
         scale: Typical change of each signal in a step.
     """
-    readings, states, before = _windows(dataset, logged, scale)
+    readings, states, before = windows_of(dataset, logged, scale, fewest=2 * (_FEWEST + len(point)))
     if len(readings) < _FEWEST + len(point):
-        return (), 0
-    point = _refitted(simulator, readings, states, point)
-    added = list(_candidates(dataset, logged, simulator, point, scale))
+        return Suspicions()
+    led, states = refitted(simulator, readings, states, point)
+    added = list(candidates(logged, simulator, led, scale))
     space = ParameterSpace((*simulator.parameters.parameters, *(parameter for _, parameter in added)))
     wide = simulation.make(replace(simulator.task, parameters=space))
-    at_nominal = np.concatenate([point, -np.ones(len(added))])
-    for _ in range(_FITS):
-        (around,) = slopes_at(wide, readings, at_nominal[None], states[None], parameters=False)
-        fit = eliminate(around, np.ones_like(around.residuals), np.full(len(readings), _STATE_DAMPING))
-        moved = states + readings.in_state_units(fit.states_step(np.zeros(0)), states.shape[1])
-        better = _costs(readings.residuals(wide, at_nominal[None], moved[None])[0, 0]) < _costs(around.residuals)
-        states = np.where((better & around.whole)[:, None], moved, states)
-    parameters = _by_calibrated(wide, readings, at_nominal, states, len(point))
-    names, effects = _effects(simulator, wide, readings, before, at_nominal, states, added)
-    slopes = replace(parameters, by_parameters=np.concatenate([parameters.by_parameters, effects], axis=-1))
-    finite = slopes.whole & np.isfinite(effects).all((1, 2))
-    columns = 1 + 2 * len(point) + len(readings.spread)
-    spent = (_FITS * (2 * columns + 2) + columns + len(names)) * len(readings) * readings.steps
-    reduced = _without_states(slopes, readings, finite)
-    if reduced is None:
-        return (), spent
-    terms = _scores(*reduced, simulator.parameters, half_widths, names)
-    return tuple(sorted(terms, key=lambda term: -abs(term.t))), spent
-
-
-def _windows(
-    dataset: Dataset, logged: LoggedStates, scale: Float[np.ndarray, " observation"]
-) -> tuple[Readings, Float[np.ndarray, "windows state"], Float[np.ndarray, "windows action"]]:
-    """Windows that share no observation, guesses of their initial states, and the actions before them."""
-    steps = longest_fit(dataset, logged.rows, STEPS)
-    later = logged.rows > dataset.episode_starts[dataset.episode_of(logged.rows)]
-    rows, states = logged.rows[later], logged.states[later]
-    chosen = evenly(disjoint_windows(dataset, rows, steps), WINDOWS) if len(rows) else np.zeros(0, np.int64)
-    readings = Readings.at(dataset, logged, rows[chosen], steps, scale)
-    return readings, states[chosen], np.asarray(dataset.transitions.action, np.float64)[rows[chosen] - 1]
-
-
-def _refitted(
-    simulator: Simulator,
-    readings: Readings,
-    states: Float[np.ndarray, "windows state"],
-    point: Float[np.ndarray, " d"],
-) -> Float[np.ndarray, " d"]:
-    """The nearest parameters that explain the windows best; those given if no step of the search helps."""
-    damping, best, least = np.full(len(readings), _STATE_DAMPING), point, np.inf
-    for _ in range(_FITS):
-        (around,) = slopes_at(simulator, readings, point[None], states[None])
-        if not around.whole.any():
-            break
-        fixed = eliminate(around, np.ones_like(around.residuals), damping).reduced.residuals[around.whole]
-        cost = float(np.median((fixed**2).mean(-1)))
-        if cost < least:
-            best, least = point, cost
-        scale = scale_of(around.residuals[around.whole], "cauchy")
-        weights = loss_slope((around.residuals / scale) ** 2, "cauchy") * around.whole[:, None]
-        left = eliminate(around, weights, damping)
-        step = damped_step(*triangular_factors(left.reduced, 1.0, "linear"), point, _DAMPING)
-        states = states + readings.in_state_units(left.states_step(step), states.shape[1])
-        point = point + step
-    return best
-
-
-def _candidates(
-    dataset: Dataset,
-    logged: LoggedStates,
-    simulator: Simulator,
-    point: Float[np.ndarray, " d"],
-    scale: Float[np.ndarray, " observation"],
-) -> Iterator[tuple[_Candidate, Parameter]]:
-    """Terms that a spec can add and does not calibrate: one a joint, actuator or sensor.
-
-    The reference of a term is the value with which it would balance the torque that typically accelerates the joint.
-    """
-    values = simulator.parameters.to_physical(point)
-    model, task = simulator.model(values), simulator.task
-    nominal_of = partial(nominal_values, model)
-    calibrated = {(each.field, element) for each in simulator.parameters.parameters for element in each.elements}
-    position, speed = (logged.states[:, : model.nq], logged.states[:, model.nq : model.nq + model.nv])
-    change = np.diff(speed, axis=0)[np.diff(logged.rows) == 1]
-    acceleration = np.sqrt((change**2).mean(0)) / simulator.control_step if len(change) else np.ones(model.nv)
-    for joint in range(model.njnt):
-        view = model.joint(joint)
-        if len(view.damping) != 1 or not view.name:
-            continue
-        dof, address = int(view.dofadr[0]), int(view.qposadr[0])
-        inertia, fast = float(model.dof_M0[dof]), max(float(np.sqrt((speed[:, dof] ** 2).mean())), 1e-9)
-        far = max(float(position[:, address].std()), 1e-9)
-        torque = max(inertia * float(acceleration[dof]), 1e-12)
-        references = {
-            "dof_frictionloss": torque,
-            "dof_drag": torque / fast**2,
-            "dof_damping": torque / fast,
-            "jnt_stiffness": torque / far,
-            "dof_armature": inertia,
-        }
-        for field, reference in references.items():
-            if (field, view.name) not in calibrated:
-                yield _candidate(nominal_of, field, view.name, reference)
-    for channel in task.actions:
-        if ("actuator_gain", channel.actuator) not in calibrated:
-            gain = abs(float(model.actuator(channel.actuator).gainprm[0])) or 1.0
-            yield _candidate(nominal_of, "actuator_gain", channel.actuator, gain)
-    if not any(each.field == "gravity" for each in simulator.parameters.parameters) and abs(model.opt.gravity[2]) > 0:
-        yield _candidate(nominal_of, "gravity", "", float(abs(model.opt.gravity[2])))
-    if task.source is not None:
-        for signal, typical in zip(task.signals[: logged.measured], scale, strict=False):
-            if ("signal_bias", signal) not in calibrated:
-                yield _candidate(nominal_of, "signal_bias", signal, float(typical))
-
-
-def _candidate(
-    nominal_of: Callable[[Parameter], tuple[float, ...]], field: str, element: str, reference: float
-) -> tuple[_Candidate, Parameter]:
-    """A term, and the parameter whose range begins at its value in the model and is `reference` wide."""
-    parameter = Parameter(field, element, 0.0, reference)
-    nominal = nominal_of(parameter)[0]
-    parameter = replace(parameter, low=nominal, high=nominal + reference)
-    kind = FIELDS[field]
-    return _Candidate(CAUSES[field], parameter.name, kind.unit, nominal, reference, kind.minimum), parameter
-
-
-def _by_calibrated(
-    wide: Simulator,
-    readings: Readings,
-    at: Float[np.ndarray, " k"],
-    states: Float[np.ndarray, "windows state"],
-    count: int,
-) -> WindowSlopes:
-    """Residuals and their derivatives by the calibrated parameters and the initial states."""
-    points = np.concatenate(
-        [difference_points(at[:count]), np.broadcast_to(at[count:], (1 + 2 * count, len(at) - count))], axis=1
+    at_nominal = np.concatenate([led, -np.ones(len(added))])
+    states = with_fitted_states(wide, readings, states, at_nominal)
+    slopes = slopes_by_calibrated(wide, readings, at_nominal, states, len(led))
+    tried, by_terms = effects(simulator, wide, readings, before, at_nominal, states, added)
+    spent = _fit_cost(readings, len(led)) + len(tried) * len(readings) * readings.steps
+    both = replace(slopes, by_parameters=np.concatenate([slopes.by_parameters, by_terms], axis=-1))
+    products = products_of(both, readings, len(led))
+    if products is None or len(products) < _FEWEST + len(led):
+        return Suspicions(control_steps=spent)
+    tests = _Tests(products, tuple(tried), simulator.parameters, half_widths)
+    chosen = _chosen(tests)
+    terms, others = (
+        [*_terms(tests), *_drifts(tests)],
+        [*_of_parts(_drifts(tests)), *_of_other_windows(tests, led - point)],
     )
-    by_points = readings.residuals(wide, points, np.repeat(states[None], len(points), axis=0))[:, 0]
-    shift = readings.in_state_units(DIFFERENCE * np.eye(len(readings.spread)), states.shape[1])
-    by_shifts = readings.residuals(wide, at[None], (states + shift[:, None]).reshape(1, -1, states.shape[1]))[0]
-    return slopes_of_windows(points[:, :count], by_points, by_shifts)
+    if chosen:
+        together = _with_terms(tests, chosen)
+        fit = None
+        if max(map(abs, together.shifts.values())) >= WORTH_FITTING:
+            fit = _fitted(tests, chosen, simulator, readings, states, led, point)
+        if fit is not None:
+            spent += _fit_cost(readings, len(led) + len(fit.terms))
+            terms = [fit.terms.get(term.parameter, term) for term in terms]
+            others.append(fit.alternative)
+        if fit is None or len(fit.terms) < len(chosen):
+            others.append(together)
+    return Suspicions(tuple(sorted(terms, key=lambda term: -abs(term.t))), tuple(others), spent)
 
 
-def _effects(
-    simulator: Simulator,
-    wide: Simulator,
-    readings: Readings,
-    before: Float[np.ndarray, "windows action"],
-    at: Float[np.ndarray, " k"],
-    states: Float[np.ndarray, "windows state"],
-    added: list[tuple[_Candidate, Parameter]],
-) -> tuple[list[_Candidate], Float[np.ndarray, "windows values terms"]]:
-    """Every candidate and the derivative of the residuals by it, in its reference."""
-    count, base = len(added), readings.residuals(wide, at[None], states[None])[0, 0]
-    points = np.repeat(at[None], count, axis=0)
-    points[np.arange(count), len(at) - count + np.arange(count)] += 2.0 * _CHANGE
-    by_candidate = readings.residuals(wide, points, np.repeat(states[None], count, axis=0))[:, 0] - base
-    candidates, effects = [candidate for candidate, _ in added], list(by_candidate / _CHANGE)
-    point, step = at[: len(at) - count], simulator.control_step
-    earlier = np.concatenate([before[:, None], readings.actions[:, :-1]], axis=1)
-    late = replace(readings, actions=readings.actions + 0.1 * (earlier - readings.actions))
-    stretched = simulation.make(simulator.task.with_time_step(1.0 + _CHANGE))
-    finer = simulation.make(simulator.task.with_time_step(0.25, substeps=4))
-    for cause, parameter, nominal, reference, least, other, inputs, change in (
-        (DELAY, "action_delay", 0.0, step, -np.inf, simulator, late, 0.1),
-        (SPACING, "", step, step, 0.0, stretched, readings, _CHANGE),
-        (INTEGRATION, "", 0.0, 1.0, -np.inf, finer, readings, 1.0),
-    ):
-        if any(each.field == parameter for each in simulator.parameters.parameters):
+@dataclass(frozen=True)
+class _Tests:
+    """What score tests need: products of residuals and derivatives, the candidates, and the scale of shifts."""
+
+    products: Products
+    tried: tuple[Candidate, ...]
+    space: ParameterSpace
+    half_widths: Float[np.ndarray, " d"]
+
+    def score(self, index: int, beside: Sequence[int] = ()) -> Score | None:
+        """The score of a candidate beside others; None if there is none, or if its value would not be physical."""
+        first = 1 + self.products.count
+        found, candidate = score(self.products, first + index, [first + other for other in beside]), self.tried[index]
+        below = found is not None and candidate.nominal + found.change * candidate.reference < candidate.least
+        return None if below else found
+
+    def by_name(self, values: Float[np.ndarray, " d"]) -> dict[str, float]:
+        """Values in [-1, 1] of each parameter, by name and in half-widths."""
+        return dict(zip(self.space.names, (values / self.half_widths).tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Terms by the name of their parameter, fitted together with the parameters, and the estimate with them."""
+
+    terms: dict[str, MissingTerm]
+    alternative: Alternative
+
+
+def _fit_cost(readings: Readings, count: int) -> int:
+    """Control steps of a fit of so many parameters and of initial states."""
+    columns = 1 + 2 * count + len(readings.spread)
+    return (FITS * (2 * columns + 2) + columns) * len(readings) * readings.steps
+
+
+def _terms(tests: _Tests) -> Iterator[MissingTerm]:
+    """The score test of every candidate whose value is physical.
+
+    If the error of the integration step is significant, it is taken away before the others are tested.
+    """
+    beside: list[int] = []
+    for index in sorted(range(len(tests.tried)), key=lambda index: tests.tried[index].cause != INTEGRATION):
+        candidate, found = tests.tried[index], tests.score(index, beside)
+        if found is None:
             continue
-        moved = inputs.residuals(other, point[None], states[None])[0, 0]
-        candidates.append(_Candidate(cause, parameter, "" if cause == INTEGRATION else "s", nominal, reference, least))
-        effects.append((moved - base) / change)
-    return candidates, np.stack(effects, axis=-1)
+        if candidate.cause == INTEGRATION and abs(found.t) >= SUSPICIOUS:
+            beside = [index]
+        yield _term(candidate, found, tests.by_name(found.shifts))
 
 
-def _costs(residuals: Float[np.ndarray, "windows values"]) -> Float[np.ndarray, " windows"]:
-    with np.errstate(over="ignore", invalid="ignore"):
-        cost = (residuals**2).mean(-1)
-    return np.where(np.isfinite(cost), cost, np.inf)
-
-
-def _without_states(
-    slopes: WindowSlopes, readings: Readings, whole: Bool[np.ndarray, " windows"]
-) -> tuple[Float[np.ndarray, "kept values"], Float[np.ndarray, "kept values columns"]] | None:
-    """Residuals and derivatives in units of the noise that no initial state explains; None if there is nothing left.
-
-    Windows with an event of their own, as a contact that begins, are left out.
-    """
-    shape = (int(whole.sum()), readings.steps + 1, len(readings.scale))
-    if not shape[0] or np.abs(slopes.residuals[whole]).max() < NEGLIGIBLE:
-        return None
-    damping = np.full(len(whole), _STATE_DAMPING)
-    first = eliminate(slopes, np.ones_like(slopes.residuals), damping)
-    noise = channel_noise(
-        first.reduced.residuals[whole, : shape[1] * shape[2]].reshape(shape), first.spare[whole].reshape(shape)
-    )
-    left = eliminate(slopes.over(np.tile(noise, shape[1])), np.ones_like(slopes.residuals), damping).reduced
-    cost = (left.residuals**2).mean(-1)
-    kept = whole & (cost <= _OUTLYING * np.median(cost[whole]))
-    return left.residuals[kept], left.jacobian[kept]
-
-
-def _scores(
-    residuals: Float[np.ndarray, "windows values"],
-    jacobian: Float[np.ndarray, "windows values columns"],
-    space: ParameterSpace,
-    half_widths: Float[np.ndarray, " d"],
-    candidates: list[_Candidate],
-) -> Iterator[MissingTerm]:
-    """The score test of every candidate, where residuals leave enough windows for one.
-
-    The first columns of the Jacobian are the calibrated parameters', the others the candidates'. If the error of the
-    integration step is significant, it is taken away before the others are tested.
-    """
-    windows, count = len(residuals), len(space)
-    if windows < _FEWEST + count:
-        return
-    parameters, effects = jacobian[..., :count], jacobian[..., count:]
-    explained_already = parameters
-    for index in sorted(range(len(candidates)), key=lambda index: candidates[index].cause != INTEGRATION):
-        term = _score(residuals, explained_already, effects[..., index], parameters, half_widths, candidates[index])
-        if term is None:
-            continue
-        if term.cause == INTEGRATION and abs(term.t) >= SUSPICIOUS:
-            explained_already = np.concatenate([parameters, effects[..., index : index + 1]], axis=-1)
-        yield replace(term, shifts=dict(zip(space.names, term.shifts.values(), strict=True)))
-    time = np.linspace(-1.0, 1.0, windows)
-    for index, name in enumerate(space.names):
-        width = float(space.high[index] - space.low[index]) / 2.0
-        candidate = _Candidate(DRIFT, name, space.parameters[index].unit, 0.0, width, -np.inf)
-        for shape in (time, time < -1.0 / 3.0, time > 1.0 / 3.0):
-            effect = (shape - np.mean(shape))[:, None] * parameters[..., index]
-            term = _score(residuals, explained_already, effect, parameters, half_widths, candidate)
-            if term is not None:
-                yield replace(term, shifts={name: term.value / width / float(half_widths[index])})
-
-
-def _score(
-    residuals: Float[np.ndarray, "windows values"],
-    explained_already: Float[np.ndarray, "windows values columns"],
-    effect: Float[np.ndarray, "windows values"],
-    parameters: Float[np.ndarray, "windows values d"],
-    half_widths: Float[np.ndarray, " d"],
-    candidate: _Candidate,
-) -> MissingTerm | None:
-    """One candidate's change, its cluster-robust standard error, and how it would move the calibrated parameters.
-
-    None if the columns that explain residuals already imitate the effect, or if the value is not physical.
-    """
-    windows, count = len(residuals), explained_already.shape[-1]
-    basis, _ = np.linalg.qr(explained_already.reshape(-1, count))
-    column, y = effect.reshape(-1), residuals.reshape(-1)
-    z, y = column - basis @ (basis.T @ column), y - basis @ (basis.T @ y)
-    power = float(z @ z)
-    if power <= _DISTINCT * float(column @ column):
-        return None
-    change = -float(z @ y) / power
-    scores = (z * (y + change * z)).reshape(windows, -1).sum(-1)
-    error = float(np.sqrt((scores**2).sum() * windows / (windows - count - 1))) / power
-    value = candidate.nominal + change * candidate.reference
-    if not error > 0.0 or value < candidate.least:
-        return None
-    shift = np.linalg.lstsq(parameters.reshape(len(column), -1), -column * change, rcond=None)[0]
+def _term(candidate: Candidate, found: Score, shifts: dict[str, float]) -> MissingTerm:
     return MissingTerm(
         cause=candidate.cause,
         parameter=candidate.parameter,
-        value=value,
-        standard_error=error * candidate.reference,
+        value=candidate.nominal + found.change * candidate.reference,
+        standard_error=found.error * candidate.reference,
         unit=candidate.unit,
-        explained=change**2 * power / float(y @ y),
-        t=change / error,
-        shifts={str(index): float(each) for index, each in enumerate(shift / half_widths)},
+        explained=found.explained,
+        t=found.t,
+        shifts=shifts,
     )
+
+
+def _drifts(tests: _Tests) -> Iterator[MissingTerm]:
+    """How each parameter changes over the log: in a straight line, in its first third, and in its last."""
+    time = np.linspace(-1.0, 1.0, len(tests.products))
+    shapes = [shape - np.mean(shape) for shape in (time, time < -1.0 / 3.0, time > 1.0 / 3.0)]
+    for index, row in enumerate(tests.space.parameters):
+        candidate = Candidate(DRIFT, row.name, row.unit, 0.0, (row.high - row.low) / 2.0, -np.inf)
+        for shape in shapes:
+            found = score(tests.products, 1 + index, shape=shape)
+            if found is not None:
+                yield _term(candidate, found, {row.name: found.change / float(tests.half_widths[index])})
+
+
+def _chosen(tests: _Tests) -> list[int]:
+    """Candidates that cannot be excluded, each the most significant beside those before it."""
+    chosen: list[int] = []
+    for _ in range(TOGETHER):
+        scores = {index: tests.score(index, chosen) for index in range(len(tests.tried)) if index not in chosen}
+        significance = {index: abs(found.t) for index, found in scores.items() if found is not None}
+        best = max(significance, key=lambda index: significance[index], default=None)
+        if best is None or significance[best] < SUSPICIOUS:
+            break
+        chosen.append(best)
+    return chosen
+
+
+def _with_terms(tests: _Tests, chosen: list[int]) -> Alternative:
+    """The estimate of the model with these terms, by linear regression.
+
+    The error of the integration step counts as uncertain by all of its effect, as that changes with the length of
+    windows.
+    """
+    _, shift, covariance = joint_shift(tests.products, [1 + tests.products.count + index for index in chosen])
+    error = _NORMAL_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    for index in chosen:
+        if tests.tried[index].cause == INTEGRATION:
+            alone = tests.score(index)
+            error = np.hypot(error, 0.0 if alone is None else alone.shifts)
+    causes = tuple(dict.fromkeys(_named(tests.tried[index]) for index in chosen))
+    return Alternative(causes, True, tests.by_name(shift), tests.by_name(error))
+
+
+def _fitted(
+    tests: _Tests,
+    chosen: list[int],
+    simulator: Simulator,
+    readings: Readings,
+    states: Float[np.ndarray, "windows state"],
+    led: Float[np.ndarray, " d"],
+    point: Float[np.ndarray, " d"],
+) -> _Fit | None:
+    """The first of these terms fitted together with the parameters; None if a spec can say none of them.
+
+    A score test is one linear step, which is too short where residuals are far from noise and so count little.
+    """
+    changes, shift, _ = joint_shift(tests.products, [1 + tests.products.count + index for index in chosen])
+    possible = [
+        (tests.tried[index], parameter, float(change))
+        for index, change in zip(chosen, changes, strict=True)
+        if (found := tests.score(index)) is not None and (parameter := tests.tried[index].added(found)) is not None
+    ][:MOST_FITTED]
+    if not possible:
+        return None
+    space = ParameterSpace((*tests.space.parameters, *(parameter for _, parameter, _ in possible)))
+    wide = simulation.make(replace(simulator.task, parameters=space))
+    values = np.array([candidate.nominal + change * candidate.reference for candidate, _, change in possible])
+    start = np.concatenate([led + shift, np.zeros(len(values))])
+    start[len(led) :] = space.to_unit(np.concatenate([simulator.parameters.middle, values]))[len(led) :]
+    at, states = refitted(wide, readings, states, np.clip(start, -1.0, 1.0))
+    states = with_fitted_states(wide, readings, states, at)
+    products = products_of(slopes_by_calibrated(wide, readings, at, states, len(at)), readings, len(at))
+    if products is None:
+        return None
+    step, covariance = parameter_shift(products)
+    at, error = at + step, np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    alone = np.sqrt(np.maximum(np.diag(parameter_shift(tests.products)[1]), 0.0))
+    beyond = _NORMAL_95 * np.sqrt(np.maximum(error[: len(led)] ** 2 - alone**2, 0.0))
+    shifts, physical = tests.by_name(at[: len(led)] - point), space.to_physical(at)
+    terms = {}
+    for place, (candidate, parameter, _) in enumerate(possible, start=len(led)):
+        found = tests.score(tests.tried.index(candidate))
+        value, deviation = float(physical[place]), float(error[place]) * (parameter.high - parameter.low) / 2.0
+        if found is not None and deviation > 0.0:
+            significance = deviate((value - candidate.nominal) / deviation, found.freedom)
+            term = replace(_term(candidate, found, shifts), value=value, standard_error=deviation, t=significance)
+            terms[candidate.parameter] = term
+    causes = tuple(_named(candidate) for candidate, _, _ in possible)
+    return _Fit(terms, Alternative(causes, True, shifts, tests.by_name(beyond)))
+
+
+def _of_parts(drifts: Iterator[MissingTerm]) -> Iterator[Alternative]:
+    """Estimates of parts of the log that disagree with the whole, to either side."""
+    for term in drifts:
+        if abs(term.t) >= DISAGREEING:
+            shift = term.shifts[term.parameter]
+            errors = {term.parameter: abs(_NORMAL_95 * shift / term.t)}
+            for side in (-shift, shift):
+                yield Alternative((f"{term.parameter} changing over the log",), False, {term.parameter: side}, errors)
+
+
+def _of_other_windows(tests: _Tests, led: Float[np.ndarray, " d"]) -> Iterator[Alternative]:
+    """The estimate of these windows, where it disagrees with the given one, from which `led` has led to them."""
+    step, covariance = parameter_shift(tests.products)
+    shifts = tests.by_name(led + step)
+    errors = tests.by_name(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    apart = [
+        name for name, shift in shifts.items() if abs(shift) > DISAGREEING * np.hypot(errors[name], 1.0 / _NORMAL_95)
+    ]
+    if apart:
+        beyond = {name: _NORMAL_95 * errors[name] for name in apart}
+        yield Alternative((OTHER_WINDOWS,), False, {name: shifts[name] for name in apart}, beyond)
+
+
+def _named(candidate: Candidate) -> str:
+    return f"{candidate.cause} ({candidate.parameter})" if candidate.parameter else candidate.cause

@@ -10,13 +10,21 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from madoc.data.dataset import Dataset
+from madoc.data.timescale import stride
 from madoc.errors import MadocError
 
 HORIZONS = (1, 5, 20)
-"""Window lengths in control steps at which simulated and logged motion are compared. Most methods fit single steps; an
-error that is small in each of them adds up."""
+"""Window lengths in strides (`data.timescale`) at which simulated and logged motion are compared; the last is the
+robot's time scale where the log's rate is high. Most methods fit single steps; an error that is small in each of them
+adds up."""
 
 Positions = Int[np.ndarray, " windows"]
+
+
+def horizons(dataset: Dataset) -> tuple[int, ...]:
+    """`HORIZONS` in control steps."""
+    rows = stride(dataset)
+    return tuple(rows * strides for strides in HORIZONS)
 
 
 @dataclass(frozen=True)

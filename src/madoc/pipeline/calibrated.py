@@ -3,15 +3,22 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
 from madoc.calibration import CalibrationResult
 from madoc.errors import MadocError
 from madoc.parameters import Parameter, ParameterSpace
 from madoc.pipeline.data_stage import Machine
 from madoc.pipeline.folders import ENDED
-from madoc.pipeline.orders import Reading, Source
+from madoc.pipeline.orders import Drawing, Reading, Source
+from madoc.policies import NormalParameters
 from madoc.report.records import SpecRecord, read_spec, restored_path
 from madoc.runs.files import read_json
 from madoc.tasks import Task
+
+NORMAL_95 = 1.96
+"""Half-width of a normal distribution's 95 % interval in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,29 @@ class Calibrated:
             return None
         reading = Reading(data.format, data.clip_actions, data.disturbance)
         return Source(tuple(restored_path(path, self.folder) for path in data.paths), data.max_transitions, reading)
+
+    def distribution(self, drawing: Drawing | None = None) -> NormalParameters:
+        """The joint distribution of the estimate: normal, with the correlations of its covariance.
+
+        The spread of a parameter is the standard deviation that its 95 % interval stands for: the interval is wider
+        than the covariance says where the model may lack a term.
+        """
+        drawing, spread = drawing or Drawing(), self.half_widths / NORMAL_95
+        correlation = np.eye(len(spread))
+        if self.result.covariance is not None:
+            covariance = np.asarray(self.result.covariance)
+            deviation = np.sqrt(np.diag(covariance))
+            deviation[deviation == 0.0] = 1.0
+            correlation = covariance / np.outer(deviation, deviation)
+            np.fill_diagonal(correlation, 1.0)
+        joint = drawing.width**2 * correlation * np.outer(spread, spread)
+        return NormalParameters(self.task.parameters, self.result.mean, joint, drawing.share)
+
+    @property
+    def half_widths(self) -> Float[np.ndarray, " parameters"]:
+        """Half the width of each parameter's 95 % interval, in its unit; that of a normal one where it has none."""
+        spans = [row.interval or (-NORMAL_95 * row.std, NORMAL_95 * row.std) for row in self.result.parameters.values()]
+        return np.array([(high - low) / 2.0 for low, high in spans])
 
 
 def read_calibration(path: str | Path, *, physics: str | None = None) -> Calibrated:

@@ -5,12 +5,14 @@ from pathlib import Path
 
 from madoc.calibration import CALIBRATORS, CalibrationResult, Calibrator, calibrate
 from madoc.calibration.holdout import NotRun, Tried
-from madoc.errors import MadocError, unknown_name
+from madoc.errors import MadocError
 from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
 from madoc.pipeline.keys import seed_key
-from madoc.pipeline.methods import hyperparameters, make_method
+from madoc.pipeline.methods import CANDIDATES, candidates_for, hyperparameters, make_method
 from madoc.pipeline.orders import AUTO, CalibrationOrder
-from madoc.pipeline.preparation import Prepared, check_order, method_of, prepare
+from madoc.pipeline.preparation import Prepared, prepare
+from madoc.pipeline.refusals import check_order, method_of
+from madoc.runs.budget import Budget, Seconds
 from madoc.runs.files import read_json
 from madoc.verdict import Assessment, assess
 from madoc.verdict.evidence import evidence, save_evidence
@@ -18,11 +20,6 @@ from madoc.verdict.judge import explains_all
 
 COMPARISON = "comparison.json"
 """Name of the file that `auto` leaves of what it has compared."""
-CANDIDATES = {"least-squares": 2 / 3, "madoc": 1 / 2}
-"""The methods that `auto` tries, in this order (seconds before minutes), with the largest share of the budget of each.
-
-What a method does not spend is left to those after it.
-"""
 
 
 def calibrate_in(
@@ -37,7 +34,7 @@ def calibrate_in(
     check_order(order, out)
     if method_of(order) == AUTO:
         return _calibrate_auto(out, prepare(order), resume=resume, quiet=quiet)
-    method = make_method(CALIBRATORS, method_of(order), order.search.changes)
+    (method,) = methods_for(order).values()
     return _calibrate_by(method, out, prepare(order), resume=resume, quiet=quiet)[0]
 
 
@@ -46,20 +43,16 @@ def default_folder(order: CalibrationOrder) -> Path:
     return Path("runs") / f"{Path(order.task).stem}-{method_of(order)}-{order.search.seed}"
 
 
-def candidates_for(prepared: Prepared) -> dict[str, Calibrator]:
-    """The candidates of `auto` by name; a hyperparameter is changed under a name such as `madoc.updates`.
+def methods_for(order: CalibrationOrder) -> dict[str, Calibrator]:
+    """The methods of an order by name: one, or the candidates of `auto`.
 
     Raises:
-        MadocError: A hyperparameter is named otherwise, or as `make_method`.
+        MadocError: As `make_method` or `candidates_for`.
     """
-    changed: dict[str, dict[str, object]] = {name: {} for name in CANDIDATES}
-    for setting, value in prepared.order.search.changes.items():
-        whole, _, part = setting.partition(".")
-        name = whole.replace("_", "-")
-        if name not in changed or not part:
-            raise unknown_name("hyperparameter of auto", setting, [f"{candidate}.NAME" for candidate in CANDIDATES])
-        changed[name][part] = value
-    return {name: make_method(CALIBRATORS, name, changed[name]) for name in CANDIDATES}
+    name = method_of(order)
+    if name == AUTO:
+        return candidates_for(order.search.changes)
+    return {name: make_method(CALIBRATORS, name, order.search.changes)}
 
 
 def _calibrate_by(
@@ -98,23 +91,24 @@ def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool)
         The best candidate's result, with the cost of all of them; `holdout` has a row for each candidate.
 
     Raises:
-        MadocError: Every candidate refuses the data, or as `candidates_for`.
+        MadocError: Every candidate refuses the data, or as `methods_for`.
     """
-    methods = candidates_for(prepared)
+    methods = methods_for(prepared.order)
     spec = prepared.spec(out) | {"hyperparameters": {name: hyperparameters(made) for name, made in methods.items()}}
     with working_folder(out, spec, resume=resume, keep=COMPARISON) as folder:
-        if ended(out, COMPARISON) and read_json(out / COMPARISON).get("budget") == prepared.budget:
+        if ended(out, COMPARISON) and read_json(out / COMPARISON).get("budget") == spec["budget"]:
             return CalibrationResult.from_json(read_json(folder.result))
         folder.result.unlink(missing_ok=True)
         rows: list[Tried | NotRun] = []
         tried: list[tuple[CalibrationResult, Assessment]] = []
         for name, share in CANDIDATES.items():
-            left = prepared.budget - sum(result.control_steps for result, _ in tried)
-            reason = _reason_to_stop(tried, left) or _refusal(methods[name], prepared)
+            allowed = _allowed(prepared.budget, share, [result for result, _ in tried])
+            reason = _reason_to_stop(tried) or ("the budget is spent" if allowed == 0 else "")
+            reason = reason or _refusal(methods[name], prepared)
             if reason:
                 rows.append(NotRun(name, reason))
                 continue
-            part = replace(prepared, method=name, budget=max(1, min(round(share * prepared.budget), left)))
+            part = replace(prepared, method=name, budget=allowed)
             place = out / name
             result, assessment = _calibrate_by(methods[name], place, part, resume=holds_run(place), quiet=quiet)
             if assessment is None:  # interrupted or diverged
@@ -129,7 +123,7 @@ def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool)
             raise MadocError("; ".join(f"{row.method}: {row.not_run}" for row in rows if isinstance(row, NotRun)))
         best = _best(tried, rows)
         _leave_evidence(out, prepared, best)
-        compared = {"candidates": [asdict(row) for row in rows], "chosen": best.method, "budget": prepared.budget}
+        compared = {"candidates": [asdict(row) for row in rows], "chosen": best.method, "budget": spec["budget"]}
         folder.write_json(COMPARISON, compared)
         folder.write_json("result.json", best.to_json())
         return best
@@ -141,15 +135,29 @@ def _leave_evidence(out: Path, prepared: Prepared, result: CalibrationResult) ->
     save_evidence(out / "evidence.npz", arrays)
 
 
-def _reason_to_stop(tried: list[tuple[CalibrationResult, Assessment]], left: int) -> str:
-    """Why no other candidate is needed, or none can be tried; empty to go on."""
+def _allowed(budget: Budget | None, share: float, earlier: list[CalibrationResult]) -> Budget | None:
+    """The budget of a candidate, at most a share of that of `auto` and what earlier ones left of it; 0 if nothing.
+
+    None where `auto` has none, so that each candidate has its own.
+    """
+    if budget is None:
+        return None
+    if isinstance(budget, Seconds):
+        time_left = budget.seconds - sum(result.seconds for result in earlier)
+        return Seconds(min(share * budget.seconds, time_left)) if time_left > 0.0 else 0
+    left = budget - sum(result.control_steps for result in earlier)
+    return max(1, min(round(share * budget), left)) if left > 0 else 0
+
+
+def _reason_to_stop(tried: list[tuple[CalibrationResult, Assessment]]) -> str:
+    """Why no other candidate is needed; empty to go on."""
     for result, assessment in tried:
         word = assessment.verdict.word
         if word == "DATA_REJECTED":
             return "the data was rejected, and no method changes that"
         if word == "CALIBRATED" and explains_all(assessment.holdout):
             return f"{result.method} explains the hold-out down to its noise"
-    return "" if left > 0 else "the budget is spent"
+    return ""
 
 
 def _refusal(method: Calibrator, prepared: Prepared) -> str:

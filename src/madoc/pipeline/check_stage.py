@@ -5,19 +5,19 @@ from dataclasses import dataclass
 import jax
 
 from madoc import robots, simulation
-from madoc.calibration import CALIBRATORS, CalibrationProblem
+from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb, logs, observed_task
 from madoc.data.findings import Finding
 from madoc.diagnosis import Diagnosis, check
 from madoc.diagnosis.channels import signal_names
 from madoc.errors import MadocError
 from madoc.parameters import ParameterSpace
-from madoc.pipeline.calibration_stage import candidates_for
+from madoc.pipeline.calibration_stage import methods_for
 from madoc.pipeline.forecast import Forecast, forecast
 from madoc.pipeline.keys import stage_key
-from madoc.pipeline.methods import make_method
-from madoc.pipeline.orders import AUTO, CalibrationOrder, CheckOrder, SelftestOrder
-from madoc.pipeline.preparation import check_order, prepare
+from madoc.pipeline.orders import CalibrationOrder, CheckOrder, SelftestOrder
+from madoc.pipeline.preparation import prepare
+from madoc.pipeline.refusals import check_order
 from madoc.verdict.predicted import sensor_noise
 from madoc.verdict.selftest import Selftest, selftest
 
@@ -81,10 +81,7 @@ def selftest_of(order: SelftestOrder, *, quiet: bool = False) -> Selftest:
     if order.truths < 1:
         raise MadocError(f"expected at least 1 truth to plant, got {order.truths}")
     prepared = prepare(calibration)
-    if prepared.method == AUTO:
-        methods = list(candidates_for(prepared).values())
-    else:
-        methods = [make_method(CALIBRATORS, prepared.method, order.search.changes)]
+    methods = list(methods_for(calibration).values())
     key = stage_key(order.search.seed, "selftest")
     return selftest(
         methods,

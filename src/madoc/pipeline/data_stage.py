@@ -60,8 +60,10 @@ class Machine:
         return self if same else Machine(tasks.make(self.task.name, physics))
 
     def at(self, truth: Mapping[str, float]) -> tuple[Simulator, np.ndarray]:
-        """The target: a simulator of all parameters that the truth names, calibrated or not, and their values."""
-        simulator = simulation.make(replace(self.task, parameters=self.task.parameters.select(list(truth))))
+        """The target that policies act in: a simulator of all parameters that the truth names, and their values."""
+        simulator = simulation.make(
+            replace(self.task.for_policies, parameters=self.task.parameters.select(list(truth)))
+        )
         return simulator, simulator.parameters.vector(truth)
 
     def check_truth(self, truth: Mapping[str, float], calibrated: Task) -> None:

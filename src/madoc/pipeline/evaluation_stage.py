@@ -1,55 +1,137 @@
-"""Evaluation as a stage: learnt policies in the target, side by side."""
+"""Evaluation as a stage: learnt policies in the target, at the estimate, and over the estimate's distribution."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from madoc import simulation
 from madoc.errors import MadocError
 from madoc.evaluation import evaluate
+from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.data_stage import Machine, read_truth
+from madoc.pipeline.film_stage import leave_film
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import EvaluationOrder
-from madoc.policies import load_policy
+from madoc.policies import ErrorCost, OverDraws, costs_of_errors, load_policy, over_draws
 from madoc.report.records import EvaluationRecord, SpecRecord, read_spec
 from madoc.runs.files import write_json
 from madoc.runs.progress import bar
+from madoc.simulation import Simulator
+from madoc.types import Policy
+
+YARDSTICKS = ("midrange", "truth")
+"""Policies that nobody would deploy: what errors cost them is of no interest."""
 
 
 def evaluate_folder(
-    folder: Path, order: EvaluationOrder | None = None, *, names: Sequence[str] = (), quiet: bool = False
+    folder: Path,
+    order: EvaluationOrder | None = None,
+    *,
+    names: Sequence[str] = (),
+    out: Path | None = None,
+    quiet: bool = False,
 ) -> EvaluationRecord:
-    """Evaluate policies of a run in the target, on the same starts, and leave `evaluation.json`.
+    """Evaluate policies of a run on the same starts, and leave `evaluation.json` and `film.npz` there, or in `out`.
 
-    The folder is that of a run or of one policy. Without `names` all its policies are evaluated; without a truth in
-    the order, that of the run is taken.
+    The folder is that of a run or of one policy. Without `names` all its policies are evaluated. They act in the target
+    where its parameters are known, from the order or from the run; and where the folder holds a calibration, at its
+    estimate, in systems drawn from its distribution, and under an error of each parameter.
 
     Raises:
-        MadocError: There is no policy, the truth is not known, or a number is out of range.
+        MadocError: There is no policy, neither truth nor calibration is known, or a number is out of range.
     """
     order = order or EvaluationOrder()
-    if order.episodes < 1:
-        raise MadocError(f"expected at least 1 episode, got {order.episodes}")
+    for what, value in {"episode": order.episodes, "draw": order.draws}.items():
+        if value < 1:
+            raise MadocError(f"expected at least 1 {what}, got {value}")
     key = stage_key(order.seed, "evaluating")
-    policies = find_policies(folder)
-    policies = {name: policies[name] for name in names or policies}
-    spec = _spec_with_truth(folder, policies)
+    found = find_policies(folder)
+    policies = {name: load_policy(found[name]) for name in names or found}
+    spec = _spec_with_truth(folder, found)
     truth = read_truth(order.truth) or spec.truth
-    if truth is None:
-        raise MadocError(f"the true parameters of {folder} are not known; pass --truth FILE.json")
-    machine = Machine.restored(spec)
-    task = machine.task
-    machine.check_truth(truth, task.with_parameters(list(spec.parameters)))
-    simulator, parameters = machine.at(truth)
-    summaries: dict[str, dict[str, float]] = {}
-    total = len(policies) * task.max_episode_steps
-    with bar(f"evaluating on {task.name}", total=total, unit="steps", quiet=quiet) as advance:
-        for name, file in policies.items():
-            policy = load_policy(file)
-            returns = evaluate(policy, simulator, parameters, key=key, episodes=order.episodes, advance=advance)
-            summaries[name] = returns.summary()
-    share = _percent_of_truth(summaries)
-    evaluation = EvaluationRecord(task.name, task.physics, order.episodes, order.seed, summaries, share)
-    write_json(folder / "evaluation.json", evaluation.to_json())
+    calibrated = _calibration_of(folder)
+    if truth is None and calibrated is None:
+        raise MadocError(
+            f"the true parameters of {folder} are not known, and it holds no calibration to evaluate at; "
+            "pass --truth FILE.json, or name the run folder"
+        )
+    target, estimated = None, None
+    if truth is not None:
+        machine = Machine.restored(spec)
+        machine.check_truth(truth, machine.task.with_parameters(list(spec.parameters)))
+        target = machine.at(truth)
+    if calibrated is not None:
+        estimated = simulation.make(calibrated.task.for_policies), calibrated.result.mean
+    in_target, at_estimate = (
+        {} if system is None else _returns(policies, *system, key, order.episodes, where, quiet=quiet)
+        for system, where in ((target, "the target"), (estimated, "the estimate"))
+    )
+    system = target or estimated
+    assert system is not None  # one of them is known
+    leave_film(out or folder, policies, *system, key)
+    task = Machine.restored(spec).task
+    evaluation = EvaluationRecord(
+        task.name,
+        task.physics,
+        order.episodes,
+        order.seed,
+        in_target,
+        at_estimate,
+        *({}, {}) if calibrated is None else _where_not_sure(policies, calibrated, key, order, quiet=quiet),
+        _percent_of_truth(in_target),
+    )
+    write_json((out or folder) / "evaluation.json", evaluation.to_json())
     return evaluation
+
+
+def _returns(
+    policies: Mapping[str, Policy],
+    simulator: Simulator,
+    parameters: Float[np.ndarray, " parameters"],
+    key: PRNGKeyArray,
+    episodes: int,
+    where: str,
+    *,
+    quiet: bool,
+) -> dict[str, dict[str, float]]:
+    """Returns of policies in one system, from the same starts."""
+    task = simulator.task
+    total = len(policies) * task.max_episode_steps
+    summaries = {}
+    with bar(f"evaluating {task.name} at {where}", total=total, unit="steps", quiet=quiet) as advance:
+        for name, policy in policies.items():
+            returns = evaluate(policy, simulator, parameters, key=key, episodes=episodes, advance=advance)
+            summaries[name] = returns.summary()
+    return summaries
+
+
+def _where_not_sure(
+    policies: Mapping[str, Policy], calibrated: Calibrated, key: PRNGKeyArray, order: EvaluationOrder, *, quiet: bool
+) -> tuple[dict[str, OverDraws], dict[str, dict[str, ErrorCost]]]:
+    """Returns over draws of the estimate, and of all but yardsticks what an error of each parameter costs."""
+    simulator = simulation.make(calibrated.task.for_policies)
+    of_draws, of_errors = jax.random.split(key)
+    drawn, costs = {}, {}
+    with bar("evaluating where the estimate is not sure", total=len(policies), unit="policies", quiet=quiet) as advance:
+        for name, policy in policies.items():
+            distribution = calibrated.distribution()
+            drawn[name] = over_draws(policy, simulator, distribution, key=of_draws, draws=order.draws)
+            if name not in YARDSTICKS:
+                estimate, half_widths = calibrated.result.mean, calibrated.half_widths
+                costs[name] = costs_of_errors(
+                    policy, simulator, estimate, half_widths, key=of_errors, episodes=order.episodes
+                )
+            advance(1)
+    return drawn, costs
+
+
+def _calibration_of(folder: Path) -> Calibrated | None:
+    """The calibration that a run folder holds, or is; None of the folder of a policy."""
+    held = (folder / "calibration" / "spec.json").exists() or read_spec(folder).command == "calibrate"
+    return read_calibration(folder) if held else None
 
 
 def find_policies(folder: Path) -> dict[str, Path]:
@@ -77,7 +159,8 @@ def _spec_with_truth(folder: Path, policies: Mapping[str, Path]) -> SpecRecord:
 
 
 def _percent_of_truth(summaries: Mapping[str, Mapping[str, float]]) -> float | None:
-    """Return of the calibrated policy in percent of that learnt at the truth, where both are there."""
-    if not {"calibrated", "truth"} <= set(summaries) or summaries["truth"]["return"] <= 0:
+    """Return of the policy learnt from the calibration in percent of that learnt at the truth, where both are there."""
+    ours = next((name for name in ("calibrated", "distribution") if name in summaries), None)
+    if ours is None or "truth" not in summaries or summaries["truth"]["return"] <= 0:
         return None
-    return 100.0 * summaries["calibrated"]["return"] / summaries["truth"]["return"]
+    return 100.0 * summaries[ours]["return"] / summaries["truth"]["return"]

@@ -35,14 +35,14 @@ class Forecast:
 
 
 def forecast(problem: CalibrationProblem, *, budget: int) -> tuple[Forecast, ...]:
-    """Forecasts of least squares and of Madoc with their defaults.
+    """Forecasts of least squares until it settles, and of Madoc for a budget of control steps, with their defaults.
 
     Least squares takes one step of its search, Madoc two epochs, the first of which compiles.
     """
-    return (_least_squares(problem, budget), _madoc(problem, budget))
+    return (_least_squares(problem), _madoc(problem, budget))
 
 
-def _least_squares(problem: CalibrationProblem, budget: int) -> Forecast:
+def _least_squares(problem: CalibrationProblem) -> Forecast:
     method, name = LeastSquares(), "least-squares"
     try:
         state = method.init(problem, jax.random.key(0))
@@ -51,7 +51,7 @@ def _least_squares(problem: CalibrationProblem, budget: int) -> Forecast:
     started = time.monotonic()
     state, epoch = method.step(problem, state)
     seconds = time.monotonic() - started
-    total = min(budget, method.whole_run(problem, state, refining_epochs=REFINING_EPOCHS))
+    total = method.whole_run(problem, state, refining_epochs=REFINING_EPOCHS)
     return Forecast(name, seconds / epoch.control_steps * total, total)
 
 

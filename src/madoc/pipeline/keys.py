@@ -17,9 +17,14 @@ def seed_key(seed: int) -> PRNGKeyArray:
     Raises:
         MadocError: The seed is negative or too large.
     """
+    check_seed(seed)
+    return jax.random.key(seed)
+
+
+def check_seed(seed: int) -> None:
+    """Refuse a seed that is negative or too large."""
     if not 0 <= seed <= LARGEST_SEED:
         raise MadocError(f"expected a seed from 0 to {LARGEST_SEED}, got {seed}")
-    return jax.random.key(seed)
 
 
 def stage_key(seed: int, stage: str) -> PRNGKeyArray:

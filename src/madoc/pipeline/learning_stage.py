@@ -1,22 +1,22 @@
 """Policy learning as a stage: in the calibrated simulator, over a distribution of it, or at a yardstick."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
 from madoc import simulation
-from madoc.calibration import CalibrationResult
 from madoc.data import Dataset
 from madoc.errors import MadocError, unknown_name
-from madoc.parameters import ParameterDistribution, ParameterSpace
+from madoc.parameters import ParameterDistribution
 from madoc.pipeline.calibrated import Calibrated
 from madoc.pipeline.data_stage import load_source, read_truth
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
-from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder, parse_settings
+from madoc.pipeline.orders import DEFAULT_LEARNER, Drawing, Place, PolicyOrder, parse_settings
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
@@ -28,6 +28,7 @@ from madoc.policies import (
 )
 from madoc.runs.budget import read_budget
 from madoc.simulation import Simulator
+from madoc.tasks import Task
 from madoc.types import entry_of
 
 PLACES: tuple[str, ...] = get_args(Place)
@@ -52,15 +53,17 @@ def learn_in(
             f"{order.method} does not learn at given parameters, so --at {order.at} would change nothing; leave it out"
         )
     require_reward(calibrated.task)
+    require_no_goals(calibrated.task, order.method)
     key = stage_key(order.seed, "learning")
     truth = read_truth(order.truth) or calibrated.spec.truth
-    simulator, parameters = _system(calibrated, order.at, truth)
+    simulator, parameters = _system(calibrated, order, truth)
     dataset = _logged(calibrated, order.method) if entry.needs_data else None
     spec = {
         "command": "learn",
         "task": calibrated.task.name,
         "physics": calibrated.task.physics,
         "at": order.at,
+        "drawing": asdict(order.drawing),
         "parameters": _described(simulator, parameters),
         "method": order.method,
         "hyperparameters": hyperparameters(method),
@@ -82,6 +85,16 @@ def policy_folder_name(at: str, method: str) -> str:
     return f"policy-{at}" if method == DEFAULT_LEARNER else f"policy-{at}-{method}"
 
 
+def require_no_goals(task: Task, method: str) -> None:
+    """Raise MadocError for a learner that learns from logged data where policies observe goals, which no log has."""
+    goals = task.for_policies.goals
+    if goals and LEARNERS[method].needs_data:
+        raise MadocError(
+            f"{method} learns from logged observations, and no log has the goals of {task.name}: {', '.join(goals)}; "
+            "take a learner that needs no data"
+        )
+
+
 def _logged(calibrated: Calibrated, method: str) -> Dataset:
     """The data of a calibration, for a learner that learns from it."""
     if calibrated.source is None:
@@ -99,29 +112,28 @@ def _logged(calibrated: Calibrated, method: str) -> Dataset:
 
 
 def _system(
-    calibrated: Calibrated, at: str, truth: Mapping[str, float] | None
+    calibrated: Calibrated, order: PolicyOrder, truth: Mapping[str, float] | None
 ) -> tuple[Simulator, np.ndarray | ParameterDistribution]:
     """The simulator to learn in, and its physical values, or the distribution to draw them from."""
+    at = order.at
     if at not in PLACES:
         raise unknown_name("place to learn at", at, PLACES)
+    if at != "distribution" and order.drawing != Drawing():
+        raise MadocError(
+            f"--share and --width are of --at distribution and would change nothing at {at}; leave them out"
+        )
     if truth is not None:
         calibrated.machine.check_truth(truth, calibrated.task)
     if at == "truth":
         if truth is None:
             raise MadocError("the true parameters are not known here; pass --truth FILE.json")
         return calibrated.machine.at(truth)
-    simulator = simulation.make(calibrated.task)
+    simulator = simulation.make(calibrated.task.for_policies)
     if at == "distribution":
-        return simulator, _calibrated_distribution(simulator.parameters, calibrated.result)
+        return simulator, calibrated.distribution(order.drawing)
     if at == "uniform":
         return simulator, UniformParameters(simulator.parameters)
     return simulator, calibrated.result.mean if at == "calibrated" else simulator.parameters.middle
-
-
-def _calibrated_distribution(space: ParameterSpace, result: CalibrationResult) -> NormalParameters:
-    """Normal about the estimate, with the covariance where the result has one, else with each parameter's spread."""
-    joint = result.covariance
-    return NormalParameters(space, result.mean, np.diag(result.std**2) if joint is None else np.asarray(joint))
 
 
 def _described(simulator: Simulator, parameters: np.ndarray | ParameterDistribution) -> dict[str, float]:

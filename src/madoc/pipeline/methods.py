@@ -8,10 +8,17 @@ from typing import Any, TypeVar, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
+from madoc.calibration import CALIBRATORS, Calibrator
 from madoc.errors import MadocError, unknown_name
 from madoc.types import MethodEntry
 
 Made = TypeVar("Made")
+
+CANDIDATES = {"least-squares": 2 / 3, "madoc": 1 / 2}
+"""The methods that `auto` tries, in this order (seconds before minutes), with the largest share of the budget of each.
+
+What a method does not spend is left to those after it.
+"""
 
 
 def make_method(
@@ -41,6 +48,22 @@ def make_method(
         whole, _, part = changed.partition(".")
         new[whole] = replace(new.get(whole, getattr(default, whole)), **{part: typed}) if part else typed  # type: ignore[type-var]
     return make(**new)
+
+
+def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator]:
+    """The candidates of `auto` by name; a hyperparameter is changed under a name such as `madoc.updates`.
+
+    Raises:
+        MadocError: A hyperparameter is named otherwise, or as `make_method`.
+    """
+    changed: dict[str, dict[str, object]] = {name: {} for name in CANDIDATES}
+    for setting, value in changes.items():
+        whole, _, part = setting.partition(".")
+        name = whole.replace("_", "-")
+        if name not in changed or not part:
+            raise unknown_name("hyperparameter of auto", setting, [f"{candidate}.NAME" for candidate in CANDIDATES])
+        changed[name][part] = value
+    return {name: make_method(CALIBRATORS, name, changed[name]) for name in CANDIDATES}
 
 
 def hyperparameters(method: object) -> dict[str, object]:

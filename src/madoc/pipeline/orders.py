@@ -73,9 +73,10 @@ class Search:
     """Where rollouts start: free running from resets, short ones from logged states, or one step of the log."""
     set: Settings = ()
     """Hyperparameters of the method as name=value; of a method that auto tries as madoc.name=value."""
-    budget: int | None = None
-    """Simulated control steps. Default: 600000 for auto, of which least squares may have two thirds and Madoc half;
-    else 300000."""
+    budget: int | str | None = None
+    """Simulated control steps, or a time, as 300s or 15min. Default: 300s for least-squares, which settles by itself
+    and mostly much sooner, 300000 control steps for the others. Of a budget for auto least squares may have two thirds
+    and Madoc half."""
     seed: int = 0
     """Of all randomness."""
 
@@ -106,7 +107,7 @@ class SelftestOrder:
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """The robot, as `madoc tasks` lists it, or the spec file of your own, as robot.yaml."""
     source: OmitArgPrefixes[Source]
-    search: OmitArgPrefixes[Search] = field(default_factory=lambda: Search(method=AUTO, budget=400_000))
+    search: OmitArgPrefixes[Search] = field(default_factory=lambda: Search(method=AUTO))
     truths: int = 3
     """How many truths to plant, one after another."""
 
@@ -124,7 +125,7 @@ class CheckOrder:
     velocities: Velocities = "logged"
     """differences puts velocities from positions where the logs have none, as `calibrate` does if told so."""
     budget: int = 300_000
-    """Control steps to forecast the time of."""
+    """Control steps of Madoc to forecast the time of; least squares settles by itself."""
     forecast: bool = True
     """Forecast how long methods would take: the longest part of a check."""
     seed: int = 0
@@ -149,6 +150,22 @@ class RecordOrder:
 
 
 @dataclass(frozen=True)
+class Drawing:
+    """How systems are drawn from the calibrated distribution, where a policy is learnt over it."""
+
+    share: float = 1.0
+    """Share of the systems that are drawn from the distribution of the estimate; the others are the estimate itself."""
+    width: float = 1.0
+    """Spread of the drawn systems, as a multiple of the estimate's own."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.share <= 1.0:
+            raise MadocError(f"expected a share of systems to draw above 0 and at most 1, got {self.share:g}")
+        if not 0.0 < self.width < float("inf"):
+            raise MadocError(f"expected a width of the distribution above 0, got {self.width:g}")
+
+
+@dataclass(frozen=True)
 class PolicyOrder:
     """Options of a policy learner."""
 
@@ -157,6 +174,7 @@ class PolicyOrder:
     at: Place = "calibrated"
     """The parameters to learn at: the estimate; draws from the calibrated distribution, or from the whole box, anew
     every epoch; or a yardstick: mid-range, or the truth, which only an evaluation knows."""
+    drawing: OmitArgPrefixes[Drawing] = field(default_factory=Drawing)
     set: Settings = ()
     """Hyperparameters of the method as name=value."""
     budget: int | str | None = None
@@ -174,26 +192,34 @@ class EvaluationOrder:
 
     episodes: int = 20
     """Episodes for each policy, from the same starts."""
+    draws: int = 50
+    """Systems drawn from the calibrated distribution, to see how policies do where the estimate is not sure."""
     seed: int = 0
-    """Of the starts."""
+    """Of the starts and of the draws."""
     truth: Path | None = None
     """JSON file {parameter: value} that makes the target. Default: what the run remembers."""
 
 
 @dataclass(frozen=True)
 class RunOrder:
-    """Options of a whole run: to record or load, calibrate, learn and evaluate."""
+    """Options of a whole run: to record or load, calibrate, learn, evaluate and export."""
 
     name: Annotated[Positional[str], arg(metavar="TASK-QUALITY")]
-    """TASK-QUALITY to record, as hopper-medium; with --data the name of the robot is enough."""
-    data: str | None = None
-    """Use this log instead of recording one."""
+    """TASK-QUALITY to record, as hopper-medium; with --data the name of the robot is enough, or the spec file of your
+    own, as robot.yaml."""
+    data: tuple[str, ...] = ()
+    """Use this log instead of recording one: a file, or of a robot of your own files or folders."""
     transitions: int = 200_000
     """Rows to record, or to keep of the log."""
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
-    search: OmitArgPrefixes[Search] = field(default_factory=lambda: Search(method="madoc", budget=300_000))
+    search: OmitArgPrefixes[Search] = field(default_factory=Search)
+    holdout: float = 0.2
+    """Share of the rows that no method sees, for the verdict."""
     truth: Path | None = None
     """JSON file {parameter: value} to judge by; no method ever sees it. Default: the data's, if it has any."""
+    policy_at: Literal["calibrated", "distribution"] = "calibrated"
+    """Learn at the estimate, or over draws from the calibrated distribution."""
+    drawing: Annotated[Drawing, arg(name="policy")] = field(default_factory=Drawing)
     learner: str = DEFAULT_LEARNER
     """A policy learner, as `madoc methods` lists it."""
     policy_set: Settings = ()
@@ -202,9 +228,11 @@ class RunOrder:
     """Simulated control steps for each policy, or updates of a learner that does not simulate; or a time, as 300s.
     Default: 2400000 for fast-sac and rlpd, else 300000."""
     yardsticks: bool = True
-    """Learn also a policy at mid-range and one at the truth."""
+    """Learn also a policy at mid-range and one at the truth, where that is known."""
     episodes: int = 20
     """Episodes for the evaluation of each policy."""
+    draws: int = 50
+    """Systems drawn from the calibrated distribution for the evaluation of each policy."""
 
 
 def parse_settings(settings: tuple[tuple[str, ...], ...], *, starts: str | None = None) -> dict[str, str]:

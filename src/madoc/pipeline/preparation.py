@@ -5,26 +5,23 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from madoc import robots, simulation
-from madoc.calibration import CalibrationProblem
+from madoc import simulation
+from madoc.calibration import CALIBRATORS, CalibrationProblem
 from madoc.data import Dataset, observed_task
 from madoc.data.split import hold_out
 from madoc.diagnosis import check, refuse_fatal
-from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.data_stage import Machine, fingerprint, load_source, read_truth
-from madoc.pipeline.keys import seed_key, stage_key
+from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import AUTO, CalibrationOrder
+from madoc.pipeline.refusals import check_search, method_of
 from madoc.report.records import DataRecord, stored_path
+from madoc.runs.budget import Budget, Seconds, read_budget
 from madoc.simulation import Simulator
 from madoc.tasks import Task
 from madoc.verdict import Bench
 
 HOLDOUT = 0.2
 """Share of the rows that `auto` holds out by default, as in five-fold cross-validation."""
-BUDGET = 300_000
-"""Control steps of one method by default."""
-AUTO_BUDGET = 600_000
-"""Control steps of all candidates of `auto` together by default."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +31,7 @@ class Prepared:
     Attributes:
         order: What was asked.
         method: Name of the calibrator, or `auto`.
-        budget: Simulated control steps.
+        budget: A count of control steps, or a time; None for `auto` where every candidate has its usual one.
         holdout: Share of the rows that no method sees; None where nothing is judged.
         machine: The robot with all of its parameters at their normal ranges.
         dataset: All rows.
@@ -44,7 +41,7 @@ class Prepared:
 
     order: CalibrationOrder
     method: str
-    budget: int
+    budget: Budget | None
     holdout: float | None
     machine: Machine
     dataset: Dataset
@@ -97,35 +94,10 @@ class Prepared:
             "method": self.method,
             "data": asdict(stored),
             "seed": self.seed,
-            "budget": self.budget,
+            "budget": str(self.budget) if isinstance(self.budget, Seconds) else self.budget,
             "truth": self.truth,
         }
         return asked | held | self.machine.stored()
-
-
-def method_of(order: CalibrationOrder) -> str:
-    """The calibrator of an order; by default `auto` for a user's own robot, else `madoc`."""
-    return order.search.method or (AUTO if robots.is_spec_path(order.task) else "madoc")
-
-
-def check_order(order: CalibrationOrder, out: Path | None = None) -> None:
-    """Refuse what can be refused without reading the data, such as a run folder `out` that holds the logs.
-
-    Raises:
-        MadocError: The seed, the budget or the share held out is impossible, or the folder holds the logs.
-    """
-    seed_key(order.search.seed)
-    if order.search.budget is not None and order.search.budget < 1:
-        raise MadocError(f"expected a budget of at least 1 control step, got {order.search.budget}")
-    if order.holdout is not None and not 0.0 < order.holdout < 1.0:
-        raise MadocError(f"expected a share of the rows to hold out between 0 and 1, got {order.holdout}")
-    if out is None:
-        return
-    folder = out.expanduser().resolve()
-    for path in order.source.paths:
-        log = Path(path).expanduser().resolve()
-        if log == folder or (log.exists() and log.is_relative_to(folder) and not (folder / "spec.json").exists()):
-            raise MadocError(f"the run folder {out} holds the log {path}; choose another --out")
 
 
 def prepare(order: CalibrationOrder) -> Prepared:
@@ -135,7 +107,10 @@ def prepare(order: CalibrationOrder) -> Prepared:
         MadocError: The robot, the data or the truth is refused, or the check finds the data to be useless.
     """
     method = method_of(order)
-    budget = order.search.budget if order.search.budget is not None else AUTO_BUDGET if method == AUTO else BUDGET
+    given = order.search.budget
+    if given is None and method != AUTO:
+        given = CALIBRATORS[method].usual_budget if method in CALIBRATORS else None
+    budget = None if given is None else read_budget(given)
     holdout = HOLDOUT if method == AUTO and order.holdout is None else order.holdout
     truth = read_truth(order.truth)
     machine, dataset, task = _read(order)
@@ -154,10 +129,7 @@ def _read(order: CalibrationOrder) -> tuple[Machine, Dataset, Task]:
     """The robot, its data, and the task with the parameters and ranges that are calibrated."""
     search = order.search
     machine = Machine.named(order.task, search.physics)
-    for name in search.parameters:
-        if name not in machine.task.parameters.names:
-            raise unknown_name(f"parameter of {order.task}", name, machine.task.parameters.names)
-    machine.task.with_level(search.level)
+    check_search(search, machine.task, order.task)
     dataset = load_source(order.source, machine, seed=search.seed)
     recorded = dataset.physics if dataset.physics != "unknown" else None
     machine = machine.in_physics(search.physics or recorded or "legacy")

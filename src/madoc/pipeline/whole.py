@@ -1,21 +1,22 @@
-"""All stages in one call: data, calibration, policies, evaluation; a stage that has ended is skipped."""
+"""All stages in one call: data, calibration, policies, evaluation, export; a stage that has ended is skipped."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
 
 from madoc import data
-from madoc.calibration import CALIBRATORS, CalibrationResult
+from madoc.calibration import CalibrationResult
 from madoc.errors import MadocError
 from madoc.pipeline.calibrated import Calibrated, calibration_ended, read_calibration
-from madoc.pipeline.calibration_stage import calibrate_in
+from madoc.pipeline.calibration_stage import calibrate_in, methods_for
 from madoc.pipeline.data_stage import Machine, load_source, read_truth, record_named, split_name
 from madoc.pipeline.evaluation_stage import evaluate_folder
+from madoc.pipeline.export_stage import export_run
 from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
-from madoc.pipeline.keys import seed_key
-from madoc.pipeline.learning_stage import learn_in
+from madoc.pipeline.learning_stage import learn_in, require_no_goals
 from madoc.pipeline.methods import hyperparameters, make_method
 from madoc.pipeline.orders import (
     CalibrationOrder,
+    Drawing,
     EvaluationOrder,
     Place,
     PolicyOrder,
@@ -24,8 +25,10 @@ from madoc.pipeline.orders import (
     Source,
     parse_settings,
 )
+from madoc.pipeline.refusals import check_order
 from madoc.policies import LEARNERS, require_reward
 from madoc.report.records import Summary, read_object, read_record
+from madoc.robots import is_spec_path
 from madoc.runs.budget import read_budget
 from madoc.runs.files import read_json
 from madoc.types import entry_of
@@ -34,9 +37,9 @@ from madoc.types import entry_of
 def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = False) -> Summary:
     """Do all stages, and leave a folder with their files.
 
-    The folder holds `data.npz`, the run folders `calibration`, `policy-calibrated`, `policy-midrange` and
-    `policy-truth`, `evaluation.json` and `summary.json`. Killed at any moment and resumed, the summary is the
-    same but for its seconds.
+    The folder holds `data.npz`, the run folders `calibration`, `policy-calibrated` (or `policy-distribution`),
+    `policy-midrange` and `policy-truth`, `evaluation.json`, `export` and `summary.json`. Killed at any moment and
+    resumed, the summary is the same but for its seconds.
 
     Returns:
         The summary. Its `status` is `finished`, or that of the stage that was interrupted or diverged.
@@ -44,11 +47,10 @@ def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = F
     Raises:
         MadocError: The order cannot be carried out.
     """
-    order = replace(order, search=replace(order.search, method=order.search.method or "madoc"))
-    if order.data is not None:
-        order = replace(order, data=_source(order).absolute().paths[0])
+    if order.data:
+        order = replace(order, data=_source(order).absolute().paths)
     machine = Machine.named(split_name(order.name)[0], order.search.physics)
-    spec = _spec(order, machine)
+    spec = _spec(order, machine, out)
     with working_folder(out, spec, resume=resume, keep="data.npz") as folder:
         if (out / "summary.json").exists():
             return read_record(Summary, out / "summary.json")
@@ -61,45 +63,59 @@ def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = F
             return replace(summary, status=result.status, sentence=f"calibration: {result.sentence}")
         truth_known = calibrated.spec.truth is not None
         compared = order.yardsticks and truth_known and LEARNERS[order.learner].needs_parameters
-        places: tuple[Place, ...] = ("calibrated", "midrange", "truth") if compared else ("calibrated",)
+        places: tuple[Place, ...] = (order.policy_at, *(("midrange", "truth") if compared else ()))
         for at in places:
             policy = _learn(order, calibrated, at, out / f"policy-{at}", quiet=quiet)
             summary = replace(summary, policies={**summary.policies, at: policy})
             if policy["status"] not in ENDED:
                 return replace(summary, status=str(policy["status"]), sentence=f"policy-{at}: {policy['sentence']}")
-        if truth_known:
-            asked = EvaluationOrder(order.episodes, order.search.seed)
-            summary = replace(summary, evaluation=evaluate_folder(out, asked, names=places, quiet=quiet))
+        asked = EvaluationOrder(order.episodes, order.draws, order.search.seed)
+        summary = replace(summary, evaluation=evaluate_folder(out, asked, names=places, quiet=quiet))
+        export_run(out)
         folder.write_json("summary.json", summary.to_json())
         return summary
 
 
 def _source(order: RunOrder) -> Source:
     """The log of an order that names one."""
-    return Source((order.data or "",), order.transitions, order.reading)
+    return Source(order.data, order.transitions, order.reading)
 
 
-def _spec(order: RunOrder, machine: Machine) -> dict[str, object]:
+def _calibration_order(order: RunOrder, source: Source) -> CalibrationOrder:
+    """The calibration that a run asks for."""
+    task = split_name(order.name)[0]
+    return CalibrationOrder(task, source, order.search, holdout=order.holdout, truth=order.truth)
+
+
+def _spec(order: RunOrder, machine: Machine, out: Path) -> dict[str, object]:
     """The order as JSON for `spec.json`; it is refused here already if a later stage would refuse it."""
     require_reward(machine.task)
-    if order.data is None and not split_name(order.name)[1]:
-        raise MadocError(f"expected TASK-QUALITY to record, as {order.name}-medium, or --data FILE to load")
+    if not order.data and not split_name(order.name)[1]:
+        own = is_spec_path(order.name)
+        raise MadocError(
+            f"expected logs of {order.name} after --data, as --data logs/"
+            if own
+            else f"expected TASK-QUALITY to record, as {order.name}-medium, or --data FILE to load"
+        )
     for what, value in {
         "transition": order.transitions,
-        "control step of budget": order.search.budget,
         "episode": order.episodes,
+        "draw": order.draws,
     }.items():
         if value is not None and value < 1:
             raise MadocError(f"expected at least 1 {what}, got {value}")
-    seed_key(order.search.seed)
-    calibrator = make_method(CALIBRATORS, order.search.method or "madoc", order.search.changes)
+    asked = _calibration_order(order, Source(order.data or (order.name,)))
+    check_order(asked, out)
+    if order.policy_at != "distribution" and order.drawing != Drawing():
+        raise MadocError("--policy.share and --policy.width are of --policy-at distribution; leave them out, or add it")
     learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
+    require_no_goals(machine.task, order.learner)
     if order.policy_budget is not None:
         read_budget(order.policy_budget, entry_of(learner, LEARNERS).unit)
     resolved = {
         "command": "run",
         "truth": read_truth(order.truth),
-        "hyperparameters": hyperparameters(calibrator),
+        "hyperparameters": {name: hyperparameters(method) for name, method in methods_for(asked).items()},
         "policy_hyperparameters": hyperparameters(learner),
     }
     plain = replace(order, search=replace(order.search, set=(), starts=None), policy_set=())
@@ -109,7 +125,7 @@ def _spec(order: RunOrder, machine: Machine) -> dict[str, object]:
 def _recorded_or_loaded(order: RunOrder, machine: Machine, *, quiet: bool) -> data.Dataset:
     """The data of the run."""
     seed, disturbance = order.search.seed, order.reading.disturbance
-    if order.data is not None:
+    if order.data:
         return load_source(_source(order), machine, seed=seed)
     physics = order.search.physics or "legacy"
     asked = RecordOrder(order.name, order.transitions, seed, physics, disturbance.friction, disturbance)
@@ -122,14 +138,14 @@ def _calibrate(order: RunOrder, out: Path, *, quiet: bool) -> CalibrationResult:
     if calibration_ended(folder) and ended(folder):
         return CalibrationResult.from_json(read_json(folder / "result.json"))
     source = Source((str(out / "data.npz"),), max_transitions=None)
-    asked = CalibrationOrder(split_name(order.name)[0], source, order.search, truth=order.truth)
-    return calibrate_in(folder, asked, resume=holds_run(folder), quiet=quiet)
+    return calibrate_in(folder, _calibration_order(order, source), resume=holds_run(folder), quiet=quiet)
 
 
 def _learn(order: RunOrder, calibrated: Calibrated, at: Place, folder: Path, *, quiet: bool) -> dict[str, object]:
     """Leave the folder of one policy; returns how its learning ended."""
     if not ended(folder, "policy.npz"):
-        asked = PolicyOrder(order.learner, at, order.policy_set, order.policy_budget, order.search.seed)
+        drawing = order.drawing if at == "distribution" else Drawing()
+        asked = PolicyOrder(order.learner, at, drawing, order.policy_set, order.policy_budget, order.search.seed)
         learn_in(folder, calibrated, asked, resume=holds_run(folder), quiet=quiet)
     return read_object(folder / "result.json")
 
@@ -144,7 +160,7 @@ def _beginning(order: RunOrder, calibrated: Calibrated) -> Summary:
         status="finished",
         sentence="all stages are done"
         if known
-        else "all stages are done that need no truth: the target is not known, so nothing was evaluated in it",
+        else "all stages are done; the target's parameters are not known, so policies were evaluated at the estimate",
         task=calibrated.task.name,
         physics=calibrated.task.physics,
         seed=order.search.seed,

@@ -13,6 +13,10 @@ from madoc.policies.learn import LearnedPolicy as LearnedPolicy
 from madoc.policies.learn import learn_policy as learn_policy
 from madoc.policies.morec import MOREC as MOREC
 from madoc.policies.registry import LEARNERS as LEARNERS
+from madoc.policies.robustness import ErrorCost as ErrorCost
+from madoc.policies.robustness import OverDraws as OverDraws
+from madoc.policies.robustness import costs_of_errors as costs_of_errors
+from madoc.policies.robustness import over_draws as over_draws
 from madoc.policies.sac import SAC as SAC
 from madoc.policies.systems import NormalParameters as NormalParameters
 from madoc.policies.systems import UniformParameters as UniformParameters

@@ -26,15 +26,17 @@ class UniformParameters:
 class NormalParameters:
     """A normal distribution, as of a calibrated estimate, with every draw clipped to the ranges of `space`.
 
-    `mean` and `covariance` are in physical units.
+    `mean` and `covariance` are in physical units. A `share` of the systems is drawn, the others are the mean.
 
     Raises:
-        MadocError: The shapes disagree, or the covariance is not symmetric or has a negative eigenvalue.
+        MadocError: The shapes disagree, the share is not in [0, 1], or the covariance is not symmetric or has a
+            negative eigenvalue.
     """
 
     space: ParameterSpace
     mean: Float[np.ndarray, " parameters"]
     covariance: Float[np.ndarray, "rows columns"]
+    share: float = 1.0
 
     def __post_init__(self) -> None:
         size = len(self.space)
@@ -43,17 +45,23 @@ class NormalParameters:
                 f"expected a mean of {size} values and a covariance of {size} x {size}, "
                 f"got shapes {np.shape(self.mean)} and {np.shape(self.covariance)}"
             )
+        if not 0.0 <= self.share <= 1.0:
+            raise MadocError(f"expected a share of systems to draw between 0 and 1, got {self.share:g}")
         symmetric = np.allclose(self.covariance, np.transpose(self.covariance))
         if not symmetric or np.linalg.eigvalsh(self._scaled_covariance).min() < -1e-6:
             raise MadocError("expected a symmetric covariance without negative eigenvalues; is it a covariance?")
 
     def draw(self, key: PRNGKeyArray, count: int) -> Float[np.ndarray, "count parameters"]:
-        """Physical values of `count` systems: mean + V sqrt(Λ) z of the scaled covariance V Λ Vᵀ, clipped."""
+        """Physical values of `count` systems: mean + V sqrt(Λ) z of the scaled covariance V Λ Vᵀ, clipped.
+
+        Those that are not drawn but the mean come first.
+        """
         values, vectors = np.linalg.eigh(self._scaled_covariance)
         # An eigenvector's sign is the library's choice, and must not decide what is drawn.
         vectors = vectors * np.where(vectors[np.abs(vectors).argmax(0), np.arange(len(self.space))] < 0, -1.0, 1.0)
         standard = np.asarray(jax.random.normal(key, (count, len(self.space))), dtype=np.float64)
         offsets = standard * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+        offsets[: count - round(self.share * count)] = 0.0
         return np.clip(self.mean + offsets * self._width, self.space.low, self.space.high)
 
     @property

@@ -224,7 +224,7 @@ def read_metrics(path: Path) -> MetricLog | None:
 
 def _read_evidence(path: Path) -> Evidence | None:
     """Held-out windows; None where the run held nothing out."""
-    arrays = _arrays(path, "signals", "scale", "time", "measured")
+    arrays = read_arrays(path, "signals", "scale", "time", "measured")
     if arrays is None:
         return None
     simulated = ("before", "after", "residual_before", "residual_after")
@@ -237,7 +237,7 @@ def _read_evidence(path: Path) -> Evidence | None:
 
 def _read_embeddings(path: Path) -> Embeddings | None:
     """The embeddings of parameters; None where the method learns none."""
-    arrays = _arrays(path, "names", "vectors")
+    arrays = read_arrays(path, "names", "vectors")
     if arrays is None:
         return None
     return Embeddings(tuple(map(str, arrays["names"])), np.asarray(arrays["vectors"], float))
@@ -251,7 +251,7 @@ def _folder_of_method(folder: Path, chosen: str | None) -> Path:
     return max((log for log in logs if log.exists()), key=lambda log: log.stat().st_mtime, default=logs[0]).parent
 
 
-def _arrays(path: Path, *needed: str) -> dict[str, np.ndarray] | None:
+def read_arrays(path: Path, *needed: str) -> dict[str, np.ndarray] | None:
     """The arrays of an npz file, or None where there is none.
 
     Raises:

@@ -8,6 +8,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from madoc.data.disturbance import Disturbance
 from madoc.errors import MadocError
+from madoc.policies import ErrorCost, OverDraws
 from madoc.runs.files import read_json
 
 Record = TypeVar("Record")
@@ -76,7 +77,12 @@ class EvaluationRecord:
         physics: `legacy` or `modern`.
         episodes: Number of episodes of each policy.
         seed: Seed of the starts.
-        policies: By name: `return` and `return_std` over episodes, `normalized` score and mean `length`.
+        policies: In the target, by name: `return` and `return_std` over episodes, `normalized` score and mean `length`;
+            empty where the target is not known.
+        at_estimate: The same in the calibrated simulator; empty without a calibration.
+        over_draws: The return in systems drawn from the calibrated distribution, by name.
+        error_costs: What an error of half an interval of each parameter costs, by name of the policy; not of
+            yardsticks.
         calibrated_percent_of_truth: Return of the calibrated policy in percent of that learnt at the truth, if known.
     """
 
@@ -85,6 +91,9 @@ class EvaluationRecord:
     episodes: int
     seed: int
     policies: dict[str, dict[str, float]]
+    at_estimate: dict[str, dict[str, float]] = field(default_factory=dict)
+    over_draws: dict[str, OverDraws] = field(default_factory=dict)
+    error_costs: dict[str, dict[str, ErrorCost]] = field(default_factory=dict)
     calibrated_percent_of_truth: float | None = None
 
     def to_json(self) -> dict[str, object]:

@@ -57,12 +57,19 @@ class Document:
         return self.error(place, f"expected {what}, got {name!r}; {nearest_hint(name, known)}")
 
 
-def read_document(content: bytes, file: str) -> Document:
-    """Read YAML 1.2 that has no tags, no anchors and no key twice; anything else is refused with its line."""
+def read_document(
+    content: bytes, file: str, *, what: str = "a robot's spec", remedy: str = "write one with: madoc init MODEL"
+) -> Document:
+    """Read YAML 1.2 that has no tags, no anchors and no key twice; anything else is refused with its line.
+
+    Args:
+        content: The file's.
+        file: Its name.
+        what: What the file should be, for the sentence of a refusal.
+        remedy: What to do where it is empty, for the same.
+    """
     if len(content) > LARGEST:
-        raise MadocError(
-            f"{file} has {len(content):,} bytes, a robot's spec at most {LARGEST:,}; is it the right file?"
-        )
+        raise MadocError(f"{file} has {len(content):,} bytes, {what} at most {LARGEST:,}; is it the right file?")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -84,9 +91,9 @@ def read_document(content: bytes, file: str) -> Document:
     except YAMLError as error:
         raise MadocError(f"{file}: this is not YAML: {' '.join(str(error).split())}") from error
     except (RecursionError, ValueError) as error:
-        raise MadocError(f"{file}: this is not a YAML file that a robot's spec could be") from error
+        raise MadocError(f"{file}: this is not a YAML file that {what} could be") from error
     if data is None:
-        raise MadocError(f"{file} is empty; write one with: madoc init MODEL")
+        raise MadocError(f"{file} is empty; {remedy}")
     return Document(file, data)
 
 
@@ -111,7 +118,7 @@ def _check_event(event: Event, depth: int) -> None:
     elif tag := getattr(event, "tag", None):
         problem = f"expected a plain value, got the tag {tag}; leave it out"
     elif depth > DEEPEST:
-        problem = f"nested more than {DEEPEST} deep, which no spec is"
+        problem = f"nested more than {DEEPEST} deep, which no such file is"
     else:
         return
     raise _Refusal(problem=problem, problem_mark=event.start_mark)

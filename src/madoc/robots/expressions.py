@@ -1,43 +1,35 @@
-"""Expressions of a spec file: arithmetic of what joints and sensors read. They are parsed into a tree, never run.
+"""Expressions of a spec file as trees: their values on arrays, and whether they are weighted sums of what they read.
 
-`position(JOINT)`, `velocity(JOINT)` and `sensor(NAME)` read one value; `[i]` picks one of several. Numbers, pi,
-`+ - * / **`, brackets and the functions below combine them. A name that is no identifier goes in quotes.
+`grammar.py` makes them of text.
 """
 
-import ast
 import math
 import operator
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 
-import numpy as np
-
-from madoc.errors import MadocError, nearest_hint
 from madoc.tasks.base import Batch
 
-READS = ("position", "velocity", "sensor")
 FUNCTIONS: dict[str, int] = {
-    **dict.fromkeys(("sin", "cos", "tan", "asin", "acos", "atan", "sqrt", "abs", "exp"), 1),
-    "atan2": 2,
+    **dict.fromkeys(("sin", "cos", "tan", "asin", "acos", "atan", "sqrt", "abs", "exp", "tanh"), 1),
+    **dict.fromkeys(("atan2", "min", "max"), 2),
+    "where": 3,
 }
 """Functions and their numbers of arguments; all are in the array API, so NumPy and JAX both have them."""
-LONGEST = 500
-"""Longest expression in characters; a longer one is refused."""
-
-_BINARY: dict[type, Callable[[Batch, Batch], Batch]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
-}
-_UNARY: dict[type, Callable[[Batch], Batch]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
+LOGIC = {"logical_and": all, "logical_or": any, "logical_not": lambda values: not values[0]}
+"""How conditions are combined: names of the array API, and what they are of plain Python values."""
+_OF_ARRAYS = {"min": "minimum", "max": "maximum"}
+"""Functions that the array API calls otherwise."""
 
 
 @dataclass(frozen=True)
 class Read:
-    """One value that an expression reads: its kind (one of `READS`, or `name` for a bare name), its name and index."""
+    """One value that an expression reads: its kind, its name and its index.
+
+    The kind is `position`, `velocity` or `sensor`; `name` of a bare name; `uniform` (in [0, 1]) or `normal` (with
+    standard deviation 1) of a random number, whose index tells it from others.
+    """
 
     kind: str
     name: str
@@ -52,7 +44,7 @@ class Read:
 
 @dataclass(frozen=True)
 class Operation:
-    """An operator of the module `operator`, or a function of `FUNCTIONS` by its name, and its arguments."""
+    """An operator of the module `operator`, or the name of one of `FUNCTIONS` or of `LOGIC`, and its arguments."""
 
     function: Callable[..., Batch] | str
     arguments: tuple["Node", ...]
@@ -69,109 +61,25 @@ class Expression:
 
     text: str
     reads: tuple[Read, ...]
-    _root: Node
+    root: Node
 
     def value(self, look_up: Callable[[Read], Batch], namespace: ModuleType = math) -> Batch:
         """The value of the expression; `look_up` gives each value read, and functions come from `namespace`."""
-        return _value(self._root, look_up, namespace)
+        return value_of(self.root, look_up, namespace)
 
     def affine(self) -> Sum | None:
         """Coefficients and constant where the expression is a weighted sum of what it reads; else None."""
-        whole = _affine(self._root)
+        whole = weighted_sum(self.root)
         return None if whole is None else ({read: weight for read, weight in whole[0].items() if weight}, whole[1])
 
 
-def parse(text: str, *, names: Collection[str] | None = None) -> Expression:
-    """An expression of joints and sensors; or, with `names`, of these names alone.
-
-    Raises:
-        MadocError: The text is not such an expression, reads nothing, or has no value, as `1 / 0`.
-    """
-    if len(text) > LONGEST:
-        raise MadocError(f"expected at most {LONGEST} characters, got {len(text)}")
-    try:
-        root = _tree(ast.parse(text.strip(), mode="eval").body, names)
-        reads = tuple(dict.fromkeys(_reads(root)))
-        with np.errstate(all="ignore"):
-            value = _value(root, lambda _: np.zeros(1), np)
-        _affine(root)
-    except MadocError:
-        raise
-    except SyntaxError as error:
-        raise MadocError(f"expected an expression, got {text!r}, which does not parse") from error
-    except (RecursionError, MemoryError, ArithmeticError, ValueError) as error:
-        raise MadocError(f"expected an expression with a value, got {text!r}") from error
-    if not reads:
-        raise MadocError(f"{text!r} is {value:g} whatever the robot does; read a joint or a sensor")
-    return Expression(text, reads, root)
-
-
-def _tree(node: ast.expr, names: Collection[str] | None) -> Node:
-    match node:
-        case ast.Constant(value=number) if isinstance(number, int | float) and not isinstance(number, bool):
-            return float(number)
-        case ast.Constant(value=other):
-            raise MadocError(f"expected a number, got {other!r}")
-        case ast.Name(id="pi"):
-            return math.pi
-        case ast.BinOp() if type(node.op) in _BINARY:
-            return Operation(_BINARY[type(node.op)], (_tree(node.left, names), _tree(node.right, names)))
-        case ast.UnaryOp() if type(node.op) in _UNARY:
-            return Operation(_UNARY[type(node.op)], (_tree(node.operand, names),))
-        case ast.Call(func=ast.Name(id=function)) if function in FUNCTIONS:
-            if node.keywords or len(node.args) != FUNCTIONS[function]:
-                raise MadocError(f"{function} takes {FUNCTIONS[function]} values, got {len(node.args)}")
-            return Operation(function, tuple(_tree(argument, names) for argument in node.args))
-    return _read(node, names)
-
-
-def _read(node: ast.expr, names: Collection[str] | None) -> Read:
-    """The joint, sensor or name that a node reads; nodes that read none of them are refused."""
-    match node:
-        case ast.Name(id=name):
-            if names is None:
-                raise MadocError(
-                    f"{name!r} alone reads nothing; write position({name}), velocity({name}) or sensor({name})"
-                )
-            if name in names:
-                return Read("name", name)
-            raise MadocError(f"unknown name {name!r}; {nearest_hint(name, [*names, *FUNCTIONS, 'pi'])}")
-        case ast.Subscript(value=ast.Call() as call, slice=ast.Constant(value=int() as index)) if index is not True:
-            inner = _read(call, names)
-            return Read(inner.kind, inner.name, index)
-        case ast.Call(func=ast.Name(id=kind), args=[argument], keywords=[]) if kind in READS and names is None:
-            return Read(kind, _name_in(argument, kind))
-        case ast.Call(func=ast.Name(id=kind)) if kind in READS and names is None:
-            raise MadocError(f"{kind} takes one name, as {kind}(NAME)")
-        case ast.Call(func=ast.Name(id=name)):
-            known = [*FUNCTIONS, *(READS if names is None else ())]
-            raise MadocError(f"unknown function {name!r}; {nearest_hint(name, known)}")
-    raise MadocError(f"expected arithmetic, got {ast.unparse(node)!r}")
-
-
-def _name_in(argument: ast.expr, kind: str) -> str:
-    match argument:
-        case ast.Name(id=name) | ast.Constant(value=str() as name):
-            return name
-    text = ast.unparse(argument)
-    raise MadocError(
-        f"expected the name of a {'sensor' if kind == 'sensor' else 'joint'} in {kind}({text}), "
-        f'in quotes where it is no plain word, as {kind}("left-knee")'
-    )
-
-
-def _reads(node: Node) -> list[Read]:
-    if isinstance(node, Operation):
-        return [read for argument in node.arguments for read in _reads(argument)]
-    return [node] if isinstance(node, Read) else []
-
-
-def _value(node: Node, look_up: Callable[[Read], Batch], namespace: ModuleType) -> Batch:
+def value_of(node: Node, look_up: Callable[[Read], Batch], namespace: ModuleType) -> Batch:
+    """The value of a node; ArithmeticError or ValueError where plain numbers have none."""
     if isinstance(node, Read):
         return look_up(node)
     if isinstance(node, float):
         return node
-    arguments = [_value(argument, look_up, namespace) for argument in node.arguments]
+    arguments = [value_of(argument, look_up, namespace) for argument in node.arguments]
     if not isinstance(node.function, str):
         value = node.function(*arguments)
         if isinstance(value, complex):
@@ -179,16 +87,30 @@ def _value(node: Node, look_up: Callable[[Read], Batch], namespace: ModuleType) 
         return value
     if node.function == "abs":
         return abs(arguments[0])
-    plain = all(isinstance(argument, float) for argument in arguments)
-    return getattr(math if plain else namespace, node.function)(*arguments)
+    if all(isinstance(argument, float | bool) for argument in arguments):
+        return _plain(node.function, arguments)
+    return getattr(namespace, _OF_ARRAYS.get(node.function, node.function))(*arguments)
 
 
-def _affine(node: Node) -> Sum | None:
+def _plain(function: str, arguments: list[float]) -> float | bool:
+    """The value of a function of plain numbers."""
+    if function in LOGIC:
+        return LOGIC[function](arguments)
+    if function == "where":
+        condition, first, second = arguments
+        return first if condition else second
+    if function in _OF_ARRAYS:
+        return min(arguments) if function == "min" else max(arguments)
+    return float(getattr(math, function)(*arguments))
+
+
+def weighted_sum(node: Node) -> Sum | None:
+    """The coefficient of each value that a node reads, and the constant; None where it is no weighted sum."""
     if isinstance(node, Read):
         return {node: 1.0}, 0.0
     if isinstance(node, float):
         return {}, node
-    parts = [_affine(argument) for argument in node.arguments]
+    parts = [weighted_sum(argument) for argument in node.arguments]
     known = [part for part in parts if part is not None]
     if len(known) < len(parts):
         return None
@@ -209,7 +131,7 @@ def _affine(node: Node) -> Sum | None:
             return _scaled(left, 1.0 / right[1])
     if any(weights for weights, _ in known):
         return None
-    return {}, _value(node, lambda _: 0.0, math)
+    return {}, value_of(node, lambda _: 0.0, math)
 
 
 def _scaled(affine: Sum, factor: float) -> Sum:

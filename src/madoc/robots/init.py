@@ -107,8 +107,12 @@ def spec_text(model: Path, out: Path) -> str:
         "#   resample: null        # hold or linear: bring another rate to control_step",
         "#   tolerance: 0.1        # how far a time step may be from control_step, as a share",
         "",
-        "# What a policy should want, for `madoc learn`: an expression of signals (after the step) and actions.",
+        "# What a policy should do, for `madoc run` and `madoc learn`. reward: an expression of signals after the step",
+        "# and actions. end: a condition. goals: what is drawn for each episode and observed. reset: where it begins.",
         "# reward: null",
+        "# end: null",
+        '# goals: []  # as [{name: target, drawn: "uniform(-1, 1)"}]',
+        '# reset: {}  # as {position(JOINT): "uniform(-0.1, 0.1)"}, also normal(MEAN, DEVIATION)',
     ]
     return "\n".join(lines) + "\n"
 

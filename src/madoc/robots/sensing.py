@@ -80,6 +80,10 @@ class Signals:
         """State and sensordata -> observation."""
         return self._stacked(self.expressions, state, sensordata)
 
+    def value(self, index: int, state: Batch) -> Batch:
+        """State -> one signal, which reads no sensor."""
+        return self._stacked([self.expressions[index]], state, None)[..., 0]
+
     def undetermined(self) -> tuple[str, ...]:
         """A sentence for each joint position and velocity that is in no signal that is a weighted sum."""
         sums = [affine[0] for expression in self.expressions if (affine := expression.affine()) is not None]

@@ -2,7 +2,8 @@
 
 import mujoco
 
-from madoc.robots.expressions import Expression, parse
+from madoc.robots.expressions import Expression
+from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_single, is_slide
 from madoc.robots.sensing import Layout, Signals
 from madoc.robots.spec import SCALES

@@ -3,7 +3,7 @@
 import mujoco
 
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
-from madoc.robots.expressions import parse
+from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_slide
 from madoc.robots.signals import signal_unit
 from madoc.robots.spec import ParameterSpec
@@ -15,6 +15,7 @@ SLIDE_UNITS = {
     "dof_armature": "kg",
     "dof_frictionloss": "N",
     "jnt_stiffness": "N/m",
+    "jnt_ref": "m",
 }
 """Units of the fields of a joint where the joint is a slide."""
 
@@ -83,6 +84,10 @@ def _element_unit(draft: Draft, model: mujoco.MjModel, given: ParameterSpec, ele
     if given.field == "signal_bias":
         index = [signal.name for signal in draft.spec.signals].index(element)
         return signal_unit(draft, model, parse(draft.spec.signals[index].reads), index)
+    if given.field == "actuator_kv":
+        driven = model.actuator(element)
+        on_joint = driven.trntype[0] == mujoco.mjtTrn.mjTRN_JOINT
+        return "N·s/m" if on_joint and is_slide(model, int(driven.trnid[0])) else ""
     return _gain_unit(model, int(model.actuator(element).id)) if given.field == "actuator_gain" else ""
 
 

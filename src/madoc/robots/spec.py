@@ -4,12 +4,12 @@ import math
 from functools import lru_cache
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_core import ErrorDetails
+from pydantic import Field, field_validator, model_validator
 
 from madoc.errors import nearest_hint
 from madoc.parameters import FIELDS, Parameter
-from madoc.robots.document import Document, Place, read_document
+from madoc.robots.document import Document, read_document
+from madoc.robots.validation import Part, refuse, refused_with_line
 from madoc.tasks import TASKS
 
 SCALES: dict[str, float] = {
@@ -24,12 +24,6 @@ Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f
 File = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00-\x1f]+$")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
-
-class Part(BaseModel):
-    """A part of the spec: no unknown key is accepted, and no value is converted into another type."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 class SignalSpec(Part):
@@ -64,21 +58,21 @@ class ActionSpec(Part):
     @model_validator(mode="after")
     def _consistent(self) -> "ActionSpec":
         neither_or_both = (self.joint is None) == (self.actuator is None)
-        _refuse(neither_or_both, "expected either joint: or actuator:, got both or neither")
+        refuse(neither_or_both, "expected either joint: or actuator:, got both or neither")
         given = [key for key in ("means", "kp", "kd", "limit") if getattr(self, key) is not None]
         if self.actuator is not None and given:
             raise ValueError(f"{given[0]}: belongs to joint:, the actuator {self.actuator!r} has its own in the model")
         if self.joint is not None:
-            _refuse(self.means is None, "expected means: torque, force, position or velocity beside joint:")
-            _refuse(self.low is None or self.high is None, "expected low: and high: beside joint:")
-            _refuse(self.means == "position" and self.kp is None, "expected kp: of a position servo")
-            _refuse(self.means == "velocity" and not self.kd, "expected kd: above 0 of a velocity servo")
-            _refuse(self.means == "velocity" and self.kp is not None, "kp: means nothing beside means: velocity")
+            refuse(self.means is None, "expected means: torque, force, position or velocity beside joint:")
+            refuse(self.low is None or self.high is None, "expected low: and high: beside joint:")
+            refuse(self.means == "position" and self.kp is None, "expected kp: of a position servo")
+            refuse(self.means == "velocity" and not self.kd, "expected kd: above 0 of a velocity servo")
+            refuse(self.means == "velocity" and self.kp is not None, "kp: means nothing beside means: velocity")
             if self.means in ("torque", "force") and len(given) > 1:
                 raise ValueError(f"{given[1]}: means nothing beside means: {self.means}")
-        _refuse((self.low is None) != (self.high is None), "expected both low: and high:, got one of them")
+        refuse((self.low is None) != (self.high is None), "expected both low: and high:, got one of them")
         if self.low is not None and self.high is not None:
-            _refuse(self.low >= self.high, f"expected low below high, got {self.low:g} and {self.high:g}")
+            refuse(self.low >= self.high, f"expected low below high, got {self.low:g} and {self.high:g}")
         return self
 
 
@@ -96,12 +90,12 @@ class ParameterSpec(Part):
     @classmethod
     def _known(cls, field: str) -> str:
         hint = nearest_hint(field, FIELDS)
-        _refuse(field not in FIELDS, f"expected a field that can be calibrated, got {field!r}; {hint}")
+        refuse(field not in FIELDS, f"expected a field that can be calibrated, got {field!r}; {hint}")
         return field
 
     @model_validator(mode="after")
     def _consistent(self) -> "ParameterSpec":
-        _refuse(self.element is not None and self.elements is not None, "expected element: or elements:, got both")
+        refuse(self.element is not None and self.elements is not None, "expected element: or elements:, got both")
         self.parameter()  # pydantic reports what it refuses, as a MadocError is a ValueError
         return self
 
@@ -125,6 +119,15 @@ class LogSpec(Part):
     )
 
 
+class GoalSpec(Part):
+    """One number that is drawn anew for every episode and holds throughout, as a target to reach."""
+
+    name: Name = Field(description="What the reward, the end and other goals call it.")
+    drawn: str | Finite = Field(
+        description="An expression of uniform(LOW, HIGH), normal(MEAN, DEVIATION), goals above."
+    )
+
+
 class RobotSpec(Part):
     """A robot of one's own, as Madoc's spec file describes it."""
 
@@ -141,22 +144,37 @@ class RobotSpec(Part):
     groups: Annotated[int, Field(ge=1)] | None = Field(None, description="Groups Madoc forms. Default: min(4, d).")
     log: LogSpec = Field(default_factory=lambda: LogSpec.model_validate({}))
     reward: str | None = Field(
-        None, description="An expression of signals, after the step, and actions, by name; needed to learn a policy."
+        None,
+        description="An expression of signals, after the step, actions and goals, by name, and of position(JOINT) and "
+        "velocity(JOINT); needed to learn a policy.",
+    )
+    end: str | None = Field(
+        None,
+        description="A condition of signals and goals, as height < 0.2: an episode ends after a step where it holds.",
+    )
+    goals: list[GoalSpec] = Field(
+        [], description="What is drawn for each episode; a policy observes goals behind the signals."
+    )
+    reset: dict[str, str | Finite] = Field(
+        {},
+        description="position(JOINT) or velocity(JOINT) -> where an episode begins: an expression as of goals. "
+        "Default: as the model does.",
     )
     max_episode_steps: Annotated[int, Field(ge=1)] = Field(1000, description="Control steps of a simulated episode.")
 
     @field_validator("name")
     @classmethod
     def _new(cls, name: str) -> str:
-        _refuse(name in TASKS, f"{name!r} is a robot of Madoc's own; choose another name")
+        refuse(name in TASKS, f"{name!r} is a robot of Madoc's own; choose another name")
         return name
 
 
-_PARTS: dict[str | int, type[Part]] = {
+_PARTS: dict[str | int, type] = {
     "signals": SignalSpec,
     "actions": ActionSpec,
     "parameters": ParameterSpec,
     "log": LogSpec,
+    "goals": GoalSpec,
 }
 """The parts of the spec by their key, for the keys that each may have."""
 
@@ -167,60 +185,5 @@ def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
     document = read_document(content, file)
     if not isinstance(document.data, dict):
         raise document.error((), "expected keys and values, as `name: my_robot`; write one with: madoc init MODEL")
-    try:
+    with refused_with_line(document, RobotSpec, _PARTS):
         return RobotSpec.model_validate(document.data), document
-    except ValidationError as error:
-        # What is missing may be there under a misspelt name, which says more.
-        details = sorted(
-            error.errors(), key=lambda detail: (detail["type"] == "missing", document.line(_place(detail)))
-        )
-        more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-        place = _place(details[0])
-        raise document.error(place, _sentence(details[0], place) + more) from error
-
-
-def _refuse(wrong: bool, sentence: str) -> None:
-    """Raise a ValueError, which pydantic reports, where something is wrong."""
-    if wrong:
-        raise ValueError(sentence)
-
-
-def _place(detail: ErrorDetails) -> Place:
-    """The place of an error in the document, without pydantic's mark for a key of a dictionary."""
-    return tuple(part for part in detail["loc"] if part != "[key]")
-
-
-def _sentence(detail: ErrorDetails, place: Place) -> str:
-    kind, got = detail["type"], detail["input"]
-    what = ".".join(str(part) for part in place if not isinstance(part, int))
-    if kind == "missing":
-        *whole, key = place
-        return f"expected {key}: {'here' if not whole else 'in this part of ' + str(whole[0])}"
-    if kind == "extra_forbidden":
-        part = _PARTS[place[0]] if len(place) > 1 else RobotSpec
-        return f"unknown key {place[-1]!r}; {nearest_hint(str(place[-1]), part.model_fields)}"
-    if kind == "value_error":
-        return str(detail["ctx"]["error"])
-    if kind == "string_type" and isinstance(got, int | float):
-        return f"expected text in {what}, got {got!r}; put it in quotes"
-    expected = detail["msg"].partition(" should ")[2].partition(" after ")[0].removeprefix("be ").removeprefix("have ")
-    expected = {
-        "string_pattern_mismatch": "a name of letters, digits, _ . and -" if place == ("name",) else "a printable name",
-        "float_type": "a number",
-        "float_parsing": "a number",
-        "model_type": "keys and values",
-        "dict_type": "keys and values",
-        "list_type": "a list",
-        "int_type": "a whole number",
-        "string_type": "text",
-    }.get(kind, expected)
-    return f"expected {expected} in {what}, got {_shown(got)}"
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, dict):
-        return "keys and values"
-    if value is None or value == []:
-        return "nothing" if value is None else "an empty list"
-    text = str(value) if isinstance(value, float) and not math.isfinite(value) else repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

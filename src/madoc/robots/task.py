@@ -1,7 +1,7 @@
 """A robot made of its spec and its model."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -13,9 +13,8 @@ from jaxtyping import PRNGKeyArray
 from madoc import simulation
 from madoc.errors import MadocError
 from madoc.robots.actions import action_channel, added_actuator, idle_actuators
-from madoc.robots.expressions import Read, parse
+from madoc.robots.episodes import Episode, no_reward, read_episode
 from madoc.robots.model import Draft, ModelFiles, compiled, make_model
-from madoc.robots.sensing import Signals
 from madoc.robots.signals import read_signals, signal_unit
 from madoc.robots.space import parameter_space
 from madoc.robots.spec import RobotSpec, read_spec
@@ -77,7 +76,7 @@ def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
     pending = max([int(np.ceil(high / spec.control_step - 1e-9)) for high in delays], default=0)
     if signals.read_sensors & signals.layout.accelerating:
         pending = max(pending, 1)  # such a sensor shows the force of the last action
-    names = tuple(signal.name for signal in spec.signals)
+    names, episode = tuple(signal.name for signal in spec.signals), read_episode(draft, signals, actions)
     task = Task(
         name=spec.name,
         physics="modern",
@@ -85,7 +84,7 @@ def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
         frame_skip=frame_skip,
         observation_size=len(names),
         observe=partial(_needs_a_system, spec.name) if signals.read_sensors else signals.observe,
-        reward=_reward(draft, signals, actions),
+        reward=no_reward if episode.goals else episode.reward,
         terminated=never_terminated,
         reset_noise=partial(_no_noise, size=model.nq + model.nv + pending * len(actions)),
         parameters=space,
@@ -102,6 +101,8 @@ def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
         rewarded=spec.reward is not None,
         source={"file": file, "spec": content.decode("utf-8-sig"), "model": files.to_json()},
     )
+    if episode.differs:
+        task = replace(task, episodes=_episodes(task, episode))
     with document.at("model"):
         simulation.make(task, threads=1)
     shown = tuple(
@@ -149,41 +150,29 @@ def _frame_skip(draft: Draft, model: mujoco.MjModel) -> int:
     return steps
 
 
-def _reward(
-    draft: Draft, signals: Signals, actions: tuple[ActionChannel, ...]
-) -> Callable[[Batch, Batch, Batch], Batch]:
-    """(state, action, next state) -> reward: the spec's expression, or 0 where it has none."""
-    if draft.spec.reward is None:
-        return _no_reward
-    of_signals = {signal.name: index for index, signal in enumerate(draft.spec.signals)}
-    of_actions = {channel.name: index for index, channel in enumerate(actions)}
-    with draft.document.at("reward"):
-        expression = parse(draft.spec.reward, names=[*of_signals, *of_actions])
-    for read in expression.reads:
-        inside = signals.expressions[of_signals[read.name]].reads if read.name in of_signals else ()
-        if any(part.kind == "sensor" for part in inside):
-            raise draft.document.error(
-                ("reward",), f"a reward is a function of state and action, and the signal {read.name!r} reads a sensor"
-            )
-
-    def reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
-        namespace = next_state.__array_namespace__()
-
-        def look_up(read: Read) -> Batch:
-            if read.name in of_signals:
-                return signals._stacked([signals.expressions[of_signals[read.name]]], next_state, None)[..., 0]
-            channel = actions[of_actions[read.name]]
-            middle, half = (channel.low + channel.high) / 2.0, (channel.high - channel.low) / 2.0
-            return middle + half * action[..., of_actions[read.name]]
-
-        with np.errstate(all="ignore"):
-            return expression.value(look_up, namespace)
-
-    return reward
+def _episodes(task: Task, episode: Episode) -> Task:
+    """The task that policies learn: begun, rewarded and ended as the spec says, with its goals behind the signals."""
+    count = len(episode.goals)
+    start = np.concatenate([simulation.make(task, threads=1).initial_state, np.zeros(count)])
+    return replace(
+        task,
+        observation_size=task.observation_size + count,
+        observe=partial(_with_goals, task.observe, count=count),
+        reward=episode.reward,
+        terminated=episode.ended,
+        reset_noise=partial(episode.starts.offsets, start=start),
+        state_from_observation=None if count else task.state_from_observation,
+        posture=None if count else task.posture,
+        signals=(*task.signals, *episode.goals),
+        sense=task.sense and partial(_with_goals, task.sense, count=count),
+        goals=episode.goals,
+    )
 
 
-def _no_reward(state: Batch, action: Batch, next_state: Batch) -> Batch:
-    return 0.0 * next_state[..., 0]
+def _with_goals(observe: Callable[..., Batch], state: Batch, *sensordata: Batch, count: int) -> Batch:
+    """An observation with the goals, which end the state, behind it."""
+    seen = observe(state, *sensordata)
+    return state.__array_namespace__().concat([seen, state[..., state.shape[-1] - count :]], axis=-1)
 
 
 def _no_noise(key: PRNGKeyArray, count: int, *, size: int) -> jax.Array:

@@ -25,12 +25,14 @@ class Moment:
         done: The same as a count, in the work's unit.
         stage: The present stage, in a short word.
         metrics: Numbers to show beside it; of more than three, the first three are shown.
+        seconds_left: Time left in s, where more is known of it than the pace so far.
     """
 
     fraction: float
     done: int
     stage: str = ""
     metrics: Metrics = field(default_factory=dict)
+    seconds_left: float | None = None
 
 
 Show = Callable[[Moment], None]
@@ -67,25 +69,32 @@ def bar(description: str, *, total: int, unit: str, quiet: bool = False) -> Iter
 
 
 class _Pace:
-    """The rate of the work and the time left, from the moments of the last `_WINDOW_SECONDS`."""
+    """The rate of the work and the time left, from the moments of the last `_WINDOW_SECONDS`.
+
+    Of work so slow that nothing was done in that time, they are those since its beginning.
+    """
 
     def __init__(self, unit: str) -> None:
         self._unit = unit
         self._started = time.monotonic()
         self._seen: deque[tuple[float, Moment]] = deque()
+        self._first: tuple[float, Moment] | None = None
 
     def words(self, moment: Moment) -> tuple[str, str, str]:
         """The rate, the time elapsed, and the time left, at a moment."""
         now = time.monotonic()
         self._seen.append((now, moment))
+        self._first = self._first or (now, moment)
         while len(self._seen) > 2 and self._seen[1][0] < now - _WINDOW_SECONDS:
             self._seen.popleft()
-        then, before = self._seen[0]
+        then, before = self._seen[0] if moment.done > self._seen[0][1].done else self._first
         seconds, done, fraction = now - then, moment.done - before.done, moment.fraction - before.fraction
-        rate = f"{done / seconds:,.0f}" if seconds > 0 and done > 0 else "-"
-        left = _clock((1.0 - moment.fraction) * seconds / fraction) if fraction > 0 else "-:--"
+        rate = _rate(done / seconds, self._unit) if seconds > 0 and done > 0 else f"- {self._unit}/s"
+        left = moment.seconds_left
+        if left is None and fraction > 0:
+            left = (1.0 - moment.fraction) * seconds / fraction
         elapsed = _clock(now - self._started)
-        return f"{rate} {self._unit}/s", f"{elapsed} elapsed", f"{left} left"
+        return rate, f"{elapsed} elapsed", f"{'-:--' if left is None else _clock(left)} left"
 
 
 @contextmanager
@@ -144,6 +153,14 @@ def _bar(description: str, unit: str) -> Iterator[Show]:
 
 def _metrics(moment: Moment) -> list[str]:
     return [f"{name} {value:.4g}" for name, value in list(moment.metrics.items())[:3]]
+
+
+def _rate(rate: float, unit: str) -> str:
+    """A rate per second, or per minute or hour where that is the first with a whole one."""
+    for seconds, name in ((1, "s"), (60, "min")):
+        if seconds * rate >= 1.0:
+            return f"{seconds * rate:,.0f} {unit}/{name}"
+    return f"{3600 * rate:,.1f} {unit}/h"
 
 
 def _clock(seconds: float) -> str:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import mujoco
 import mujoco.rollout
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter
@@ -55,9 +55,10 @@ class CpuSimulator:
 
     @property
     def initial_state(self) -> Float[np.ndarray, " state"]:
-        """The model's (qpos0, 0), followed by the pending actions at rest."""
+        """The model's (qpos0, 0), followed by the pending actions at rest, and goals of 0."""
         rest = [channel.rest for channel in self.task.actions] or self.action_size * [0.0]
-        return np.concatenate([self._model.qpos0, np.zeros(self._model.nv), np.tile(rest, self.task.pending)])
+        still, goals = np.zeros(self._model.nv), np.zeros(len(self.task.goals))
+        return np.concatenate([self._model.qpos0, still, np.tile(rest, self.task.pending), goals])
 
     def bind(self, parameters: Float[np.ndarray, "*systems parameters"] | Mapping[str, float]) -> "CpuSystem":
         """A system for each row of physical values, or the one of a vector or of values by name.
@@ -109,13 +110,23 @@ class CpuSimulator:
         control[..., self._actuators] = self._centre + self._half * action
         return control
 
+    def touching(self, state: Float[np.ndarray, "rows state"]) -> Bool[np.ndarray, " rows"]:
+        """Whether any two bodies are in contact in each state; no parameter changes the shape of a body."""
+        data, touching = self._data[0], np.zeros(len(state), dtype=bool)
+        for row, position in enumerate(state[:, : self._model.nq]):
+            data.qpos[:] = position
+            mujoco.mj_kinematics(self._model, data)
+            mujoco.mj_collision(self._model, data)
+            touching[row] = data.ncon > 0
+        return touching
+
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
         """A MuJoCo model at the given physical values, owned by the caller."""
         return self.bind(np.asarray(values)[None]).models[0]
 
 
 class CpuSystem:
-    """Systems at fixed parameters; states are (qpos, qvel, pending actions).
+    """Systems at fixed parameters; states are (qpos, qvel, pending actions, goals).
 
     The solver's warm start is always 0, so a step depends on state, action and parameters alone, whatever the number
     of threads.
@@ -131,6 +142,7 @@ class CpuSystem:
         self.models, self.count = models, len(models)
         self._simulator, self._delay, self._bias = simulator, delay, bias
         self._physical = models[0].nq + models[0].nv
+        self._goals = self._physical + simulator.task.pending * simulator.action_size
         self._weights = delay_weights(
             delay,
             control_step=simulator.control_step,
@@ -158,7 +170,8 @@ class CpuSystem:
         history = np.concatenate([action[..., None, :], self._pending(state)], axis=-2)
         control = self._simulator._controls(blend(self._weights, history))
         moved, _ = self._roll_out(state[..., : self._physical], control)
-        kept = history[..., :-1, :].reshape(*state.shape[:2], state.shape[2] - self._physical)
+        pending = history[..., :-1, :].reshape(*state.shape[:2], self._goals - self._physical)
+        kept = np.concatenate([pending, state[..., self._goals :]], axis=-1)
         return np.concatenate([moved, np.where(np.isnan(moved[..., :1]), np.nan, kept)], axis=-1)
 
     def observe(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows observation"]:
@@ -194,7 +207,7 @@ class CpuSystem:
     ) -> Float[np.ndarray, "systems rows pending action"]:
         """Past actions, newest first."""
         sizes = self._simulator.task.pending, self._simulator.action_size
-        return state[..., self._physical :].reshape(*state.shape[:2], *sizes)
+        return state[..., self._physical : self._goals].reshape(*state.shape[:2], *sizes)
 
     def _roll_out(
         self,
@@ -232,7 +245,7 @@ class CpuSystem:
 
     def _check_shapes(self, state: tuple[int, ...], action: tuple[int, ...]) -> None:
         simulator, rows = self._simulator, state[1] if len(state) == 3 else 0
-        size = self._physical + simulator.task.pending * simulator.action_size
+        size = self._goals + len(simulator.task.goals)
         if state != (self.count, rows, size) or action != (self.count, rows, simulator.action_size):
             raise MadocError(
                 f"expected states of shape ({self.count}, rows, {size}) and actions of shape "

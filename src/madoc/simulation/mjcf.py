@@ -204,16 +204,25 @@ def _write_rows(
     """Write an attribute of all elements of a kind, which is equal to their rows of an array of the model."""
     changes = []
     for element in spec.bodies if kind == "body" else getattr(spec, f"{kind}s"):
-        index = int(bound.jnt_dofadr[element.id]) if array.startswith("dof_") else element.id
+        index = _index(bound, array, element.id)
         old, new = _row(nominal, array, index), _row(bound, array, index)
         if old == new:
             continue
+        if attribute in _ANGLES and spec.compiler.degree and int(element.type) == int(mujoco.mjtJoint.mjJNT_HINGE):
+            old, new = np.rad2deg(old).tolist(), np.rad2deg(new).tolist()
         if np.ndim(getattr(element, attribute)):
             getattr(element, attribute)[: len(new)] = new
         else:
             setattr(element, attribute, new[0])
         changes.append(Change(f"{kind} {element.name or element.id}", attribute, old, new))
     return changes
+
+
+def _index(model: mujoco.MjModel, array: str, element: int) -> int:
+    """The row of an element in an array of the model; those of a joint by what the array has a row for."""
+    if array.startswith("dof_"):
+        return int(model.jnt_dofadr[element])
+    return int(model.jnt_qposadr[element]) if array.startswith("qpos") else element
 
 
 def _row(model: mujoco.MjModel, array: str, index: int) -> list[float]:
@@ -238,6 +247,9 @@ _ROWS = (
     ("joint", "frictionloss", "dof_frictionloss"),
     ("joint", "stiffness", "jnt_stiffness"),
     ("joint", "pos", "jnt_pos"),
+    ("joint", "ref", "qpos0"),
+    ("joint", "springref", "qpos_spring"),
+    ("joint", "range", "jnt_range"),
     ("geom", "friction", "geom_friction"),
     ("geom", "size", "geom_size"),
     ("geom", "pos", "geom_pos"),
@@ -246,3 +258,6 @@ _ROWS = (
     ("actuator", "biasprm", "actuator_biasprm"),
 )
 """What a parameter may change, besides gravity and inertias: kind of element, attribute in MJCF, array of the model."""
+
+_ANGLES = ("ref", "springref", "range")
+"""Attributes of a hinge that are in degrees where the other angles of a model's file are."""

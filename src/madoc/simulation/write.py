@@ -23,6 +23,7 @@ _KINDS = {
 }
 """By kind of element, MuJoCo's object type and the attribute of a model that counts them."""
 
+_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _INERTIAL_FRAMES = (mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA, mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT)
 
 
@@ -137,6 +138,30 @@ def _write_gain(model: mujoco.MjModel, actuator: int, value: float) -> None:
     model.actuator_gainprm[actuator, 0] = value
 
 
+def _write_kv(model: mujoco.MjModel, actuator: int, value: float) -> None:
+    """A position servo brakes with kv · velocity: the third number of its bias, with the other sign."""
+    position, velocity = model.actuator_biasprm[actuator, 1:3]
+    affine = int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    if not affine or (not position and velocity == -model.actuator_gainprm[actuator, 0]):
+        raise MadocError(
+            f"actuator_kv: actuator {model.actuator(actuator).name!r} is not a position servo; use dof_damping for the "
+            "damping of its joint, or actuator_gain for the kv of a velocity servo"
+        )
+    model.actuator_biasprm[actuator, 2] = -value
+
+
+def _write_ref(model: mujoco.MjModel, joint: int, value: float) -> None:
+    """The joint's limits, and the position at which its spring is at rest, stay where they are in space."""
+    if int(model.jnt_type[joint]) not in _SINGLE:
+        raise MadocError(f"jnt_ref: joint {model.joint(joint).name!r} is a ball or free; only a hinge or slide has one")
+    address = model.jnt_qposadr[joint]
+    shift = value - model.qpos0[address]
+    model.qpos0[address] = value
+    model.qpos_spring[address] += shift
+    if model.jnt_limited[joint]:
+        model.jnt_range[joint] += shift
+
+
 _NUMBERS: dict[str, Callable[[mujoco.MjModel, int], np.ndarray]] = {
     "gravity": lambda model, _: model.opt.gravity[2:],
     "body_mass": lambda model, body: model.body_mass[body : body + 1],
@@ -148,8 +173,10 @@ _NUMBERS: dict[str, Callable[[mujoco.MjModel, int], np.ndarray]] = {
     "dof_armature": lambda model, joint: model.dof_armature[_dofs(model, joint)],
     "dof_frictionloss": lambda model, joint: model.dof_frictionloss[_dofs(model, joint)],
     "jnt_stiffness": lambda model, joint: model.jnt_stiffness[joint : joint + 1],
+    "jnt_ref": lambda model, joint: model.qpos0[model.jnt_qposadr[joint] :][:1],
     "geom_friction": lambda model, geom: model.geom_friction[geom, :1],
     "actuator_gain": lambda model, actuator: model.actuator_gainprm[actuator, :1],
+    "actuator_kv": lambda model, actuator: 0.0 - model.actuator_biasprm[actuator, 2:3],
 }
 """The numbers of an element that a field stands for, the first of which is its value. A field without a writer of its
 own is written into all of them."""
@@ -159,6 +186,8 @@ _WRITERS: dict[str, Callable[[mujoco.MjModel, int, float], None]] = {
     "body_mass_and_inertia": _write_mass_and_inertia,
     "body_inertia": _write_inertia,
     "body_com": _write_centre_of_mass,
+    "jnt_ref": _write_ref,
     "actuator_gain": _write_gain,
+    "actuator_kv": _write_kv,
 }
 """Fields whose value has a floor, or changes other numbers of the model too."""

@@ -75,8 +75,8 @@ class ActionChannel:
 class Task:
     """A robot and its reward, without the true parameters of the target.
 
-    The state is (qpos, qvel, pending actions), float64, on the last axis. Functions are pure and batched over leading
-    axes.
+    The state is (qpos, qvel, pending actions, goals), float64, on the last axis. Functions are pure and batched over
+    leading axes.
 
     Attributes:
         name: `hopper`, ...
@@ -103,6 +103,9 @@ class Task:
         rewarded: Whether the task has a reward; without one no policy can be learnt or evaluated.
         source: The files of a robot's spec as JSON, from which `robots.restore` makes the task again; None for a task
             that its name determines.
+        goals: Names of the values that are drawn at a reset, hold for an episode, and end state and observation.
+        episodes: The task that policies learn, where a user's own robot starts, ends or is rewarded there unlike in
+            its logs; None where it is this one. `for_policies` has the parameters as well.
         posture: observation -> (qpos, qvel), NaN for values not determined; None where no position is determined.
     """
 
@@ -130,6 +133,8 @@ class Task:
     rewarded: bool = True
     source: Mapping[str, object] | None = None
     posture: Callable[[Batch], Batch] | None = None
+    goals: tuple[str, ...] = ()
+    episodes: "Task | None" = None
 
     @property
     def action_size(self) -> int:
@@ -145,6 +150,11 @@ class Task:
         """A copy of the model at nominal parameters, free to be changed."""
         return copy.copy(self.model)
 
+    @property
+    def for_policies(self) -> "Task":
+        """The task that policies learn and are evaluated in, with the same parameters."""
+        return self if self.episodes is None else replace(self.episodes, parameters=self.parameters, ranges=self.ranges)
+
     def with_level(self, level: str) -> "Task":
         """The same task searched in its `easy`, `normal` or `hard` ranges (appendix D, Jiang et al. 2024)."""
         if level not in self.ranges:
@@ -156,8 +166,13 @@ class Task:
         return replace(self, spec=partial(scaled_friction, self.spec, factor))
 
     def with_time_step(self, factor: float, *, substeps: int = 1) -> "Task":
-        """The same task with the integration step times `factor`, and `substeps` times as many a control step."""
+        """The same task with the integration step times `factor`, and `substeps` times as many a control step.
+
+        Its model is a copy of this one's: a second compilation may take seconds, and would differ by that number alone.
+        """
         spec = partial(scaled_time_step, self.spec, factor)
+        _MODELS[spec] = self.compile()
+        _MODELS[spec].opt.timestep *= factor
         return replace(self, spec=spec, frame_skip=self.frame_skip * substeps)
 
     def with_parameters(self, names: list[str]) -> "Task":

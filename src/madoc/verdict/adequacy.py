@@ -1,11 +1,15 @@
 """Whether the model is adequate for an estimate: the terms that it seems to lack, and what they do to the intervals."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult
-from madoc.identification.missing_terms import DRIFT, INTEGRATION, SUSPICIOUS, MissingTerm
+from madoc.identification.candidate_terms import INTEGRATION
+from madoc.identification.combinations import Combination
+from madoc.identification.missing_terms import DRIFT, Alternative, MissingTerm
 
 CERTAIN = 5.0
 """|t| from which a term is missing; by chance one in two million is larger where residuals are normal."""
@@ -13,64 +17,110 @@ CERTAIN_DRIFT = 6.0
 """The same for a parameter that changes over the log, whose standard error rests on a third of the windows."""
 MOVES = 0.5
 """Shift of a parameter in half-widths of its 95 % interval; a term that moves all by less may be left out."""
-NUMERICAL = 0.5
+NUMERICAL = 0.3
 """Share of squared residuals explained by the integration step; above it they are no mismatch of the model."""
+AS_SIGNIFICANT = 0.6
+"""|t| over that of the most significant term; among terms above it the one that explains most is named."""
+
+NEARLY = 0.8
+"""Share explained by a term over that of the one named; terms above it are as likely."""
 
 
 def missing_term(holdout: HoldOut) -> MissingTerm | None:
-    """The most significant term that the model certainly lacks and that would move the estimate.
+    """The likeliest term that the model certainly lacks, if such terms move the estimate by themselves or together.
 
     None where the integration step explains most of the residuals: beside its error no other can be told.
     """
     if numerical(holdout) is not None:
         return None
-    for term in holdout.missing_terms:
-        certain = CERTAIN_DRIFT if term.cause == DRIFT else CERTAIN
-        if term.cause != INTEGRATION and abs(term.t) >= certain and _largest_shift(term) >= MOVES:
-            return term
-    return None
+    certain = [term for term in holdout.missing_terms if is_certain(term)]
+    moving = [term for term in certain if max(map(abs, term.shifts.values())) >= MOVES]
+    if certain and not moving and _moved_together(holdout):
+        moving = [term for term in holdout.missing_terms if term.cause not in (DRIFT, INTEGRATION)]
+    if not moving:
+        return None
+    most = max(abs(term.t) for term in moving)
+    return max((term for term in moving if abs(term.t) >= AS_SIGNIFICANT * most), key=lambda term: term.explained)
+
+
+def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
+    """Other terms that are certain and explain nearly as much: the log hardly tells which of them is missing."""
+    return [
+        term
+        for term in holdout.missing_terms
+        if term != named and is_certain(term) and term.cause != DRIFT and term.explained >= NEARLY * named.explained
+    ]
+
+
+def is_certain(term: MissingTerm) -> bool:
+    """Whether a term is so significant that it is missing, whatever it does to the estimate."""
+    return term.cause != INTEGRATION and abs(term.t) >= (CERTAIN_DRIFT if term.cause == DRIFT else CERTAIN)
+
+
+def _moved_together(holdout: HoldOut) -> bool:
+    """Whether terms that cannot be excluded together move a parameter by more than the error of that."""
+    return any(
+        abs(shift) >= max(MOVES, each.errors[name])
+        for each in holdout.alternatives
+        if each.terms
+        for name, shift in each.shifts.items()
+    )
 
 
 def numerical(holdout: HoldOut) -> MissingTerm | None:
-    """The error of the integration step, where it explains most of the residuals."""
+    """The error of the integration step, where it explains much of the residuals."""
     term = next((term for term in holdout.missing_terms if term.cause == INTEGRATION), None)
     return term if term is not None and abs(term.t) >= CERTAIN and term.explained >= NUMERICAL else None
 
 
-def widening(terms: tuple[MissingTerm, ...], names: tuple[str, ...]) -> Float[np.ndarray, " d"]:
-    """By how many half-widths each interval must grow to either side to cover a term that cannot be excluded.
+def widening(alternatives: tuple[Alternative, ...], names: tuple[str, ...]) -> Float[np.ndarray, "d 2"]:
+    """By how many half-widths each interval's low and high end must move out to cover every alternative as well.
 
-    The error of the integration step counts twice where it is significant, as it changes with the length of windows,
-    and of the other terms the most significant one.
+    An alternative's own interval is its estimate and, to either side, the root of the sum of the squares of the given
+    half-width and of the error of the shift: the two are independent, as terms are tested beside the parameters.
     """
-    doubtful = [term for term in terms if abs(term.t) >= SUSPICIOUS and term.cause != DRIFT]
-    numerical = [term for term in doubtful if term.cause == INTEGRATION]
-    physical = [term for term in doubtful if term.cause != INTEGRATION]
-    counted = (*numerical, *numerical, *physical[:1])
-    shifts = [[abs(term.shifts[name]) for name in names] for term in counted]
-    return np.sum(shifts, axis=0) if shifts else np.zeros(len(names))
+    ends = np.ones((len(names), 2))
+    for each in alternatives:
+        for index, name in enumerate(names):
+            if name in each.shifts:
+                shift, reach = each.shifts[name], float(np.hypot(1.0, each.errors[name]))
+                ends[index] = np.maximum(ends[index], [reach - shift, reach + shift])
+    return ends - 1.0
 
 
 def with_widened_intervals(result: CalibrationResult, holdout: HoldOut) -> CalibrationResult:
-    """The result with intervals that cover terms which cannot be excluded, and a warning that says so."""
-    factors = widening(holdout.missing_terms, tuple(result.parameters))
-    grown = {name: factor for name, factor in zip(result.parameters, factors, strict=True) if factor > 0.0}
-    if result.interval is None or not grown:
+    """The result with intervals that cover the alternatives as well, and a warning that says so."""
+    if result.interval is None:
         return result
-    return result.with_intervals(grown, _sentence(holdout.missing_terms))
+    ends = widening(holdout.alternatives, tuple(result.parameters))
+    grown = {
+        name: (low, high) for name, (low, high) in zip(result.parameters, ends.tolist(), strict=True) if low + high
+    }
+    if not grown:
+        return result
+    told = [_covering(combination, result, holdout.alternatives) for combination in result.combinations]
+    return replace(result.with_intervals(grown, _sentence(holdout.alternatives)), combinations=told)
 
 
-def _sentence(terms: tuple[MissingTerm, ...]) -> str:
-    doubtful = [term for term in terms if abs(term.t) >= SUSPICIOUS and term.cause != DRIFT]
-    named = list(dict.fromkeys(term.cause for term in doubtful if term.cause == INTEGRATION))
-    named += [_named(term) for term in doubtful if term.cause != INTEGRATION][:1]
-    return f"intervals were widened to cover {' and '.join(named)}, which the data does not exclude"
+def _covering(
+    combination: Combination, result: CalibrationResult, alternatives: tuple[Alternative, ...]
+) -> Combination:
+    """The combination with an interval that covers the alternatives, to first order in their shifts."""
+    low, high = combination.interval
+    below, above = combination.estimate - low, high - combination.estimate
+    for each in alternatives:
+        shift = reach = 0.0
+        for name, factor in combination.parameters.items():
+            row = result.parameters[name]
+            if name in each.shifts and row.interval is not None:
+                slope = factor if combination.kind == "sum" else factor * combination.estimate / row.estimate
+                half = slope * (row.interval[1] - row.interval[0]) / 2.0
+                shift, reach = shift + half * each.shifts[name], reach + abs(half) * each.errors[name]
+        low = min(low, combination.estimate + shift - float(np.hypot(below, reach)))
+        high = max(high, combination.estimate + shift + float(np.hypot(above, reach)))
+    return replace(combination, interval=(low, high))
 
 
-def _named(term: MissingTerm) -> str:
-    what = f"{term.cause} ({term.parameter})" if term.parameter else term.cause
-    return f"{what} of {term.value:.2g} ± {term.standard_error:.1g} {term.unit}".rstrip()
-
-
-def _largest_shift(term: MissingTerm) -> float:
-    return max(abs(shift) for shift in term.shifts.values())
+def _sentence(alternatives: tuple[Alternative, ...]) -> str:
+    causes = dict.fromkeys(cause for each in alternatives for cause in each.causes)
+    return f"intervals were widened to cover what the data does not exclude: {', '.join(causes)}"

@@ -70,8 +70,9 @@ def assess(
             f"{', '.join(bench.simulator.parameters.names)}"
         )
     holdout = measured(bench, result.mean, result.interval)
-    verdict = judge(holdout, settled=result.settled)
-    widened = replace(with_widened_intervals(result, holdout), verdict=verdict, holdout=holdout)
+    widened = with_widened_intervals(result, holdout)
+    verdict = judge(holdout, settled=result.settled, combinations=widened.combinations)
+    widened = replace(widened, verdict=verdict, holdout=holdout)
     return Assessment(verdict, holdout, widened)
 
 

@@ -1,7 +1,7 @@
 """What estimates of one problem are judged on: the training rows, the hold-out, and ways to replay the latter."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -12,14 +12,14 @@ from sklearn.neighbors import NearestNeighbors
 
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.holdout import AgainstChance, Area, Judged
-from madoc.data import Dataset
+from madoc.data import Dataset, stride
 from madoc.diagnosis.channels import signal_names
 from madoc.errors import MadocError
 from madoc.identification.excitation import expected_half_widths
-from madoc.identification.missing_terms import MissingTerm, missing_terms
+from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
 from madoc.identification.noise import difference_noise
-from madoc.identification.states import logged_states
-from madoc.identification.windows import consecutive_rows, evenly
+from madoc.identification.states import LoggedStates, logged_states
+from madoc.identification.windows import consecutive_rows, evenly, horizons
 from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import FIELDS
@@ -87,21 +87,28 @@ class Bench:
         return self.problem.typical_change
 
     @property
+    def states(self) -> LoggedStates:
+        """What the training rows say of states; those with velocities derived from noisy positions are approximate."""
+        states = self.problem.states
+        derived = states.measured < self.simulator.task.observation_size
+        return replace(states, kind="approximate") if states.kind == "exact" and derived else states
+
+    @property
     def states_known(self) -> bool:
         """Whether states can be rebuilt from observations."""
-        return self.problem.states.kind == "exact"
+        return self.states.kind == "exact"
 
     @cached_property
     def replays(self) -> Replays:
         """Windows of the hold-out to replay from logged states, where states can be rebuilt."""
-        return replays_of(self.held_out, self.simulator, self.change)
+        return replays_of(self.held_out, self.simulator, self.change, horizons(self.problem.dataset))
 
     @cached_property
     def fitted(self) -> FittedReplays | None:
         """Windows of the hold-out whose initial states are to be fitted; None where they cannot be."""
-        if self.problem.states.kind != "approximate" or self.held_out.disturbance.shuffled != "none":
+        if self.states.kind != "approximate" or self.held_out.disturbance.shuffled != "none":
             return None
-        return fitted_replays_of(self.held_out, self.simulator, self.change)
+        return fitted_replays_of(self.held_out, self.simulator, self.change, stride(self.problem.dataset))
 
     @cached_property
     def clone(self) -> TanhGaussianPolicy:
@@ -182,13 +189,22 @@ def judged(
     """
     space, problem = bench.simulator.parameters, bench.problem
     residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
-    half, spent = expected_half_widths(problem.states, problem.dataset, problem.simulator, at, residual)
+    exact = bench.states_known
+    half, spent = expected_half_widths(problem.states, problem.dataset, problem.simulator, at, residual, exact=exact)
+    if exact and noise.any():  # then windows with fitted initial states may tell more than single noisy steps do
+        sensors = np.maximum(noise, NEGLIGIBLE) * bench.change
+        fitted, more = expected_half_widths(
+            problem.states, problem.dataset, problem.simulator, at, sensors, exact=False
+        )
+        half, spent = np.minimum(half, fitted), spent + more
     own = half if interval is None else np.maximum((interval[:, 1] - interval[:, 0]) / (space.high - space.low), 1e-9)
-    terms: tuple[MissingTerm, ...] = ()
-    if problem.states.kind != "unknown" and problem.dataset.disturbance.shuffled == "none":
-        terms, searching = missing_terms(problem.dataset, problem.states, problem.simulator, point, own, bench.change)
-        spent += searching
-    shares = np.minimum(np.maximum(half, own * (1.0 + widening(terms, space.names))), 1.0)
+    doubts = Suspicions()
+    if bench.states.kind != "unknown" and problem.dataset.disturbance.shuffled == "none":
+        doubts = suspicions(problem.dataset, bench.states, problem.simulator, point, own, bench.change)
+    # Another estimate of other windows says that the search is not at its end, not that a parameter is open.
+    open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
+    covered = own * (1.0 + widening(open_by, space.names).mean(1))
+    shares = np.minimum(np.maximum(half, covered), 1.0)
     signals = signal_names(bench.simulator.task)[: len(noise)]
     return record(
         split=bench.split,
@@ -198,8 +214,10 @@ def judged(
         interval_shares=dict(zip(space.names, shares.tolist(), strict=True)),
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
-        control_steps=control_steps + spent,
-        missing_terms=terms[:_MOST_TERMS],
+        control_steps=control_steps + spent + doubts.control_steps,
+        missing_terms=doubts.terms[:_MOST_TERMS],
+        alternatives=doubts.alternatives,
+        contradictions=tuple(each.sentence for each in problem.dataset.findings if each.contradicts),
         at_end=tuple(
             row.name
             for row, value in zip(space.parameters, point, strict=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from madoc.data import stride
 from madoc.diagnosis.channels import signal_names
 from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, first_rows, longest_fit, readings_at, windows_at
@@ -13,8 +14,8 @@ from madoc.verdict.bench import Bench
 
 TRACES = 6
 """Largest number of stretches of the hold-out that are drawn."""
-TRACE_STEPS = 100
-"""Largest length of a stretch in control steps; it is shorter where no episode is as long."""
+TRACE_STRIDES = 100
+"""Largest length of a stretch of the hold-out in strides (`data.timescale`); shorter where no episode is as long."""
 
 
 def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float) -> dict[str, np.ndarray]:
@@ -29,7 +30,7 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     """
     held, replays = bench.held_out, bench.replays if bench.states_known else None
     states, rows = logged_states(held, bench.simulator.task) if replays else (np.empty(0), np.arange(len(held)))
-    steps = longest_fit(held, rows, TRACE_STEPS)
+    steps = longest_fit(held, rows, TRACE_STRIDES * stride(bench.problem.dataset))
     chosen = evenly(first_rows(held, rows, steps), TRACES)
     first = rows[chosen]
     arrays = {

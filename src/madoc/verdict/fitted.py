@@ -14,7 +14,7 @@ from madoc.identification.losses import loss_slope, scale_of
 from madoc.identification.noise import residual_noise
 from madoc.identification.replay import slopes_at
 from madoc.verdict.bench import Bench, judged
-from madoc.verdict.fitted_starts import AHEAD, FITTED, FittedReplays
+from madoc.verdict.fitted_starts import FittedReplays
 from madoc.verdict.prediction import magnitudes
 from madoc.verdict.statistics import best_of, better_than_chance, prediction_errors
 from madoc.verdict.systematic import explained_at_end
@@ -25,7 +25,6 @@ _CANDIDATES = 2
 """Number of last points whose predictions are compared: an earlier one may be better where the last went too far."""
 _DAMPING = 1e-6
 """Marquardt's damping of a step, relative to the squared lengths of the columns; 0 is none."""
-_HORIZONS = FITTED + np.array(AHEAD)
 
 
 def fitted(
@@ -35,9 +34,9 @@ def fitted(
     nearby, searching = _nearby_best(replays, point)
     points = np.concatenate([np.zeros((1, len(point))), point[None], nearby])
     residuals = replays.residuals(points)
-    sizes = magnitudes(residuals[:, :, _HORIZONS])
+    sizes = magnitudes(replays.at_horizons(residuals))
     best = best_of(sizes)
-    noise = residual_noise(residuals[best][:, : FITTED + 1], len(replays.readings.spread))
+    noise = residual_noise(residuals[best][:, : replays.fitted + 1], len(replays.readings.spread))
     alone = _with_noise_alone(bench, replays, points[best], residuals[best], noise)
     fitting = (len(points) + 1) * replays.fit_cost
     predicting = residuals[:, :, 1:, 0].size + alone[:, :, 1:, 0].size
@@ -47,15 +46,15 @@ def fitted(
         Fitted,
         errors=prediction_errors(
             sizes,
-            magnitudes(alone[:, :, _HORIZONS])[:, 0],
+            magnitudes(replays.at_horizons(alone))[:, 0],
             best,
             episodes=replays.episodes,
-            horizons=AHEAD,
+            horizons=replays.ahead,
             signals=signal_names(bench.simulator.task)[: len(noise)],
             failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
         ),
         explained=explained_at_end(start_and_actions, residuals[best]),
-        fitted_steps=FITTED,
+        fitted_steps=replays.fitted,
     )
     return judged(
         record,
@@ -113,8 +112,8 @@ def _against_chance(replays: FittedReplays, residuals: Float[np.ndarray, "window
     """The simulator's predictions of the first observations after the fitted steps, compared with chance."""
     observed, scale = replays.readings.observed, replays.readings.scale
     spread = np.maximum(observed.std((0, 1)), 1e-8)
-    followed = observed[:, FITTED + 1]
-    ahead = residuals[:, FITTED + 1]
-    guess = np.where(np.isfinite(ahead), followed + ahead * scale, observed[:, FITTED])
+    followed = observed[:, replays.fitted + replays.stride]
+    ahead = residuals[:, replays.fitted + replays.stride]
+    guess = np.where(np.isfinite(ahead), followed + ahead * scale, observed[:, replays.fitted])
     skill, p_value = better_than_chance(guess / spread, followed / spread, replays.episodes)
     return AgainstChance("the simulator at the best parameters nearby, from fitted states", skill, p_value)

@@ -18,9 +18,9 @@ from madoc.simulation.base import Simulator
 from madoc.verdict.prediction import FEWEST_WINDOWS
 
 FITTED = 10
-"""Number of control steps at the beginning of a window to whose observations its initial state is fitted."""
+"""Number of strides at the beginning of a window to whose observations its initial state is fitted."""
 AHEAD = (1, 5, 10)
-"""Numbers of control steps after the fitted ones at which errors are taken."""
+"""Numbers of strides after the fitted ones at which errors are taken."""
 MOST = 150
 """Largest number of windows."""
 FIT_STEPS = 10
@@ -39,6 +39,23 @@ class FittedReplays:
     readings: Readings
     near: Float[np.ndarray, "windows state"]
     episodes: Int[np.ndarray, " windows"]
+    stride: int
+
+    @property
+    def fitted(self) -> int:
+        """Number of control steps to whose observations an initial state is fitted."""
+        return FITTED * self.stride
+
+    @property
+    def ahead(self) -> tuple[int, ...]:
+        """Numbers of control steps after the fitted ones at which errors are taken."""
+        return tuple(self.stride * strides for strides in AHEAD)
+
+    def at_horizons(
+        self, residuals: Float[np.ndarray, "systems windows readings channels"]
+    ) -> Float[np.ndarray, "systems windows horizons channels"]:
+        """The residuals at the readings at which errors are taken."""
+        return residuals[:, :, self.fitted + np.array(self.ahead)]
 
     def residuals(
         self, points: Float[np.ndarray, "systems d"]
@@ -50,7 +67,7 @@ class FittedReplays:
     def starts(self, points: Float[np.ndarray, "systems d"]) -> Float[np.ndarray, "systems windows state"]:
         """The initial states from which each system comes nearest to the observations of the fitted steps."""
         whole = self.readings
-        first = replace(whole, actions=whole.actions[:, :FITTED], observed=whole.observed[:, : FITTED + 1])
+        first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
         states = np.repeat(self.near[None], len(points), axis=0)
         damping, size = np.full(len(first), _DAMPING), states.shape[2]
         for _ in range(FIT_STEPS):
@@ -69,19 +86,22 @@ class FittedReplays:
     def fit_cost(self) -> int:
         """Number of control steps that fitting the initial states of one system takes."""
         columns = 1 + len(self.readings.spread) + len(_SHARES)
-        return FIT_STEPS * columns * len(self.readings) * FITTED
+        return FIT_STEPS * columns * len(self.readings) * self.fitted
 
 
 def fitted_replays_of(
-    held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " channels"]
+    held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " channels"], stride: int
 ) -> FittedReplays | None:
-    """Windows spread evenly over the hold-out; None where too few are long enough."""
+    """Windows spread evenly over the hold-out; None where too few are long enough.
+
+    `stride` is the number of control steps between readings at which the robot has moved, `data.timescale.stride`.
+    """
     logged = states_of(held, simulator)
     near, rows = logged.guesses()
-    steps = FITTED + AHEAD[-1]
+    steps = (FITTED + AHEAD[-1]) * stride
     possible = rows_that_fit(held, rows, steps)
     if len(possible) < FEWEST_WINDOWS:
         return None
     chosen = evenly(possible, MOST)
     readings = Readings.at(held, logged, rows[chosen], steps, scale)
-    return FittedReplays(simulator, readings, near[chosen], held.episode_of(rows[chosen]))
+    return FittedReplays(simulator, readings, near[chosen], held.episode_of(rows[chosen]), stride)

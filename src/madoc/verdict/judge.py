@@ -15,11 +15,18 @@ from madoc.calibration.holdout import (
     Verdict,
     Word,
 )
+from madoc.identification.candidate_terms import SATURATION, SPACING
+from madoc.identification.combinations import Combination
 from madoc.identification.missing_terms import DRIFT, MissingTerm
-from madoc.verdict.adequacy import missing_term, numerical
+from madoc.verdict.adequacy import as_likely, missing_term, numerical
 from madoc.verdict.bench import AT_END
 from madoc.verdict.statistics import NEGLIGIBLE
 
+REMEDIES = {
+    SPACING: "check control_step of the spec against the log's time column",
+    SATURATION: "narrow low and high of the spec's actions to what the drive follows, or log smaller actions",
+}
+"""What to do about terms that no parameter of a spec adds."""
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
 
 WORDS: dict[Word, str] = {
@@ -42,6 +49,8 @@ EXPLAINED = 0.1
 systematic. Noise alone gives at most a few percent."""
 WHITE = 0.2
 """Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
+PERSISTENT = 0.1
+"""Correlation in [-1, 1] of residuals with those a few rows later, above which a force is missing that lasts."""
 OPEN = 0.5
 """Share in [0, 1] of its range that a parameter's 95 % interval covers; from it on the parameter counts as open."""
 GAINED = 0.75
@@ -53,19 +62,21 @@ SEPARABLE = 0.65
 true simulator have about 0.55."""
 
 
-def judge(holdout: HoldOut, *, settled: bool = True) -> Verdict:
+def judge(holdout: HoldOut, *, settled: bool = True, combinations: Sequence[Combination] = ()) -> Verdict:
     """The first verdict that applies: rejected data, a mismatch, open parameters, no improvement; else calibrated.
 
     Args:
         holdout: What the hold-out says of the estimate.
         settled: Whether the search that led to it came to its end.
+        combinations: What the log tells of parameters that it leaves open.
     """
     return (
         _rejected(holdout)
         or _missing(holdout)
         or _mismatch(holdout)
+        or _contradicted(holdout)
         or _outside(holdout)
-        or _open(holdout)
+        or _open(holdout, combinations)
         or _no_improvement(holdout)
         or (None if settled else Verdict("NO_IMPROVEMENT", f"{_how_good(holdout)}, but {UNSETTLED}"))
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and every parameter is known to within half of its range")
@@ -99,30 +110,46 @@ def _missing(holdout: HoldOut) -> Verdict | None:
     if term.cause == DRIFT:
         return Verdict(
             "MODEL_MISMATCH",
-            f"{term.parameter} changes over the log, by {value} between its parts (t = {abs(term.t):.0f}), which is "
-            f"{abs(term.shifts[term.parameter]):.2g} half-widths of its interval; calibrate to each run by itself",
+            f"{term.parameter} drifts: it changes over the log by {value} between its parts (t = {abs(term.t):.0f}), "
+            f"which is {abs(term.shifts[term.parameter]):.2g} half-widths of its interval; "
+            "calibrate to each run by itself",
             (term.parameter,),
         )
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
     effect = " and ".join(f"{name} by {abs(term.shifts[name]):.2g}" for name in moved)
-    where = f" ({term.parameter})" if term.parameter else ""
+    others = [_named(other) for other in as_likely(holdout, term)]
+    likely = f" ({' or '.join(others)} would explain nearly as much)" if others else ""
     return Verdict(
         "MODEL_MISMATCH",
-        f"the model lacks {term.cause}{where}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
-        f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval; {_remedy(term)}",
+        f"the model lacks {_named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
+        f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval{likely}; "
+        f"{_remedy(term)}",
         tuple(moved),
     )
+
+
+def _named(term: MissingTerm) -> str:
+    return f"{term.cause} ({term.parameter})" if term.parameter else term.cause
 
 
 def _remedy(term: MissingTerm) -> str:
     """What to do about a missing term: the line of the spec that adds it, where there is one."""
     field, _, element = term.parameter.partition(".")
     if not field:
-        return "check control_step of the spec against the log's time column"
+        return REMEDIES[term.cause]
     high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
     low = 0.0 if term.value >= 0.0 else -high
+    joints = element.split("+")
     named = f", element: {element}" if element else ""
+    named = named if len(joints) == 1 else f", elements: [{', '.join(joints)}]"
     return f"add to the spec's parameters: {{field: {field}{named}, low: {low:.2g}, high: {high:.2g}}}"
+
+
+def _contradicted(holdout: HoldOut) -> Verdict | None:
+    """A log that the check before the calibration found to contradict the spec."""
+    if not holdout.contradictions:
+        return None
+    return Verdict("MODEL_MISMATCH", f"the log contradicts the spec: {holdout.contradictions[0]}")
 
 
 def _outside(holdout: HoldOut) -> Verdict | None:
@@ -157,6 +184,9 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
         reasons.append(f"{inputs} explain {100 * holdout.explained:.0f} % of it")
     if isinstance(holdout, Predicted) and holdout.autocorrelation > WHITE:
         reasons.append(f"it is correlated from step to step ({holdout.autocorrelation:.2f})")
+    if isinstance(holdout, Predicted) and holdout.persistence > PERSISTENT:
+        lasts = f"it lasts over several rows (correlation {holdout.persistence:.2f})"
+        reasons.append(f"{lasts}, as an external force does or a base that moves")
     reasons += at_end
     beyond = _beyond_noise(errors.nearby_best, errors.noise)
     if not beyond or not reasons:
@@ -180,14 +210,15 @@ def _separable(before: Area, after: Area, at_end: list[str]) -> str:
     )
 
 
-def _open(holdout: HoldOut) -> Verdict | None:
+def _open(holdout: HoldOut, combinations: Sequence[Combination]) -> Verdict | None:
     shares = {name: share for name, share in holdout.interval_shares.items() if share >= OPEN}
     if not shares:
         return None
+    told = f"; it tells {', '.join(map(str, combinations))}" if combinations else ""
     return Verdict(
         "NOT_IDENTIFIABLE",
         f"the data leaves {', '.join(shares)} open: a 95 % interval covers {100 * min(shares.values()):.0f} % of the "
-        "range or more; leave out all but one of those that act alike, or log motions that excite them",
+        f"range or more{told}; leave out all but one of those that act alike, or log motions that excite them",
         tuple(shares),
     )
 

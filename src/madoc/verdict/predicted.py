@@ -4,7 +4,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from madoc.calibration.holdout import Predicted
 from madoc.diagnosis.channels import signal_names
@@ -13,8 +13,11 @@ from madoc.identification.states import logged_states
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.prediction import nearby_best
 from madoc.verdict.statistics import best_of, prediction_errors, relative_to_first
-from madoc.verdict.systematic import autocorrelation, explained, explained_at_end
+from madoc.verdict.systematic import autocorrelation, explained, explained_at_end, persistence
 from madoc.verdict.two_sample import classify, replayed
+
+MOST_ROWS = 4000
+"""Largest number of held-out rows whose residuals are compared with those of later rows."""
 
 
 def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
@@ -46,6 +49,7 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         ),
         explained=max(single.explained, explained_at_end(start_and_actions, residuals[best])),
         autocorrelation=single.autocorrelation,
+        persistence=_persistence(bench, points[best]),
         area_at_mid_range=area_at_mid_range,
         area_at_estimate=area_at_estimate,
     )
@@ -102,11 +106,24 @@ def _single_steps(bench: Bench, point: Float[np.ndarray, " d"]) -> _SingleSteps:
     return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise, spent)
 
 
-def _simulated(bench: Bench, point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "rows observation"]:
-    """Next observations of the judged rows in the simulator."""
+def _persistence(bench: Bench, point: Float[np.ndarray, " d"]) -> float:
+    """How residuals of single steps last, over the first rows of the hold-out whose states can be rebuilt."""
+    held = bench.held_out
+    rows = logged_states(held, bench.simulator.task)[1][:MOST_ROWS]
+    followed = np.asarray(held.transitions.next_observation)[rows]
+    residuals = sensors.clipped((_simulated(bench, point, rows) - followed) / bench.change)
+    follows = np.concatenate([[False], (np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts)])
+    return persistence(residuals, follows)
+
+
+def _simulated(
+    bench: Bench, point: Float[np.ndarray, " d"], rows: Int[np.ndarray, " rows"] | None = None
+) -> Float[np.ndarray, "rows observation"]:
+    """Next observations of some rows, by default of the judged ones, in the simulator."""
     held, simulator = bench.held_out, bench.simulator
-    states, rows = logged_states(held, simulator.task)
-    states = states[np.searchsorted(rows, bench.judged_rows)]
+    rows = bench.judged_rows if rows is None else rows
+    states, known = logged_states(held, simulator.task)
+    states = states[np.searchsorted(known, rows)]
     system = simulator.bind(simulator.parameters.to_physical(point)[None])
-    action = np.asarray(held.transitions.action)[bench.judged_rows]
+    action = np.asarray(held.transitions.action)[rows]
     return np.asarray(system.observe(system.step(system.unbiased(states[None]), action[None]))[0])

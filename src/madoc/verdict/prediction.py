@@ -9,7 +9,7 @@ from madoc.data import Dataset
 from madoc.identification.gauss_newton import descend
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states, states_observed_as
-from madoc.identification.windows import HORIZONS, Windows, evenly, rows_that_fit, windows_at
+from madoc.identification.windows import Windows, evenly, rows_that_fit, windows_at
 from madoc.simulation.base import Simulator
 
 MOST_WINDOWS = 400
@@ -77,9 +77,9 @@ class Replays:
         return moved - self.residuals(point[None]) + deviation * rng.standard_normal(shape)
 
     def single_steps(self) -> Windows:
-        """The first step of each window alone."""
-        windows = self.windows
-        return replace(windows, actions=windows.actions[:, :1], following=windows.following[:, :1])
+        """The beginning of each window, as long as the shortest horizon."""
+        windows, steps = self.windows, self.horizons[0]
+        return replace(windows, actions=windows.actions[:, :steps], following=windows.following[:, :steps])
 
 
 def magnitudes(
@@ -94,16 +94,19 @@ def magnitudes(
     return np.moveaxis(np.where(np.isfinite(size), size, worst), 0, 1)
 
 
-def replays_of(held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " observation"]) -> Replays:
-    """Windows spread evenly over the hold-out.
+def replays_of(
+    held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " observation"], lengths: tuple[int, ...]
+) -> Replays:
+    """Windows spread evenly over the hold-out, of those `lengths` in control steps that it is long enough for.
 
     Raises:
         MadocError: None of its states can be rebuilt.
     """
     states, rows = logged_states(held, simulator.task)
-    starts = {horizon: rows_that_fit(held, rows, horizon) for horizon in HORIZONS}
-    enough = min(FEWEST_WINDOWS, len(starts[1]))
-    horizons = tuple(horizon for horizon in HORIZONS if len(starts[horizon]) >= enough)
+    lengths = lengths if len(rows_that_fit(held, rows, lengths[0])) else (1,)
+    starts = {length: rows_that_fit(held, rows, length) for length in lengths}
+    enough = min(FEWEST_WINDOWS, len(starts[lengths[0]]))
+    horizons = tuple(horizon for horizon in lengths if len(starts[horizon]) >= enough)
     chosen = evenly(starts[horizons[-1]], MOST_WINDOWS)
     return Replays(
         simulator,

@@ -10,11 +10,12 @@ from jaxtyping import Float, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Calibrator
 from madoc.calibration.calibrate import calibrate
 from madoc.calibration.result import CalibrationResult
-from madoc.data import Dataset, Disturbance, disturb, hide_velocities
+from madoc.data import Dataset, Disturbance, disturb, hide_velocities, stride
 from madoc.data.dataset import starts_after
 from madoc.errors import MadocError
 from madoc.identification.states import states_of
 from madoc.identification.windows import successive_windows
+from madoc.runs.budget import Budget
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import reset_states
 from madoc.tasks import Task
@@ -25,7 +26,7 @@ RECOVERABLE = 10.0
 INNER = 0.8
 """Largest |parameter| of a planted truth in [-1, 1], so that none is recovered by being at the end of its range."""
 STRETCH = 25
-"""Largest number of control steps of a replay from a logged state; a longer one would leave the logged motion."""
+"""Largest number of strides of a replay from a logged state; a longer one would leave the logged motion."""
 LONGEST = 1000
 """Largest number of control steps of a replay from a reset, where states cannot be rebuilt."""
 
@@ -78,9 +79,9 @@ def plant(
 ) -> Dataset:
     """The log as it would be if the simulator at `truth` were the robot: its actions, its starts, its noise.
 
-    Replays begin at a logged state every `STRETCH` rows; where states cannot be rebuilt, at a reset for each episode.
-    Every replay is an episode, and ends where its simulation failed or the task ended. Where the log's velocities are
-    finite differences of its positions, so are the planted ones.
+    Replays begin at a logged state every `STRETCH` strides; where states cannot be rebuilt, at a reset for each
+    episode. Every replay is an episode, and ends where its simulation failed or the task ended. Where the log's
+    velocities are finite differences of its positions, so are the planted ones.
 
     `truth` are physical parameters, `noise` is the standard deviation of the sensors' noise in their units.
 
@@ -95,7 +96,7 @@ def plant(
         lengths = np.minimum(dataset.episode_ends - first, LONGEST)
         state = reset_states(simulator)(of_start, len(first))[None]
     else:
-        chosen, lengths = successive_windows(dataset, states.rows, STRETCH)
+        chosen, lengths = successive_windows(dataset, states.rows, STRETCH * stride(dataset))
         first = states.rows[chosen]
         state = system.unbiased(states.states[None, chosen])
     logged = np.asarray(dataset.transitions.action)
@@ -147,7 +148,7 @@ def selftest(
     noise: Float[np.ndarray, " observation"],
     signals: Sequence[str],
     keys: Sequence[PRNGKeyArray],
-    budget: int,
+    budget: Budget | str | None = None,
     quiet: bool = True,
 ) -> Selftest:
     """Plant one truth for each key, and calibrate to its data with the first method that does not refuse it.

@@ -1,7 +1,7 @@
 """Whether residuals are noise, or a function of the robot's state and action."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from sklearn.ensemble import ExtraTreesRegressor
 from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import KFold
@@ -16,6 +16,11 @@ _FEWEST = 2 * FOLDS
 """Smallest number of rows to which regressions are fitted; with fewer, nothing counts as explained."""
 _ROUNDING = 1e-6
 """Residual in typical changes of a step; a smaller one is within the tolerance of MuJoCo's solver at contacts."""
+
+LAGS = range(4, 9)
+"""Distances in rows at which residuals are compared: behind noise, its filters, and differences of readings."""
+CERTAIN = 6.0
+"""Standard errors of a correlation, from which it counts; many channels are looked at."""
 
 EXPLAINERS = {
     "a linear function": lambda: make_pipeline(StandardScaler(), RidgeCV(np.logspace(-3, 3, 7))),
@@ -62,3 +67,21 @@ def autocorrelation(
     """Correlation of residuals of consecutive steps over all signals: 0 if independent, -½ if they are sensor noise."""
     size = float(np.sqrt((first**2).sum() * (second**2).sum()))
     return 0.0 if size == 0.0 else float((first * second).sum()) / size
+
+
+def persistence(residuals: Float[np.ndarray, "rows observation"], follows: Bool[np.ndarray, " rows"]) -> float:
+    """Correlation of residuals of single steps with those some rows later, the largest over signals; 0 if uncertain.
+
+    Noise of sensors and forces has none at such `LAGS`; a force that the model lacks has, if it lasts. `follows` is
+    whether a row is the next one of the row before it.
+    """
+    run, largest = np.cumsum(~follows), 0.0
+    for signal in residuals.T:
+        shared = np.zeros(len(signal))
+        for lag in LAGS:
+            same = run[lag:] == run[:-lag]
+            shared[lag:] += np.where(same, signal[lag:] * signal[:-lag], 0.0) / len(LAGS)
+        size = float(np.sqrt((shared**2).sum()))
+        if size > 0.0 and shared.sum() >= CERTAIN * size:
+            largest = max(largest, float(shared.sum() / (signal**2).sum()))
+    return largest

@@ -5,10 +5,10 @@ of the arrays in every generation, so that a resumed search is the same search.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
-from cmaes import CMA
 from jaxtyping import Float, PRNGKeyArray
 
 FIRST_DEVIATION = 0.5
@@ -94,8 +94,10 @@ def settled(evolution: Evolution, tolerance: float) -> str | None:
     return f"after {evolution.generation} generations every deviation is below {tolerance:g} of its range"
 
 
-def _optimiser(evolution: Evolution, population: int, seed: int = 0) -> CMA:
+def _optimiser(evolution: Evolution, population: int, seed: int = 0) -> Any:
     """The library's optimiser in this state. It has no public way to set the last three attributes."""
+    from cmaes import CMA  # slow to import, and only methods that search by it need it
+
     optimiser = CMA(
         mean=np.clip(evolution.mean, -1.0, 1.0),
         sigma=evolution.deviation,

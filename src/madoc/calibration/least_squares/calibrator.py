@@ -12,6 +12,7 @@ from madoc.calibration.cautions import at_end_of_range
 from madoc.calibration.least_squares import sentences
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.lengthening import (
+    FEWEST,
     LENGTHS,
     READINGS,
     continued,
@@ -24,8 +25,10 @@ from madoc.calibration.least_squares.lengthening import (
 from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.statistics import alternation, consecutive_residuals
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
+from madoc.data import stride
 from madoc.identification.information import half_width, identifiability, sandwich
 from madoc.identification.losses import Loss
+from madoc.identification.noise import difference_noise
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
 
 InitialStates = Literal["logged", "estimated"]
@@ -36,6 +39,10 @@ WINDOWS: dict[InitialStates, int] = {"logged": 1000, "estimated": 100}
 """Largest number of windows in the end."""
 SEARCH_WINDOWS: dict[InitialStates, int] = {"logged": 64, "estimated": 24}
 """Largest number of windows while searching."""
+STARTING_STRIDES = 1
+"""Length in strides of the rows of windows from logged states where these are noisy and only a start is wanted."""
+NOISY_STRIDE = 1e-3
+"""Noise of a channel in its typical changes in a stride; above it logged states are noisy where rows are close."""
 NOISY = 0.25
 """Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5."""
 
@@ -193,19 +200,20 @@ class LeastSquares:
         if problem.states.kind != "exact" and len(problem.states.rows):
             return "estimated"
         disturbance = problem.dataset.disturbance
-        noisy = disturbance.noise > 0 or disturbance.velocities == "differences"
+        noisy = disturbance.noise > 0 or disturbance.velocities == "differences" or _noisy_rows(problem)
         return "starting" if noisy or self.initial_states == "estimated" else "undecided"
 
     def _known(self, problem: CalibrationProblem) -> Search:
         """The search from logged states; its windows are shortest where it only finds where the other begins."""
         starting = self._first_stage(problem) == "starting"
-        horizon = LOGGED_HORIZON if starting else self.horizon or LOGGED_HORIZON
+        horizon = STARTING_STRIDES * stride(problem.dataset) if starting else self.horizon or LOGGED_HORIZON
         return self._search(KnownStarts, "logged", horizon, self.searches)
 
     def _unknown(self, problem: CalibrationProblem, length: int = 0) -> Search:
         """The search with unknown initial states; after one from logged states it needs to begin at one point only."""
         searches = self.searches if self._first_stage(problem) == "estimated" else 1
-        horizon = self.horizon or LENGTHS[length] * horizon_of(problem.dataset)
+        fewest = 2 * (FEWEST + len(problem.simulator.parameters))
+        horizon = self.horizon or LENGTHS[length] * horizon_of(problem.dataset, fewest)
         return self._search(UnknownStarts, "estimated", horizon, searches)
 
     def _search(
@@ -285,6 +293,15 @@ class LeastSquares:
             if settled and not self._noise_alone(problem, state, longer):
                 return (*about, sentences.about_model_errors(self._unknown(problem, longer).horizon))
         return about
+
+
+def _noisy_rows(problem: CalibrationProblem) -> bool:
+    """Whether noise hides the motion from row to row, in a log whose rate is high for its robot.
+
+    There noise need not alternate: steps of an encoder and filters of a drive last for several rows.
+    """
+    dataset = problem.dataset
+    return stride(dataset) > 1 and bool((difference_noise(dataset) > NOISY_STRIDE * problem.typical_change).any())
 
 
 def _begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:

@@ -1,14 +1,15 @@
 """Windows that begin at logged states, which are assumed to be exact.
 
 The loss is scaled by the robust standard deviation of all residuals, and a window whose simulation fails counts as the
-worst that does not.
+worst that does not. Windows with contacts have a scale of their own where they are explained worse than the others, so
+that a wrong contact model does not bias what the others tell.
 """
 
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import TRIALS, Outcome, Plan
@@ -16,9 +17,15 @@ from madoc.errors import MadocError
 from madoc.identification.gauss_newton import damped_step, triangular_factors
 from madoc.identification.information import bread, meat
 from madoc.identification.linearisation import difference_points, linearise
-from madoc.identification.losses import ALL_FAILED, Loss, mean_cost, scale_of
+from madoc.identification.losses import ALL_FAILED, Loss, mean_cost, robust_deviation, scale_of
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import Windows, disjoint_windows, first_rows, windows_at
+
+FEWEST_FREE = 0.05
+"""Share in [0, 1] of windows without a contact; with fewer, those with contacts are weighted like them."""
+LEAST_WEIGHT = 1e-3
+"""Smallest weight of the residuals of windows with contacts, so that parameters of contacts are still identified."""
+_SMALLEST = 1e-100
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,7 @@ class KnownStarts:
 
     problem: CalibrationProblem
     windows: Windows
+    touching: Bool[np.ndarray, " windows"]
     loss: Loss
     unknown: ClassVar[bool] = False
     failed_cost: ClassVar[float] = ALL_FAILED
@@ -35,11 +43,30 @@ class KnownStarts:
 
     @classmethod
     def at(
-        cls, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int, loss: Loss
+        cls,
+        problem: CalibrationProblem,
+        rows: Int[np.ndarray, " windows"],
+        touching: Bool[np.ndarray, " windows"],
+        horizon: int,
+        loss: Loss,
     ) -> "KnownStarts":
-        """The windows that begin at the given rows."""
+        """The windows that begin at the given rows, and whether a contact was seen in each."""
         states = problem.states.states[np.searchsorted(problem.states.rows, rows)]
-        return cls(problem, windows_at(problem.dataset, states, rows, horizon), loss)
+        return cls(problem, windows_at(problem.dataset, states, rows, horizon), touching, loss)
+
+    @staticmethod
+    def touched(
+        problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
+    ) -> Bool[np.ndarray, " windows"]:
+        """Whether bodies were in contact at any logged state of a window, from its first to its last."""
+        states, known = problem.states.exact()
+        ends = problem.dataset.episode_ends[problem.dataset.episode_of(rows)]
+        touched = np.zeros(len(rows), dtype=bool)
+        for later in range(horizon + 1):
+            there = np.minimum(rows + later, ends - 1)
+            place = np.minimum(np.searchsorted(known, there), len(known) - 1)
+            touched |= problem.simulator.touching(states[place]) & (known[place] == there)
+        return touched
 
     @staticmethod
     def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
@@ -83,7 +110,8 @@ class KnownStarts:
         """Costs after every step of every search, in one batch."""
         tried = np.stack([plan.point + plan.steps[:-1] for plan in plans])
         outcomes = []
-        for plan, residuals in zip(plans, self._residuals(tried), strict=True):
+        for plan, simulated in zip(plans, self._residuals(tried), strict=True):
+            residuals = simulated * plan.relative[:, None]
             before = mean_cost(plan.residuals, plan.scale, self.loss)
             totals = np.array([*(mean_cost(each, plan.scale, self.loss) for each in residuals), before])
             failures = int((~np.isfinite(residuals).all(-1)).sum())
@@ -96,13 +124,16 @@ class KnownStarts:
         residuals: Float[np.ndarray, "points windows values"],
         damping: float,
     ) -> Plan:
+        relative = self._relative(residuals[0])
+        residuals = residuals * relative[:, None]
         around = linearise(points, residuals)
-        scale = scale_of(around.residuals, self.loss)
+        scale = scale_of(around.residuals[(relative == 1.0)[np.isfinite(residuals).all((0, 2))]], self.loss)
         factors = triangular_factors(around, scale, self.loss)
         steps = [damped_step(*factors, points[0], damping * trial) for trial in TRIALS]
         return Plan(
             point=points[0],
             residuals=residuals[0],
+            relative=relative,
             kept=np.isfinite(residuals).all((0, 2)),
             steps=np.stack([*steps, np.zeros_like(points[0])]),
             state_steps=np.zeros((len(TRIALS) + 1, 0, 0)),
@@ -113,6 +144,22 @@ class KnownStarts:
             meat=meat(around, scale, self.loss),
             failures=int((~np.isfinite(residuals).all(-1)).sum()),
         )
+
+    def _relative(self, residuals: Float[np.ndarray, "windows values"]) -> Float[np.ndarray, " windows"]:
+        """Weight of each window's residuals, in (0, 1]; below 1 where contacts are explained worse than the rest."""
+        weights = np.ones(len(residuals))
+        whole = np.isfinite(residuals).all(-1)
+        free, touching = whole & ~self.touching, whole & self.touching
+        fewest = FEWEST_FREE * residuals.shape[0]
+        if (
+            self.loss == "linear"
+            or not touching.any()
+            or free.sum() < max(fewest, len(self.problem.simulator.parameters))
+        ):
+            return weights
+        scales = [robust_deviation(np.abs(residuals[part])) for part in (free, touching)]
+        weights[self.touching] = np.clip(scales[0] / max(scales[1], _SMALLEST), LEAST_WEIGHT, 1.0)
+        return weights
 
     def _residuals(
         self, points: Float[np.ndarray, "searches points d"]

@@ -17,9 +17,9 @@ from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
 LENGTHS = (1, 3, 9)
 """Lengths of windows, relative to the first."""
-SHORTEST, LONGEST = 3, 20
-"""Smallest and largest length of the first windows in control steps: shorter ones hold little information besides their
-initial state, longer ones are slow. A robot's own length is clipped to them."""
+SHORTEST = 3
+"""Smallest length of the first windows in control steps: shorter ones hold little information besides their initial
+state."""
 READINGS = 2
 """Largest number of readings in all windows of a length, relative to the first; more only for `FEWEST` windows."""
 FEWEST = 10
@@ -36,19 +36,16 @@ CHANCE = 3.0
 _SMALLEST = 1e-100
 
 
-def horizon_of(dataset: Dataset) -> int:
-    """A channel's standard deviation over that of its change in a control step, the median over channels.
+def horizon_of(dataset: Dataset, fewest: int) -> int:
+    """Length in control steps of the first windows with unknown initial states: the robot's time scale.
 
-    In so many control steps the robot goes from one pose to another. In shorter windows little moves; in longer ones
-    small errors grow until simulated and logged motion are unrelated. The length is within `SHORTEST` and `LONGEST`,
-    and no longer than the episode that the median row is in.
+    In shorter windows little moves; in longer ones small errors grow until simulated and logged motion are unrelated.
+    The length is at least `SHORTEST`, no longer than the episode that the median row is in, and short enough for
+    `fewest` windows in all rows.
     """
-    logged = dataset.transitions
-    change = np.asarray(logged.next_observation - logged.observation).std(0)
-    moving = change > 0.0
-    ratio = np.median(np.asarray(logged.observation).std(0)[moving] / change[moving]) if moving.any() else 0.0
     lengths = dataset.episode_ends - dataset.episode_starts
-    return min(int(np.clip(round(float(ratio)), SHORTEST, LONGEST)), int(np.median(np.repeat(lengths, lengths))))
+    longest = min(int(np.median(np.repeat(lengths, lengths))), len(dataset) // fewest - 1)
+    return max(min(SHORTEST, int(lengths.max())), min(dataset.time_scale, longest))
 
 
 def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, most: int) -> SearchState | None:
@@ -71,6 +68,7 @@ def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, 
         cost=shorter.cost[:1],
         moved=shorter.moved[:1],
         rows=chosen,
+        touching=np.zeros(len(chosen), dtype=bool),
         refining=1,
     )
 

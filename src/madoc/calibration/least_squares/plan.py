@@ -21,6 +21,7 @@ class Plan:
     Attributes:
         point: The point, in [-1, 1].
         residuals: The residuals of each window there, over `deviation`.
+        relative: Weight of each window's residuals, in (0, 1], by which they are multiplied already.
         kept: Windows that move the parameters.
         steps: Steps of the parameters, one for each of `TRIALS`; the last is zero.
         state_steps: Steps of unknown initial states that go with each of these, in units of `spread`.
@@ -37,6 +38,7 @@ class Plan:
 
     point: Float[np.ndarray, " d"]
     residuals: Float[np.ndarray, "windows values"]
+    relative: Float[np.ndarray, " windows"]
     kept: Bool[np.ndarray, " windows"]
     steps: Float[np.ndarray, "trials d"]
     state_steps: Float[np.ndarray, "trials unknown physical"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
@@ -41,6 +41,7 @@ class SearchState:
             squared standard deviations of the noise where initial states are unknown and the search refines.
         moved: The largest component of each search's last step, relative to one that matters; below 1 it has settled.
         rows: First rows of the windows.
+        touching: Whether a contact was seen in each window; False where initial states are unknown.
         deviation: Noise of each channel in its typical changes; 1 where initial states are known.
         bread: Curvature of the best search's cost where it last linearised.
         meat: Scatter of the cost's gradient there.
@@ -59,6 +60,7 @@ class SearchState:
     cost: Float[np.ndarray, " searches"]
     moved: Float[np.ndarray, " searches"]
     rows: Int[np.ndarray, " windows"]
+    touching: Bool[np.ndarray, " windows"]
     deviation: Float[np.ndarray, " channels"]
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
@@ -110,6 +112,7 @@ class Search:
             cost=np.full(self.searches, ALL_FAILED),
             moved=np.full(self.searches, 1.0 / _SMALLEST),
             rows=rows,
+            touching=self.starts.touched(problem, rows, self.horizon),
             deviation=np.ones(problem.states.measured),
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),
@@ -124,7 +127,7 @@ class Search:
     def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
         """One damped step of every point that still moves: derivatives in one batch, the steps tried in another."""
         running, count = self._running(state), self.window_count(state)
-        windows = self.starts.at(problem, state.rows[:count], self.horizon, self.loss)
+        windows = self.starts.at(problem, state.rows[:count], state.touching[:count], self.horizon, self.loss)
         points, states = state.point[:running], state.states[:running, :count]
         damping, state_damping = state.damping[:running], state.state_damping[:running, :count]
         plans = windows.plans(points, states, damping, state_damping, refining=bool(state.refining))

@@ -60,11 +60,23 @@ class UnknownStarts:
 
     @classmethod
     def at(
-        cls, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int, loss: Loss
+        cls,
+        problem: CalibrationProblem,
+        rows: Int[np.ndarray, " windows"],
+        touching: Bool[np.ndarray, " windows"],
+        horizon: int,
+        loss: Loss,
     ) -> "UnknownStarts":
-        """The windows that begin at the given rows."""
+        """The windows that begin at the given rows; `touching` is of no use, as windows without a fit are left out."""
         readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
         return cls(problem.simulator, readings, loss)
+
+    @staticmethod
+    def touched(
+        problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
+    ) -> Bool[np.ndarray, " windows"]:
+        """No window: initial states are not known well enough to tell."""
+        return np.zeros(len(rows), dtype=bool)
 
     @staticmethod
     def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
@@ -168,6 +180,7 @@ class UnknownStarts:
         return Plan(
             point=point,
             residuals=slopes.residuals,
+            relative=np.ones(len(kept)),
             kept=kept,
             steps=np.stack(steps),
             state_steps=np.stack([damped.states_step(step) for step in steps]),

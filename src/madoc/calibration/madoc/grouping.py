@@ -6,8 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
-from sklearn.cluster import KMeans
-from sklearn.decomposition import PCA
 
 from madoc.learning import replay
 from madoc.learning.networks import Network, Observations, Scalar, minimise
@@ -85,6 +83,9 @@ def cluster(embeddings: Float[Array | np.ndarray, "d latent"], groups: int, seed
     if groups == 1:
         return np.zeros(len(embeddings), dtype=np.int64)
     rows = np.asarray(embeddings, dtype=np.float64)
+    from sklearn.cluster import KMeans  # slow to import, and only needed here
+    from sklearn.decomposition import PCA
+
     projected = PCA(min(PROJECTED, *rows.shape), svd_solver="full").fit_transform(rows)
     labels = KMeans(groups, n_init=10, random_state=seed).fit_predict(projected)
     order = {label: rank for rank, label in enumerate(dict.fromkeys(labels.tolist()))}

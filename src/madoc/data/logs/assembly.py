@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from madoc.data.dataset import Dataset, close_episodes, join
 from madoc.data.findings import Finding
 from madoc.data.logs.tables import Run, Table, as_numbers
-from madoc.data.logs.timing import Resample, Series, check_ascending, common_grid, on_grid, steady_links
+from madoc.data.logs.timing import Resample, Series, check_ascending, common_grid, on_grid, rate_findings, steady_links
 from madoc.data.validation import ACTION_TOLERANCE
 from madoc.errors import MadocError, nearest_hint
 from madoc.robots import Robot
@@ -104,7 +104,7 @@ def _steps(run: Run, robot: Robot) -> Steps:
     series, findings = _series(run, tables[first], list(wanted.values()), layout)
     if run.timed:
         linked, unsteady = steady_links(series, control_step, layout.tolerance)
-        findings += unsteady
+        findings += [*unsteady, *rate_findings(series, control_step)]
     else:
         linked = np.ones(len(series.time) - 1, dtype=bool)
         what = f"its format keeps no times: rows are taken to be {control_step:g} s apart"

@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.stats import linregress
 
 from madoc.data.findings import Finding
 from madoc.data.logs.tables import Table
@@ -14,6 +15,17 @@ Resample = Literal["hold", "linear"]
 
 GAP = 3.0
 """Time between two rows of a resampled log, in median time steps; a longer one is a gap."""
+OFF_RATE, FAR_OFF_RATE = 0.01, 0.02
+"""Difference of the mean time step from the control step, as a share of it. From the first on a log is warned of, from
+the second on it is refused: lengths and gravity, which go with the square of time, would be 4 % wrong."""
+UNSTEADY = 0.05
+"""Standard deviation of time steps as a share of the control step; a larger one is noted."""
+DRIFT = 0.01
+"""Change of the time step from the first to the last row, as a share of the control step; a larger one is warned of."""
+_CERTAIN = 5.0
+"""Standard errors by which a mean or a slope has to differ before it is told."""
+_SKIPPED = 1.5
+"""Time between two rows in median time steps; a longer one has lost rows in it, and says nothing of the rate."""
 _FACTORS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}
 _ROUNDING = 1e-6
 """Difference of two times as a share of a control step; with a smaller one they count as equal."""
@@ -87,6 +99,51 @@ def steady_links(
         "log: resample",
     )
     return steady, [finding]
+
+
+def rate_findings(series: Series, control_step: float) -> list[Finding]:
+    """Findings on the rate at which rows were logged: its mean, its change over the run, and its scatter.
+
+    Steps in which rows were lost are left out. A clock that runs evenly but wrongly cannot be seen here.
+
+    Raises:
+        MadocError: Rows are on average so far from a control step apart that every estimate would be wrong.
+    """
+    steps = np.diff(series.time)
+    kept = np.flatnonzero(steps < _SKIPPED * np.median(steps))
+    if len(kept) < 10:
+        return []
+    steps = steps[kept] / control_step
+    mean, deviation = float(steps.mean()), float(steps.std())
+    certain = _CERTAIN * deviation / np.sqrt(len(steps)) + _ROUNDING
+    line = linregress(kept, steps)
+    change = float(line.slope * (kept[-1] - kept[0]))
+    findings, drift = [], ""
+    if abs(change) > max(DRIFT, _CERTAIN * line.stderr * (kept[-1] - kept[0])):
+        begin, end = (control_step * (mean + side * change / 2.0) for side in (-1.0, 1.0))
+        drift = f"{begin:.4g} s apart at the beginning of the run and {end:.4g} s at its end"
+        remedy = "look at the recorder's clock, or ask for log: resample: linear"
+        findings.append(Finding("warning", f"the time between rows drifts: {drift}", series.run, remedy))
+    if abs(mean - 1.0) > max(OFF_RATE, certain):
+        findings.append(_off_rate(series, control_step, mean, drift))
+    if deviation > UNSTEADY:
+        what = f"time steps scatter by {100 * deviation:.2g} % of the control step (standard deviation)"
+        remedy = "nothing if only the time stamps are late; if rows were taken then, ask for log: resample: linear"
+        findings.append(Finding("note", what, series.run, remedy))
+    return findings
+
+
+def _off_rate(series: Series, control_step: float, ratio: float, drift: str) -> Finding:
+    """A warning that rows are on average `ratio` control steps apart; a ratio far from 1 is refused."""
+    more = f"{abs(100 * (ratio - 1.0)):.2g} % {'more' if ratio > 1.0 else 'less'}"
+    spacing, remedy = control_step * ratio, "set control_step to that, or ask for log: resample: linear"
+    if abs(ratio - 1.0) > FAR_OFF_RATE:
+        raise MadocError(
+            f"expected rows {control_step:g} s apart in {series.run}, as control_step says, got {spacing:.4g} s on "
+            f"average, {more}{drift and f' ({drift})'}: speeds and accelerations would all be wrong; {remedy}"
+        )
+    what = f"rows are {spacing:.5g} s apart on average, {more} than the control step of {control_step:g} s"
+    return Finding("warning", what, series.run, remedy)
 
 
 def _wrong_rate(series: Series, control_step: float, tolerance: float) -> MadocError:

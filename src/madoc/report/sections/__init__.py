@@ -6,22 +6,28 @@ The macro of `templates/parts.html` with the section's name draws it.
 from collections.abc import Callable, Mapping
 
 from madoc.report.reading import Run
+from madoc.report.sections.adequacy import lacks, together
 from madoc.report.sections.course import curves, trace
 from madoc.report.sections.estimates import correlations, estimates, grouping
 from madoc.report.sections.holdout import holdout, methods, residuals, signals
 from madoc.report.sections.outcome import asked, cost, policies
+from madoc.report.sections.robustness import film, robustness
 
 SECTIONS: Mapping[str, tuple[str, Callable[[Run], dict[str, object] | str]]] = {
     "estimates": ("Estimates", estimates),
     "holdout": ("On data it has not seen", holdout),
+    "lacks": ("What the model may lack", lacks),
     "signals": ("Measured and simulated", signals),
     "residuals": ("Residual by signal", residuals),
     "trace": ("The way there", trace),
     "grouping": ("What acts alike", grouping),
     "curves": ("While it learnt", curves),
+    "together": ("Told in combination", together),
     "correlations": ("What makes up for what", correlations),
     "methods": ("Methods compared", methods),
     "policies": ("Policies in the target", policies),
+    "film": ("Policies at work", film),
+    "robustness": ("Where the estimate is not sure", robustness),
     "cost": ("Cost", cost),
     "asked": ("What was asked", asked),
 }

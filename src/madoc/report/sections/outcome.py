@@ -5,21 +5,22 @@ import numpy as np
 from madoc.report.reading import MetricLog, Run
 from madoc.report.words import count, duration
 
-_POLICIES = {
+POLICIES = {
     "calibrated": ("calibrated", "after"),
     "midrange": ("mid-range, uncalibrated", "before"),
     "truth": ("truth, a yardstick", "truth"),
+    "distribution": ("over the calibrated distribution", "after"),
 }
 """What a policy is called, and the class of its colour, by where it was learnt."""
 
 
 def policies(run: Run) -> dict[str, object] | str:
     """Returns of policies in the target."""
-    if run.evaluation is None:
+    if run.evaluation is None or not run.evaluation.policies:
         return "No policy of this run was evaluated in the target."
     returns = run.evaluation.policies
     largest = max(abs(row["return"]) + row["return_std"] for row in returns.values()) or 1.0
-    rows = [(*_POLICIES.get(name, (name, "measured")), row) for name, row in returns.items()]
+    rows = [(*POLICIES.get(name, (name, "measured")), row) for name, row in returns.items()]
     return {"rows": rows, "largest": largest, "episodes": run.evaluation.episodes}
 
 

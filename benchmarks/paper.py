@@ -1,0 +1,229 @@
+"""The paper's tables and figures: what their suites have found, beside what the paper prints.
+
+    madoc suite benchmarks/suites/table-10.yaml --out runs/paper       # hours to weeks; may be stopped at any time
+    python benchmarks/paper.py --collect runs/paper                    # keeps what has ended in results/paper
+    python benchmarks/paper.py                                         # prints the tables, and writes results/paper.md
+
+Suites share their cells: what table 10 has calibrated, table 1 learns policies at.
+"""
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from calibration import commit
+from madoc.suites.cells import KINDS, Cell
+from madoc.suites.options import flat
+from madoc.suites.planning import Plan, plan_of
+from madoc.suites.results import Result, results_of
+from madoc.suites.standing import Standing
+
+SUITES = Path(__file__).parent / "suites"
+RESULTS = Path(__file__).parent / "results" / "paper"
+OUT = "runs/paper"
+RESAMPLES = 2000
+"""Of the bootstrap."""
+TITLES = {
+    "table-10": "Table 10: mean absolute calibration error, D4RL's qualities",
+    "table-11": "Table 11: mean absolute calibration error, NeoRL's qualities",
+    "table-1": "Table 1: normalized return, D4RL's qualities",
+    "table-2": "Table 2: normalized return, NeoRL's qualities",
+    "table-12": "Table 12: normalized return by the kind of credit",
+    "table-13": "Table 13: normalized return with cloning",
+    "figure-4": "Figures 4 and 8: normalized return by rows and ranges",
+    "figure-6": "Figure 6: normalized return with groups and without",
+    "figure-7": "Figure 7: normalized return by the number of groups and α",
+}
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a cell of a suite found, and where it stands in its table."""
+
+    row: str
+    column: str
+    value: float | None
+    refused: bool
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--collect", type=Path, help="folder of the suites, whose ended cells are kept")
+    arguments = parser.parse_args()
+    if arguments.collect:
+        for name in TITLES:
+            print(f"{name}: {collect(name, arguments.collect)} cells kept")
+    else:
+        (RESULTS.parent / "paper.md").write_text(tables())
+        print(tables())
+
+
+def collect(name: str, folder: Path) -> int:
+    """Keep what the cells of a suite have found, those of earlier calls included: how many."""
+    plan = plan_of(SUITES / f"{name}.yaml")
+    wanted = [cell for cell in plan.cells if cell.wanted]
+    found = kept(name) | {
+        result.cell.name: told(result) | {"commit": commit()}
+        for result in results_of(Standing(folder, wanted, workers=1), folder)
+        if result.cell.name not in kept(name) and result.status not in ("not run", "failed")
+    }
+    if found:
+        RESULTS.mkdir(parents=True, exist_ok=True)
+        lines = ",\n".join(f' "{cell}": {json.dumps(row)}' for cell, row in sorted(found.items()))
+        (RESULTS / f"{name}.json").write_text(f"{{\n{lines}\n}}\n")
+    return len(found)
+
+
+def told(result: Result) -> dict:
+    """What is kept of a result: a number or the sentence of a refusal, and its cost."""
+    if result.calibration is not None:
+        error = result.error.get("mean_absolute")
+        percent = result.error.get("mean_percent_of_range")
+        cost = {"control_steps": result.calibration.control_steps, "seconds": result.calibration.seconds}
+        return {"value": error, "percent_of_range": percent} | cost
+    if result.evaluation is not None:
+        (returns,) = result.evaluation.policies.values()
+        return {"value": returns["normalized"], "return": returns["return"]}
+    return {"value": None, "refusal": result.sentence}
+
+
+def kept(name: str) -> dict[str, dict]:
+    """What was collected of a suite, by cell."""
+    file = RESULTS / f"{name}.json"
+    return json.loads(file.read_text()) if file.exists() else {}
+
+
+def tables() -> str:
+    """All tables, as Markdown."""
+    head = "# The paper's tables\n\nMade by `python benchmarks/paper.py`; in brackets, as printed.\n"
+    return "\n".join([head, *(table(name) for name in TITLES)])
+
+
+def printed(name: str, row: str, column: str) -> tuple[float, float] | None:
+    """Mean and 95 % interval that the paper prints in a cell of a table; None where it prints none."""
+    cell = _printed().get(name, {}).get(row, {}).get(column)
+    return None if cell is None else (cell[0], cell[1])
+
+
+@cache
+def _printed() -> dict[str, dict[str, dict[str, list[float]]]]:
+    return json.loads((SUITES / "printed.json").read_text())
+
+
+def table(name: str) -> str:
+    """One table: ours beside the printed value, cells that were not run, and their command."""
+    plan = planned(name)
+    scores, wanted = scores_of(plan, kept(name)), [cell for cell in plan.cells if cell.wanted]
+    rows = list(dict.fromkeys(score.row for score in scores))
+    columns = list(dict.fromkeys(score.column for score in scores))
+    by_cell = defaultdict[tuple[str, str], list[Score]](list)
+    for score in scores:
+        by_cell[score.row, score.column].append(score)
+    missing = len(wanted) - len(kept(name).keys() & {cell.name for cell in wanted})
+    command = f"`madoc suite benchmarks/suites/{name}.yaml --out {OUT}`"
+    state = f"{missing} of {len(wanted)} cells are not run: {command}" if missing else f"All cells are run by {command}"
+    lines = [f"## {TITLES[name]}\n", f"{state}. Interquartile mean over seeds (the paper's mean, over 6 seeds).\n"]
+    lines += [f"| task | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
+    for row in rows:
+        cells = [_shown(by_cell[row, column], printed(name, row, column)) for column in columns]
+        lines.append(f"| {row} | {' | '.join(cells)} |")
+    over = [_over_tasks([by_cell[row, column] for row in rows]) for column in columns]
+    if any(over):
+        lines.append(f"| interquartile mean [95 %] | {' | '.join(over)} |")
+    return "\n".join(lines) + "\n"
+
+
+@cache
+def planned(name: str) -> Plan:
+    """The plan of a suite."""
+    return plan_of(SUITES / f"{name}.yaml")
+
+
+def scores_of(plan: Plan, found: Mapping[str, Mapping]) -> list[Score]:
+    """Every cell that a suite asks for, with its place in the table and what it found."""
+    by_name = {cell.name: cell for cell in plan.cells}
+    scores = []
+    for cell in plan.cells:
+        if not cell.wanted:
+            continue
+        chain = {cell.kind: cell}
+        while cell.needs:
+            cell = by_name[cell.needs]
+            chain[cell.kind] = cell
+        last = next(chain[kind] for kind in ("evaluate", "learn", "calibrate") if kind in chain)
+        known = found.get(last.name, {})
+        scores.append(Score(*place(chain), known.get("value"), "refusal" in known))
+    return scores
+
+
+def place(chain: Mapping[str, Cell]) -> tuple[str, str]:
+    """Row and column of a cell: the data with what differs in it, and the system of calibrator and learner."""
+    calibration, record = asked(chain["calibrate"]), asked(chain["record"])
+    row = str(record["name"])
+    if "transitions" in record:
+        row += f", {int(record['transitions']):,} rows"
+    if "level" in calibration:
+        row += f", {calibration['level']} ranges"
+    method = str(calibration["method"])
+    column = " ".join([method, *(text for group in calibration.get("set", []) for text in group)])
+    if "learn" not in chain:
+        return row, column
+    policy = asked(chain["learn"])
+    learner, at = str(policy["method"]), str(policy.get("at", "calibrated"))
+    if method != "nominal":
+        return row, column if learner == "sac" else f"{column} + {learner}"
+    return row, (at if at != "calibrated" else method) if learner == "sac" else learner
+
+
+def asked(cell: Cell) -> dict:
+    """What a cell asks, by the keys of a suite file."""
+    return flat(KINDS[cell.kind], cell.order)
+
+
+def interquartile_mean(*rows: Float[np.ndarray, "*resamples seeds"], axis: int = -1) -> Float[np.ndarray, "*resamples"]:
+    """Mean of the middle half of all values of several tasks."""
+    return stats.trim_mean(np.concatenate(rows, axis=axis), 0.25, axis=axis)
+
+
+def stratified_interval(tasks: Sequence[Sequence[float]]) -> tuple[float, float]:
+    """95 % interval of the interquartile mean: seeds are drawn with replacement within each task (a stratum)."""
+    drawn = stats.bootstrap(
+        [np.asarray(values) for values in tasks],
+        interquartile_mean,
+        n_resamples=RESAMPLES,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    )
+    return float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
+
+
+def _shown(scores: Iterable[Score], paper: tuple[float, float] | None) -> str:
+    """A cell of a table: ours, of fewer seeds than asked with their number, and in brackets what is printed."""
+    listed = list(scores)
+    values = [score.value for score in listed if score.value is not None]
+    told = "" if not listed else "refuses" if all(score.refused for score in listed) else "not run"
+    if values:
+        told = f"{float(interquartile_mean(np.array(values))):.3g}"
+        told += "" if len(values) == len(listed) else f" ({len(values)} of {len(listed)} seeds)"
+    return told + (f" [{paper[0]:g} ± {paper[1]:g}]" if paper else "")
+
+
+def _over_tasks(cells: Sequence[Sequence[Score]]) -> str:
+    """The interquartile mean over all tasks, once each has at least two seeds."""
+    tasks = [[score.value for score in scores if score.value is not None] for scores in cells if scores]
+    if not tasks or min(map(len, tasks)) < 2:
+        return ""
+    low, high = stratified_interval(tasks)
+    return f"{float(interquartile_mean(*map(np.asarray, tasks))):.3g} [{low:.3g}, {high:.3g}]"
+
+
+if __name__ == "__main__":
+    main()

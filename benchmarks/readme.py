@@ -1,0 +1,61 @@
+"""The measured tables of the README, made from committed results, between marks that name them."""
+
+import re
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import paper
+
+README = Path(__file__).parents[1] / "README.md"
+NAMES = {"hopper": "Hopper", "halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "ant": "Ant"}
+_MARKED = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def rewritten(text: str, calibrations: Sequence[dict], policies: Sequence[dict]) -> str:
+    """The README with its marked tables made anew.
+
+    Args:
+        text: The README.
+        calibrations: Every calibration that was run.
+        policies: Every policy that was learnt and evaluated.
+
+    Raises:
+        KeyError: A mark names no table.
+    """
+    tables: dict[str, Callable[[], str]] = {
+        "errors": lambda: errors(calibrations),
+        "returns": lambda: returns(policies),
+    }
+    return _MARKED.sub(lambda found: found[1] + tables[found[2]]() + found[3], text)
+
+
+def errors(rows: Sequence[dict]) -> str:
+    """Median error of Madoc on clean medium data with 300 000 control steps, by where rollouts start."""
+    cells = defaultdict[tuple[str, str], list[float]](list)
+    for row in rows:
+        if (row["method"], row["quality"], row["data"], row["budget"]) == ("madoc", "medium", "clean", 300_000):
+            cells[row["robot"], row["starts"]].append(row["error"]["mean_absolute"])
+    lines = ["| robot | `logged` starts | `policy` starts | paper |", "|---|---|---|---|"]
+    for robot, name in NAMES.items():
+        ours = " | ".join(f"{np.median(cells[robot, starts]):.3f}" for starts in ("logged", "policy"))
+        printed = paper.printed("table-10", f"{robot}-medium", "madoc")
+        assert printed is not None
+        lines.append(f"| {name} | {ours} | {printed[0]:.2f} |")
+    return "\n".join(lines) + "\n"
+
+
+def returns(rows: Sequence[dict]) -> str:
+    """Median return of SAC with 300 000 control steps, by the parameters it learnt at."""
+    places = ("calibrated", "truth", "midrange")
+    cells = defaultdict[tuple[str, str], list[float]](list)
+    for row in rows:
+        if (row["method"], row["budget"]) == ("sac", 300_000):
+            cells[row["robot"], row["at"]].append(row["return"])
+    lines = ["| robot | learnt at the calibrated parameters | at the truth | at mid-range |", "|---|---|---|---|"]
+    for robot in ("hopper", "halfcheetah"):
+        found = [cells[robot, place] for place in places]
+        ours = " | ".join(f"{np.median(each):.0f} ({min(each):.0f} to {max(each):.0f})" for each in found)
+        lines.append(f"| {NAMES[robot]} | {ours} |")
+    return "\n".join(lines) + "\n"

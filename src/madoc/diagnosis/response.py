@@ -1,0 +1,277 @@
+"""How late, how strongly and in which direction each joint's acceleration follows its action, from the log alone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.signal import correlate
+
+from madoc.data import Dataset
+from madoc.data.findings import Finding
+from madoc.diagnosis.channels import action_names
+from madoc.identification.states import LoggedStates
+from madoc.identification.windows import evenly
+from madoc.simulation.base import Simulator
+from madoc.simulation.response import DrivenJoint, driven_joints, responses
+
+LONGEST = 0.3
+"""s; a lag is looked for up to this."""
+LATE = 0.25
+"""Lag in control steps; a shorter one is not told."""
+CONTRADICTING = 0.5
+"""Lag in control steps from which a model without a delay is wrong, whatever its parameters."""
+CERTAIN = 5.0
+"""Standard errors by which a lag or a response has to differ from 0 before it is told."""
+FAR = 3.0
+"""Ratio of the logged response to the nearest that the model has; a larger one is told."""
+_TAPS = 2
+"""Number of rows on either side of the correlation's peak over which the response is resolved."""
+_BLOCKS = 12
+"""Number of parts of the log that are left out, one at a time, for standard errors."""
+_FEWEST = 8
+"""Number of rows for each coefficient of the regression; with fewer nothing is said."""
+_EXPLAINED = 0.1
+"""Share in [0, 1] of the acceleration's variance, beyond what the state explains, that an action has to explain."""
+_FEW = 6
+"""Number of joints up to which products of their speeds, as in centrifugal forces, are part of the state."""
+_RIDGE = 1e-10
+"""Smallest eigenvalue of the regression's products, relative to the rows: columns may be constant, or alike."""
+_ROWS = 32
+"""Number of logged rows at which the model's response is computed."""
+_UNIT_ERRORS = {
+    180.0 / np.pi: "degrees for radians",
+    1000.0: "thousandths, as mm or mN·m, for the whole unit",
+    100.0: "cm for m",
+    30.0 / np.pi: "rpm for rad/s",
+}
+"""Mistakes of a unit by the ratio, or its inverse, of the logged response to the model's."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """The response of a joint's acceleration to its action, with standard errors from leaving out parts of the log.
+
+    Attributes:
+        joint: The joint and its action.
+        gain: Change of the joint's velocity in a control step over that of the action, in [-1, 1].
+        gain_error: Standard error of the gain.
+        lag: Time from an action to the acceleration it causes, beyond that of a command held for a control step, s.
+        lag_error: Standard error of the lag, s.
+        share: Share in [0, 1] of the acceleration's variance, beyond what the state explains, that the action explains.
+    """
+
+    joint: DrivenJoint
+    gain: float
+    gain_error: float
+    lag: float
+    lag_error: float
+    share: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether the joint answers its action at all."""
+        return self.share > _EXPLAINED and abs(self.gain) > CERTAIN * self.gain_error
+
+
+def response_findings(
+    dataset: Dataset,
+    simulator: Simulator,
+    logged: LoggedStates,
+    points: Float[np.ndarray, "points d"],
+    *,
+    late_speeds: bool = False,
+) -> tuple[list[Finding], int]:
+    """Findings on actions that come late, push the wrong way, or push far more or less than the model can.
+
+    Args:
+        dataset: The log.
+        simulator: The model, of which the directions and sizes are those at `points`, in [-1, 1].
+        logged: The log's states.
+        points: Where in the ranges of the parameters the model's responses are computed.
+        late_speeds: Whether logged speeds are known to come late, so that actions seem to as well.
+
+    Returns:
+        The findings, and the number of control steps simulated.
+    """
+    measured = tuple(one for one in measured_responses(dataset, simulator) if one.certain)
+    if not measured:
+        return [], 0
+    names = action_names(simulator.task)
+    findings = []
+    if not late_speeds:
+        findings = [finding for one in measured for finding in _lag_findings(one, names[one.joint.action], simulator)]
+    if not logged.starts_known:
+        return findings, 0
+    chosen = evenly(np.arange(len(logged.rows)), _ROWS)
+    actions = np.asarray(dataset.transitions.action, np.float64)[logged.rows[chosen]]
+    joints = tuple(one.joint for one in measured)
+    modelled = responses(simulator, logged.states[chosen], actions, points, joints)
+    for one, gains in zip(measured, modelled.T, strict=True):
+        findings += _gain_findings(one, names[one.joint.action], gains[np.isfinite(gains)])
+    return findings, 2 * len(joints) * len(points) * len(chosen)
+
+
+def _lag_findings(response: Response, action: str, simulator: Simulator) -> list[Finding]:
+    """A warning where a lag is certain, and no calibrated delay can stand for it."""
+    step, lag, error = simulator.control_step, response.lag, response.lag_error
+    delays = [row for row in simulator.parameters.parameters if row.field == "action_delay"]
+    if lag < max(LATE * step, CERTAIN * error) or any(row.low <= lag <= row.high for row in delays):
+        return []
+    what = (
+        f"the acceleration of {response.joint.joint} follows it {lag:.3g} ± {2.0 * error:.1g} s late ({lag / step:.2g} "
+        "rows)"
+    )
+    low, high = max(0.0, lag - 2.0 * step), lag + 2.0 * step
+    remedy = f"{{field: action_delay, low: {0.0 if low < step else low:.2g}, high: {high:.2g}}}"
+    verb = "widen the range of the delay to" if delays else "add the parameter"
+    do = f"{verb} {remedy}; a lag of the motor and a filter on the logged speed look alike"
+    return [Finding("warning", what, action, do, contradicts=lag >= CONTRADICTING * step)]
+
+
+def _gain_findings(response: Response, action: str, modelled: Float[np.ndarray, " points"]) -> list[Finding]:
+    """A warning where the measured response has the other sign than the model's, or another order of magnitude."""
+    if not len(modelled) or not (modelled.min() > 0.0 or modelled.max() < 0.0):
+        return []
+    measured, joint = response.gain, response.joint.joint
+    if measured * modelled.sum() < 0:
+        what = f"it accelerates {joint} the other way than in the model"
+        return [
+            Finding("warning", what, action, f"reverse its sign, or that of {joint}, in the spec or in the log", True)
+        ]
+    least, most = np.abs(modelled).min(), np.abs(modelled).max()
+    ratio = abs(measured) / (most if abs(measured) > most else least)
+    if least <= abs(measured) <= most or 1.0 / FAR < ratio < FAR:
+        return []
+    factors = ((each, text) for factor, text in _UNIT_ERRORS.items() for each in (factor, 1.0 / factor))
+    mistake = next((text for each, text in factors if least / 1.5 < abs(measured) / each < 1.5 * most), "")
+    what = f"it accelerates {joint} {ratio:.2g} times as much as anywhere in the ranges of the parameters"
+    what += f": {mistake}?" if mistake else ""
+    return [Finding("warning", what, action, "look at the units of the spec and of the log, and at the ranges", True)]
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Rows of a log that have a row before them: what the robot did, and what can explain it.
+
+    Attributes:
+        rows: The rows, ascending.
+        state: Constant, positions, velocities, and functions of them, one column each.
+        change: Change of each joint's velocity in a control step, joint units per s.
+        ahead: Time by which `change` is early, in control steps: half of one if positions were differentiated twice.
+    """
+
+    rows: Int[np.ndarray, " rows"]
+    state: Float[np.ndarray, "rows features"]
+    change: Float[np.ndarray, "rows joints"]
+    ahead: Float[np.ndarray, " joints"]
+
+
+def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response, ...]:
+    """The response of every joint that has an action of its own and whose position or velocity is logged.
+
+    The change of velocity is regressed on the state and on the action of some rows before. Which rows is found by the
+    cross-correlation of the two, both cleared of what the state explains. Only actions at or before a row are taken, as
+    those after it depend on the motion where a controller chose them.
+    """
+    joints, motion = _motion(dataset, simulator)
+    if not joints:
+        return ()
+    action = np.asarray(dataset.transitions.action, np.float64)
+    peaks = _peaks(motion, action[motion.rows][:, [joint.action for joint in joints]], simulator.control_step)
+    windows = [np.arange(max(0, peak - _TAPS), peak + _TAPS + 1) for peak in peaks]
+    age = motion.rows - dataset.episode_starts[dataset.episode_of(motion.rows)]
+    kept = np.flatnonzero(age >= max(window[-1] for window in windows))
+    rows = motion.rows[kept]
+    taps = [action[rows[:, None] - window, joint.action] for window, joint in zip(windows, joints, strict=True)]
+    design = np.concatenate([motion.state[kept], *taps], axis=1)
+    if len(rows) < _FEWEST * design.shape[1]:
+        return ()
+    ends = motion.state.shape[1] + np.cumsum([len(window) for window in windows])
+    own = [np.arange(end - len(window), end) for end, window in zip(ends, windows, strict=True)]
+    found = []
+    for at, joint in enumerate(joints):
+        estimates, share = _regressed(design, motion.change[kept, at], own[at])
+        gains = estimates.sum(-1)
+        lags = simulator.control_step * ((estimates @ windows[at]) / gains - motion.ahead[at])
+        found.append(Response(joint, float(gains[0]), _jackknife(gains), float(lags[0]), _jackknife(lags), share))
+    return tuple(found)
+
+
+def _motion(dataset: Dataset, simulator: Simulator) -> tuple[tuple[DrivenJoint, ...], _Motion]:
+    """The joints that actions drive and whose motion is logged, and that motion."""
+    task = simulator.task
+    rows = np.setdiff1d(np.arange(len(dataset)), dataset.episode_starts)
+    nothing = _Motion(rows, np.zeros((len(rows), 0)), np.zeros((len(rows), 0)), np.zeros(0))
+    if task.posture is None or not len(rows):
+        return (), nothing
+    measured = task.observation_size - task.velocities  # the others were derived from positions
+    logged = dataset.transitions
+    now, then = (
+        np.asarray(task.posture(np.asarray(part, np.float64)[:, :measured]))
+        for part in (logged.observation, logged.next_observation)
+    )
+    before, now, then = now[rows - 1], now[rows], then[rows]
+    seen = ~np.isnan(now).any(0)
+    joints, changes, speeds, ahead = [], [], [], []
+    for joint in driven_joints(simulator):
+        position, velocity = joint.position, joint.velocity
+        if seen[velocity]:
+            change, speed = then[:, velocity] - now[:, velocity], now[:, velocity]
+        elif seen[position]:
+            speed = (now[:, position] - before[:, position]) / simulator.control_step
+            change = (then[:, position] - now[:, position]) / simulator.control_step - speed
+        else:
+            continue
+        joints.append(joint)
+        changes.append(change)
+        speeds.append(speed)
+        ahead.append(0.0 if seen[velocity] else 0.5)
+    if not joints:
+        return (), nothing
+    angles = [now[:, joint.position] for joint in joints if joint.hinge and seen[joint.position]]
+    inertial = [one * other for at, one in enumerate(speeds[:_FEW]) for other in speeds[at:_FEW]]
+    functions = [*np.sign(speeds), *np.sin(angles), *np.cos(angles), *inertial]
+    columns = [np.ones(len(rows)), *now[:, seen].T, *speeds, *functions]
+    return tuple(joints), _Motion(rows, np.stack(columns, axis=-1), np.stack(changes, axis=-1), np.array(ahead))
+
+
+def _peaks(motion: _Motion, action: Float[np.ndarray, "rows joints"], control_step: float) -> list[int]:
+    """The lags in rows at which each joint's acceleration correlates most with its action, in absolute value."""
+    basis = np.linalg.qr(motion.state / np.maximum(np.abs(motion.state).max(0), np.finfo(float).tiny))[0]
+    changes, actions = (columns - basis @ (basis.T @ columns) for columns in (motion.change, action))
+    longest = int(np.ceil(LONGEST / control_step))
+    cuts = np.flatnonzero(np.diff(motion.rows) > 1) + 1
+    peaks = []
+    for change, moved in zip(changes.T, actions.T, strict=True):
+        total = np.zeros(longest + 1)
+        for response, cause in zip(np.split(change, cuts), np.split(moved, cuts), strict=True):
+            lagged = correlate(response, cause)[len(cause) - 1 :][: longest + 1]
+            total[: len(lagged)] += lagged
+        peaks.append(int(np.argmax(np.abs(total))))
+    return peaks
+
+
+def _regressed(
+    design: Float[np.ndarray, "rows columns"], change: Float[np.ndarray, " rows"], own: Int[np.ndarray, " taps"]
+) -> tuple[Float[np.ndarray, "estimates taps"], float]:
+    """The coefficients of a joint's own action, of the whole log and without each of its parts; and its share."""
+    scale = np.maximum(np.sqrt((design**2).mean(0)), np.finfo(float).tiny)
+    table = np.column_stack([design / scale, change])
+    parts = np.stack([part.T @ part for part in np.array_split(table, _BLOCKS)])
+    whole = parts.sum(0)
+    count = design.shape[1]
+
+    def solved(products: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        ridge = _RIDGE * len(table) * np.eye(len(columns))
+        return np.linalg.solve(products[np.ix_(columns, columns)] + ridge, products[columns, count])
+
+    everything, others = np.arange(count), np.setdiff1d(np.arange(count), own)
+    estimates = np.stack([solved(each, everything)[own] for each in (whole, *(whole - parts))]) / scale[own]
+    left = [whole[count, count] - whole[count, some] @ solved(whole, some) for some in (others, everything)]
+    return estimates, float(1.0 - left[1] / max(left[0], np.finfo(float).tiny))
+
+
+def _jackknife(values: Float[np.ndarray, " estimates"]) -> float:
+    """The standard error of the first value from the others, each of which leaves one part of the log out."""
+    without = values[1:]
+    return float(np.sqrt((len(without) - 1) * without.var()))

@@ -1,0 +1,63 @@
+"""Scales that no log can show: masses and forces known only relative to each other, and what they rest on."""
+
+import numpy as np
+from jaxtyping import Float
+
+from madoc.data import Dataset
+from madoc.data.findings import Finding
+from madoc.errors import listed
+from madoc.identification.states import LoggedStates, probing_rows
+from madoc.identification.windows import evenly
+from madoc.simulation.base import Simulator
+from madoc.simulation.response import hidden_scales, mass_like
+
+_ROWS = 16
+"""Number of states at which a scale is tried."""
+
+
+def scale_findings(
+    dataset: Dataset,
+    simulator: Simulator,
+    logged: LoggedStates,
+    point: Float[np.ndarray, " d"],
+    *,
+    only_ratios: bool,
+) -> list[Finding]:
+    """What the scale of masses and forces, and that of positions, rests on where no log can show it.
+
+    Args:
+        dataset: The log.
+        simulator: The model.
+        logged: The log's states.
+        point: The parameters in [-1, 1] at which the scales are tried.
+        only_ratios: Whether the calibrated parameters alone can be scaled alike without a trace.
+    """
+    names = [row.name for row in simulator.parameters.parameters if mass_like(row.field)]
+    if not names:
+        return []
+    states, actions = (rows[evenly(np.arange(len(rows)), _ROWS)] for rows in probing_rows(logged, dataset, simulator))
+    by_mass, by_length = hidden_scales(simulator, simulator.parameters.to_physical(point), states, actions)
+    findings = []
+    if by_mass:
+        findings.append(_scale_of_masses(names, only_ratios=only_ratios))
+    if by_length:
+        what = (
+            "no log can show the scale of positions here: were all of them logged too large, and every gain with them, "
+            f"the fit would be as good, and {listed(names)} wrong"
+        )
+        findings.append(Finding("note", what, "scale", "check one distance with a ruler"))
+    return findings
+
+
+def _scale_of_masses(names: list[str], *, only_ratios: bool) -> Finding:
+    if only_ratios:
+        what = (
+            f"only ratios can be found: {listed(names)} times one common factor change nothing that is seen, as a gear "
+            "and all masses scaled alike"
+        )
+        return Finding("warning", what, "parameters", "take one of them out of the spec, at a value that was measured")
+    what = (
+        f"no log can show a gear and all masses scaled alike: {listed(names)} will be found in proportion to the "
+        "masses and gains that the model takes as known"
+    )
+    return Finding("note", what, "scale", "weigh a part, or measure a torque, and put that into the model")

@@ -1,0 +1,201 @@
+"""The terms that a model may lack: what each stands for, its value in the model, its effect on simulated windows."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from madoc import simulation
+from madoc.identification.replay import Readings
+from madoc.identification.score_tests import Score
+from madoc.identification.states import LoggedStates
+from madoc.parameters import FIELDS, Parameter
+from madoc.simulation.base import Simulator
+from madoc.simulation.write import nominal_values
+
+CAUSES = {
+    "dof_frictionloss": "Coulomb friction",
+    "dof_drag": "drag that grows with the square of the speed",
+    "dof_damping": "viscous damping",
+    "dof_armature": "inertia that goes with the acceleration of a joint",
+    "jnt_stiffness": "a spring",
+    "actuator_gain": "another gain of the actuator",
+    "signal_bias": "an offset of the sensor",
+    "gravity": "another gravity",
+}
+"""What a candidate of each field stands for, in words."""
+DELAY = "actions that take effect later, by a delay or a lag of the actuator"
+SATURATION = "a drive that saturates below the limit of its actions"
+SPACING = "rows that are farther apart in time than the spec says, by another rate or a clock that drifts"
+INTEGRATION = "the error of the model's integration step"
+_CHANGE = 1e-3
+"""Change of a candidate, as a share of what would balance the joint's typical torque, for its one-sided difference."""
+_SATURATED = 0.3
+"""Share of the largest logged action by which actions are cut off, to compute the effect of a drive that saturates."""
+_RANGE = 10.0
+"""Half of the range in which a term is fitted, in its change or standard error by the score test."""
+_LATER = 0.1
+"""Delay in control steps with which the effect of a delay is computed."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A term that is tried.
+
+    Attributes:
+        cause: What it stands for, in words.
+        parameter: Name of the parameter that adds it to a spec; empty if there is none.
+        unit: Unit of its value.
+        nominal: Its value in the model.
+        reference: Unit change of its value.
+        least: Its smallest physical value.
+        elements: Elements of the model that share the value; empty for a term of the whole robot.
+    """
+
+    cause: str
+    parameter: str
+    unit: str
+    nominal: float
+    reference: float
+    least: float
+    elements: tuple[str, ...] = ()
+
+    def added(self, score: Score) -> Parameter | None:
+        """The parameter that adds the term, in a range wide enough for its score; None if there is none."""
+        field = self.parameter.partition(".")[0]
+        if field not in FIELDS or not FIELDS[field].in_model:
+            return None
+        reach = _RANGE * self.reference * max(abs(score.change), score.error)
+        low = max(self.least, self.nominal - reach)
+        element = self.elements if len(self.elements) > 1 else "".join(self.elements)
+        return Parameter(field, element, low, self.nominal + reach)
+
+
+def candidates(
+    logged: LoggedStates,
+    simulator: Simulator,
+    point: Float[np.ndarray, " d"],
+    scale: Float[np.ndarray, " observation"],
+) -> Iterator[tuple[Candidate, Parameter]]:
+    """Terms that a spec can add and does not calibrate: some for each joint, one for each actuator and sensor."""
+    model, task = simulator.model(simulator.parameters.to_physical(point)), simulator.task
+    calibrated = {(each.field, element) for each in simulator.parameters.parameters for element in each.elements}
+    fields = {each.field for each in simulator.parameters.parameters}
+    wanted: list[tuple[str, str, float]] = []
+    for name in (model.joint(joint).name for joint in range(model.njnt)):
+        if name:
+            references = _references(logged, simulator, model.joint(name))
+            wanted += [(field, name, reference) for field, reference in references.items()]
+    for channel in task.actions:
+        wanted.append(
+            ("actuator_gain", channel.actuator, abs(float(model.actuator(channel.actuator).gainprm[0])) or 1.0)
+        )
+    if "gravity" not in fields and abs(model.opt.gravity[2]) > 0:
+        wanted.append(("gravity", "", float(abs(model.opt.gravity[2]))))
+    if task.source is not None:
+        measured = zip(task.signals[: logged.measured], scale, strict=False)
+        wanted += [("signal_bias", signal, float(typical)) for signal, typical in measured]
+    for field, element, reference in wanted:
+        if (field, element) not in calibrated:
+            yield _candidate(partial(nominal_values, model), field, element, reference)
+
+
+def _references(logged: LoggedStates, simulator: Simulator, joint: Any) -> dict[str, float]:
+    """By field, the value with which a term would balance the torque that typically accelerates a joint.
+
+    All degrees of freedom of a free or a ball joint share one value, and it has no spring.
+    """
+    model = simulator.task.model
+    dofs = slice(int(joint.dofadr[0]), int(joint.dofadr[0]) + len(joint.damping))
+    position, speed = logged.states[:, : model.nq], logged.states[:, model.nq : model.nq + model.nv][:, dofs]
+    change = np.diff(speed, axis=0)[np.diff(logged.rows) == 1]
+    acceleration = np.sqrt((change**2).mean(0)) / simulator.control_step if len(change) else np.ones(speed.shape[1])
+    inertia, fast = model.dof_M0[dofs], max(float(np.sqrt((speed**2).mean())), 1e-9)
+    torque = max(float((inertia * acceleration).mean()), 1e-12)
+    references = {
+        "dof_frictionloss": torque,
+        "dof_drag": torque / fast**2,
+        "dof_damping": torque / fast,
+        "dof_armature": float(inertia.mean()),
+    }
+    far = max(float(position[:, int(joint.qposadr[0])].std()), 1e-9)
+    return references | ({"jnt_stiffness": torque / far} if len(joint.damping) == 1 else {})
+
+
+def _candidate(
+    nominal_of: Callable[[Parameter], tuple[float, ...]], field: str, element: str, reference: float
+) -> tuple[Candidate, Parameter]:
+    """A term, and the parameter whose range begins at its value in the model and is `reference` wide."""
+    parameter = Parameter(field, element, 0.0, reference)
+    nominal = nominal_of(parameter)[0]
+    parameter = replace(parameter, low=nominal, high=nominal + reference)
+    least, elements = FIELDS[field].minimum, parameter.elements
+    return Candidate(CAUSES[field], parameter.name, parameter.unit, nominal, reference, least, elements), parameter
+
+
+def effects(
+    simulator: Simulator,
+    wide: Simulator,
+    readings: Readings,
+    before: Float[np.ndarray, "windows action"],
+    at: Float[np.ndarray, " k"],
+    states: Float[np.ndarray, "windows state"],
+    added: list[tuple[Candidate, Parameter]],
+) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"]]:
+    """Every candidate and the derivative of the residuals by it, in its reference.
+
+    `wide` is the simulator with the added parameters, the last ones of `at`; `before` are the actions before windows.
+    """
+    count, base = len(added), readings.residuals(wide, at[None], states[None])[0, 0]
+    points = np.repeat(at[None], count, axis=0)
+    points[np.arange(count), len(at) - count + np.arange(count)] += 2.0 * _CHANGE
+    by_candidate = readings.residuals(wide, points, np.repeat(states[None], count, axis=0))[:, 0] - base
+    tried, found = [candidate for candidate, _ in added], list(by_candidate / _CHANGE)
+    for candidate, column in _of_groups(simulator, added, np.stack(found)):
+        tried.append(candidate)
+        found.append(column)
+    point, step = at[: len(at) - count], simulator.control_step
+    earlier = np.concatenate([before[:, None], readings.actions[:, :-1]], axis=1)
+    late = replace(readings, actions=readings.actions + _LATER * (earlier - readings.actions))
+    most = (1.0 - _SATURATED) * np.abs(readings.actions).max((0, 1))
+    saturated = replace(readings, actions=np.clip(readings.actions, -most, most))
+    stretched = simulation.make(simulator.task.with_time_step(1.0 + _CHANGE))
+    finer = simulation.make(simulator.task.with_time_step(0.25, substeps=4))
+    fields = {each.field for each in simulator.parameters.parameters}
+    for candidate, other, inputs, change in (
+        (Candidate(DELAY, "action_delay", "s", 0.0, step, -np.inf), simulator, late, _LATER),
+        (Candidate(SATURATION, "", "of the largest action cut off", 0.0, 1.0, 0.0), simulator, saturated, _SATURATED),
+        (Candidate(SPACING, "", "s", step, step, 0.0), stretched, readings, _CHANGE),
+        (Candidate(INTEGRATION, "", "", 0.0, 1.0, -np.inf), finer, readings, 1.0),
+    ):
+        if candidate.parameter not in fields:
+            moved = inputs.residuals(other, point[None], states[None])[0, 0]
+            tried.append(candidate)
+            found.append((moved - base) / change)
+    return tried, np.stack(found, axis=-1)
+
+
+def _of_groups(
+    simulator: Simulator,
+    added: list[tuple[Candidate, Parameter]],
+    columns: Float[np.ndarray, "added windows values"],
+) -> Iterator[tuple[Candidate, Float[np.ndarray, "windows values"]]]:
+    """The terms of joints that share a calibrated parameter, of one value for all: effects of small values add up.
+
+    Of terms that all of these joints lack, the others would hide each single one.
+    """
+    index_of = {(parameter.field, parameter.element): index for index, (_, parameter) in enumerate(added)}
+    groups = dict.fromkeys(row.elements for row in simulator.parameters.parameters if len(row.elements) > 1)
+    joint_fields = [field for field in CAUSES if FIELDS[field].element == "joint"]
+    for field, group in product(joint_fields, groups):
+        members = [index_of[field, element] for element in group if (field, element) in index_of]
+        if len(members) == len(group):
+            single = [added[index][0] for index in members]
+            reference = float(np.mean([each.reference for each in single]))
+            name = Parameter(field, group, 0.0, 1.0).name
+            together = replace(single[0], parameter=name, elements=group, reference=reference)
+            yield together, sum(reference / added[index][0].reference * columns[index] for index in members)

@@ -1,0 +1,180 @@
+"""Score tests of terms that a model may lack (Rao 1948), on windows of a log that are simulated at the estimate.
+
+Residuals and derivatives enter as their sums of products within each window. Standard errors are those of leaving out
+one window at a time, so they hold for residuals that are correlated within a window or larger in some windows than in
+others (Liang and Zeger 1986; MacKinnon and White 1985), with as many degrees of freedom as there are windows that tell
+of a term (Carter, Schnepel and Steigerwald 2017). The influence of a window in which a contact magnifies every
+change is bounded (Mallows 1975).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+REACH = 3.0
+"""Length of a column of derivatives in a window relative to the median window's; a window with more is shrunk to it."""
+_DISTINCT = 1e-3
+"""Share of a column's squares that the columns before it cannot imitate; below it the two are one."""
+_SINGULAR = 1e-10
+"""Smallest eigenvalue of a matrix of products, relative to the largest, that counts as more than 0."""
+
+
+@dataclass(frozen=True)
+class Products:
+    """Sums of products within each window: of the residuals (index 0), and of the columns of derivatives (from 1 on).
+
+    `count` columns, the first ones, are those of the calibrated parameters.
+    """
+
+    each: Float[np.ndarray, "windows columns columns"]
+    count: int
+
+    @classmethod
+    def of(
+        cls,
+        residuals: Float[np.ndarray, "windows values"],
+        by_parameters: Float[np.ndarray, "windows values d"],
+        others: Float[np.ndarray, "windows values terms"],
+    ) -> "Products":
+        """Those of residuals, of their derivatives by the parameters, and by other terms."""
+        columns = np.concatenate([residuals[..., None], by_parameters, others], axis=-1)
+        return cls(np.swapaxes(columns, 1, 2) @ columns, by_parameters.shape[-1])
+
+    def __len__(self) -> int:
+        return len(self.each)
+
+    @property
+    def parameters(self) -> list[int]:
+        """Indices of the calibrated parameters' columns."""
+        return list(range(1, 1 + self.count))
+
+    def bounded(self, columns: Sequence[int]) -> Float[np.ndarray, "windows columns columns"]:
+        """The products, of which no window has more than `REACH` times the usual length of any of these columns."""
+        lengths = np.sqrt(np.maximum(self.each[:, columns, columns], 0.0))
+        usual = np.array([np.median(column[column > 0.0]) if column.any() else 0.0 for column in lengths.T])
+        longest = (lengths / np.where(usual > 0.0, REACH * usual, np.inf)).max(1)
+        return self.each / np.maximum(longest, 1.0)[:, None, None] ** 2
+
+
+@dataclass(frozen=True)
+class Score:
+    """One term's change from the model, in its reference, and what is known of it.
+
+    Attributes:
+        change: The change that explains the residuals best.
+        error: Its standard error.
+        explained: Share of the squared residuals that it explains, those of initial states and parameters taken away.
+        shifts: How it moves each calibrated parameter, in [-1, 1].
+        freedom: Degrees of freedom of the standard error: the number of windows that tell of the term, less one.
+    """
+
+    change: float
+    error: float
+    explained: float
+    shifts: Float[np.ndarray, " d"]
+    freedom: float
+
+    @property
+    def t(self) -> float:
+        """The change over its standard error; see `deviate`."""
+        return deviate(self.change / self.error, self.freedom)
+
+
+def deviate(ratio: float, freedom: float) -> float:
+    """The normal deviate of the same probability as this ratio of an estimate to its standard error.
+
+    With few degrees of freedom large ratios come by chance (Student 1908), so that thresholds would mean little.
+    """
+    from scipy.stats import norm  # slow to import, and only tests of terms need it
+    from scipy.stats import t as student
+
+    chance = max(float(student.sf(abs(ratio), freedom)), np.finfo(float).tiny)
+    return float(np.copysign(norm.isf(chance), ratio))
+
+
+def score(
+    products: Products,
+    index: int,
+    already: Sequence[int] = (),
+    shape: Float[np.ndarray, " windows"] | None = None,
+) -> Score | None:
+    """The score test of one column, where the parameters' columns and those `already` included explain what they can.
+
+    With a `shape`, the column is multiplied by its value in each window. None if the column is no other than those
+    included, or if a single window holds all that is known of it.
+    """
+    included = [*products.parameters, *already]
+    each = products.bounded([*included, index])
+    shape = np.ones(len(products)) if shape is None else shape
+    total, mixed = each.sum(0), (shape[:, None] * each[:, included, index])
+    imitation = _solved(total[np.ix_(included, included)], mixed.sum(0))
+    fitted = _solved(total[np.ix_(included, included)], total[included, 0])
+    inner = each[:, included][:, :, included]
+    own = shape**2 * each[:, index, index]
+    alone = own - 2.0 * mixed @ imitation + np.einsum("wij,i,j->w", inner, imitation, imitation)
+    power = float(alone.sum())
+    if power <= _DISTINCT * own.sum():
+        return None
+    left = shape * each[:, index, 0] - mixed @ fitted
+    left -= each[:, included, 0] @ imitation - np.einsum("wij,i,j->w", inner, imitation, fitted)
+    change = -float(left.sum()) / power
+    without = power - alone
+    if (without <= _DISTINCT * power).any():
+        return None
+    error = float(_jackknife(((left + change * alone) / without)[:, None])[0, 0]) ** 0.5
+    squares = total[0, 0] - 2.0 * fitted @ total[included, 0] + fitted @ total[np.ix_(included, included)] @ fitted
+    own_columns = products.parameters
+    response = _solved(total[np.ix_(own_columns, own_columns)], mixed.sum(0)[: products.count])
+    if not error > 0.0:
+        return None
+    freedom = max(1.0, power**2 / float((alone**2).sum()) - 1.0)
+    return Score(change, error, change**2 * power / float(squares), -response * change, freedom)
+
+
+def joint_shift(
+    products: Products, terms: Sequence[int]
+) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
+    """The changes of several terms together, how they move the parameters, in [-1, 1], and the covariance of that."""
+    parameters, terms = products.parameters, list(terms)
+    each = products.bounded([*parameters, *terms])
+    changes, covariance = _regression(each, [*parameters, *terms])
+    total = each.sum(0)
+    response = -_solved(total[np.ix_(parameters, parameters)], total[np.ix_(parameters, terms)])
+    of_terms = slice(products.count, None)
+    return changes[of_terms], response @ changes[of_terms], response @ covariance[of_terms, of_terms] @ response.T
+
+
+def parameter_shift(products: Products) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
+    """The step to the parameters that explain the windows best, in [-1, 1], and its covariance."""
+    return _regression(products.bounded(products.parameters), products.parameters)
+
+
+def _regression(
+    each: Float[np.ndarray, "windows columns columns"], columns: list[int]
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+    """Coefficients of columns that make residuals smallest, and their covariance by leaving out windows."""
+    lengths = np.sqrt(np.maximum(np.diag(each.sum(0))[columns], np.finfo(float).tiny))
+    inner = each[:, columns][:, :, columns] / lengths[:, None] / lengths
+    with_residuals = each[:, columns, 0] / lengths
+    total = inner.sum(0)
+    change = -_solved(total, with_residuals.sum(0))
+    scores = with_residuals + inner @ change
+    influence = np.einsum("wij,wj->wi", np.linalg.pinv(total - inner, rcond=_SINGULAR, hermitian=True), scores)
+    return change / lengths, _jackknife(influence) / lengths[:, None] / lengths
+
+
+def _jackknife(influence: Float[np.ndarray, "windows k"]) -> Float[np.ndarray, "k k"]:
+    """Covariance of an estimate from how it changes as each window is left out."""
+    windows = len(influence)
+    return influence.T @ influence * (windows - 1) / windows
+
+
+def _solved(
+    matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, "k *columns"]
+) -> Float[np.ndarray, "k *columns"]:
+    """The least-squares solution of a symmetric system that may be singular, in units of its diagonal."""
+    lengths = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    inverse = np.linalg.pinv(matrix / lengths[:, None] / lengths, rcond=_SINGULAR, hermitian=True)
+    return (inverse / lengths[:, None] / lengths) @ right

@@ -1,0 +1,161 @@
+"""How a model's joints answer: which joint each action drives, how much it accelerates it, and what scale it has."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from madoc.parameters import FIELDS
+from madoc.simulation.base import Simulator
+
+_PUSH = 1e-3
+"""Half the difference of an action, in [-1, 1], by which the response of a joint is computed."""
+_SCALE = 1.25
+"""Factor on masses and forces, or on positions."""
+_SAME = 1e-3
+"""Difference of two next states relative to the largest change; up to it they are equal but for the solver's error."""
+_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_FORCES = (
+    "body_mass",
+    "body_inertia",
+    "dof_damping",
+    "dof_dampingpoly",
+    "dof_armature",
+    "dof_frictionloss",
+    "jnt_stiffness",
+    "jnt_actfrcrange",
+    "jnt_stiffnesspoly",
+    "tendon_stiffness",
+    "tendon_stiffnesspoly",
+    "tendon_damping",
+    "tendon_dampingpoly",
+    "tendon_frictionloss",
+    "tendon_armature",
+    "tendon_actfrcrange",
+    "actuator_gainprm",
+    "actuator_biasprm",
+    "actuator_forcerange",
+    "actuator_damping",
+    "actuator_dampingpoly",
+    "actuator_armature",
+)
+"""Arrays of a model whose numbers are masses, forces or torques, or in proportion to them."""
+
+
+@dataclass(frozen=True)
+class DrivenJoint:
+    """A hinge or slide that an action drives by an actuator of its own.
+
+    Attributes:
+        action: Index of the action.
+        joint: Name of the joint.
+        hinge: Whether it is a hinge.
+        position: Index of its position in a state.
+        velocity: Index of its velocity in a state.
+    """
+
+    action: int
+    joint: str
+    hinge: bool
+    position: int
+    velocity: int
+
+
+def driven_joints(simulator: Simulator) -> tuple[DrivenJoint, ...]:
+    """The joints that actions drive directly, in the order of the actions; none for tendons, sites and free bodies."""
+    model = simulator.task.model
+    channels = simulator.task.actions
+    actuators = [model.actuator(channel.actuator).id for channel in channels] or range(simulator.action_size)
+    found = []
+    for action, actuator in enumerate(actuators):
+        joint = int(model.actuator_trnid[actuator, 0])
+        if int(model.actuator_trntype[actuator]) in _JOINT and int(model.jnt_type[joint]) in _SINGLE:
+            hinge = bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE)
+            place = int(model.jnt_qposadr[joint]), int(model.nq + model.jnt_dofadr[joint])
+            found.append(DrivenJoint(action, model.joint(joint).name, hinge, *place))
+    return tuple(found)
+
+
+def responses(
+    simulator: Simulator,
+    states: Float[np.ndarray, "rows state"],
+    actions: Float[np.ndarray, "rows action"],
+    points: Float[np.ndarray, "points d"],
+    joints: tuple[DrivenJoint, ...],
+) -> Float[np.ndarray, "points joints"]:
+    """Change of each joint's velocity in a control step from rest, over that of its action.
+
+    The action is held since long before, so that a delay does not count, and the velocities of the states are not used.
+    It is the mean over the rows whose simulation succeeds at a point, NaN where there are none. Spends
+    points · (2 · joints) · rows control steps.
+    """
+    system = simulator.bind(simulator.parameters.to_physical(points))
+    first, model = len(simulator.initial_state) - simulator.task.pending * simulator.action_size, simulator.task.model
+    found = []
+    for joint in joints:
+        ends = []
+        for side in (-_PUSH, _PUSH):
+            state, action = states.copy(), actions.copy()
+            state[:, model.nq : first] = 0.0
+            state[:, first + joint.action :: simulator.action_size] += side  # the pending actions
+            action[:, joint.action] += side
+            batch = (
+                np.ascontiguousarray(np.broadcast_to(each, (len(points), *each.shape))) for each in (state, action)
+            )
+            ends.append(system.step(*batch)[..., joint.velocity])
+        slopes = (ends[1] - ends[0]) / (2.0 * _PUSH)
+        count = np.isfinite(slopes).sum(-1)
+        found.append(np.where(count > 0, np.nansum(slopes, axis=-1) / np.maximum(count, 1), np.nan))
+    return np.stack(found, axis=-1)
+
+
+def mass_like(field: str) -> bool:
+    """Whether a field is a mass, an inertia, a force or a torque, or in proportion to one: kg or N is in its unit."""
+    return field == "actuator_gain" or any(unit in FIELDS[field].unit for unit in ("kg", "N"))
+
+
+def hidden_scales(
+    simulator: Simulator,
+    values: Float[np.ndarray, " d"],
+    states: Float[np.ndarray, "rows state"],
+    actions: Float[np.ndarray, "rows action"],
+) -> tuple[bool, bool]:
+    """Whether all masses and forces, and whether all positions and actions, can be scaled alike without a trace.
+
+    Each state is stepped by the model at the given values, by one whose masses and forces are scaled, and by the first
+    from scaled positions, velocities and controls. As this is a property of the model, actions in [-1, 1] stand for the
+    controls. What the spec's sensors read is compared too, so that one of force or acceleration counts.
+    """
+    model, heavier = simulator.model(values), simulator.model(values)
+    for name in _FORCES:
+        getattr(heavier, name)[:] *= _SCALE
+    heavier.opt.density *= _SCALE
+    heavier.opt.viscosity *= _SCALE
+    mujoco.mj_setConst(heavier, mujoco.MjData(heavier))
+    start = states[:, : model.nq + model.nv]
+    plain = _stepped(simulator, model, start, actions)
+    resolution = _SAME * np.abs(plain[:, : start.shape[1]] - start).max()
+    by_mass = np.abs(_stepped(simulator, heavier, start, actions) - plain).max()
+    by_length = np.abs(_stepped(simulator, model, _SCALE * start, _SCALE * actions) - _SCALE * plain).max()
+    return bool(by_mass <= resolution), bool(by_length <= resolution)
+
+
+def _stepped(
+    simulator: Simulator,
+    model: mujoco.MjModel,
+    states: Float[np.ndarray, "rows physical"],
+    controls: Float[np.ndarray, "rows action"],
+) -> Float[np.ndarray, "rows seen"]:
+    """States after a control step of a model, with its sensors where signals read them."""
+    task, data = simulator.task, mujoco.MjData(model)
+    driven = [model.actuator(channel.actuator).id for channel in task.actions] or slice(None)
+    seen = []
+    for state, control in zip(states, controls, strict=True):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = np.split(state, [model.nq])
+        data.ctrl[driven] = control
+        mujoco.mj_step(model, data, nstep=task.frame_skip)
+        seen.append(np.concatenate([data.qpos, data.qvel, data.sensordata if task.sense else []]))
+    return np.stack(seen)

@@ -1,0 +1,203 @@
+"""What is refused of a cell before anything starts, and what tells the contents of its files apart.
+
+Each answer is kept, so that ten thousand cells of one robot and one method cost one check.
+"""
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+from madoc import robots
+from madoc.calibration import CALIBRATORS
+from madoc.errors import MadocError
+from madoc.pipeline.keys import check_seed
+from madoc.pipeline.methods import candidates_for, make_method
+from madoc.pipeline.orders import (
+    AUTO,
+    CalibrationOrder,
+    EvaluationOrder,
+    PolicyOrder,
+    RecordOrder,
+    Search,
+    Settings,
+    parse_settings,
+)
+from madoc.pipeline.refusals import check_order, check_search, method_of
+from madoc.policies import LEARNERS, require_reward
+from madoc.runs.budget import read_budget
+from madoc.runs.files import read_json
+from madoc.suites.cells import hashed
+from madoc.suites.options import Misfit
+from madoc.tasks import TASKS, Task
+
+
+@contextmanager
+def under(key: str) -> Iterator[None]:
+    """Say under which key of the file a refusal inside the block belongs."""
+    try:
+        yield
+    except Misfit:
+        raise
+    except MadocError as error:
+        raise Misfit(key, str(error)) from error
+
+
+def check_calibration(order: CalibrationOrder, *, recorded: bool) -> None:
+    """Refuse a calibration whose robot, method or numbers are; its data is only looked for.
+
+    Raises:
+        Misfit: Names the key.
+    """
+    search = order.search
+    with under("task"):
+        task = _robot(order.task, search.physics)
+    with under("parameters" if search.parameters else "level"):
+        _ranges(order.task, search.physics, search.parameters, search.level)
+    method = method_of(order)
+    with under("method"):
+        _calibrator(method, (), None)
+    with under("starts" if search.starts and not search.set else "set"):
+        _calibrator(method, search.set, search.starts)
+    with under("seed"):
+        check_seed(search.seed)
+    with under("holdout" if order.holdout is not None and not 0 < order.holdout < 1 else "budget"):
+        check_order(order)
+    if not recorded:
+        with under("data"):
+            for path in order.source.paths:
+                content_of_log(path, own=task.source is not None)
+    _check_truth(order)
+
+
+def check_policy(order: PolicyOrder, search: Search, task: str) -> None:
+    """Refuse a policy that cannot be learnt of a calibrated robot.
+
+    Raises:
+        Misfit: Names the key.
+    """
+    with under("method"):
+        entry = _learner(order.method, ())
+    with under("set"):
+        _learner(order.method, order.set)
+    with under("budget"):
+        read_budget(LEARNERS[order.method].usual_budget if order.budget is None else order.budget)
+    with under("at"):
+        if not entry and order.at != "calibrated":
+            raise MadocError(f"{order.method} does not learn at given parameters; leave out at: {order.at}")
+    with under(""):
+        require_reward(_robot(task, search.physics))
+    with under("seed"):
+        check_seed(order.seed)
+    _check_truth(order)
+
+
+def check_recording(order: RecordOrder) -> None:
+    """Refuse a recording of an unknown robot or quality, or of no rows.
+
+    Raises:
+        Misfit: Names the key.
+    """
+    from madoc.pipeline.data_stage import split_name  # reads data formats, which only recordings need
+
+    with under("name"):
+        if not split_name(order.name)[1]:
+            raise MadocError(f"expected TASK-QUALITY to record, as hopper-medium, got {order.name!r}")
+    with under("transitions"):
+        if order.transitions < 1:
+            raise MadocError(f"expected at least 1 transition, got {order.transitions}")
+    with under("seed"):
+        check_seed(order.seed)
+
+
+def check_evaluation(order: EvaluationOrder) -> None:
+    """Refuse an evaluation of no episodes.
+
+    Raises:
+        Misfit: Names the key.
+    """
+    with under("episodes"):
+        if order.episodes < 1:
+            raise MadocError(f"expected at least 1 episode, got {order.episodes}")
+    with under("seed"):
+        check_seed(order.seed)
+    _check_truth(order)
+
+
+def _check_truth(order: CalibrationOrder | PolicyOrder | EvaluationOrder) -> None:
+    """Refuse a file of true parameters that cannot be read."""
+    if order.truth is not None:
+        with under("truth"):
+            content_of_file(str(order.truth))
+
+
+@cache
+def content_of_robot(task: str) -> str:
+    """What a robot is: the name of one of Madoc's, or the content of a spec file and its model."""
+    return task if task in TASKS else hashed(dict(robots.load(task).task.source or {}))
+
+
+@cache
+def content_of_log(path: str, *, own: bool) -> str:
+    """The content of a file or folder of logs; the id itself of a Minari dataset on this machine.
+
+    Raises:
+        MadocError: There is no such log.
+    """
+    place = Path(path)
+    if place.is_dir():
+        files = sorted(file for file in place.rglob("*") if file.is_file())
+        if not files:
+            raise MadocError(f"the folder {path} holds no files; name one with logs")
+        return hashed([[str(file.relative_to(place)), content_of_file(str(file))] for file in files])
+    if place.is_file():
+        return hashed(place.name, content_of_file(path))
+    if own:
+        raise MadocError(f"there is no file or folder {path}; check the path")
+    from madoc.data.formats import recognise  # reads data formats, which only ids need
+
+    recognise(place)
+    return path
+
+
+@cache
+def content_of_file(path: str) -> str:
+    """A checksum of a file; one that should be JSON is read as such.
+
+    Raises:
+        MadocError: It cannot be read.
+    """
+    if path.endswith(".json"):
+        return hashed(read_json(Path(path)))
+    try:
+        with open(path, "rb") as stream:
+            return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+    except OSError as error:
+        raise MadocError(f"could not read {path}: {error.strerror or error}") from error
+
+
+@cache
+def _robot(task: str, physics: str | None) -> Task:
+    return robots.resolve(task, physics)
+
+
+@cache
+def _ranges(task: str, physics: str | None, parameters: tuple[str, ...], level: str) -> None:
+    check_search(Search(parameters=parameters, level=level), _robot(task, physics), Path(task).name)
+
+
+@cache
+def _calibrator(method: str, settings: Settings, starts: str | None) -> None:
+    changes = parse_settings(settings, starts=starts)
+    if method == AUTO:
+        candidates_for(changes)
+    else:
+        make_method(CALIBRATORS, method, changes)
+
+
+@cache
+def _learner(method: str, settings: Settings) -> bool:
+    """Whether a learner takes parameters to learn at."""
+    make_method(LEARNERS, method, parse_settings(settings))
+    return LEARNERS[method].needs_parameters

@@ -1,0 +1,198 @@
+"""A suite on a Ray cluster: Ray chooses the process, and the process is the worker of `madoc worker`.
+
+A cell is a task of one CPU. Where its process or its machine is lost, Ray starts the task again elsewhere, and the
+worker goes on from the cell's checkpoint. The folder of the suite has to be seen by all machines of the cluster.
+"""
+
+import logging
+import os
+import secrets
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from madoc.errors import MadocError
+from madoc.runs.interruption import interruptible
+from madoc.runs.progress import display
+from madoc.suites.cells import Cell
+from madoc.suites.claims import MOST_ATTEMPTS
+from madoc.suites.standing import Standing
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+_LOOK = 0.5
+"""Time in s between two looks at the disk."""
+_WAIT = 30.0
+"""Time in s that a task waits for a cell whose earlier process has not quite ended."""
+_OBJECT_STORE = 80 * 2**20
+"""Memory for Ray's object store in bytes: only names of cells pass through it."""
+
+
+def run_on_ray(
+    suite: Path, standing: Standing, *, workers: int | None, address: str | None, quiet: bool = False
+) -> bool:
+    """Do what is left of a suite on a Ray cluster.
+
+    Args:
+        suite: The folder of the suite, with its plan.
+        standing: How far it is.
+        workers: How many cells are done at a time, where the cluster is started for this suite.
+        address: An existing cluster; None starts one on this machine and ends it afterwards.
+        quiet: Show no progress.
+
+    Returns:
+        Whether all was done; False where it was interrupted.
+
+    Raises:
+        MadocError: Ray is not installed, or there is no cluster at the address.
+    """
+    with (
+        interruptible() as interruption,
+        _cluster(workers, address) as ray,
+        display(f"{suite.name} on Ray", unit="cells", quiet=quiet) as show,
+    ):
+        tasks = _Tasks(ray, suite.resolve())
+        while standing.runnable:
+            show(standing.moment())
+            if interruption.asked:
+                tasks.cancel()
+                standing.look()
+                return not standing.runnable
+            tasks.keep_up(standing)
+            standing.look()
+        show(standing.moment())
+    return True
+
+
+def do_cell(suite: str, name: str) -> str:
+    """One task: do a cell of a suite, in a process of the cluster.
+
+    Returns:
+        How it ended; empty where another process still holds the cell.
+    """
+    from madoc.suites.process import prepare
+
+    prepare(Path(suite))
+    from madoc.suites.worker import work  # computes numbers, on the core that was taken
+
+    until = time.monotonic() + _WAIT
+    while time.monotonic() < until:
+        done = work(Path(suite), [name])
+        if done is None:
+            return "interrupted"
+        if done:
+            return done[0].status
+        time.sleep(1.0)  # the process of an earlier attempt is about to end, or has just ended the cell
+        if (Path(suite) / "cells" / name / "outcome.json").exists():
+            return "ended"
+    return ""
+
+
+class _Tasks:
+    """The tasks of a suite that Ray has been given."""
+
+    def __init__(self, ray: "ModuleType", suite: Path) -> None:
+        self._ray, self._suite = ray, str(suite)
+        self._do = ray.remote(num_cpus=1, max_retries=MOST_ATTEMPTS)(do_cell)
+        self._given: dict[str, Any] = {}
+
+    def keep_up(self, standing: Standing) -> None:
+        """Give Ray every cell that can start, and again one whose task ended without an end of the cell."""
+        for cell in standing.runnable:
+            if cell.name not in self._given and _can_start(cell, standing):
+                self._given[cell.name] = self._do.remote(self._suite, cell.name)
+        if not self._given:
+            time.sleep(_LOOK)
+            return
+        names = {reference: name for name, reference in self._given.items()}
+        over, _ = self._ray.wait(list(names), num_returns=1, timeout=_LOOK)
+        for reference in over:
+            del self._given[names[reference]]
+            try:
+                self._ray.get(reference)
+            except self._ray.exceptions.RayTaskError as error:
+                last = str(error).strip().splitlines()[-1]
+                raise MadocError(
+                    f"the worker on the cluster ended with an error: {last}; is Madoc installed there?"
+                ) from error
+            except self._ray.exceptions.RayError:
+                continue  # its process was lost more often than Ray tries; the claim counts how often it got no further
+
+    def cancel(self) -> None:
+        """Take back every task."""
+        for reference in self._given.values():
+            self._ray.cancel(reference, force=True)
+
+
+def _can_start(cell: Cell, standing: Standing) -> bool:
+    """Whether what a cell needs is there."""
+    return cell.needs is None or cell.needs in standing.ended
+
+
+@contextmanager
+def _cluster(workers: int | None, address: str | None) -> Iterator["ModuleType"]:
+    """Ray, connected to a cluster for a block."""
+    if address is not None:
+        _look_for(address)
+    temporary = Path(tempfile.mkdtemp(prefix="madoc-ray-"))
+    # Read by Ray when it is imported and by all processes it starts. A cluster of one's own lets in only who knows its
+    # token, which stands in no file.
+    own = {
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+        "RAY_worker_niceness": "0",  # a cell is what the machine is for
+    }
+    before = {name: os.environ.get(name) for name in own}
+    if address is None:
+        os.environ.update(own)
+    try:
+        ray = _imported()
+        common: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR, "configure_logging": False}
+        if address is None:
+            common |= {
+                "num_cpus": workers or len(os.sched_getaffinity(0)),
+                "include_dashboard": False,
+                "_node_ip_address": "127.0.0.1",  # nobody outside this machine is spoken to
+                "object_store_memory": _OBJECT_STORE,
+                "_temp_dir": str(temporary),
+            }
+        try:
+            ray.init(address=address, **common)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            reason = " ".join(str(error).split())[:300]
+            raise MadocError(f"there is no Ray cluster at {address or 'this machine'}: {reason}") from error
+        try:
+            yield ray
+        finally:
+            ray.shutdown()
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _look_for(address: str) -> None:
+    """Refuse an address at which nobody listens: Ray itself would wait for a minute, and end this process."""
+    host, _, port = address.rpartition(":")
+    if host and port.isdecimal() and "/" not in host:
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=10.0).close()
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise MadocError(f"there is no Ray cluster at {address}: {reason}; start one with: ray start") from error
+
+
+def _imported() -> "ModuleType":
+    """The package ray."""
+    try:
+        import ray
+    except ImportError as error:
+        raise MadocError(f'--executor ray needs ray: pip install "madoc-calibration[ray]" ({error})') from error
+    return ray

@@ -1,0 +1,164 @@
+"""A suite file planned into cells: every order built and checked before anything starts."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from madoc.errors import nearest_hint
+from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
+from madoc.robots.document import Document
+from madoc.suites import checks
+from madoc.suites.cells import RECORDED, Cell, Kind, hashed
+from madoc.suites.grid import GRID, ROBOTS, Combination, combinations, read_suite
+from madoc.suites.options import Misfit, Order, build, keys_of, stored
+from madoc.tasks import TASKS
+
+Asked = TypeVar("Asked", RecordOrder, CalibrationOrder, PolicyOrder, EvaluationOrder)
+
+PARTS: Mapping[str, str] = {"record": "name", "learn": "method", "evaluate": "episodes"}
+"""Parts of an entry that are orders of their own, and the key that a bare value of each stands for."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A suite file, planned: its name, and its cells so that each comes after what it needs."""
+
+    name: str
+    file: Path
+    cells: tuple[Cell, ...]
+
+
+def plan_of(file: Path) -> Plan:
+    """Read a suite file, and plan all that it asks.
+
+    Raises:
+        MadocError: It has a mistake, or asks for the same thing twice; the sentence names the line.
+    """
+    suite, document = read_suite(file)
+    planner = _Planner(document, file.resolve().parent)
+    for combination in combinations(suite, document, planner.folder):
+        planner.add(combination)
+    return Plan(file.stem, file, tuple(planner.cells.values()))
+
+
+class _Planner:
+    """The cells so far, and the line at which each was asked for."""
+
+    def __init__(self, document: Document, folder: Path) -> None:
+        self.document, self.folder = document, folder
+        self.cells: dict[str, Cell] = {}
+        self._lines: dict[str, int] = {}
+
+    def add(self, asked: Combination) -> None:
+        """Add the cells of a combination: a recording, a calibration, a policy and its evaluation, as far as asked."""
+        given = dict(asked.given)
+        parts = {name: given.pop(name) for name in PARTS if name in given}
+        try:
+            last = self._calibration(given, parts.pop("record", None), asked)
+            if parts:
+                last = self._policy(parts, last, asked)
+        except Misfit as error:
+            place = asked.places.get(error.key, asked.places[""])
+            raise self.document.error(place, str(error)) from error
+        self._want(last, asked)
+
+    def _want(self, cell: Cell, asked: Combination) -> None:
+        """Note that the file asks for a cell itself; the same cell twice is refused."""
+        line = self.document.line(asked.places[""])
+        if cell.name in self._lines:
+            what = "within this entry" if self._lines[cell.name] == line else f"on line {self._lines[cell.name]}"
+            raise self.document.error(asked.places[""], f"two cells ask for exactly the same: this one and one {what}")
+        self._lines[cell.name] = line
+        self.cells[cell.name] = replace(cell, wanted=True)
+
+    def _calibration(self, given: dict[str, Any], record: object, asked: Combination) -> Cell:
+        """The calibration of a combination, and the recording that it needs."""
+        needs = None
+        if record is not None:
+            if "data" in given:
+                raise Misfit("record", "record: and data: both name the data; keep one")
+            recording = self._part(RecordOrder, "record", record, asked)
+            with self._inside("record", asked):
+                checks.check_recording(recording)
+            needs = self._put("record", recording, None, asked, stored(recording)).name
+            given |= {"data": [f"{needs}/{RECORDED}"], "task": given.get("task", recording.name.partition("-")[0])}
+        known = [*keys_of(CalibrationOrder), *PARTS, ROBOTS, GRID]
+        if unknown := next((key for key in given if key not in known), None):
+            raise Misfit(unknown, f"unknown key {unknown!r}; {nearest_hint(unknown, known)}")
+        order = build(CalibrationOrder, self._located(given, recorded=needs is not None))
+        checks.check_calibration(order, recorded=needs is not None)
+        told = stored(order) | {"task": checks.content_of_robot(order.task)}
+        own = order.task not in TASKS
+        logs = [needs] if needs else [checks.content_of_log(path, own=own) for path in order.source.paths]
+        told["source"] = {key: value for key, value in told["source"].items() if key != "paths"} | {"logs": logs}
+        return self._put("calibrate", order, needs, asked, told)
+
+    def _policy(self, parts: Mapping[str, object], calibration: Cell, asked: Combination) -> Cell:
+        """The policy of a combination, and its evaluation if that is asked for too."""
+        if "learn" not in parts:
+            raise Misfit("evaluate", "evaluate: belongs to learn:, and there is no policy to evaluate; add one")
+        calibrating = calibration.read()
+        assert isinstance(calibrating, CalibrationOrder)
+        seed = calibrating.search.seed
+        order = self._part(PolicyOrder, "learn", parts["learn"], asked, seed=seed)
+        with self._inside("learn", asked):
+            checks.check_policy(order, calibrating.search, calibrating.task)
+        policy = self._put("learn", order, calibration.name, asked, stored(order))
+        if "evaluate" not in parts:
+            return policy
+        evaluation = self._part(EvaluationOrder, "evaluate", parts["evaluate"], asked)
+        with self._inside("evaluate", asked):
+            checks.check_evaluation(evaluation)
+        return self._put("evaluate", evaluation, policy.name, asked, stored(evaluation))
+
+    def _put(self, kind: Kind, order: Order, needs: str | None, asked: Combination, told: dict[str, Any]) -> Cell:
+        """The cell of an order, the same for all combinations that ask for the same."""
+        truth = getattr(order, "truth", None)
+        if truth is not None:
+            told = told | {"truth": checks.content_of_file(str(truth))}
+        name = hashed(kind, told, needs)
+        cell = Cell(name, kind, stored(order), needs, asked.entry, asked.robot, wanted=False)
+        return self.cells.setdefault(name, cell)
+
+    def _part(self, kind: type[Asked], name: str, value: object, asked: Combination, **default: object) -> Asked:
+        """The order of a part of an entry: keys and values, or the one value that matters most."""
+        keys = dict(value) if isinstance(value, dict) else {PARTS[name]: value}
+        with self._inside(name, asked):
+            return build(kind, self._located({**default, **keys}))
+
+    @contextmanager
+    def _inside(self, name: str, asked: Combination) -> Iterator[None]:
+        """Give refusals in the block the line of their key inside a part of the entry, as `learn:`."""
+        try:
+            yield
+        except Misfit as error:
+            raise self.document.error((*asked.places[name], error.key), str(error)) from error
+
+    def _located(self, given: Mapping[str, Any], *, recorded: bool = False) -> dict[str, Any]:
+        """Values with the paths among them made absolute: they are relative to the suite file."""
+        located = dict(given)
+        if isinstance(located.get("truth"), str):
+            located["truth"] = self._absolute(located["truth"])
+        if isinstance(task := located.get("task"), str) and task not in TASKS and self._is_there(task):
+            located["task"] = self._absolute(task)
+        if not recorded and "data" in located:
+            paths = [located["data"]] if isinstance(located["data"], str) else located["data"]
+            if isinstance(paths, list):
+                located["data"] = [(isinstance(path, str) and _located(self.folder, path)) or path for path in paths]
+        return located
+
+    def _is_there(self, path: str) -> bool:
+        return _located(self.folder, path) is not None
+
+    def _absolute(self, path: str) -> str:
+        return _located(self.folder, path) or str(self.folder / path)
+
+
+@lru_cache(maxsize=100_000)
+def _located(folder: Path, path: str) -> str | None:
+    """The absolute path of a file or folder that is named relative to another; None where there is none."""
+    place = folder / Path(path).expanduser()
+    return str(place.resolve()) if place.exists() else None

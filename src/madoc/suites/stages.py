@@ -1,0 +1,71 @@
+"""One cell carried out: its order handed to the stage that every single run uses."""
+
+import traceback
+from dataclasses import replace
+from pathlib import Path
+from time import monotonic
+
+from madoc import data
+from madoc.errors import MadocError
+from madoc.pipeline import calibrate_in, evaluate_folder, learn_in, read_calibration, record_named
+from madoc.pipeline.folders import ENDED, holds_run
+from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
+from madoc.suites.cells import RECORDED
+from madoc.suites.claims import MOST_ATTEMPTS, Claim, Outcome
+
+
+def carry_out(claim: Claim, suite: Path) -> Outcome | None:
+    """Do what a cell asks, or go on with it where an earlier process was stopped.
+
+    Returns:
+        How it ended; None where it was interrupted, and the next process goes on.
+    """
+    if claim.attempts > MOST_ATTEMPTS:
+        tried = (
+            f"begun {MOST_ATTEMPTS} times and never got further; its process was ended from outside: was memory short?"
+        )
+        return claim.end("failed", tried, 0.0)
+    started = monotonic()
+    try:
+        status, sentence = _done(claim, suite)
+    except MadocError as error:
+        # A full disk or a file that is gone is no refusal: the same order may go through another time.
+        kind = "failed" if isinstance(error.__cause__, OSError) else "refused"
+        return claim.end(kind, str(error), monotonic() - started)  # type: ignore[arg-type]
+    except Exception as error:
+        (claim.folder / "failure.txt").write_text(traceback.format_exc(), encoding="utf-8")
+        sentence = f"{type(error).__name__}: {error}; see {claim.folder / 'failure.txt'}"
+        return claim.end("failed", sentence, monotonic() - started)
+    if status == "interrupted":
+        return None
+    known = status if status in ENDED else "diverged"
+    return claim.end(known, sentence, monotonic() - started)  # type: ignore[arg-type]
+
+
+def _done(claim: Claim, suite: Path) -> tuple[str, str]:
+    """Carry the order out: the status, and that in words."""
+    folder, order = claim.folder, claim.cell.read()
+    resume = holds_run(folder)
+    needed = suite / "cells" / (claim.cell.needs or "")
+    match order:
+        case RecordOrder():
+            dataset = record_named(order, quiet=True)
+            data.save(dataset, folder / RECORDED)
+            return "finished", f"{len(dataset):,} transitions are recorded"
+        case CalibrationOrder():
+            result = calibrate_in(folder, _with_recording(order, claim, suite), resume=resume, quiet=True)
+            return result.status, result.sentence
+        case PolicyOrder():
+            learnt = learn_in(folder, read_calibration(needed), order, resume=resume, quiet=True)
+            return learnt.status, learnt.sentence
+        case EvaluationOrder():
+            evaluation = evaluate_folder(needed, order, out=folder, quiet=True)
+            return "finished", f"{evaluation.episodes} episodes are evaluated"
+
+
+def _with_recording(order: CalibrationOrder, claim: Claim, suite: Path) -> CalibrationOrder:
+    """The order with the path of the data that another cell has recorded, where it takes such data."""
+    if claim.cell.needs is None:
+        return order
+    paths = tuple(str(suite.resolve() / "cells" / path) for path in order.source.paths)
+    return replace(order, source=replace(order.source, paths=paths))

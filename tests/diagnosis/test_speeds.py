@@ -1,0 +1,46 @@
+"""Positions and speeds compared: the true rate of rows, and speeds that come late."""
+
+import numpy as np
+import pytest
+from logged_arm import arm_of, write_csv
+from mujoco_log import recorded
+
+from madoc import simulation
+from madoc.data import logs
+from madoc.diagnosis.speeds import speed_findings
+
+
+@pytest.fixture
+def told(tmp_path):
+    """The findings on a log of the arm, as (where, what), and whether speeds are late."""
+
+    def run(columns):
+        robot = arm_of(tmp_path)
+        dataset = logs.read(write_csv(tmp_path / "log.csv", columns), robot)
+        found, late = speed_findings(dataset, simulation.make(robot.task, threads=1))
+        return [(finding.where, finding.what) for finding in found], late
+
+    return run
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_an_honest_log_raises_nothing(told, noise):
+    assert told(recorded(noise=noise)) == ([], False)
+
+
+@pytest.mark.parametrize(("spacing", "ratio"), [(0.0212, "1.06"), (0.019, "0.95")])
+def test_rows_farther_apart_than_their_times_say(told, spacing, ratio):
+    """Positions change by speed times the true spacing, and the time column says 0.02 s."""
+    (finding,), late = told(recorded(spacing=spacing))
+    assert finding[0] in ("shoulder", "elbow")
+    assert finding[1].startswith(f"it changes {ratio}")
+    assert not late
+
+
+def test_speeds_that_are_two_rows_late(told):
+    columns = recorded()
+    columns |= {name: np.roll(columns[name], 2) for name in ("shoulder_speed", "elbow_speed")}
+    found, late = told({name: values[2:] for name, values in columns.items()})
+    assert late
+    assert [where for where, _ in found if where.endswith("speed")] == ["shoulder_speed", "elbow_speed"]
+    assert all(what.startswith("it comes 0.0") for where, what in found if where.endswith("speed"))

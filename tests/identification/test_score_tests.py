@@ -1,0 +1,67 @@
+"""Score tests by hand."""
+
+import numpy as np
+import pytest
+
+from madoc.identification.score_tests import Products, deviate, joint_shift, parameter_shift, score
+
+EFFECT = np.array([[1.0, 1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, -1.0]])
+NOISE = 0.1 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, 1.0], [-1.0, -1.0]])
+ONES = np.ones((4, 2, 1))
+
+
+def test_a_change_and_its_error():
+    """y = -2 z + noise of ±0.1 that is orthogonal to z: the change is 2, and its error that of the noise."""
+    found = score(Products.of(-2.0 * EFFECT + NOISE, ONES, EFFECT[..., None]), 2)
+    assert found.change == pytest.approx(2.0)
+    # Without window w the change moves by z_w · e_w / (z · z - z_w · z_w) = ±0.2 / (8 - 2); times 3/4 of 4 squares.
+    assert found.error == pytest.approx(np.sqrt(3 / 4 * 4) * 0.2 / 6)
+    assert found.explained == pytest.approx(32.0 / 32.08)
+    assert found.freedom == pytest.approx(3.0)  # four windows that tell alike
+    assert found.shifts == pytest.approx([0.0])  # the effect has no part along the parameter's
+
+
+def test_a_column_that_parameters_imitate_is_none():
+    assert score(Products.of(NOISE, ONES, 3.0 * ONES), 2) is None
+
+
+def test_the_parameter_makes_room_for_the_term():
+    """The effect is twice the parameter's and some more: with a change of -1 the parameter rises by 2."""
+    effect = 2.0 * ONES + EFFECT[..., None]
+    products = Products.of(EFFECT, ONES, effect)
+    assert score(products, 2).shifts == pytest.approx([2.0])
+    changes, shift, _ = joint_shift(products, [2])
+    assert (changes[0], shift[0]) == (pytest.approx(-1.0), pytest.approx(2.0))
+
+
+def test_two_terms_hide_each_other_and_are_found_together():
+    """Of y = -(a + b) the parameter p explains all but what a and b do in opposite windows."""
+    random = np.random.default_rng(0)
+    a, b = np.zeros((40, 2, 1)), np.zeros((40, 2, 1))
+    a[:20], b[20:] = 1.0, 1.0
+    a, b = a * random.uniform(0.5, 1.5, (40, 1, 1)), b * random.uniform(0.5, 1.5, (40, 1, 1))
+    p = (np.where(a + b > 0, 1.0, 0.0)).reshape(40, 2, 1)
+    y = -(a + b)[..., 0] + 0.01 * random.standard_normal((40, 2))
+    products = Products.of(y, p, np.concatenate([a, b], axis=-1))
+    assert abs(score(products, 2).change - 1.0) > 0.2
+    assert score(products, 2, [3]).change == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_window_with_a_magnified_effect_has_bounded_influence():
+    effect = np.ones((9, 1, 1)) * np.array([1.0, -1.0] * 4 + [1000.0]).reshape(9, 1, 1)
+    products = Products.of(np.zeros((9, 1)), np.ones((9, 1, 1)), effect)
+    assert products.bounded([2])[8, 2, 2] == pytest.approx(9.0)
+    assert products.bounded([1])[8, 2, 2] == pytest.approx(1e6)
+
+
+def test_the_step_to_the_minimum():
+    step, covariance = parameter_shift(Products.of(0.5 + NOISE, ONES, np.zeros((4, 2, 0))))
+    assert step == pytest.approx([-0.5])
+    assert covariance[0, 0] == pytest.approx(3 / 4 * 4 * (0.2 / 6) ** 2)
+
+
+def test_a_ratio_counts_less_with_few_degrees_of_freedom():
+    """The quantile of 97.5 % of Student's t is 12.7 with one degree of freedom, and 1.96 with many."""
+    assert deviate(12.706, 1.0) == pytest.approx(1.96, abs=1e-3)
+    assert deviate(-12.706, 1.0) == pytest.approx(-1.96, abs=1e-3)
+    assert deviate(1.96, 1e6) == pytest.approx(1.96, abs=1e-3)

@@ -1,0 +1,70 @@
+"""A mistake in a suite file is one sentence with its line, and nothing is started."""
+
+import pytest
+from suite_files import CELL
+
+from madoc.commands.main import main
+
+GRID = CELL + "    grid:\n"
+
+
+def changed(old, new):
+    assert old in CELL
+    return CELL.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "sentence"),
+    [
+        (changed("least-squares", "least-square"), 5, "did you mean least-squares?"),
+        (changed("log.npz", "logs.npz"), 4, "there is no file or folder"),
+        (CELL + CELL, 8, "two cells ask for exactly the same: this one and one on line 3"),
+        (GRID + "      seed: 0..\n", 9, "the range 0.. of seed has no end; write both, as 0..4"),
+        (changed("spring.yaml", "sping.yaml"), 3, "expected the spec file of a robot"),
+        (changed("budget: 400", "budget: many"), 6, "expected a budget such as 300000, 300s, 15min or 2h, got 'many'"),
+        (changed("budget: 400", "seed: two"), 6, "expected a whole number in seed, got 'two'"),
+        (changed("budget: 400", "budget: 0"), 6, "at least 1 control step, got 0"),
+        (changed("budget", "budgt"), 6, "unknown key 'budgt'; nearest: budget"),
+        (changed("windows", "windws"), 7, "did you mean windows?"),
+        (CELL + "    parameters: [body_mass.cat]\n", 8, "unknown parameter of spring.yaml 'body_mass.cat'"),
+        (GRID + "      seed: []\n", 9, "at least one value for seed, got an empty list"),
+        (GRID + "      seed: 3..1\n", 9, "ends before it begins"),
+        (GRID + "      budget: [400, 500]\n", 9, "budget is given here and again outside of grid"),
+        (GRID + "      holdout: [0.2, 1.5]\n", 9, "share of the rows to hold out between 0 and 1, got 1.5"),
+        (CELL + "    truth: truth.json\n", 8, "could not read"),
+        (CELL + "    learn: {method: sca}\n", 8, "unknown method 'sca'"),
+        (CELL + "    learn: {method: bc}\n", 8, "reward"),
+        (CELL + "    evaluate: 3\n", 8, "evaluate: belongs to learn:"),
+        (CELL + "    robots: [log.npz, other.npz]\n", 8, "robots: and data: both name logs"),
+        (CELL.replace("    data: log.npz\n", "    robots: arm-*\n"), 4, "there is no file or folder arm-*"),
+        ("  - {record: hopper-mdium}\n", 3, "did you mean medium?"),
+        ("madoc: 1\ncells: []\n", 2, "at least 1 item"),
+        ("madoc: 2\ncells: []\n", 1, "expected 1 in madoc, got 2"),
+        ("madoc: 1\ncells: *all\n", 2, "anchors and aliases"),
+        ("", None, "suite.yaml is empty"),
+    ],
+)
+def test_a_mistake_is_one_sentence_with_its_line(suite, place, capsys, text, line, sentence):
+    assert main(["suite", str(suite(text)), "--out", str(place / "out")]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("madoc: suite.yaml" if line is None else f"madoc: suite.yaml, line {line}: ")
+    assert sentence in err
+    assert not (place / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ("--workers -1", "at least 1 worker"),
+        ("--workers 0 --executor ray", "at least 1 worker"),
+        ("--address auto", "add --executor ray"),
+        ("--dry-run --report", "choose one"),
+        ("--parquet", "add --report"),
+    ],
+)
+def test_options_that_do_not_go_together(suite, place, capsys, options, sentence):
+    assert main(["suite", str(suite(CELL)), "--out", str(place / "out"), *options.split()]) == 2
+    assert sentence in capsys.readouterr().err
+    assert not (place / "out").exists()

@@ -1,0 +1,120 @@
+import json
+import threading
+from dataclasses import replace
+
+import pytest
+from suite_files import CELL
+
+from madoc.suites import stages
+from madoc.suites.cells import write_plan
+from madoc.suites.claims import MOST_ATTEMPTS, claimed, outcome_of, try_again
+from madoc.suites.planning import plan_of
+from madoc.suites.standing import Standing
+from madoc.suites.worker import work
+
+
+@pytest.fixture
+def planned(suite, place):
+    """A function that plans a suite in the folder `out`: that folder, and the cells."""
+
+    def plan(text):
+        cells = plan_of(suite(text)).cells
+        write_plan(place / "out", "suite", cells)
+        return place / "out", cells
+
+    return plan
+
+
+def test_a_worker_does_every_cell_once(planned):
+    out, cells = planned(CELL + "    grid: {seed: 0..1}\n")
+    assert [outcome.status for outcome in work(out)] == ["finished", "finished"]
+    assert work(out) == []
+    for cell, fresh in zip(cells, (True, False), strict=True):
+        assert outcome_of(cell, out).fresh is fresh
+        assert json.loads((cell.folder(out) / "result.json").read_text())["seed"] == cell.read().search.seed
+
+
+def test_a_refusal_is_kept_with_its_sentence_and_others_go_on(planned):
+    out, (refused, done) = planned(CELL + "    grid: {velocities: [differences, logged]}\n")
+    assert [outcome.status for outcome in work(out)] == ["refused", "finished"]
+    assert "velocities" in outcome_of(refused, out).sentence
+    assert outcome_of(done, out).usable
+
+
+def test_only_one_of_two_claims_gets_a_cell(planned):
+    out, (cell,) = planned(CELL)
+    with claimed(cell, out) as first, claimed(cell, out) as second:
+        assert first is not None
+        assert second is None
+    with claimed(cell, out) as later:
+        assert later.attempts == 2  # it was begun before, and got nowhere
+
+
+def test_two_workers_that_race_for_every_cell_do_each_once(planned, monkeypatch):
+    out, cells = planned(CELL + "    grid: {seed: 0..199}\n")
+    barrier, done = threading.Barrier(2), []
+
+    def quick(claim, suite):
+        done.append(claim.cell.name)
+        return claim.end("finished", "done", 0.0)
+
+    def race():
+        barrier.wait()
+        work(out)
+
+    monkeypatch.setattr("madoc.suites.worker.carry_out", quick)
+    threads = [threading.Thread(target=race) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(done) == sorted(cell.name for cell in cells)
+
+
+def test_a_cell_that_never_gets_further_fails_in_the_end(planned, monkeypatch):
+    out, (cell,) = planned(CELL)
+    for _ in range(MOST_ATTEMPTS):
+        with claimed(cell, out) as claim:
+            assert claim is not None  # and its process ends without a word
+    assert [outcome.status for outcome in work(out)] == ["failed"]
+    assert try_again(cell, out)
+    assert [outcome.status for outcome in work(out)] == ["finished"]
+    assert not try_again(cell, out)
+
+
+def test_a_cell_that_ends_its_processes_comes_after_the_others(planned):
+    out, (first, second) = planned(CELL + "    grid: {seed: 0..1}\n")
+    for _ in range(3):
+        with claimed(first, out) as claim:
+            assert claim is not None
+    work(out)
+    assert outcome_of(second, out).fresh
+    assert (outcome_of(first, out).fresh, outcome_of(first, out).attempts) == (False, 4)
+
+
+def test_an_error_that_is_no_refusal_is_told_and_stops_nobody(planned, monkeypatch):
+    out, cells = planned(CELL + "    grid: {seed: 0..1}\n")
+    whole = stages.calibrate_in
+
+    def broken(folder, order, **options):
+        if order.search.seed == 0:
+            raise ZeroDivisionError("division by zero")
+        return whole(folder, order, **options)
+
+    monkeypatch.setattr(stages, "calibrate_in", broken)
+    assert [outcome.status for outcome in work(out)] == ["failed", "finished"]
+    assert "ZeroDivisionError: division by zero" in outcome_of(cells[0], out).sentence
+    assert "Traceback" in (cells[0].folder(out) / "failure.txt").read_text()
+
+
+def test_blocked_cells_wait_and_vain_ones_are_left(planned):
+    out, (cell,) = planned(CELL)
+    needing = replace(cell, name="needing", kind="learn", order={"method": "bc"}, needs=cell.name)
+    last = replace(needing, name="last", needs="needing")
+    write_plan(out, "suite", (cell, needing, last))
+    with claimed(cell, out) as claim:
+        claim.end("refused", "no", 0.0)
+    standing = Standing(out, (cell, needing, last), workers=1)
+    assert standing.runnable == []
+    assert standing.counts == {"refused": 1, "not run": 2}
+    assert work(out) == []

@@ -1,0 +1,55 @@
+"""The measured tables of the README and of the documentation say what the committed results say."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import paper
+import readme
+import tables
+
+STALE = "stale: run make figures"
+
+
+def test_the_readme_says_what_was_measured():
+    text = readme.README.read_text()
+    assert text.count("<!-- measured: ") == 2
+    assert readme.rewritten(text, tables.calibrations(), tables.learnt()) == text, STALE
+
+
+def test_the_tables_say_what_was_measured():
+    assert tables.measured() == (tables.RESULTS / "README.md").read_text(), STALE
+
+
+@pytest.mark.slow
+def test_the_papers_tables_say_what_was_measured():
+    assert paper.tables() == (tables.RESULTS / "paper.md").read_text(), STALE
+
+
+def test_another_result_is_another_table():
+    rows = tables.calibrations()
+    changed = [row | {"error": {"mean_absolute": 9.0}} if "error" in row else row for row in rows]
+    assert readme.errors(changed) != readme.errors(rows)
+
+
+def test_a_cell_shows_seeds_refusals_what_was_not_run_and_what_is_printed():
+    def cell(*values, refused=False):
+        return [paper.Score("row", "column", value, refused) for value in values]
+
+    assert paper._shown(cell(1.0, 2.0, 6.0), (0.06, 0.01)) == "3 [0.06 ± 0.01]"  # a quarter of 3 is nobody: the mean
+    assert paper._shown(cell(2.0, None), None) == "2 (1 of 2 seeds)"
+    assert paper._shown(cell(None, None), (1.5, 0.25)) == "not run [1.5 ± 0.25]"
+    assert paper._shown(cell(None, None, refused=True), None) == "refuses"
+
+
+def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
+    assert paper.interquartile_mean(np.array([1.0, 2, 3, 4]), np.array([5.0, 6, 7, 100])) == pytest.approx(4.5)
+
+
+def test_resampling_stays_within_tasks():
+    """Tasks without spread of their own leave no doubt, however far apart they are."""
+    low, high = paper.stratified_interval([[1.0, 1.0], [50.0, 50.0], [100.0, 100.0]])
+    assert low == high == pytest.approx(50.25)  # of six values one at each end is left out

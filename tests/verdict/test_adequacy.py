@@ -1,0 +1,80 @@
+"""Intervals that cover what the log does not exclude, and the term that is named, from numbers chosen by hand."""
+
+import numpy as np
+import pytest
+
+from madoc.calibration.holdout import AgainstChance, Area, ToldApart
+from madoc.calibration.result import CalibrationResult, ParameterEstimate
+from madoc.identification.candidate_terms import INTEGRATION
+from madoc.identification.combinations import Combination
+from madoc.identification.missing_terms import DRIFT, Alternative, MissingTerm
+from madoc.verdict.adequacy import as_likely, missing_term, numerical, widening, with_widened_intervals
+
+BEYOND = Alternative(("a spring",), True, {"mass": 3.0, "damping": -0.5}, {"mass": 0.0, "damping": 2.4})
+
+
+def term(cause="friction", t=8.0, shift=2.0, explained=0.1, parameter="dof_frictionloss.hip"):
+    return MissingTerm(cause, parameter, 1.0, 1.0 / abs(t), "N·m", explained, t, {"mass": shift})
+
+
+def held(*terms, alternatives=()):
+    area = Area(0.5, (0.4, 0.6), 400)
+    chance = (AgainstChance("the simulator", 0.9, 0.002),)
+    return ToldApart(
+        **{"split": "", "rows": 400, "episodes": 1, "estimate": {}, "interval_shares": {}, "against_chance": chance},
+        **{"noise": {}, "control_steps": 0, "area_at_mid_range": area, "area_at_estimate": area},
+        missing_terms=terms,
+        alternatives=alternatives,
+    )
+
+
+def test_each_end_moves_out_to_the_alternatives_own_interval():
+    # 3 ± 1 moves the high end of ±1 by 3; -0.5 ± √(1 + 2.4²) = -0.5 ± 2.6 moves the ends by 2.1 and 1.1.
+    assert widening((BEYOND,), ("mass", "damping", "gain")) == pytest.approx(
+        np.array([[0.0, 3.0], [2.1, 1.1], [0.0, 0.0]])
+    )
+
+
+def test_intervals_and_combinations_cover_the_alternatives():
+    rows = {
+        "mass": ParameterEstimate(1.0, 0.05, 0.0, 1.25, "kg", [0.9, 1.1]),
+        "damping": ParameterEstimate(0.5, 0.1, 0.0, 2.0, "N·s/m", [0.4, 0.6]),
+    }
+    both = Combination("mass + 2·damping", {"mass": 1.0, "damping": 2.0}, "sum", 2.0, (1.9, 2.1), "kg")
+    result = CalibrationResult("m", "t", "finished", "", 0, 0.0, 0, [], rows, combinations=[both])
+    wide = with_widened_intervals(result, held(alternatives=(BEYOND,)))
+    assert wide.parameters["mass"].interval == pytest.approx([0.9, 1.25])  # 1.4, but for the end of its range
+    assert wide.parameters["damping"].interval == pytest.approx([0.19, 0.71])
+    # The sum moves by 0.1 · 3 - 2 · 0.1 · 0.5 = 0.2, known to 2 · 0.1 · 2.4 = 0.48.
+    assert wide.combinations[0].interval[1] == pytest.approx(2.2 + np.hypot(0.1, 0.48))
+    assert wide.warnings == ["intervals were widened to cover what the data does not exclude: a spring"]
+
+
+def test_the_term_that_explains_most_is_named_among_those_as_significant():
+    friction, spring = term(explained=0.2), term("a spring", t=9.0, explained=0.05, parameter="jnt_stiffness.hip")
+    assert missing_term(held(spring, friction)) is friction
+    assert missing_term(held(term("a spring", t=30.0, explained=0.05), friction)).cause == "a spring"
+
+
+def test_what_is_uncertain_or_moves_nothing_is_not_missing():
+    assert missing_term(held(term(t=4.9))) is None
+    assert missing_term(held(term(DRIFT, t=5.5))) is None
+    assert missing_term(held(term(shift=0.4))) is None
+
+
+def test_certain_terms_that_move_the_estimate_only_together_are_missing():
+    alone = term(shift=0.1)
+    assert missing_term(held(alone, alternatives=(BEYOND,))) is alone
+
+
+def test_beside_a_coarse_integration_step_nothing_else_is_named():
+    coarse = term(INTEGRATION, t=20.0, explained=0.4, parameter="")
+    assert numerical(held(coarse)) is coarse
+    assert missing_term(held(coarse, term())) is None
+    assert numerical(held(term(INTEGRATION, t=20.0, explained=0.2))) is None
+
+
+def test_terms_that_explain_nearly_as_much_are_as_likely():
+    friction, gain = term(explained=0.5), term("another gain", explained=0.45)
+    assert as_likely(held(friction, gain, term("a spring", explained=0.3)), friction) == [gain]
+    assert as_likely(held(friction, term("another gain", t=4.0, explained=0.5)), friction) == []
