@@ -18,9 +18,10 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def main() -> None:
-    (RESULTS / "README.md").write_text(measured())
+    text = measured()
+    (RESULTS / "README.md").write_text(text)
     readme.README.write_text(readme.rewritten(readme.README.read_text(), calibrations(), learnt()))
-    print(measured())
+    print(text)
 
 
 def measured() -> str:

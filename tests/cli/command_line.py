@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from madoc.commands.answer import EXIT_CODES
 from madoc.commands.main import main
 
 SOURCE = Path(__file__).parents[2] / "src"
@@ -30,8 +31,8 @@ WHOLE = [
     *("--policy-set", *FAST_LEARNER),
 ]
 
-JUDGED = (0, 10, 11, 12)
-"""Exit codes of a calibration that ended, by its verdict."""
+WHOLE_CODE = EXIT_CODES["NO_IMPROVEMENT"]
+"""Exit code of that run: 2,000 control steps of `madoc-s` are too few."""
 
 
 def arguments(line, **paths):

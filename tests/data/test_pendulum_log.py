@@ -62,4 +62,4 @@ def test_a_real_pendulum(tmp_path):
     assert (errors[-1] < 0.6).all()  # 0.4 s ahead
     assert np.isfinite(found.excitation.half_width).all()
     mass = found.excitation.half_width[0]
-    assert 0.0 < mass < 0.25
+    assert 0.0 < mass < 0.1

@@ -25,7 +25,7 @@ from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.simulation.response import mass_like
 
-WINDOWS = {5: 200, 20: 60}
+WINDOWS = {3: 300, 20: 60}
 """Largest number of windows, by their length in strides (`data.timescale`). Long ones narrow the intervals where
 sensors are noisy, short ones where the robot is chaotic."""
 ROUNDS = 3

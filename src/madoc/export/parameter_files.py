@@ -4,16 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from scipy.stats import norm
-
 from madoc.calibration.result import ParameterEstimate
+from madoc.identification.information import NORMAL_95
 from madoc.parameters import FIELDS, Parameter
 from madoc.robots.document import yaml_text
 from madoc.runs.files import replacing
 from madoc.simulation.mjcf import Change
-
-NORMAL_95 = float(norm.ppf(0.975))
-"""Half of the interval that holds 95 % of a normal distribution, in standard deviations."""
 
 
 @dataclass(frozen=True)

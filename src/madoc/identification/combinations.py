@@ -6,10 +6,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import qr
 
+from madoc.identification.information import NORMAL_95, OPEN
 from madoc.parameters import ParameterSpace
 
-OPEN = 0.5
-"""Half of a parameter's 95 % interval in [-1, 1] of its range; from it on the parameter counts as open."""
 TOLD = 0.25
 """Half of a combination's 95 % interval in [-1, 1]; below it the combination counts as told."""
 SPARSE = 1.5
@@ -20,7 +19,6 @@ WHOLE = 0.15
 """Distance of an exponent from a whole number, below which parameters combine as a product."""
 LARGEST_POWER = 3
 """Largest exponent of a product."""
-_NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -57,9 +55,9 @@ def combinations(
     """
     half = (space.high - space.low) / 2.0
     scaled = covariance / half[:, None] / half
-    is_open = np.flatnonzero(_NORMAL_95 * np.sqrt(np.diag(scaled)) >= OPEN)
+    is_open = np.flatnonzero(NORMAL_95 * np.sqrt(np.diag(scaled)) >= OPEN)
     values, vectors = np.linalg.eigh(scaled[np.ix_(is_open, is_open)])
-    told = vectors[:, _NORMAL_95 * np.sqrt(np.maximum(values, 0.0)) < TOLD].T
+    told = vectors[:, NORMAL_95 * np.sqrt(np.maximum(values, 0.0)) < TOLD].T
     if not len(told):
         return ()
     _, factor, order = qr(told, mode="economic", pivoting=True)
@@ -110,7 +108,7 @@ def _sum(
         parameters={space.names[index]: float(factors[index]) for index in (first, *others)},
         kind="sum",
         estimate=value,
-        interval=(value - _NORMAL_95 * error, value + _NORMAL_95 * error),
+        interval=(value - NORMAL_95 * error, value + NORMAL_95 * error),
         unit=space.parameters[first].unit,
     )
 
@@ -143,7 +141,7 @@ def _product(
     exact = max(_error(weights, scaled), EXACT) / np.abs(weights).max() * np.abs(gradient).max()
     if error > SPARSE * exact:
         return None
-    low, high = value * np.exp(-_NORMAL_95 * error), value * np.exp(_NORMAL_95 * error)
+    low, high = value * np.exp(-NORMAL_95 * error), value * np.exp(NORMAL_95 * error)
     return Combination(
         name=_powers([space.names[index] for index in involved], whole),
         parameters={space.names[index]: float(power) for index, power in zip(involved, whole, strict=True)},

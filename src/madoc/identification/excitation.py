@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from madoc.data.dataset import Dataset, spread_of
 from madoc.identification.gauss_newton import eliminate
-from madoc.identification.information import BOX_VARIANCE, CONFIDENCE
+from madoc.identification.information import BOX_VARIANCE, NORMAL_95
 from madoc.identification.linearisation import difference_points, linearise
 from madoc.identification.replay import Readings, slopes_at, window_residuals
 from madoc.identification.states import LoggedStates, probing_windows
@@ -62,10 +62,7 @@ def expected_half_widths(
         share = len(dataset) / windows.steps / max(1, int(around.whole.sum()))
     flat = slopes.reshape(-1, len(point))
     information = flat.T @ flat * share + np.eye(len(point)) / BOX_VARIANCE
-    from scipy.stats import norm  # slow to import, and only checks need it
-
-    quantile = norm.ppf(0.5 + CONFIDENCE / 2.0)
-    return quantile * np.sqrt(np.diag(widened(np.linalg.inv(information)))), spent
+    return NORMAL_95 * np.sqrt(np.diag(widened(np.linalg.inv(information)))), spent
 
 
 def widened(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:

@@ -10,6 +10,10 @@ from madoc.identification.losses import Loss, loss_curvature, loss_slope
 
 CONFIDENCE = 0.95
 """Level of confidence intervals, in (0, 1)."""
+NORMAL_95 = 1.959963984540054
+"""Half of a 95 % interval in standard errors of a normal estimate."""
+OPEN = 0.5
+"""Share in [0, 1] of its range that a parameter's 95 % interval covers; from it on the parameter counts as open."""
 SETTLED = 0.1
 """Ratio in [0, 1] of a step to the standard error; a smaller step is not worth a simulation."""
 BOX_VARIANCE = 1.0 / 3.0

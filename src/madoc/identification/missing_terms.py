@@ -22,6 +22,7 @@ from madoc.identification.fitted_windows import (
     windows_of,
     with_fitted_states,
 )
+from madoc.identification.information import NORMAL_95
 from madoc.identification.replay import Readings
 from madoc.identification.score_tests import Products, Score, deviate, joint_shift, parameter_shift, score
 from madoc.identification.states import LoggedStates
@@ -40,8 +41,6 @@ MOST_FITTED = 2
 """Largest number of terms that are fitted together with the parameters."""
 DRIFT = "a value that changes over the log"
 OTHER_WINDOWS = "windows of another length, which give another estimate"
-_NORMAL_95 = 1.96
-"""Half of a 95 % interval in standard errors of a normal estimate."""
 _FEWEST = 12
 """Fewest windows beyond the number of parameters for which a standard error is worth anything."""
 
@@ -254,7 +253,7 @@ def _with_terms(tests: _Tests, chosen: list[int]) -> Alternative:
     windows.
     """
     _, shift, covariance = joint_shift(tests.products, [1 + tests.products.count + index for index in chosen])
-    error = _NORMAL_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    error = NORMAL_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     for index in chosen:
         if tests.tried[index].cause == INTEGRATION:
             alone = tests.score(index)
@@ -297,7 +296,7 @@ def _fitted(
     step, covariance = parameter_shift(products)
     at, error = at + step, np.sqrt(np.maximum(np.diag(covariance), 0.0))
     alone = np.sqrt(np.maximum(np.diag(parameter_shift(tests.products)[1]), 0.0))
-    beyond = _NORMAL_95 * np.sqrt(np.maximum(error[: len(led)] ** 2 - alone**2, 0.0))
+    beyond = NORMAL_95 * np.sqrt(np.maximum(error[: len(led)] ** 2 - alone**2, 0.0))
     shifts, physical = tests.by_name(at[: len(led)] - point), space.to_physical(at)
     terms = {}
     for place, (candidate, parameter, _) in enumerate(possible, start=len(led)):
@@ -316,7 +315,7 @@ def _of_parts(drifts: Iterator[MissingTerm]) -> Iterator[Alternative]:
     for term in drifts:
         if abs(term.t) >= DISAGREEING:
             shift = term.shifts[term.parameter]
-            errors = {term.parameter: abs(_NORMAL_95 * shift / term.t)}
+            errors = {term.parameter: abs(NORMAL_95 * shift / term.t)}
             for side in (-shift, shift):
                 yield Alternative((f"{term.parameter} changing over the log",), False, {term.parameter: side}, errors)
 
@@ -327,10 +326,10 @@ def _of_other_windows(tests: _Tests, led: Float[np.ndarray, " d"]) -> Iterator[A
     shifts = tests.by_name(led + step)
     errors = tests.by_name(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     apart = [
-        name for name, shift in shifts.items() if abs(shift) > DISAGREEING * np.hypot(errors[name], 1.0 / _NORMAL_95)
+        name for name, shift in shifts.items() if abs(shift) > DISAGREEING * np.hypot(errors[name], 1.0 / NORMAL_95)
     ]
     if apart:
-        beyond = {name: _NORMAL_95 * errors[name] for name in apart}
+        beyond = {name: NORMAL_95 * errors[name] for name in apart}
         yield Alternative((OTHER_WINDOWS,), False, {name: shifts[name] for name in apart}, beyond)
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from madoc.calibration import CalibrationResult
 from madoc.errors import MadocError
+from madoc.identification.information import NORMAL_95
 from madoc.parameters import Parameter, ParameterSpace
 from madoc.pipeline.data_stage import Machine
 from madoc.pipeline.folders import ENDED
@@ -16,9 +17,6 @@ from madoc.policies import NormalParameters
 from madoc.report.records import SpecRecord, read_spec, restored_path
 from madoc.runs.files import read_json
 from madoc.tasks import Task
-
-NORMAL_95 = 1.96
-"""Half-width of a normal distribution's 95 % interval in standard deviations."""
 
 
 @dataclass(frozen=True)

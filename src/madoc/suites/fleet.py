@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy import stats
 
 from madoc.calibration.result import ParameterEstimate
+from madoc.identification.information import NORMAL_95
 from madoc.suites.cells import KINDS
 from madoc.suites.options import flat
-from madoc.suites.random_effects import CONFIDENCE, Common, common, outliers
+from madoc.suites.random_effects import Common, common, outliers
 from madoc.suites.results import Result
 
 _FEWEST = 2
@@ -117,7 +117,7 @@ def _standard_error(row: ParameterEstimate) -> float:
     low, high = row.interval
     half = (high - low) / 2.0
     smallest = np.finfo(np.float64).eps * max(abs(low), abs(high), 1e-12)
-    return float(max(half, smallest) / stats.norm.ppf((1 + CONFIDENCE) / 2))
+    return float(max(half, smallest) / NORMAL_95)
 
 
 def ranges(fleet: Fleet) -> dict[str, tuple[float, float]]:

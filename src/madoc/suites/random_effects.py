@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy import optimize, stats
 
-CONFIDENCE = 0.95
-"""Of all intervals."""
+from madoc.identification.information import CONFIDENCE
+
 SIGNIFICANCE = 0.05
 """Largest probability, over all robots together, of calling one an outlier that is none."""
 FEWEST = 3

@@ -21,7 +21,6 @@ NUMERICAL = 0.3
 """Share of squared residuals explained by the integration step; above it they are no mismatch of the model."""
 AS_SIGNIFICANT = 0.6
 """|t| over that of the most significant term; among terms above it the one that explains most is named."""
-
 NEARLY = 0.8
 """Share explained by a term over that of the one named; terms above it are as likely."""
 

@@ -17,6 +17,7 @@ from madoc.calibration.holdout import (
 )
 from madoc.identification.candidate_terms import SATURATION, SPACING
 from madoc.identification.combinations import Combination
+from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import DRIFT, MissingTerm
 from madoc.verdict.adequacy import as_likely, missing_term, numerical
 from madoc.verdict.bench import AT_END
@@ -51,8 +52,6 @@ WHITE = 0.2
 """Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
 PERSISTENT = 0.1
 """Correlation in [-1, 1] of residuals with those a few rows later, above which a force is missing that lasts."""
-OPEN = 0.5
-"""Share in [0, 1] of its range that a parameter's 95 % interval covers; from it on the parameter counts as open."""
 GAINED = 0.75
 """Share in [0, 1] of the possible gain over mid-range on the hold-out; with less, an estimate is no improvement."""
 WORTH_GAINING = 0.05

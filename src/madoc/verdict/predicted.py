@@ -31,6 +31,8 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
     single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
     systems = {"the simulator at mid-range": mid_range, "the simulator at the best parameters nearby": points[best]}
+    lasting, rows = _persistence(bench, points[best])
+    spent = single.control_steps + rows
     area_at_mid_range, area_at_estimate = (
         classify(*replayed(replays, bench.scaling, part, noisy[0]), overlap=False) for part in residuals[:2]
     )
@@ -49,7 +51,7 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         ),
         explained=max(single.explained, explained_at_end(start_and_actions, residuals[best])),
         autocorrelation=single.autocorrelation,
-        persistence=_persistence(bench, points[best]),
+        persistence=lasting,
         area_at_mid_range=area_at_mid_range,
         area_at_estimate=area_at_estimate,
     )
@@ -62,7 +64,7 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         residual=single.size,
         by_model=tuple(bench.against_chance(name, _simulated(bench, system)) for name, system in systems.items()),
         noise=single.noise,
-        control_steps=searching + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps,
+        control_steps=searching + residuals[..., 0].size + noisy[..., 0].size * 2 + spent,
     )
 
 
@@ -106,14 +108,14 @@ def _single_steps(bench: Bench, point: Float[np.ndarray, " d"]) -> _SingleSteps:
     return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise, spent)
 
 
-def _persistence(bench: Bench, point: Float[np.ndarray, " d"]) -> float:
-    """How residuals of single steps last, over the first rows of the hold-out whose states can be rebuilt."""
+def _persistence(bench: Bench, point: Float[np.ndarray, " d"]) -> tuple[float, int]:
+    """How residuals of single steps last, over the first rows whose states can be rebuilt, and their number."""
     held = bench.held_out
     rows = logged_states(held, bench.simulator.task)[1][:MOST_ROWS]
     followed = np.asarray(held.transitions.next_observation)[rows]
     residuals = sensors.clipped((_simulated(bench, point, rows) - followed) / bench.change)
     follows = np.concatenate([[False], (np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts)])
-    return persistence(residuals, follows)
+    return persistence(residuals, follows), len(rows)
 
 
 def _simulated(

@@ -6,14 +6,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.holdout import PredictionError, PredictionErrors
+from madoc.identification.information import CONFIDENCE
 
 NEGLIGIBLE = 1e-3
 """Residual in typical changes of a signal in one step; no sensor is more precise, so smaller ones count as none."""
 RESAMPLES = 500
 """Number of bootstrap samples. The ends of a 95 % interval then vary by about a tenth of its width (Efron and
 Tibshirani 1993, section 13.3)."""
-CONFIDENCE = 0.95
-"""Level of confidence intervals, in (0, 1)."""
 FEWEST_EPISODES = 5
 """Smallest number of episodes that are resampled whole; with fewer, single windows are resampled."""
 SHUFFLES = 499

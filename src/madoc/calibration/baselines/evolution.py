@@ -5,11 +5,14 @@ of the arrays in every generation, so that a resumed search is the same search.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
+
+if TYPE_CHECKING:
+    from cmaes import CMA
 
 FIRST_DEVIATION = 0.5
 """Deviation of the first candidates, in [-1, 1]: a quarter of each range."""
@@ -94,7 +97,7 @@ def settled(evolution: Evolution, tolerance: float) -> str | None:
     return f"after {evolution.generation} generations every deviation is below {tolerance:g} of its range"
 
 
-def _optimiser(evolution: Evolution, population: int, seed: int = 0) -> Any:
+def _optimiser(evolution: Evolution, population: int, seed: int = 0) -> "CMA":
     """The library's optimiser in this state. It has no public way to set the last three attributes."""
     from cmaes import CMA  # slow to import, and only methods that search by it need it
 
