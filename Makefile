@@ -24,10 +24,10 @@ demo: $(RUNS)  ## the main job on an arm with an unknown load: logs, calibration
 	@echo "The paper's robots:                $(BIN)/madoc run hopper-medium --policy-budget 300s"
 
 test: $(TESTS)  ## every test that takes seconds
-	$(BIN)/python -m pytest -n 2 -rs
+	$(BIN)/python -m pytest -n 2 --dist worksteal -rs
 
 test-slow: $(TESTS)  ## the others
-	$(BIN)/python -m pytest -n 2 -m slow
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
 check: $(TESTS)  ## format, lint, types, layers
 	$(BIN)/ruff format --check src tests benchmarks examples docs/hooks.py
