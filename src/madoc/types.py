@@ -55,6 +55,11 @@ class Transitions:
         return jax.tree.map(lambda column: column[rows], self)
 
 
+def generator(key: PRNGKeyArray) -> np.random.Generator:
+    """NumPy's generator with a JAX key as its seed, for draws whose shapes vary: JAX compiles anew for each shape."""
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)))
+
+
 @runtime_checkable
 class Policy(Protocol):
     """A map from observations to actions in [-1, 1]: sampled with a key, deterministic without one."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from madoc.identification.combinations import combinations
+from madoc.identification.information import NORMAL_95
 from madoc.parameters import Parameter, ParameterSpace
 
 BOX = 1.0 / 3.0
@@ -30,7 +31,7 @@ def test_a_geared_joint_tells_the_sum_of_its_inertias():
     by_joint = 1.0 / found.parameters["joint"]
     assert found.estimate * by_joint == pytest.approx(0.36 + 36 * 0.01)
     # One direction of [-1, 1] is (1, 1) / √2: the sum of both has √2 times its error, in halves of 0.36.
-    assert (found.interval[1] - found.estimate) * by_joint == pytest.approx(1.96 * 0.01 * np.sqrt(2) * 0.36)
+    assert (found.interval[1] - found.estimate) * by_joint == pytest.approx(NORMAL_95 * 0.01 * np.sqrt(2) * 0.36)
 
 
 def test_a_mass_on_a_rod_tells_their_product():
@@ -40,7 +41,7 @@ def test_a_mass_on_a_rod_tells_their_product():
     assert (found.name, found.kind, found.unit) == ("mass·length", "product", "kg·m")
     assert found.estimate == pytest.approx(0.5)
     # The error of ln(ml) is 0.5 · √2 · 0.02.
-    assert found.interval[1] == pytest.approx(0.5 * np.exp(1.96 * 0.5 * np.sqrt(2) * 0.02))
+    assert found.interval[1] == pytest.approx(0.5 * np.exp(NORMAL_95 * 0.5 * np.sqrt(2) * 0.02))
 
 
 def test_a_ratio_has_its_divisor_last():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from madoc.verdict.statistics import better_than_chance, interval_of, resampled, shares_of_ranges
+from madoc.verdict.statistics import better_than_chance, interval_of, resampled
 
 
 def test_the_interval_of_a_mean_is_as_wide_as_its_standard_error_says():
@@ -45,10 +45,3 @@ def test_telling_one_run_from_another_is_no_skill():
 def test_rows_of_their_own_are_exchanged_with_any():
     followed = np.random.default_rng(5).standard_normal((60, 1))
     assert better_than_chance(followed, followed, np.arange(60))[0] == 1.0
-
-
-def test_shares_are_the_wider_interval_and_at_most_everything():
-    interval = np.array([[1.0, 2.0], [0.0, 1.0], [-5.0, 5.0]])
-    shares = shares_of_ranges(np.array([0.1, 0.6, 0.2]), interval, np.array([4.0, 4.0, 4.0]))
-    assert shares.tolist() == [0.25, 0.6, 1.0]
-    assert shares_of_ranges(np.array([0.1, 3.0]), None, np.ones(2)).tolist() == [0.1, 1.0]

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from jaxtyping import Int, PRNGKeyArray
 
 from madoc.data.dataset import Dataset
 from madoc.errors import MadocError
+from madoc.types import generator
 
 STRETCHES = 10
 """Number of stretches that a log of one episode is cut into, at least 2; some of them are held out."""
@@ -57,7 +57,7 @@ def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
             "follow those calibrated to",
         )
     lengths = dataset.episode_ends - starts
-    held = _drawn(lengths, share, np.asarray(jax.random.permutation(key, len(starts))))
+    held = _drawn(lengths, share, generator(key).permutation(len(starts)))
     fits = 0.5 <= lengths[held].sum() / (share * rows) <= 2.0
     if not fits and rows >= STRETCHES * _SHORTEST and lengths.max() > 1.5 * rows / STRETCHES:
         return _stretches(dataset, share, key)

@@ -15,7 +15,7 @@ from madoc.identification.score_tests import Score
 from madoc.identification.states import LoggedStates
 from madoc.parameters import FIELDS, Parameter
 from madoc.simulation.base import Simulator
-from madoc.simulation.write import nominal_values
+from madoc.simulation.write import element_names, heavy_bodies, nominal_values
 
 CAUSES = {
     "dof_frictionloss": "Coulomb friction",
@@ -26,12 +26,16 @@ CAUSES = {
     "actuator_gain": "another gain of the actuator",
     "signal_bias": "an offset of the sensor",
     "gravity": "another gravity",
+    "body_mass": "another mass, as of a payload",
+    "body_com": "another centre of mass, as with a payload",
 }
 """What a candidate of each field stands for, in words."""
 DELAY = "actions that take effect later, by a delay or a lag of the actuator"
 SATURATION = "a drive that saturates below the limit of its actions"
 SPACING = "rows that are farther apart in time than the spec says, by another rate or a clock that drifts"
+TILTS = ("a base or a floor that is tilted towards x", "a base or a floor that is tilted towards y")
 INTEGRATION = "the error of the model's integration step"
+_KNOWN_BEFORE = ("body_mass", "body_com")
 _CHANGE = 1e-3
 """Change of a candidate, as a share of what would balance the joint's typical torque, for its one-sided difference."""
 _SATURATED = 0.3
@@ -54,6 +58,8 @@ class Candidate:
         reference: Unit change of its value.
         least: Its smallest physical value.
         elements: Elements of the model that share the value; empty for a term of the whole robot.
+        known_before: Whether users know the value well without the log, as by scales or a level, so that only a
+            certain sign of another counts.
     """
 
     cause: str
@@ -63,6 +69,7 @@ class Candidate:
     reference: float
     least: float
     elements: tuple[str, ...] = ()
+    known_before: bool = False
 
     def added(self, score: Score) -> Parameter | None:
         """The parameter that adds the term, in a range wide enough for its score; None if there is none."""
@@ -94,6 +101,12 @@ def candidates(
         wanted.append(
             ("actuator_gain", channel.actuator, abs(float(model.actuator(channel.actuator).gainprm[0])) or 1.0)
         )
+    weighed = {element for field, element in calibrated if field in ("body_mass", "body_mass_and_inertia")}
+    for body in heavy_bodies(model):
+        at = model.body(body) if body in element_names(model, "body") else model.body(model.joint(body).bodyid[0])
+        distance = float(np.linalg.norm(at.ipos))
+        wanted += [("body_mass", body, float(at.mass[0]))] * (body not in weighed)
+        wanted += [("body_com", body, distance)] * (distance > 0.0)
     if "gravity" not in fields and abs(model.opt.gravity[2]) > 0:
         wanted.append(("gravity", "", float(abs(model.opt.gravity[2]))))
     if task.source is not None:
@@ -134,7 +147,10 @@ def _candidate(
     nominal = nominal_of(parameter)[0]
     parameter = replace(parameter, low=nominal, high=nominal + reference)
     least, elements = FIELDS[field].minimum, parameter.elements
-    return Candidate(CAUSES[field], parameter.name, parameter.unit, nominal, reference, least, elements), parameter
+    known = field in _KNOWN_BEFORE
+    return Candidate(
+        CAUSES[field], parameter.name, parameter.unit, nominal, reference, least, elements, known
+    ), parameter
 
 
 def effects(
@@ -166,7 +182,17 @@ def effects(
     stretched = simulation.make(simulator.task.with_time_step(1.0 + _CHANGE))
     finer = simulation.make(simulator.task.with_time_step(0.25, substeps=4))
     fields = {each.field for each in simulator.parameters.parameters}
+    tilts = TILTS if np.any(simulator.task.model.opt.gravity) else ()
     for candidate, other, inputs, change in (
+        *(
+            (
+                Candidate(cause, "", "rad", 0.0, 1.0, -np.inf, known_before=True),
+                simulation.make(simulator.task.with_tilt(axis, _CHANGE)),
+                readings,
+                _CHANGE,
+            )
+            for axis, cause in enumerate(tilts)
+        ),
         (Candidate(DELAY, "action_delay", "s", 0.0, step, -np.inf), simulator, late, _LATER),
         (Candidate(SATURATION, "", "of the largest action cut off", 0.0, 1.0, 0.0), simulator, saturated, _SATURATED),
         (Candidate(SPACING, "", "s", step, step, 0.0), stretched, readings, _CHANGE),

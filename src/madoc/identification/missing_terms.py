@@ -237,7 +237,8 @@ def _chosen(tests: _Tests) -> list[int]:
     """Candidates that cannot be excluded, each the most significant beside those before it."""
     chosen: list[int] = []
     for _ in range(TOGETHER):
-        scores = {index: tests.score(index, chosen) for index in range(len(tests.tried)) if index not in chosen}
+        others = (index for index, each in enumerate(tests.tried) if index not in chosen and not each.known_before)
+        scores = {index: tests.score(index, chosen) for index in others}
         significance = {index: abs(found.t) for index, found in scores.items() if found is not None}
         best = max(significance, key=lambda index: significance[index], default=None)
         if best is None or significance[best] < SUSPICIOUS:

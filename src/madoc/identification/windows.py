@@ -5,13 +5,13 @@ Every function that picks windows takes `rows`, the ascending rows at which one 
 
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from madoc.data.dataset import Dataset
 from madoc.data.timescale import stride
 from madoc.errors import MadocError
+from madoc.types import generator
 
 HORIZONS = (1, 5, 20)
 """Window lengths in strides (`data.timescale`) at which simulated and logged motion are compared; the last is the
@@ -145,7 +145,7 @@ def consecutive_rows(dataset: Dataset, rows: Int[np.ndarray, " states"]) -> Posi
 
 def drawn(positions: Int[np.ndarray, " possible"], count: int, key: PRNGKeyArray) -> Positions:
     """At most `count` of the positions drawn at random, in ascending order."""
-    return positions[np.sort(np.asarray(jax.random.permutation(key, len(positions)))[:count])]
+    return positions[np.sort(generator(key).permutation(len(positions))[:count])]
 
 
 def evenly(positions: Int[np.ndarray, " possible"], count: int) -> Positions:

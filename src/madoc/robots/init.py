@@ -15,7 +15,7 @@ from madoc.robots.expressions import Read
 from madoc.robots.model import ModelFiles, compiled, is_single, is_slide
 from madoc.robots.space import SLIDE_UNITS
 from madoc.runs.files import replacing
-from madoc.simulation.write import element_names, nominal_values
+from madoc.simulation.write import element_names, heavy_bodies, nominal_values
 from madoc.tasks import TASKS
 
 Fields = dict[str, str | float]
@@ -175,7 +175,7 @@ def _parameters(model: mujoco.MjModel, joints: list[str]) -> Iterator[str]:
     geoms = [model.geom(name) for name in element_names(model, "geom")]
     touching = [geom.name for geom in geoms if geom.contype[0] or geom.conaffinity[0]]
     rows = [
-        *_scaled(model, "body_mass", _heavy_bodies(model), wanted=True),
+        *_scaled(model, "body_mass", heavy_bodies(model), wanted=True),
         *_scaled(model, "jnt_stiffness", sprung, wanted=True),
         *_dissipation(model, joints),
         *_scaled(model, "actuator_gain", element_names(model, "actuator")),
@@ -185,20 +185,6 @@ def _parameters(model: mujoco.MjModel, joints: list[str]) -> Iterator[str]:
     for fields, comment, wanted in rows:
         active += wanted
         yield f"  {'' if wanted and active <= _ACTIVE else '# '}- {_mapping(**fields)}  # {comment}"
-
-
-def _heavy_bodies(model: mujoco.MjModel) -> Iterator[str]:
-    """Names of bodies that move and have a mass; a body without a name takes that of its first joint."""
-    bodies = element_names(model, "body")
-    for body in range(1, model.nbody):
-        if model.body_mass[body] <= 0.0 or model.body_weldid[body] == 0:
-            continue
-        name = model.body(body).name
-        if not name and model.body_jntnum[body]:
-            joint = model.joint(model.body_jntadr[body]).name
-            name = "" if joint in bodies else joint
-        if name:
-            yield name
 
 
 def _scaled(

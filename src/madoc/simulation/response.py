@@ -73,9 +73,19 @@ def driven_joints(simulator: Simulator) -> tuple[DrivenJoint, ...]:
         joint = int(model.actuator_trnid[actuator, 0])
         if int(model.actuator_trntype[actuator]) in _JOINT and int(model.jnt_type[joint]) in _SINGLE:
             hinge = bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE)
-            place = int(model.jnt_qposadr[joint]), int(model.nq + model.jnt_dofadr[joint])
-            found.append(DrivenJoint(action, model.joint(joint).name, hinge, *place))
+            found.append(DrivenJoint(action, model.joint(joint).name, hinge, *_place(model, joint)))
     return tuple(found)
+
+
+def single_joints(simulator: Simulator) -> dict[str, tuple[int, int]]:
+    """Indices in a state of the position and of the velocity of every hinge and slide, by its name."""
+    model = simulator.task.model
+    single = (joint for joint in range(model.njnt) if int(model.jnt_type[joint]) in _SINGLE)
+    return {model.joint(joint).name: _place(model, joint) for joint in single}
+
+
+def _place(model: mujoco.MjModel, joint: int) -> tuple[int, int]:
+    return int(model.jnt_qposadr[joint]), int(model.nq + model.jnt_dofadr[joint])
 
 
 def responses(

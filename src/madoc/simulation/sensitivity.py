@@ -1,11 +1,11 @@
 """Insensitive parameters: those that change no next state are found before any budget is spent on them."""
 
-import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.simulation.base import Simulator
+from madoc.types import generator
 
 
 def insensitive(
@@ -27,7 +27,7 @@ def insensitive(
     if not len(states):
         raise MadocError("expected at least one logged state to test the parameters at, got none")
     count = min(rows, len(states))
-    chosen = np.asarray(jax.random.choice(key, len(states), (count,), replace=False))
+    chosen = generator(key).permutation(len(states))[:count]
     # Mid-range, then each parameter in turn at its low and at its high end.
     space = simulator.parameters
     ends = space.to_physical(np.vstack([np.zeros(len(space)), np.kron(np.eye(len(space)), [[-1.0], [1.0]])]))

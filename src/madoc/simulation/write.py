@@ -1,6 +1,6 @@
 """Parameters into a MuJoCo model: elements found by name, values written, derived constants recomputed."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -75,6 +75,20 @@ def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
     object_type, count = _KINDS[kind]
     names = (mujoco.mj_id2name(model, object_type, index) for index in range(getattr(model, count)))
     return [name for name in names if name]
+
+
+def heavy_bodies(model: mujoco.MjModel) -> Iterator[str]:
+    """Names of bodies that move and have a mass; a body without a name takes that of its first joint."""
+    bodies = element_names(model, "body")
+    for body in range(1, model.nbody):
+        if model.body_mass[body] <= 0.0 or model.body_weldid[body] == 0:
+            continue
+        name = model.body(body).name
+        if not name and model.body_jntnum[body]:
+            joint = model.joint(model.body_jntadr[body]).name
+            name = "" if joint in bodies else joint
+        if name:
+            yield name
 
 
 def _dofs(model: mujoco.MjModel, joint: int) -> slice:

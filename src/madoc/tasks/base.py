@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 
 import jax
 import mujoco
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.errors import MadocError
@@ -32,6 +33,13 @@ def scaled_time_step(spec: Callable[[], mujoco.MjSpec], factor: float) -> mujoco
     """The spec with the integration step times `factor`."""
     changed = spec()
     changed.option.timestep *= factor
+    return changed
+
+
+def tilted(spec: Callable[[], mujoco.MjSpec], axis: int, angle: float) -> mujoco.MjSpec:
+    """The spec with gravity tilted towards an axis, 0 for x and 1 for y, by an angle in rad."""
+    changed = spec()
+    changed.option.gravity[axis] += np.linalg.norm(changed.option.gravity) * np.sin(angle)
     return changed
 
 
@@ -174,6 +182,13 @@ class Task:
         _MODELS[spec] = self.compile()
         _MODELS[spec].opt.timestep *= factor
         return replace(self, spec=spec, frame_skip=self.frame_skip * substeps)
+
+    def with_tilt(self, axis: int, angle: float) -> "Task":
+        """The same task on a base that is tilted by an angle in rad, so that gravity points towards an axis, x or y."""
+        spec = partial(tilted, self.spec, axis, angle)
+        _MODELS[spec] = self.compile()
+        _MODELS[spec].opt.gravity[axis] += np.linalg.norm(_MODELS[spec].opt.gravity) * np.sin(angle)
+        return replace(self, spec=spec)
 
     def with_parameters(self, names: list[str]) -> "Task":
         """The same task with only the named parameters calibratable."""

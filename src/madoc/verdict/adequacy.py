@@ -1,9 +1,11 @@
 """Whether the model is adequate for an estimate: the terms that it seems to lack, and what they do to the intervals."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.constants import g as standard_gravity
 
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult
@@ -23,6 +25,8 @@ AS_SIGNIFICANT = 0.6
 """|t| over that of the most significant term; among terms above it the one that explains most is named."""
 NEARLY = 0.8
 """Share explained by a term over that of the one named; terms above it are as likely."""
+EARTH = 0.03
+"""m/s², by which gravity on the ground differs from the standard 9.80665 (poles, equator, mountains)."""
 
 
 def missing_term(holdout: HoldOut) -> MissingTerm | None:
@@ -36,10 +40,23 @@ def missing_term(holdout: HoldOut) -> MissingTerm | None:
     moving = [term for term in certain if max(map(abs, term.shifts.values())) >= MOVES]
     if certain and not moving and _moved_together(holdout):
         moving = [term for term in holdout.missing_terms if term.cause not in (DRIFT, INTEGRATION)]
-    if not moving:
+    return likeliest(moving)
+
+
+def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
+    """Of significant terms the one that explains most; None of none.
+
+    A gravity that is not the earth's is hardly ever the reason: a term that explains nearly as much comes first.
+    """
+    most = max((abs(term.t) for term in terms), default=0.0)
+    significant = [term for term in terms if abs(term.t) >= AS_SIGNIFICANT * most]
+    if not significant:
         return None
-    most = max(abs(term.t) for term in moving)
-    return max((term for term in moving if abs(term.t) >= AS_SIGNIFICANT * most), key=lambda term: term.explained)
+    best = max(significant, key=lambda term: term.explained)
+    if best.parameter != "gravity" or abs(abs(best.value) - standard_gravity) <= EARTH + 2.0 * best.standard_error:
+        return best
+    near = [term for term in significant if term != best and term.explained >= NEARLY * best.explained]
+    return max(near, key=lambda term: term.explained, default=best)
 
 
 def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:

@@ -25,6 +25,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
 from madoc.verdict.adequacy import widening
+from madoc.verdict.exchanged_columns import exchanged_columns
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
@@ -201,6 +202,13 @@ def judged(
     doubts = Suspicions()
     if bench.states.kind != "unknown" and problem.dataset.disturbance.shuffled == "none":
         doubts = suspicions(problem.dataset, bench.states, problem.simulator, point, own, bench.change)
+    contradictions = tuple(each.sentence for each in problem.dataset.findings if each.contradicts)
+    if bench.simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none":
+        points = np.stack([np.zeros(len(point)), point, at])
+        exchanged, steps = exchanged_columns(
+            bench.held_out, bench.simulator, points, horizons(problem.dataset)[1], bench.change
+        )
+        contradictions, spent = (*contradictions, *exchanged), spent + steps
     # Another estimate of other windows says that the search is not at its end, not that a parameter is open.
     open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
     covered = own * (1.0 + widening(open_by, space.names).mean(1))
@@ -217,7 +225,7 @@ def judged(
         control_steps=control_steps + spent + doubts.control_steps,
         missing_terms=doubts.terms[:_MOST_TERMS],
         alternatives=doubts.alternatives,
-        contradictions=tuple(each.sentence for each in problem.dataset.findings if each.contradicts),
+        contradictions=contradictions,
         at_end=tuple(
             row.name
             for row, value in zip(space.parameters, point, strict=True)

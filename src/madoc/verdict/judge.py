@@ -15,17 +15,18 @@ from madoc.calibration.holdout import (
     Verdict,
     Word,
 )
-from madoc.identification.candidate_terms import SATURATION, SPACING
+from madoc.identification.candidate_terms import SATURATION, SPACING, TILTS
 from madoc.identification.combinations import Combination
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import DRIFT, MissingTerm
-from madoc.verdict.adequacy import as_likely, missing_term, numerical
+from madoc.verdict.adequacy import as_likely, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END
 from madoc.verdict.statistics import NEGLIGIBLE
 
 REMEDIES = {
     SPACING: "check control_step of the spec against the log's time column",
     SATURATION: "narrow low and high of the spec's actions to what the drive follows, or log smaller actions",
+    **dict.fromkeys(TILTS, "level it, or tilt the gravity of the model (its option gravity) as the base is"),
 }
 """What to do about terms that no parameter of a spec adds."""
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
@@ -71,9 +72,9 @@ def judge(holdout: HoldOut, *, settled: bool = True, combinations: Sequence[Comb
     """
     return (
         _rejected(holdout)
+        or _contradicted(holdout)
         or _missing(holdout)
         or _mismatch(holdout)
-        or _contradicted(holdout)
         or _outside(holdout)
         or _open(holdout, combinations)
         or _no_improvement(holdout)
@@ -105,7 +106,7 @@ def _missing(holdout: HoldOut) -> Verdict | None:
     term = missing_term(holdout)
     if term is None:
         return None
-    value = f"{term.value:.3g} ± {term.standard_error:.1g} {term.unit}".rstrip()
+    value = _value(term)
     if term.cause == DRIFT:
         return Verdict(
             "MODEL_MISMATCH",
@@ -129,6 +130,10 @@ def _missing(holdout: HoldOut) -> Verdict | None:
 
 def _named(term: MissingTerm) -> str:
     return f"{term.cause} ({term.parameter})" if term.parameter else term.cause
+
+
+def _value(term: MissingTerm) -> str:
+    return f"{term.value:.3g} ± {term.standard_error:.1g} {term.unit}".rstrip()
 
 
 def _remedy(term: MissingTerm) -> str:
@@ -172,7 +177,15 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
         sentence = _separable(holdout.area_at_mid_range, holdout.area_at_estimate, at_end)
     else:
         sentence = _systematic(holdout, at_end)
-    return Verdict("MODEL_MISMATCH", sentence, pinned) if sentence else None
+    if not sentence:
+        return None
+    term = likeliest([each for each in holdout.missing_terms if is_certain(each) and each.cause != DRIFT])
+    if term is not None:
+        sentence += (
+            f"; of single terms {_named(term)} is the likeliest: {_value(term)} explains {100 * term.explained:.2g} % "
+            f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}); {_remedy(term)}"
+        )
+    return Verdict("MODEL_MISMATCH", sentence, pinned)
 
 
 def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:

@@ -107,18 +107,6 @@ def relative_to_first(errors: Float[np.ndarray, "*draws points horizons"]) -> Fl
     return np.where(negligible, np.maximum(1.0, errors / NEGLIGIBLE), ratio).mean(-1)
 
 
-def shares_of_ranges(
-    half: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None, width: Float[np.ndarray, " d"]
-) -> Float[np.ndarray, " d"]:
-    """Share of each range, at most 1, that the wider of two 95 % intervals covers.
-
-    `half` is half of the best possible one in [-1, 1]; the method's `interval`, if it gives one, and the `width` of
-    each range are in physical units.
-    """
-    share = half if interval is None else np.maximum(half, (interval[:, 1] - interval[:, 0]) / width)
-    return np.minimum(share, 1.0)
-
-
 def better_than_chance(
     predicted: Float[np.ndarray, "rows values"],
     followed: Float[np.ndarray, "rows values"],

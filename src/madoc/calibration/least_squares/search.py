@@ -15,7 +15,7 @@ from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome,
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.identification.information import SETTLED, sandwich
 from madoc.identification.losses import ALL_FAILED, Loss
-from madoc.types import Epoch
+from madoc.types import Epoch, generator
 
 DAMPING_RANGE = (1e-10, 1e10)
 """Smallest and largest relative damping of the parameters' step; it is clipped to them."""
@@ -98,8 +98,7 @@ class Search:
         count = len(problem.simulator.parameters)
         possible = self.starts.possible_rows(problem, self.horizon, self.windows)
         drawn = min(self.windows, len(possible))
-        order = jax.random.choice(of_windows, len(possible), (drawn,), replace=False)
-        rows = possible[np.asarray(order)]
+        rows = possible[generator(of_windows).permutation(len(possible))[:drawn]]
         points = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
         points[0] = 0.0
         logged = problem.states
