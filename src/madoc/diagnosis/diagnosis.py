@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import jax
 
-from madoc.data import Dataset
+from madoc.data import Dataset, typical_change
 from madoc.data.findings import Finding, worst_first
 from madoc.diagnosis.channels import Channel, channel_findings, channels_of
+from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, excite_unknown
 from madoc.diagnosis.explanation import Explanation, action_findings, box_draws, explain, explanation_findings
 from madoc.diagnosis.response import response_findings
@@ -78,7 +79,11 @@ def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None,
         findings, spent = findings + responding, spent + steps
         if logged.kind == "exact":
             explanation = explain(dataset, simulator, logged, draws, key=of_starts)
-            findings += explanation_findings(explanation, channels)
+            points, ahead = draws[[0, explanation.best]], explanation.horizons[min(1, len(explanation.horizons) - 1)]
+            scale = typical_change(dataset)
+            exchanged, steps = exchanged_columns(dataset, simulator, points, ahead, scale, contradicts=False)
+            findings += [*explanation_findings(explanation, channels, exchanged), *exchanged]
+            spent += steps
             told = frozenset(finding.where for finding in responding)
             acting, steps = action_findings(dataset, simulator, logged, explanation, told=told, key=of_actions)
             findings += acting

@@ -10,12 +10,11 @@ from scipy.stats import qmc
 
 from madoc.data import Dataset
 from madoc.data.findings import Finding
-from madoc.diagnosis.channels import Channel, action_names
+from madoc.diagnosis.channels import Channel
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import LoggedStates
 from madoc.identification.windows import Windows, drawn, horizons, longest_fit, rows_that_fit, windows_at
 from madoc.simulation.base import Simulator
-from madoc.tasks import Task
 
 WINDOWS = 64
 """Largest number of windows replayed."""
@@ -84,8 +83,13 @@ def box_draws(count: int, key: PRNGKeyArray) -> Float[np.ndarray, "draws d"]:
     return np.concatenate([np.zeros((1, count)), np.unique(corners, axis=0), inside])
 
 
-def explanation_findings(explanation: Explanation, channels: tuple[Channel, ...]) -> list[Finding]:
-    """Findings on signals that no draw explains; one fatal finding if these are half of the signals or more."""
+def explanation_findings(
+    explanation: Explanation, channels: tuple[Channel, ...], exchanged: tuple[Finding, ...]
+) -> list[Finding]:
+    """Findings on signals that no draw explains; one fatal finding if these are half of the signals or more.
+
+    It says which columns are `exchanged`, if any are found to be.
+    """
     names = [channel.name for channel in channels if channel.kind == "signal"]
     live = ~np.isnan(explanation.errors).all((0, 1))
     lost = [name for name, error in zip(names, explanation.errors.min((0, 1)), strict=True) if error >= 1.0]
@@ -93,7 +97,8 @@ def explanation_findings(explanation: Explanation, channels: tuple[Channel, ...]
     remedy = "look at its column, sign and unit in the spec, and at the model"
     if lost and len(lost) >= HALF * live.sum():
         what = f"no draw from the box predicts {', '.join(lost)} {better}"
-        return [Finding("fatal", what, "the model", remedy.replace("its column, sign", "columns, signs"))]
+        remedy = remedy.replace("its column, sign", "columns, signs")
+        return [Finding("fatal", what, "the model", exchanged[0].what if exchanged else remedy)]
     overall = explanation.overall
     if not lost and (overall[0] >= 1.0).all() and (overall.min(0) < 1.0).any():
         what = "at mid-range it is no better than 'nothing changes', in parts of the box it is"
@@ -110,10 +115,10 @@ def action_findings(
     told: Collection[str] = (),
     key: PRNGKeyArray,
 ) -> tuple[list[Finding], int]:
-    """Findings on actions that the model explains clearly better if they are reversed, a row later or a row earlier.
+    """Findings on actions that the model explains clearly better if they are a row later or a row earlier.
 
-    Actions that are told of already are not reversed, and with any of them none is tried later. The second value is
-    the number of control steps simulated.
+    Where actions are told of already they are not tried later. The second value is the number of control steps
+    simulated.
     """
     task, (states, rows) = simulator.task, logged.exact()
     at = min(1, len(explanation.horizons) - 1)
@@ -131,11 +136,6 @@ def action_findings(
         return float(np.sqrt(np.nanmean(np.minimum(errors, WORST) ** 2, axis=-1)).min())
 
     changes = []
-    for index, name in enumerate(action_names(task)):
-        reversed_actions = _reversed(windows.actions, task, index)
-        if reversed_actions is not None and name not in told:
-            what = "with its sign reversed the model explains the log clearly better"
-            changes.append((reversed_actions, Finding("warning", what, name, "reverse it in the spec or in the log")))
     action, stretch = np.asarray(dataset.transitions.action), rows[chosen][:, None] + np.arange(horizon)
     later = "a row later than they are logged", "add the parameter action_delay"
     earlier = "a row before they are logged", "log each action with what was seen just before it"
@@ -166,19 +166,6 @@ def _errors(
     power = (still**2).mean(0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.sqrt(np.where(power > 0.0, (residuals**2).mean(1) / power, np.nan))
-
-
-def _reversed(actions: Float[np.ndarray, "windows steps action"], task: Task, index: int) -> np.ndarray | None:
-    """The actions with one of them negated; None where that would leave its range or change nothing."""
-    if task.actions:
-        channel = task.actions[index]
-        if abs(channel.low + channel.high) > 1e-9 * (channel.high - channel.low):
-            return None
-    if not actions[..., index].any():
-        return None
-    changed = actions.copy()
-    changed[..., index] *= -1.0
-    return changed
 
 
 def _ahead(horizons: tuple[int, ...]) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.constants import g as standard_gravity
 
 from madoc import simulation
 from madoc.identification.replay import Readings
@@ -107,8 +108,8 @@ def candidates(
         distance = float(np.linalg.norm(at.ipos))
         wanted += [("body_mass", body, float(at.mass[0]))] * (body not in weighed)
         wanted += [("body_com", body, distance)] * (distance > 0.0)
-    if "gravity" not in fields and abs(model.opt.gravity[2]) > 0:
-        wanted.append(("gravity", "", float(abs(model.opt.gravity[2]))))
+    if "gravity" not in fields:
+        wanted.append(("gravity", "", float(abs(model.opt.gravity[2])) or standard_gravity))
     if task.source is not None:
         measured = zip(task.signals[: logged.measured], scale, strict=False)
         wanted += [("signal_bias", signal, float(typical)) for signal, typical in measured]
@@ -147,7 +148,7 @@ def _candidate(
     nominal = nominal_of(parameter)[0]
     parameter = replace(parameter, low=nominal, high=nominal + reference)
     least, elements = FIELDS[field].minimum, parameter.elements
-    known = field in _KNOWN_BEFORE
+    known = field in _KNOWN_BEFORE or (field == "gravity" and nominal == 0.0)
     return Candidate(
         CAUSES[field], parameter.name, parameter.unit, nominal, reference, least, elements, known
     ), parameter

@@ -14,6 +14,7 @@ from madoc.calibration import CalibrationProblem
 from madoc.calibration.holdout import AgainstChance, Area, Judged
 from madoc.data import Dataset, stride
 from madoc.diagnosis.channels import signal_names
+from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.errors import MadocError
 from madoc.identification.excitation import expected_half_widths
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
@@ -25,7 +26,6 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
 from madoc.verdict.adequacy import widening
-from madoc.verdict.exchanged_columns import exchanged_columns
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
@@ -202,13 +202,13 @@ def judged(
     doubts = Suspicions()
     if bench.states.kind != "unknown" and problem.dataset.disturbance.shuffled == "none":
         doubts = suspicions(problem.dataset, bench.states, problem.simulator, point, own, bench.change)
-    contradictions = tuple(each.sentence for each in problem.dataset.findings if each.contradicts)
+    found = problem.dataset.findings
     if bench.simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none":
         points = np.stack([np.zeros(len(point)), point, at])
         exchanged, steps = exchanged_columns(
-            bench.held_out, bench.simulator, points, horizons(problem.dataset)[1], bench.change
+            bench.held_out, bench.simulator, points, horizons(problem.dataset)[1], bench.change, contradicts=True
         )
-        contradictions, spent = (*contradictions, *exchanged), spent + steps
+        found, spent = (*exchanged, *found), spent + steps
     # Another estimate of other windows says that the search is not at its end, not that a parameter is open.
     open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
     covered = own * (1.0 + widening(open_by, space.names).mean(1))
@@ -225,7 +225,7 @@ def judged(
         control_steps=control_steps + spent + doubts.control_steps,
         missing_terms=doubts.terms[:_MOST_TERMS],
         alternatives=doubts.alternatives,
-        contradictions=contradictions,
+        contradictions=tuple(each.sentence for each in found if each.contradicts),
         at_end=tuple(
             row.name
             for row, value in zip(space.parameters, point, strict=True)
