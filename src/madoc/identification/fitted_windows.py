@@ -22,7 +22,9 @@ STRIDES = 20
 NEGLIGIBLE = 1e-5
 """Residual in typical changes of a step; below it there is nothing to explain."""
 FITS = 4
-"""Gauss-Newton steps of parameters and of initial states, which begin at the estimate and at logged states."""
+"""Largest number of Gauss-Newton steps of parameters and initial states, from the estimate and from logged states."""
+GAIN = 0.01
+"""Share of the cost that a step must remove for another one to follow."""
 _STATE_DAMPING = 1e-9
 """Relative damping of initial states, far below the rounding of their differences."""
 _DAMPING = 1e-6
@@ -60,8 +62,11 @@ def refitted(
             break
         fixed = eliminate(around, np.ones_like(around.residuals), damping).reduced.residuals[around.whole]
         cost = float(np.median((fixed**2).mean(-1)))
+        enough = cost >= (1.0 - GAIN) * least
         if cost < least:
             best, least = (point, states), cost
+        if enough:
+            break
         scale = scale_of(around.residuals[around.whole], "cauchy")
         weights = loss_slope((around.residuals / scale) ** 2, "cauchy") * around.whole[:, None]
         left = eliminate(around, weights, damping)
@@ -85,8 +90,11 @@ def with_fitted_states(
         fit = eliminate(scaled, _weights(scaled), np.full(len(readings), _STATE_DAMPING))
         moved = states + readings.in_state_units(fit.states_step(np.zeros(0)), states.shape[1])
         after = readings.residuals(simulator, point[None], moved[None])[0, 0]
-        better = around.whole & (_costs(after / noise) < _costs(scaled.residuals))
+        before, now = _costs(scaled.residuals), _costs(after / noise)
+        better = around.whole & (now < before)
         states = np.where(better[:, None], moved, states)
+        if before[better].sum() - now[better].sum() <= GAIN * before[around.whole].sum():
+            break
     return states
 
 
