@@ -22,7 +22,7 @@ def usual(robot: Robot, *, share: float = 0.02) -> tuple[Case, ...]:
     )
 
 
-_LONG = ("length", "damping", "friction", "gain", "armature")
+_LONG = ("length", "damping", "friction", "armature")  # with the gain as well, the log would tell only ratios
 _EIGHT = tuple(ARM.catalogue)
 
 _SPECIAL = (
