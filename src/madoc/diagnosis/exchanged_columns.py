@@ -22,11 +22,12 @@ WINDOWS = 64
 """Largest number of windows that are replayed."""
 FEWEST_WINDOWS = 8
 """Smallest number of windows with which two columns are exchanged; where so many cost too much, none are."""
-MOST_STEPS = 200_000
+MOST_STEPS = 60_000
 """Largest number of control steps that all replays take."""
 _BEYOND = 1.05
 """Largest action over the largest logged one, or over the range; sensors of current read more than the range."""
-_NOTHING = np.finfo(float).tiny
+_NEGLIGIBLE = 1e-3
+"""Error in typical changes of a step, up to which the log is predicted exactly."""
 
 
 def exchanged_columns(
@@ -64,7 +65,9 @@ def exchanged_columns(
         return (), spent
     least = min(better.values())
     likely = [mistake for mistake, error in better.items() if BETTER * error <= least]
-    what = f"{' or '.join(likely)}; put right, the log is predicted {as_logged / max(least, _NOTHING):.2g} times better"
+    what = (
+        f"{' or '.join(likely)}; put right, the log is predicted {as_logged / max(least, _NEGLIGIBLE):.2g} times better"
+    )
     return (Finding("warning", what, "columns", "correct the spec or the log", contradicts=contradicts),), spent
 
 
