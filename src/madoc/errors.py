@@ -8,6 +8,10 @@ class MadocError(ValueError):
     """Bad input or a refused problem. The command line prints its sentence and exits with code 2."""
 
 
+class NotAllowed(MadocError):
+    """What was asked would run code of a user's file, and nobody has allowed that."""
+
+
 def unknown_name(what: str, name: str, known: Iterable[str]) -> MadocError:
     """The error for a name that is not among the known ones; it suggests the nearest."""
     names = list(known)

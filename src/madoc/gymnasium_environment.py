@@ -62,7 +62,10 @@ class Episodes:
         self._axes = (rows, 1) if self._distribution else (1, rows)
         self._system: System = self._simulator.bind(self.parameters[: self._axes[0]])
         noise = self.task.reset_noise
-        self._noise = jax.jit(jax.vmap(lambda seed: noise(jax.random.key(seed), 1)[0]))
+        of_row = lambda seed: noise(jax.random.key(seed), 1)[0]  # noqa: E731
+        self._noise = (
+            jax.jit(jax.vmap(of_row)) if self.task.traced_reset else lambda seeds: np.stack([*map(of_row, seeds)])
+        )
         self.observation_space = Box(-np.inf, np.inf, (self.task.observation_size,), np.float64)
         self.action_space = Box(-1.0, 1.0, (self.task.action_size,), np.float32)
 

@@ -74,3 +74,34 @@ def test_refusals(words, changed, sentence, tmp_path, capsys):
 def test_logs_are_needed(words, capsys):
     assert main(["run", str(words[1])]) == 2
     assert f"expected logs of {words[1]} after --data" in capsys.readouterr().err
+
+
+FUNCTIONS = """
+import numpy as np
+
+def reward(place, push):
+    return np.exp(-(place**2)) - 0.01 * push**2
+
+def reset(random, count):
+    return {"position(rail)": random.uniform(-1, 1, count)}
+"""
+
+
+def test_a_reward_in_python_is_kept_with_the_run(words, tmp_path, capsys):
+    spec, out = tmp_path / "python.yaml", tmp_path / "run"
+    spec.write_text(f"{CART_SPEC}python: cart.py\nmax_episode_steps: 10\n")
+    (tmp_path / "cart.py").write_text(FUNCTIONS)
+    calibrate = ["calibrate", spec, "--data", tmp_path / "log.npz", "--method", "least-squares", "--out", out]
+    assert main([*map(str, calibrate)]) == 2
+    refusal = (
+        "the spec names the Python file cart.py, which would be run; read it, and if you trust it pass --allow-code"
+    )
+    assert refusal in capsys.readouterr().err
+    asked_for_json(capsys, [*calibrate, "--allow-code", "--quiet"])
+    (tmp_path / "cart.py").write_text(FUNCTIONS.replace("0.01", "0.02"))
+    assert main([*map(str, calibrate), "--allow-code", "--resume"]) == 2
+    assert "robot.python.sha256 was" in capsys.readouterr().err
+    for command in ("learn", "export"):
+        assert main([command, str(out)]) == 2
+        assert "this run keeps, with the spec python.yaml, the Python file cart.py" in capsys.readouterr().err
+    assert main(["export", str(out), "--allow-code"]) == 0

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from suite_files import CELL
 
+from madoc.errors import MadocError, NotAllowed
 from madoc.suites import stages
 from madoc.suites.cells import write_plan
 from madoc.suites.claims import MOST_ATTEMPTS, claimed, outcome_of, try_again
@@ -17,8 +18,8 @@ from madoc.suites.worker import work
 def planned(suite, place):
     """A function that plans a suite in the folder `out`: that folder, and the cells."""
 
-    def plan(text):
-        cells = plan_of(suite(text)).cells
+    def plan(text, **options):
+        cells = plan_of(suite(text), **options).cells
         write_plan(place / "out", "suite", cells)
         return place / "out", cells
 
@@ -54,7 +55,7 @@ def test_two_workers_that_race_for_every_cell_do_each_once(planned, monkeypatch)
     out, cells = planned(CELL + "    grid: {seed: 0..199}\n")
     barrier, done = threading.Barrier(2), []
 
-    def quick(claim, suite):
+    def quick(claim, suite, **options):
         done.append(claim.cell.name)
         return claim.end("finished", "done", 0.0)
 
@@ -118,3 +119,16 @@ def test_blocked_cells_wait_and_vain_ones_are_left(planned):
     assert standing.runnable == []
     assert standing.counts == {"refused": 1, "not run": 2}
     assert work(out) == []
+
+
+def test_a_worker_leaves_code_to_those_that_are_allowed_to_run_it(planned, place):
+    with (place / "spring.yaml").open("a") as spec:
+        spec.write("python: task.py\n")
+    (place / "task.py").write_text("def reward(place): return -abs(place)\n")
+    with pytest.raises(MadocError, match=r"the spec names the Python file task.py"):
+        planned(CELL)
+    out, (cell,) = planned(CELL, allow_code=True)
+    with pytest.raises(NotAllowed, match="pass --allow-code"):
+        work(out)
+    assert outcome_of(cell, out) is None
+    assert [outcome.status for outcome in work(out, allow_code=True)] == ["finished"]

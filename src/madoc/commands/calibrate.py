@@ -8,7 +8,7 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from madoc.commands.answer import Answer, Output, calibration_status, calibration_text, page_line
 from madoc.errors import MadocError
-from madoc.pipeline.orders import CalibrationOrder
+from madoc.pipeline.orders import CalibrationOrder, Permission
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,7 @@ class Calibrate:
     """Run folder. Default: runs/TASK-METHOD-SEED."""
     resume: bool = False
     """Go on with the run in the folder."""
+    permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
@@ -35,6 +36,7 @@ class Calibrate:
         if split_name(self.order.task)[1]:
             raise MadocError(f"expected the name of a robot, got {self.order.task!r}; the data is given with --data")
         out = self.out or default_folder(self.order)
-        result = calibrate_in(out, self.order, resume=self.resume, quiet=self.output.quiet)
+        allow_code = self.permission.allow_code
+        result = calibrate_in(out, self.order, resume=self.resume, quiet=self.output.quiet, allow_code=allow_code)
         lines = (*calibration_text(result), f"run folder: {out}", *page_line(leave_report(out)))
         return Answer(result.to_json(), lines, calibration_status(result))

@@ -6,7 +6,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, arg
 
 from madoc.commands.answer import Answer, Output
-from madoc.pipeline.orders import CheckOrder
+from madoc.pipeline.orders import CheckOrder, Permission
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,7 @@ class Check:
     """
 
     order: Annotated[CheckOrder, arg(name="")]
+    permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
@@ -24,7 +25,7 @@ class Check:
         from madoc.diagnosis import tables, to_json
         from madoc.pipeline import check_logs
 
-        checked = check_logs(self.order)
+        checked = check_logs(self.order, allow_code=self.permission.allow_code)
         status = "rejected" if checked.fatal else "finished"
         if checked.diagnosis is None:
             assert checked.refusal is not None

@@ -7,7 +7,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output, evaluation_text
-from madoc.pipeline.orders import EvaluationOrder
+from madoc.pipeline.orders import EvaluationOrder, Permission
 
 
 @dataclass(frozen=True)
@@ -17,12 +17,15 @@ class Evaluate:
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """A run folder with policies in it, or the folder of one policy."""
     order: Annotated[EvaluationOrder, arg(name="")] = field(default_factory=EvaluationOrder)
+    permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
         """Evaluate, and leave evaluation.json."""
         from madoc.pipeline import evaluate_folder
 
-        evaluation = evaluate_folder(self.folder, self.order, quiet=self.output.quiet)
+        evaluation = evaluate_folder(
+            self.folder, self.order, quiet=self.output.quiet, allow_code=self.permission.allow_code
+        )
         lines = (*evaluation_text(evaluation), f"evaluation: {self.folder / 'evaluation.json'}")
         return Answer(evaluation.to_json(), lines)

@@ -7,6 +7,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output
+from madoc.pipeline.orders import Permission
 
 
 @dataclass(frozen=True)
@@ -23,12 +24,13 @@ class Export:
     """Folder for the files. Default: export in the run folder."""
     onnx: bool = False
     """Write the run's policies as ONNX too; needs the package onnx."""
+    permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
         """Write the files."""
         from madoc.pipeline import export_run
 
-        files = export_run(self.folder, self.out, onnx=self.onnx)
+        files = export_run(self.folder, self.out, onnx=self.onnx, allow_code=self.permission.allow_code)
         lines = tuple(f"{what}: {path}" for what, path in files.items())
         return Answer({"files": {what: str(path) for what, path in files.items()}}, lines)

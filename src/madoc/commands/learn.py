@@ -7,7 +7,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import PLACE_NAMES, Answer, Output
-from madoc.pipeline.orders import Physics, PolicyOrder, parse_settings
+from madoc.pipeline.orders import Permission, Physics, PolicyOrder, parse_settings
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,15 @@ class Learn:
     """Run folder. Default: policy-AT within the run."""
     resume: bool = False
     """Go on with the run in the folder."""
+    permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
         """Learn, and leave the run folder."""
         from madoc.pipeline import learn_in, policy_folder_name, read_calibration
 
-        calibrated, order = read_calibration(self.calibration, physics=self.physics), self.order
+        order, allow_code = self.order, self.permission.allow_code
+        calibrated = read_calibration(self.calibration, physics=self.physics, allow_code=allow_code)
         place = self.calibration if self.calibration.is_dir() else self.calibration.parent
         out = self.out or place / policy_folder_name(order.at, order.method)
         learnt = learn_in(out, calibrated, order, resume=self.resume, quiet=self.output.quiet)

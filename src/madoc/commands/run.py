@@ -8,7 +8,7 @@ from rich.console import RenderableType
 from tyro.conf import OmitArgPrefixes, arg
 
 from madoc.commands.answer import Answer, Output, calibration_status, calibration_text, evaluation_text, page_line
-from madoc.pipeline.orders import RunOrder
+from madoc.pipeline.orders import Permission, RunOrder
 
 if TYPE_CHECKING:
     from madoc.report.records import Summary
@@ -28,6 +28,7 @@ class Run:
     """Folder. Default: runs/NAME, of a robot of your own without the .yaml."""
     resume: bool = False
     """Go on with the run in the folder."""
+    permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
@@ -40,7 +41,8 @@ class Run:
         out = self.out or Path("runs") / (
             Path(self.order.name).stem if is_spec_path(self.order.name) else self.order.name
         )
-        summary = run_all(self.order, out, resume=self.resume, quiet=self.output.quiet)
+        allow_code = self.permission.allow_code
+        summary = run_all(self.order, out, resume=self.resume, quiet=self.output.quiet, allow_code=allow_code)
         result = CalibrationResult.from_json(summary.calibration)
         lines = (*calibration_text(result), *_rest(summary, out), *page_line(leave_report(out)))
         status = calibration_status(result) if summary.status == "finished" else summary.status

@@ -7,7 +7,7 @@ from rich.table import Table
 from tyro.conf import OmitArgPrefixes, arg
 
 from madoc.commands.answer import Answer, Output
-from madoc.pipeline.orders import SelftestOrder
+from madoc.pipeline.orders import Permission, SelftestOrder
 
 if TYPE_CHECKING:
     from madoc.verdict.selftest import Selftest as Outcome
@@ -21,13 +21,14 @@ class Selftest:
     """
 
     order: Annotated[SelftestOrder, arg(name="")]
+    permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
         """Plant truths, calibrate, and compare."""
         from madoc.pipeline import selftest_of
 
-        outcome = selftest_of(self.order, quiet=self.output.quiet)
+        outcome = selftest_of(self.order, quiet=self.output.quiet, allow_code=self.permission.allow_code)
         status = "finished" if outcome.passed else "NOT_RECOVERABLE"
         return Answer(outcome.to_json(), (outcome.sentence, _table(outcome, self.order.task)), status)
 

@@ -10,6 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output
 from madoc.errors import MadocError
+from madoc.pipeline.orders import Permission
 
 if TYPE_CHECKING:
     from madoc.robots import Robot
@@ -51,6 +52,7 @@ class Spec:
     """The file, as robot.yaml."""
     schema: bool = False
     """Print the file's JSON schema instead, for editors."""
+    permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
@@ -63,7 +65,7 @@ class Spec:
             return Answer(schema, (json_text(schema, what="the schema", indent=2),))
         if not self.spec:
             raise MadocError("expected the spec file of a robot, as madoc spec robot.yaml; madoc init MODEL writes one")
-        robot = robots.load(self.spec)
+        robot = robots.load(self.spec, allow_code=self.permission.allow_code)
         return Answer(describe(robot), (*_tables(robot), *_sentences(robot)))
 
 

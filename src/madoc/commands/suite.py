@@ -8,6 +8,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output
 from madoc.errors import MadocError
+from madoc.pipeline.orders import Permission
 
 if TYPE_CHECKING:
     from madoc.suites.planning import Plan
@@ -39,6 +40,7 @@ class Suite:
     """Only report what has been done: a page and a table of all results."""
     parquet: bool = False
     """With --report: leave the table as Parquet too; needs the package pyarrow."""
+    permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
@@ -48,7 +50,7 @@ class Suite:
         from madoc.suites.standing import Standing
 
         self._check()
-        plan = plan_of(self.file)
+        plan = plan_of(self.file, allow_code=self.permission.allow_code)
         out = self.out or Path("runs") / plan.name
         workers = usual_workers() if self.workers is None else self.workers
         standing = Standing(out, plan.cells, workers=max(1, workers))
@@ -79,14 +81,16 @@ class Suite:
         if any([try_again(cell, out) for cell in plan.cells]):
             standing = type(standing)(out, plan.cells, workers=max(1, workers))
         if workers == 0:
-            lines = (f"{len(standing.runnable):,} cells to do, by: madoc worker {out}",)
+            flag = " --allow-code" if self.permission.allow_code else ""
+            lines = (f"{len(standing.runnable):,} cells to do, by: madoc worker {out}{flag}",)
             return Answer({"folder": str(out), "cells": len(plan.cells), "left": len(standing.runnable)}, lines)
+        options = {"quiet": self.output.quiet, "allow_code": self.permission.allow_code}
         if self.executor == "ray":
             from madoc.suites.on_ray import run_on_ray
 
-            whole = run_on_ray(out, standing, workers=self.workers, address=self.address, quiet=self.output.quiet)
+            whole = run_on_ray(out, standing, workers=self.workers, address=self.address, **options)
         else:
-            whole = run_locally(out, standing, workers=workers, quiet=self.output.quiet)
+            whole = run_locally(out, standing, workers=workers, **options)
         return _told(standing, plan, out, whole=whole)
 
     def _reported(self, plan: "Plan", standing: "Standing", out: Path) -> Answer:
@@ -94,6 +98,7 @@ class Suite:
         from madoc.suites.report import write_report
 
         command = f"madoc suite {self.file}" + ("" if self.out is None else f" --out {out}")
+        command += " --allow-code" if self.permission.allow_code else ""
         files = write_report(plan, standing, out, command=command, parquet=self.parquet)
         lines = tuple(f"{what}: {file}" for what, file in files.items())
         counts = dict(standing.counts)

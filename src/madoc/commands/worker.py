@@ -12,6 +12,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output
+from madoc.pipeline.orders import Permission
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Worker:
     """The folder of a suite, as `madoc suite` names it."""
     attached: bool = False
     """Stop when standard input closes, as it does when the process that started this one ends."""
+    permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
@@ -37,7 +39,7 @@ class Worker:
         prepare(self.folder)
         from madoc.suites.worker import work  # computes numbers, on the core that was taken
 
-        done = work(self.folder)
+        done = work(self.folder, allow_code=self.permission.allow_code)
         if done is None:
             return Answer({"status": "interrupted"}, ("interrupted; the next worker goes on",), "interrupted")
         counts = Counter(outcome.status for outcome in done)

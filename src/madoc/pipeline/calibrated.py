@@ -70,12 +70,13 @@ class Calibrated:
         return np.array([(high - low) / 2.0 for low, high in spans])
 
 
-def read_calibration(path: str | Path, *, physics: str | None = None) -> Calibrated:
+def read_calibration(path: str | Path, *, physics: str | None = None, allow_code: bool = False) -> Calibrated:
     """A finished calibration: a run folder of `madoc calibrate` or `madoc run`, or a `result.json` alone.
 
     Args:
         path: The folder or file.
         physics: Physics of the simulator, for a result outside its run folder; None is `legacy`.
+        allow_code: Run the Python file of the robot's spec, if it has one; else such a run is refused.
 
     Raises:
         MadocError: There is no calibration, or it has not ended.
@@ -91,7 +92,7 @@ def read_calibration(path: str | Path, *, physics: str | None = None) -> Calibra
     if not file.exists():
         raise MadocError(f"there is no calibration at {path}; name a run folder or its result.json")
     result = CalibrationResult.from_json(read_json(file))
-    machine = Machine.restored(replace(spec, task=result.task, physics=spec.physics or physics))
+    machine = Machine.restored(replace(spec, task=result.task, physics=spec.physics or physics), allow_code=allow_code)
     task = replace(machine.task, parameters=_calibrated_space(result, machine.task.parameters))
     return Calibrated(machine, task, result, spec, folder)
 

@@ -23,7 +23,12 @@ COMPARISON = "comparison.json"
 
 
 def calibrate_in(
-    out: str | Path, order: CalibrationOrder, *, resume: bool = False, quiet: bool = False
+    out: str | Path,
+    order: CalibrationOrder,
+    *,
+    resume: bool = False,
+    quiet: bool = False,
+    allow_code: bool = False,
 ) -> CalibrationResult:
     """Calibrate, judge the result where rows are held out, and leave a run folder.
 
@@ -33,9 +38,9 @@ def calibrate_in(
     out = Path(out)
     check_order(order, out)
     if method_of(order) == AUTO:
-        return _calibrate_auto(out, prepare(order), resume=resume, quiet=quiet)
+        return _calibrate_auto(out, prepare(order, allow_code=allow_code), resume=resume, quiet=quiet)
     (method,) = methods_for(order).values()
-    return _calibrate_by(method, out, prepare(order), resume=resume, quiet=quiet)[0]
+    return _calibrate_by(method, out, prepare(order, allow_code=allow_code), resume=resume, quiet=quiet)[0]
 
 
 def default_folder(order: CalibrationOrder) -> Path:

@@ -44,13 +44,13 @@ class Checked:
         return self.diagnosis is None or self.diagnosis.fatal
 
 
-def check_logs(order: CheckOrder) -> Checked:
+def check_logs(order: CheckOrder, *, allow_code: bool = False) -> Checked:
     """Read logs of a user's own robot, with velocities put in if asked, and diagnose them.
 
     Raises:
         MadocError: The robot's spec or its model is refused; the refusal of a log is part of the outcome.
     """
-    robot = robots.load(order.spec)
+    robot = robots.load(order.spec, allow_code=allow_code)
     task = robot.task
     try:
         dataset = logs.read(order.paths, robot, clip_actions=order.clip_actions)
@@ -68,7 +68,7 @@ def check_logs(order: CheckOrder) -> Checked:
     return Checked(task.parameters, diagnosis, forecasts)
 
 
-def selftest_of(order: SelftestOrder, *, quiet: bool = False) -> Selftest:
+def selftest_of(order: SelftestOrder, *, quiet: bool = False, allow_code: bool = False) -> Selftest:
     """Plant truths in the order's robot, replay the logged actions, and calibrate to each replay.
 
     The method is the order's; of `auto`, the first candidate that does not refuse.
@@ -80,7 +80,7 @@ def selftest_of(order: SelftestOrder, *, quiet: bool = False) -> Selftest:
     check_order(calibration)
     if order.truths < 1:
         raise MadocError(f"expected at least 1 truth to plant, got {order.truths}")
-    prepared = prepare(calibration)
+    prepared = prepare(calibration, allow_code=allow_code)
     methods = list(methods_for(calibration).values())
     key = stage_key(order.search.seed, "selftest")
     return selftest(

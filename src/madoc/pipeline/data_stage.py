@@ -31,26 +31,26 @@ class Machine:
     robot: Robot | None = None
 
     @classmethod
-    def named(cls, name: str, physics: str | None = None) -> "Machine":
+    def named(cls, name: str, physics: str | None = None, *, allow_code: bool = False) -> "Machine":
         """The robot that a command names: one of Madoc's, or the path of a spec file.
 
         Raises:
             MadocError: There is no such robot, or its spec is refused.
         """
         if robots.is_spec_path(name) and physics != "legacy":
-            robot = robots.load(name)
+            robot = robots.load(name, allow_code=allow_code)
             return cls(robot.task, robot)
         return cls(robots.resolve(name, physics))
 
     @classmethod
-    def restored(cls, spec: SpecRecord) -> "Machine":
+    def restored(cls, spec: SpecRecord, *, allow_code: bool = False) -> "Machine":
         """The robot of a run, from its `spec.json` alone.
 
         Raises:
             MadocError: The spec names no robot, or keeps one that cannot be made.
         """
         if spec.robot is not None:
-            robot = robots.restore(spec.robot)
+            robot = robots.restore(spec.robot, allow_code=allow_code)
             return cls(robot.task, robot)
         return cls(tasks.make(spec.task, spec.physics or "legacy"))
 

@@ -33,6 +33,7 @@ def evaluate_folder(
     names: Sequence[str] = (),
     out: Path | None = None,
     quiet: bool = False,
+    allow_code: bool = False,
 ) -> EvaluationRecord:
     """Evaluate policies of a run on the same starts, and leave `evaluation.json` and `film.npz` there, or in `out`.
 
@@ -52,7 +53,7 @@ def evaluate_folder(
     policies = {name: load_policy(found[name]) for name in names or found}
     spec = _spec_with_truth(folder, found)
     truth = read_truth(order.truth) or spec.truth
-    calibrated = _calibration_of(folder)
+    calibrated = _calibration_of(folder, allow_code=allow_code)
     if truth is None and calibrated is None:
         raise MadocError(
             f"the true parameters of {folder} are not known, and it holds no calibration to evaluate at; "
@@ -60,7 +61,7 @@ def evaluate_folder(
         )
     target, estimated = None, None
     if truth is not None:
-        machine = Machine.restored(spec)
+        machine = Machine.restored(spec, allow_code=allow_code)
         machine.check_truth(truth, machine.task.with_parameters(list(spec.parameters)))
         target = machine.at(truth)
     if calibrated is not None:
@@ -72,7 +73,7 @@ def evaluate_folder(
     system = target or estimated
     assert system is not None  # one of them is known
     leave_film(out or folder, policies, *system, key)
-    task = Machine.restored(spec).task
+    task = Machine.restored(spec, allow_code=allow_code).task
     evaluation = EvaluationRecord(
         task.name,
         task.physics,
@@ -128,10 +129,10 @@ def _where_not_sure(
     return drawn, costs
 
 
-def _calibration_of(folder: Path) -> Calibrated | None:
+def _calibration_of(folder: Path, *, allow_code: bool) -> Calibrated | None:
     """The calibration that a run folder holds, or is; None of the folder of a policy."""
     held = (folder / "calibration" / "spec.json").exists() or read_spec(folder).command == "calibrate"
-    return read_calibration(folder) if held else None
+    return read_calibration(folder, allow_code=allow_code) if held else None
 
 
 def find_policies(folder: Path) -> dict[str, Path]:

@@ -14,7 +14,7 @@ from madoc.simulation.mjcf import save_mjcf
 from madoc.simulation.write import nominal_values
 
 
-def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dict[str, Path]:
+def export_run(run: Path, out: Path | None = None, *, onnx: bool = False, allow_code: bool = False) -> dict[str, Path]:
     """Leave a finished calibration as MJCF, patch, randomization ranges and parameters for `mujoco.sysid`.
 
     Policies are written too, as ONNX, if asked. The folder `out` is `export` in the run folder by default.
@@ -25,7 +25,7 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False) -> dic
     Raises:
         MadocError: There is no finished calibration, no policy where `onnx` wants one, or a file cannot be written.
     """
-    calibrated = read_calibration(run)
+    calibrated = read_calibration(run, allow_code=allow_code)
     policies = find_policies(run) if onnx else {}
     folder = (out or run / "export").expanduser()
     try:

@@ -36,6 +36,14 @@ class Reading:
 
 
 @dataclass(frozen=True)
+class Permission:
+    """What a command may do beside reading files; no file can grant it."""
+
+    allow_code: bool = False
+    """Run the Python file that the spec of a robot names, with its reward, end or reset: only if you trust it."""
+
+
+@dataclass(frozen=True)
 class Source:
     """Where logged data is, and how it is read."""
 

@@ -100,7 +100,7 @@ class Prepared:
         return asked | held | self.machine.stored()
 
 
-def prepare(order: CalibrationOrder) -> Prepared:
+def prepare(order: CalibrationOrder, *, allow_code: bool = False) -> Prepared:
     """Read the robot and the data of an order, and check the logs of a user's own robot.
 
     Raises:
@@ -113,7 +113,7 @@ def prepare(order: CalibrationOrder) -> Prepared:
     budget = None if given is None else read_budget(given)
     holdout = HOLDOUT if method == AUTO and order.holdout is None else order.holdout
     truth = read_truth(order.truth)
-    machine, dataset, task = _read(order)
+    machine, dataset, task = _read(order, allow_code=allow_code)
     truth = dataset.true_parameters if truth is None else truth
     if truth is not None:
         machine.check_truth(truth, task)
@@ -125,10 +125,10 @@ def prepare(order: CalibrationOrder) -> Prepared:
     return Prepared(order, method, budget, holdout, machine, dataset, simulator, truth)
 
 
-def _read(order: CalibrationOrder) -> tuple[Machine, Dataset, Task]:
+def _read(order: CalibrationOrder, *, allow_code: bool) -> tuple[Machine, Dataset, Task]:
     """The robot, its data, and the task with the parameters and ranges that are calibrated."""
     search = order.search
-    machine = Machine.named(order.task, search.physics)
+    machine = Machine.named(order.task, search.physics, allow_code=allow_code)
     check_search(search, machine.task, order.task)
     dataset = load_source(order.source, machine, seed=search.seed)
     recorded = dataset.physics if dataset.physics != "unknown" else None

@@ -34,7 +34,9 @@ from madoc.runs.files import read_json
 from madoc.types import entry_of
 
 
-def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = False) -> Summary:
+def run_all(
+    order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = False, allow_code: bool = False
+) -> Summary:
     """Do all stages, and leave a folder with their files.
 
     The folder holds `data.npz`, the run folders `calibration`, `policy-calibrated` (or `policy-distribution`),
@@ -49,15 +51,15 @@ def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = F
     """
     if order.data:
         order = replace(order, data=_source(order).absolute().paths)
-    machine = Machine.named(split_name(order.name)[0], order.search.physics)
+    machine = Machine.named(split_name(order.name)[0], order.search.physics, allow_code=allow_code)
     spec = _spec(order, machine, out)
     with working_folder(out, spec, resume=resume, keep="data.npz") as folder:
         if (out / "summary.json").exists():
             return read_record(Summary, out / "summary.json")
         if not (out / "data.npz").exists():
             data.save(_recorded_or_loaded(order, machine, quiet=quiet), out / "data.npz")
-        result = _calibrate(order, out, quiet=quiet)
-        calibrated = read_calibration(out / "calibration")
+        result = _calibrate(order, out, quiet=quiet, allow_code=allow_code)
+        calibrated = read_calibration(out / "calibration", allow_code=allow_code)
         summary = _beginning(order, calibrated)
         if result.status not in ENDED:
             return replace(summary, status=result.status, sentence=f"calibration: {result.sentence}")
@@ -70,8 +72,9 @@ def run_all(order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = F
             if policy["status"] not in ENDED:
                 return replace(summary, status=str(policy["status"]), sentence=f"policy-{at}: {policy['sentence']}")
         asked = EvaluationOrder(order.episodes, order.draws, order.search.seed)
-        summary = replace(summary, evaluation=evaluate_folder(out, asked, names=places, quiet=quiet))
-        export_run(out)
+        evaluation = evaluate_folder(out, asked, names=places, quiet=quiet, allow_code=allow_code)
+        summary = replace(summary, evaluation=evaluation)
+        export_run(out, allow_code=allow_code)
         folder.write_json("summary.json", summary.to_json())
         return summary
 
@@ -132,13 +135,14 @@ def _recorded_or_loaded(order: RunOrder, machine: Machine, *, quiet: bool) -> da
     return record_named(asked, quiet=quiet)
 
 
-def _calibrate(order: RunOrder, out: Path, *, quiet: bool) -> CalibrationResult:
+def _calibrate(order: RunOrder, out: Path, *, quiet: bool, allow_code: bool) -> CalibrationResult:
     """Leave `calibration`."""
     folder = out / "calibration"
     if calibration_ended(folder) and ended(folder):
         return CalibrationResult.from_json(read_json(folder / "result.json"))
     source = Source((str(out / "data.npz"),), max_transitions=None)
-    return calibrate_in(folder, _calibration_order(order, source), resume=holds_run(folder), quiet=quiet)
+    asked = _calibration_order(order, source)
+    return calibrate_in(folder, asked, resume=holds_run(folder), quiet=quiet, allow_code=allow_code)
 
 
 def _learn(order: RunOrder, calibrated: Calibrated, at: Place, folder: Path, *, quiet: bool) -> dict[str, object]:

@@ -1,10 +1,13 @@
-"""The film of a run's policies, read from its folder and drawn as strips of frames."""
+"""The film of a run's policies, read from its folder and shown as strips of frames."""
 
+import base64
+import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from markupsafe import Markup
 
 from madoc.report.reading import read_arrays
@@ -12,6 +15,8 @@ from madoc.report.rendering import chart
 
 FRAME = 88.0
 """Width of a frame in the units of a chart."""
+LARGEST = 300_000
+"""Largest size of all pictures of a page in bytes."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +28,14 @@ class Film:
         time: Time of each frame since the start, s.
         ends: The two ends of each geom, m; NaN after an episode has ended.
         radius: Radius of each geom, m.
+        pictures: The frames by MuJoCo's renderer, transparent where nothing is; None where OpenGL was not to be had.
     """
 
     names: tuple[str, ...]
     time: Float[np.ndarray, " frames"]
     ends: Float[np.ndarray, "policies frames geoms ends xyz"]
     radius: Float[np.ndarray, " geoms"]
+    pictures: UInt8[np.ndarray, "policies frames height width 4"] | None = None
 
 
 def read_film(folder: Path) -> Film | None:
@@ -36,8 +43,52 @@ def read_film(folder: Path) -> Film | None:
     arrays = read_arrays(folder / "film.npz", "names", "time", "ends", "radius")
     if arrays is None:
         return None
+    time, ends, radius = (np.asarray(arrays[name], float) for name in ("time", "ends", "radius"))
+    pictures = arrays.get("pictures")
     return Film(
-        tuple(map(str, arrays["names"])), *(np.asarray(arrays[name], float) for name in ("time", "ends", "radius"))
+        tuple(map(str, arrays["names"])), time, ends, radius, None if pictures is None else np.asarray(pictures, "u1")
+    )
+
+
+def rendered(film: Film) -> list[Markup] | None:
+    """The pictures of each policy as a strip; None where there are none, or they are too large for a page."""
+    if film.pictures is None:
+        return None
+    images = [png(np.concatenate(list(frames), axis=1)) for frames in film.pictures]
+    if sum(map(len, images)) > LARGEST:
+        return None
+    _, frames, height, width, _ = film.pictures.shape
+    times = [(FRAME * (index + 0.5), f"{time:.1f} s") for index, time in enumerate(film.time.tolist())]
+    tall = FRAME * height / width
+    return [
+        chart(
+            "pictures",
+            label=f"frames of the policy {name}",
+            width=FRAME * frames,
+            height=tall + 18,
+            tall=tall,
+            data=base64.b64encode(image).decode(),
+            times=times,
+        )
+        for name, image in zip(film.names, images, strict=True)
+    ]
+
+
+def png(pixels: UInt8[np.ndarray, "height width 4"]) -> bytes:
+    """An image as a PNG file (ISO/IEC 15948), each row as its difference from the row above.
+
+    Colours are kept to 5 of their 8 bits, which halves the file and hardly shows; what is transparent has none.
+    """
+    height, width, _ = pixels.shape
+    kept = np.where(pixels[..., 3:] > 0, pixels & np.array([0xF8, 0xF8, 0xF8, 0xFF], dtype=np.uint8), np.uint8(0))
+    rows = kept.reshape(height, -1)
+    above = np.concatenate([np.zeros_like(rows[:1]), rows[:-1]])
+    filtered = np.concatenate([np.full((height, 1), 2, dtype=np.uint8), rows - above], axis=1)
+    header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
+    parts = ((b"IHDR", header), (b"IDAT", zlib.compress(filtered.tobytes(), 9)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+        for name, content in parts
     )
 
 

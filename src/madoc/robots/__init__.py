@@ -10,6 +10,7 @@ from pathlib import Path
 
 from madoc import tasks
 from madoc.errors import MadocError, unknown_name
+from madoc.robots.functions import PythonFile, require_permission
 from madoc.robots.model import ModelFiles, read_bytes
 from madoc.robots.spec import RobotSpec, read_spec
 from madoc.robots.task import Robot, Signal, make_robot
@@ -18,11 +19,16 @@ from madoc.tasks import TASKS, Task
 SUFFIXES = (".yaml", ".yml")
 
 
-def load(path: str | Path) -> Robot:
+def load(path: str | Path, *, allow_code: bool = False) -> Robot:
     """Read a spec file and its model. Files whose content has not changed are parsed and compiled once.
+
+    Args:
+        path: The file.
+        allow_code: Run the Python file that the spec names, if it names one; else such a spec is refused.
 
     Raises:
         MadocError: A file is missing, or the spec has a mistake; the sentence names its line.
+        NotAllowed: The spec names a Python file, and `allow_code` is not given.
     """
     file = Path(path).expanduser()
     if not file.is_file():
@@ -34,27 +40,42 @@ def load(path: str | Path) -> Robot:
     spec, document = read_spec(content, file.name)
     with document.at("model"):
         model = ModelFiles.read(file.parent / spec.model)
-    return replace(make_robot(content, file.name, model), path=file)
+    python = None
+    if spec.python is not None:
+        names = f"{file.name}, line {document.line(('python',))}: the spec names"
+        require_permission(spec.python, names, allowed=allow_code)
+        with document.at("python"):
+            python = PythonFile.read(file.parent, spec.python)
+    return replace(make_robot(content, file.name, model, python), path=file)
 
 
-def restore(source: Mapping[str, object]) -> Robot:
-    """The robot that `Task.source` describes, without reading any file; a damaged source is refused."""
+def restore(source: Mapping[str, object], *, allow_code: bool = False) -> Robot:
+    """The robot that `Task.source` describes, without reading any file.
+
+    Raises:
+        MadocError: The source is damaged.
+        NotAllowed: The source holds a Python file, and `allow_code` is not given.
+    """
     file, spec, model = (source.get(name) for name in ("file", "spec", "model"))
     try:
         if not (isinstance(file, str) and isinstance(spec, str) and isinstance(model, Mapping)):
             raise ValueError("it has no file, spec or model")
         content, files = spec.encode(), ModelFiles.from_json(model)
+        python = PythonFile.from_json(source["python"]) if "python" in source else None
     except ValueError as error:
         raise MadocError(f"the robot in this run's spec.json cannot be read: {error}; restore the file") from error
-    return make_robot(content, file, files)
+    if python is not None:
+        require_permission(python.name, f"this run keeps, with the spec {file},", allowed=allow_code)
+    return make_robot(content, file, files, python)
 
 
-def resolve(name: str | Path, physics: str | None = None) -> Task:
+def resolve(name: str | Path, physics: str | None = None, *, allow_code: bool = False) -> Task:
     """The task of a robot, given by name or by the path of a spec file.
 
     Args:
         name: The name of one of Madoc's robots, as `hopper`, or a path, as `arm.yaml`.
         physics: `legacy` or `modern`; None takes `legacy` for Madoc's robots. A robot of a spec file is `modern`.
+        allow_code: As for `load`.
 
     Raises:
         MadocError: There is no such robot, or `load` refuses its file.
@@ -62,7 +83,7 @@ def resolve(name: str | Path, physics: str | None = None) -> Task:
     if is_spec_path(name):
         if physics == "legacy":
             raise MadocError(f"legacy physics exists only for Madoc's own robots; leave it out for {name}")
-        return load(name).task
+        return load(name, allow_code=allow_code).task
     if str(name) not in TASKS:
         raise MadocError(
             f"{unknown_name('task', str(name), TASKS)}; or give the path of a robot's spec file, as arm.yaml"

@@ -11,9 +11,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.robots.expressions import Expression, Read
+from madoc.robots.functions import NAMES, Argument, Function, read_functions
 from madoc.robots.grammar import Scope, parse
 from madoc.robots.model import Draft
-from madoc.robots.sensing import Signals
+from madoc.robots.sensing import Layout, Signals, Span
 from madoc.tasks.base import ActionChannel, Batch, never_terminated
 
 _OF_STATE = ("position", "velocity")
@@ -30,6 +31,7 @@ class Episode:
         ended: next state -> whether the episode has ended there.
         starts: How goals and starts are drawn.
         differs: Whether an episode differs from a log of the robot in more than its reward.
+        rewarded: Whether there is a reward.
     """
 
     goals: tuple[str, ...]
@@ -37,18 +39,23 @@ class Episode:
     ended: Callable[[Batch], Batch]
     starts: "Starts"
     differs: bool
+    rewarded: bool
 
 
 @dataclass(frozen=True)
 class Starts:
-    """How the beginnings of episodes are drawn: the goals in order, then values of the state by their address."""
+    """How the beginnings of episodes are drawn: the goals in order, then values of the state by their address.
+
+    A function of a Python file may stand in the place of the latter; it draws with NumPy, and is not traced.
+    """
 
     goals: tuple[tuple[str, Expression], ...]
     reset: tuple[tuple[int, Expression], ...]
+    function: "ResetFunction | None" = None
 
     def offsets(
         self, key: PRNGKeyArray, count: int, *, start: Float[np.ndarray, " state"]
-    ) -> Float[Array, "count state"]:
+    ) -> Float[Array | np.ndarray, "count state"]:
         """What is added to the state `start`, in which goals are 0, to begin `count` episodes."""
         of_goals, of_reset = jax.random.split(key)
         drawn: dict[str, Array] = {}
@@ -60,7 +67,40 @@ class Starts:
         for index, (address, expression) in enumerate(self.reset):
             value = _drawn(expression, drawn, jax.random.fold_in(of_reset, index), count)
             offsets = offsets.at[:, address].set(value - start[address])
+        if self.function is not None:
+            return self.function.offsets(of_reset, offsets, drawn, start)
         return offsets
+
+
+@dataclass(frozen=True)
+class ResetFunction:
+    """A function `reset` of a Python file, and where the values of a state are."""
+
+    function: Function
+    layout: Layout
+
+    def offsets(
+        self,
+        key: PRNGKeyArray,
+        offsets: Float[Array, "count state"],
+        goals: Mapping[str, Array],
+        start: Float[np.ndarray, " state"],
+    ) -> Float[np.ndarray, "count state"]:
+        """Offsets from `start`, float64, with those of the values that the function names."""
+        count, made = len(offsets), np.array(offsets, dtype=np.float64)
+        values: dict[str, Argument] = {name: _read_only(np.asarray(goal, np.float64)) for name, goal in goals.items()}
+        values |= {"random": np.random.default_rng(np.asarray(jax.random.key_data(key))), "count": count}
+        result = self.function(values)
+        if not isinstance(result, Mapping):
+            got = type(result).__name__
+            raise MadocError(f'{self.function.place}: expected {{"position(JOINT)": values, ...}}, got {got}')
+        for place, drawn in result.items():
+            try:
+                address = _address(str(place), self.layout)
+            except MadocError as error:
+                raise MadocError(f"{self.function.place}: {error}") from error
+            made[:, address] = self.function.checked(drawn, (count,), f" for {place}") - start[address]
+        return made
 
 
 def _drawn(expression: Expression, goals: Mapping[str, Array], key: PRNGKeyArray, count: int) -> Float[Array, " count"]:
@@ -80,13 +120,44 @@ def read_episode(draft: Draft, signals: Signals, actions: tuple[ActionChannel, .
     spec, goals = draft.spec, _read_goals(draft, actions)
     names = tuple(name for name, _ in goals)
     reader = _Reader(draft, signals, actions, names)
+    functions = _read_functions(reader)
+    reset = ResetFunction(functions["reset"], signals.layout) if "reset" in functions else None
+    reward: Callable[[Batch, Batch, Batch], Batch] = no_reward
+    ended: Callable[[Batch], Batch] = never_terminated
+    if "reward" in functions:
+        reward = partial(_function_reward, reader, functions["reward"])
+    elif spec.reward is not None:
+        reward = partial(_reward, reader, reader.expression("reward", spec.reward))
+    if "end" in functions:
+        ended = partial(_function_ended, reader, functions["end"])
+    elif spec.end is not None:
+        ended = partial(_ended, reader, reader.expression("end", spec.end))
     return Episode(
         goals=names,
-        reward=no_reward if spec.reward is None else partial(_reward, reader, reader.expression("reward", spec.reward)),
-        ended=never_terminated if spec.end is None else partial(_ended, reader, reader.expression("end", spec.end)),
-        starts=Starts(goals, _read_reset(draft, signals, names)),
-        differs=bool(spec.goals or spec.reset or spec.end is not None),
+        reward=reward,
+        ended=ended,
+        starts=Starts(goals, _read_reset(draft, signals, names), reset),
+        differs=bool(spec.goals or spec.reset or spec.end is not None or functions.keys() & {"end", "reset"}),
+        rewarded=spec.reward is not None or "reward" in functions,
     )
+
+
+def _read_functions(reader: "_Reader") -> dict[str, Function]:
+    """The functions of the Python file of a spec; one whose key the spec has too is refused."""
+    draft = reader.draft
+    if draft.python is None:
+        return {}
+    after = [*reader.state_names, "position", "velocity"]
+    actions = [channel.name for channel in reader.actions]
+    with draft.document.at("python"):
+        functions = read_functions(
+            draft.python,
+            {"reward": [*after, *actions], "end": after, "reset": ["random", "count", *reader.goals]},
+        )
+    for name in NAMES:
+        if name in functions and getattr(draft.spec, name):
+            raise draft.document.error((name,), f"{name}: is here and a function in {draft.python.name}; keep one")
+    return functions
 
 
 def _read_goals(draft: Draft, actions: tuple[ActionChannel, ...]) -> tuple[tuple[str, Expression], ...]:
@@ -110,14 +181,26 @@ def _read_reset(draft: Draft, signals: Signals, goals: tuple[str, ...]) -> tuple
     places: dict[int, Expression] = {}
     for key, given in draft.spec.reset.items():
         with draft.document.at("reset", key):
-            place = parse(key, Scope(reads=_OF_STATE)).root
-            if not isinstance(place, Read):
-                raise MadocError(f"expected position(JOINT) or velocity(JOINT) before the colon, got {key!r}")
-            address = signals.layout.address(place)
+            address = _address(key, signals.layout)
             if address in places:
                 raise MadocError(f"{key} is given twice; keep one")
             places[address] = parse(str(given), Scope(goals, (), draws=True, constant=True))
     return tuple(places.items())
+
+
+def _address(text: str, layout: Layout) -> int:
+    """Address in a state of `position(JOINT)` or `velocity(JOINT)`; any other text is refused."""
+    place = parse(text, Scope(reads=_OF_STATE)).root
+    if not isinstance(place, Read):
+        raise MadocError(f"expected position(JOINT) or velocity(JOINT) before the colon, got {text!r}")
+    return layout.address(place)
+
+
+def _read_only(values: Batch) -> Batch:
+    """A view that a user's function cannot write through."""
+    view = values.view()
+    view.flags.writeable = False
+    return view
 
 
 @dataclass(frozen=True)
@@ -143,11 +226,17 @@ class _Reader:
         """Refuse what the model does not have, and a signal that reads a sensor."""
         if read.kind != "name":
             self.signals.layout.address(read)
-        elif read.name in self._of_signals:
-            inside = self.signals.expressions[self._of_signals[read.name]].reads
-            if any(part.kind == "sensor" for part in inside):
-                what = "reward is a function of state and action" if key == "reward" else "end is a condition of states"
-                raise MadocError(f"a {what}, and the signal {read.name!r} reads a sensor")
+        elif read.name in self._of_signals and self._reads_sensor(read.name):
+            what = "reward is a function of state and action" if key == "reward" else "end is a condition of states"
+            raise MadocError(f"a {what}, and the signal {read.name!r} reads a sensor")
+
+    def _reads_sensor(self, signal: str) -> bool:
+        return any(part.kind == "sensor" for part in self.signals.expressions[self._of_signals[signal]].reads)
+
+    @property
+    def state_names(self) -> list[str]:
+        """What a state determines by name: the goals, and the signals that read no sensor."""
+        return [*(name for name in self._of_signals if not self._reads_sensor(name)), *self.goals]
 
     @property
     def _of_signals(self) -> dict[str, int]:
@@ -155,22 +244,37 @@ class _Reader:
 
     def value(self, expression: Expression, state: Batch, action: Batch) -> Batch:
         """The value of an expression after a step to `state` under `action`; without a warning where it has none."""
-        of_signals, of_actions = self._of_signals, {channel.name: index for index, channel in enumerate(self.actions)}
-        first_goal = state.shape[-1] - len(self.goals)
-
-        def look_up(read: Read) -> Batch:
-            if read.kind != "name":
-                return state[..., self.signals.layout.address(read)]
-            if read.name in of_signals:
-                return self.signals.value(of_signals[read.name], state)
-            if read.name in self.goals:
-                return state[..., first_goal + self.goals.index(read.name)]
-            channel = self.actions[of_actions[read.name]]
-            middle, half = (channel.low + channel.high) / 2.0, (channel.high - channel.low) / 2.0
-            return middle + half * action[..., of_actions[read.name]]
-
         with np.errstate(all="ignore"):
-            return expression.value(look_up, state.__array_namespace__())
+            return expression.value(partial(self._look_up, state, action), state.__array_namespace__())
+
+    def arguments(self, function: Function, state: Batch, action: Batch) -> dict[str, Argument]:
+        """What a function of a Python file is handed after a step to `state` under `action`: float64, read-only."""
+        state = np.asarray(state, dtype=np.float64)
+        values: dict[str, Argument] = {}
+        named = [*self.state_names, *(channel.name for channel in self.actions)]
+        for name in function.arguments:
+            if name in _OF_STATE and name not in named:
+                spans: dict[str, Span] = getattr(self.signals.layout, name)
+                values[name] = {
+                    joint: _read_only(state[..., start] if count == 1 else state[..., start : start + count])
+                    for joint, (start, count) in spans.items()
+                }
+            else:
+                values[name] = _read_only(np.asarray(self._look_up(state, action, Read("name", name)), np.float64))
+        return values
+
+    def _look_up(self, state: Batch, action: Batch, read: Read) -> Batch:
+        """One value after a step."""
+        of_signals, of_actions = self._of_signals, {channel.name: index for index, channel in enumerate(self.actions)}
+        if read.kind != "name":
+            return state[..., self.signals.layout.address(read)]
+        if read.name in of_signals:
+            return self.signals.value(of_signals[read.name], state)
+        if read.name in self.goals:
+            return state[..., state.shape[-1] - len(self.goals) + self.goals.index(read.name)]
+        channel = self.actions[of_actions[read.name]]
+        middle, half = (channel.low + channel.high) / 2.0, (channel.high - channel.low) / 2.0
+        return middle + half * action[..., of_actions[read.name]]
 
 
 def _reward(reader: _Reader, expression: Expression, state: Batch, action: Batch, next_state: Batch) -> Batch:
@@ -179,6 +283,15 @@ def _reward(reader: _Reader, expression: Expression, state: Batch, action: Batch
 
 def _ended(reader: _Reader, expression: Expression, next_state: Batch) -> Batch:
     return reader.value(expression, next_state, None)  # which no end reads
+
+
+def _function_reward(reader: _Reader, function: Function, state: Batch, action: Batch, next_state: Batch) -> Batch:
+    return function.numbers(reader.arguments(function, next_state, action), next_state.shape[:-1])
+
+
+def _function_ended(reader: _Reader, function: Function, next_state: Batch) -> Batch:
+    values = reader.arguments(function, next_state, None)  # which no end reads
+    return function.conditions(values, next_state.shape[:-1])
 
 
 def no_reward(state: Batch, action: Batch, next_state: Batch) -> Batch:

@@ -12,6 +12,7 @@ import numpy as np
 
 from madoc.errors import MadocError
 from madoc.robots.document import Document
+from madoc.robots.functions import PythonFile
 from madoc.robots.spec import RobotSpec
 from madoc.tasks.base import compiled_model
 
@@ -84,11 +85,15 @@ class ModelFiles:
 
 @dataclass(frozen=True)
 class Draft:
-    """A spec with its lines, and the MuJoCo spec of its model file, without the actuators that it adds."""
+    """A spec with its lines, and the MuJoCo spec of its model file, without the actuators that it adds.
+
+    The Python file is that which the spec names, allowed to be run.
+    """
 
     spec: RobotSpec
     document: Document
     base: mujoco.MjSpec
+    python: PythonFile | None = None
 
 
 @dataclass(frozen=True)

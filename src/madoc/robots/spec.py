@@ -160,6 +160,11 @@ class RobotSpec(Part):
         description="position(JOINT) or velocity(JOINT) -> where an episode begins: an expression as of goals. "
         "Default: as the model does.",
     )
+    python: File | None = Field(
+        None,
+        description="A Python file in the folder of this one. Its functions reward, end and reset take the place of "
+        "these keys. It is run only with --allow-code.",
+    )
     max_episode_steps: Annotated[int, Field(ge=1)] = Field(1000, description="Control steps of a simulated episode.")
 
     @field_validator("name")

@@ -14,6 +14,7 @@ from madoc import simulation
 from madoc.errors import MadocError
 from madoc.robots.actions import action_channel, added_actuator, idle_actuators
 from madoc.robots.episodes import Episode, no_reward, read_episode
+from madoc.robots.functions import PythonFile
 from madoc.robots.model import Draft, ModelFiles, compiled, make_model
 from madoc.robots.signals import read_signals, signal_unit
 from madoc.robots.space import parameter_space
@@ -57,11 +58,16 @@ class Robot:
 
 
 @lru_cache(maxsize=32)
-def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
-    """The robot that a spec describes; of the same content, the same robot. A mistake is refused with its line."""
+def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile | None = None) -> Robot:
+    """The robot that a spec describes; of the same content, the same robot. A mistake is refused with its line.
+
+    The Python file is that which the spec names; it is run.
+    """
     spec, document = read_spec(content, file)
+    if spec.python is not None and python is None:
+        raise document.error(("python",), f"the Python file {spec.python} is missing; restore it")
     with document.at("model"):
-        draft = Draft(spec, document, files.spec())
+        draft = Draft(spec, document, files.spec(), python)
     _check_names(draft)
     try:
         factory, model = _model(draft, files.main)
@@ -98,13 +104,17 @@ def make_robot(content: bytes, file: str, files: ModelFiles) -> Robot:
         actions=actions,
         signals=names,
         sense=signals.sense if signals.read_sensors else None,
-        rewarded=spec.reward is not None,
-        source={"file": file, "spec": content.decode("utf-8-sig"), "model": files.to_json()},
+        rewarded=episode.rewarded,
+        source={"file": file, "spec": content.decode("utf-8-sig"), "model": files.to_json()}
+        | ({} if python is None else {"python": python.to_json()}),
     )
     if episode.differs:
         task = replace(task, episodes=_episodes(task, episode))
     with document.at("model"):
         simulation.make(task, threads=1)
+    if python is not None:
+        with document.at("python"):
+            _try_out(task.for_policies)
     shown = tuple(
         Signal(given.name, signal_unit(draft, model, expression, index), expression.text)
         for index, (given, expression) in enumerate(zip(spec.signals, signals.expressions, strict=True))
@@ -161,12 +171,21 @@ def _episodes(task: Task, episode: Episode) -> Task:
         reward=episode.reward,
         terminated=episode.ended,
         reset_noise=partial(episode.starts.offsets, start=start),
+        traced_reset=episode.starts.function is None,
         state_from_observation=None if count else task.state_from_observation,
         posture=None if count else task.posture,
         signals=(*task.signals, *episode.goals),
         sense=task.sense and partial(_with_goals, task.sense, count=count),
         goals=episode.goals,
     )
+
+
+def _try_out(task: Task) -> None:
+    """Call what a Python file may define with a few rows, as a mistake there should not wait for a policy."""
+    states = np.tile(simulation.make(task, threads=1).initial_state, (2, 3, 1))
+    task.reward(states, np.zeros((2, 3, len(task.actions))), states)
+    task.terminated(states)
+    task.reset_noise(jax.random.key(0), 3)
 
 
 def _with_goals(observe: Callable[..., Batch], state: Batch, *sensordata: Batch, count: int) -> Batch:

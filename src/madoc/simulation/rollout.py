@@ -44,7 +44,8 @@ def reset_states(simulator: Simulator) -> Starts:
     """Starts drawn by the task's own reset."""
 
     def draw(key: PRNGKeyArray, count: int) -> np.ndarray:
-        noise = _reset_noise(simulator.task.reset_noise, key, count)
+        task = simulator.task
+        noise = _reset_noise(task.reset_noise, key, count) if task.traced_reset else task.reset_noise(key, count)
         return simulator.initial_state + np.asarray(noise, dtype=np.float64)
 
     return draw

@@ -44,7 +44,7 @@ def under(key: str) -> Iterator[None]:
         raise Misfit(key, str(error)) from error
 
 
-def check_calibration(order: CalibrationOrder, *, recorded: bool) -> None:
+def check_calibration(order: CalibrationOrder, *, recorded: bool, allow_code: bool = False) -> None:
     """Refuse a calibration whose robot, method or numbers are; its data is only looked for.
 
     Raises:
@@ -52,9 +52,9 @@ def check_calibration(order: CalibrationOrder, *, recorded: bool) -> None:
     """
     search = order.search
     with under("task"):
-        task = _robot(order.task, search.physics)
+        task = _robot(order.task, search.physics, allow_code)
     with under("parameters" if search.parameters else "level"):
-        _ranges(order.task, search.physics, search.parameters, search.level)
+        _ranges(order.task, search.physics, search.parameters, search.level, allow_code)
     method = method_of(order)
     with under("method"):
         _calibrator(method, (), None)
@@ -71,7 +71,7 @@ def check_calibration(order: CalibrationOrder, *, recorded: bool) -> None:
     _check_truth(order)
 
 
-def check_policy(order: PolicyOrder, search: Search, task: str) -> None:
+def check_policy(order: PolicyOrder, search: Search, task: str, *, allow_code: bool = False) -> None:
     """Refuse a policy that cannot be learnt of a calibrated robot.
 
     Raises:
@@ -87,7 +87,7 @@ def check_policy(order: PolicyOrder, search: Search, task: str) -> None:
         if not entry and order.at != "calibrated":
             raise MadocError(f"{order.method} does not learn at given parameters; leave out at: {order.at}")
     with under(""):
-        require_reward(_robot(task, search.physics))
+        require_reward(_robot(task, search.physics, allow_code))
     with under("seed"):
         check_seed(order.seed)
     _check_truth(order)
@@ -133,9 +133,9 @@ def _check_truth(order: CalibrationOrder | PolicyOrder | EvaluationOrder) -> Non
 
 
 @cache
-def content_of_robot(task: str) -> str:
-    """What a robot is: the name of one of Madoc's, or the content of a spec file and its model."""
-    return task if task in TASKS else hashed(dict(robots.load(task).task.source or {}))
+def content_of_robot(task: str, *, allow_code: bool = False) -> str:
+    """What a robot is: the name of one of Madoc's, or the content of a spec file and of what it names."""
+    return task if task in TASKS else hashed(dict(robots.load(task, allow_code=allow_code).task.source or {}))
 
 
 @cache
@@ -178,13 +178,13 @@ def content_of_file(path: str) -> str:
 
 
 @cache
-def _robot(task: str, physics: str | None) -> Task:
-    return robots.resolve(task, physics)
+def _robot(task: str, physics: str | None, allow_code: bool) -> Task:
+    return robots.resolve(task, physics, allow_code=allow_code)
 
 
 @cache
-def _ranges(task: str, physics: str | None, parameters: tuple[str, ...], level: str) -> None:
-    check_search(Search(parameters=parameters, level=level), _robot(task, physics), Path(task).name)
+def _ranges(task: str, physics: str | None, parameters: tuple[str, ...], level: str, allow_code: bool) -> None:
+    check_search(Search(parameters=parameters, level=level), _robot(task, physics, allow_code), Path(task).name)
 
 
 @cache

@@ -26,7 +26,9 @@ def usual_workers() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def run_locally(suite: Path, standing: Standing, *, workers: int, quiet: bool = False) -> bool:
+def run_locally(
+    suite: Path, standing: Standing, *, workers: int, quiet: bool = False, allow_code: bool = False
+) -> bool:
     """Do what is left of a suite with workers of this machine.
 
     Args:
@@ -34,6 +36,7 @@ def run_locally(suite: Path, standing: Standing, *, workers: int, quiet: bool = 
         standing: How far it is.
         workers: Number of processes.
         quiet: Show no progress.
+        allow_code: Workers may run the Python files that specs of robots name.
 
     Returns:
         Whether all was done; False where it was interrupted.
@@ -44,7 +47,7 @@ def run_locally(suite: Path, standing: Standing, *, workers: int, quiet: bool = 
     with (
         interruptible() as interruption,
         display(suite.name, unit="cells", quiet=quiet) as show,
-        _crew(suite, min(workers, len(standing.runnable))) as crew,
+        _crew(suite, min(workers, len(standing.runnable)), allow_code=allow_code) as crew,
     ):
         while standing.runnable:
             show(standing.moment())
@@ -62,8 +65,8 @@ def run_locally(suite: Path, standing: Standing, *, workers: int, quiet: bool = 
 class Crew:
     """The processes of some workers; each writes to a log of its own in the suite's folder."""
 
-    def __init__(self, suite: Path, workers: int) -> None:
-        self._suite, self._futile = suite, 0
+    def __init__(self, suite: Path, workers: int, *, allow_code: bool = False) -> None:
+        self._suite, self._futile, self._allow_code = suite, 0, allow_code
         self._logs = suite / "logs"
         self._logs.mkdir(exist_ok=True)
         self._processes = {number: self._start(number) for number in range(workers)}
@@ -107,6 +110,7 @@ class Crew:
         # Its standard input is our end of a pipe that says nothing: it closes when we end, however that happens.
         # A session of its own keeps Ctrl-C for us alone: we pass it on once.
         words = [sys.executable, "-m", "madoc", "worker", str(self._suite), "--attached", "--quiet"]
+        words += ["--allow-code"] if self._allow_code else []
         with (self._logs / f"worker-{number}.log").open("ab") as log:
             return subprocess.Popen(
                 words,
@@ -122,9 +126,9 @@ class Crew:
 
 
 @contextmanager
-def _crew(suite: Path, workers: int) -> Iterator[Crew]:
+def _crew(suite: Path, workers: int, *, allow_code: bool) -> Iterator[Crew]:
     """Workers for a block; none is left after it."""
-    crew = Crew(suite, workers)
+    crew = Crew(suite, workers, allow_code=allow_code)
     try:
         yield crew
     finally:

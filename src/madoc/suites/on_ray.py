@@ -35,7 +35,13 @@ _OBJECT_STORE = 80 * 2**20
 
 
 def run_on_ray(
-    suite: Path, standing: Standing, *, workers: int | None, address: str | None, quiet: bool = False
+    suite: Path,
+    standing: Standing,
+    *,
+    workers: int | None,
+    address: str | None,
+    quiet: bool = False,
+    allow_code: bool = False,
 ) -> bool:
     """Do what is left of a suite on a Ray cluster.
 
@@ -45,6 +51,7 @@ def run_on_ray(
         workers: How many cells are done at a time, where the cluster is started for this suite.
         address: An existing cluster; None starts one on this machine and ends it afterwards.
         quiet: Show no progress.
+        allow_code: Tasks may run the Python files that specs of robots name.
 
     Returns:
         Whether all was done; False where it was interrupted.
@@ -57,7 +64,7 @@ def run_on_ray(
         _cluster(workers, address) as ray,
         display(f"{suite.name} on Ray", unit="cells", quiet=quiet) as show,
     ):
-        tasks = _Tasks(ray, suite.resolve())
+        tasks = _Tasks(ray, suite.resolve(), allow_code=allow_code)
         while standing.runnable:
             show(standing.moment())
             if interruption.asked:
@@ -70,7 +77,7 @@ def run_on_ray(
     return True
 
 
-def do_cell(suite: str, name: str) -> str:
+def do_cell(suite: str, name: str, allow_code: bool = False) -> str:
     """One task: do a cell of a suite, in a process of the cluster.
 
     Returns:
@@ -83,7 +90,7 @@ def do_cell(suite: str, name: str) -> str:
 
     until = time.monotonic() + _WAIT
     while time.monotonic() < until:
-        done = work(Path(suite), [name])
+        done = work(Path(suite), [name], allow_code=allow_code)
         if done is None:
             return "interrupted"
         if done:
@@ -97,8 +104,8 @@ def do_cell(suite: str, name: str) -> str:
 class _Tasks:
     """The tasks of a suite that Ray has been given."""
 
-    def __init__(self, ray: "ModuleType", suite: Path) -> None:
-        self._ray, self._suite = ray, str(suite)
+    def __init__(self, ray: "ModuleType", suite: Path, *, allow_code: bool = False) -> None:
+        self._ray, self._suite, self._allow_code = ray, str(suite), allow_code
         self._do = ray.remote(num_cpus=1, max_retries=MOST_ATTEMPTS)(do_cell)
         self._given: dict[str, Any] = {}
 
@@ -106,7 +113,7 @@ class _Tasks:
         """Give Ray every cell that can start, and again one whose task ended without an end of the cell."""
         for cell in standing.runnable:
             if cell.name not in self._given and _can_start(cell, standing):
-                self._given[cell.name] = self._do.remote(self._suite, cell.name)
+                self._given[cell.name] = self._do.remote(self._suite, cell.name, self._allow_code)
         if not self._given:
             time.sleep(_LOOK)
             return

@@ -31,14 +31,14 @@ class Plan:
     cells: tuple[Cell, ...]
 
 
-def plan_of(file: Path) -> Plan:
-    """Read a suite file, and plan all that it asks.
+def plan_of(file: Path, *, allow_code: bool = False) -> Plan:
+    """Read a suite file, and plan all that it asks; `allow_code` runs Python files that specs of robots name.
 
     Raises:
         MadocError: It has a mistake, or asks for the same thing twice; the sentence names the line.
     """
     suite, document = read_suite(file)
-    planner = _Planner(document, file.resolve().parent)
+    planner = _Planner(document, file.resolve().parent, allow_code=allow_code)
     for combination in combinations(suite, document, planner.folder):
         planner.add(combination)
     return Plan(file.stem, file, tuple(planner.cells.values()))
@@ -47,8 +47,8 @@ def plan_of(file: Path) -> Plan:
 class _Planner:
     """The cells so far, and the line at which each was asked for."""
 
-    def __init__(self, document: Document, folder: Path) -> None:
-        self.document, self.folder = document, folder
+    def __init__(self, document: Document, folder: Path, *, allow_code: bool) -> None:
+        self.document, self.folder, self.allow_code = document, folder, allow_code
         self.cells: dict[str, Cell] = {}
         self._lines: dict[str, int] = {}
 
@@ -89,8 +89,8 @@ class _Planner:
         if unknown := next((key for key in given if key not in known), None):
             raise Misfit(unknown, f"unknown key {unknown!r}; {nearest_hint(unknown, known)}")
         order = build(CalibrationOrder, self._located(given, recorded=needs is not None))
-        checks.check_calibration(order, recorded=needs is not None)
-        told = stored(order) | {"task": checks.content_of_robot(order.task)}
+        checks.check_calibration(order, recorded=needs is not None, allow_code=self.allow_code)
+        told = stored(order) | {"task": checks.content_of_robot(order.task, allow_code=self.allow_code)}
         own = order.task not in TASKS
         logs = [needs] if needs else [checks.content_of_log(path, own=own) for path in order.source.paths]
         told["source"] = {key: value for key, value in told["source"].items() if key != "paths"} | {"logs": logs}
@@ -105,7 +105,7 @@ class _Planner:
         seed = calibrating.search.seed
         order = self._part(PolicyOrder, "learn", parts["learn"], asked, seed=seed)
         with self._inside("learn", asked):
-            checks.check_policy(order, calibrating.search, calibrating.task)
+            checks.check_policy(order, calibrating.search, calibrating.task, allow_code=self.allow_code)
         policy = self._put("learn", order, calibration.name, asked, stored(order))
         if "evaluate" not in parts:
             return policy

@@ -6,7 +6,7 @@ from pathlib import Path
 from time import monotonic
 
 from madoc import data
-from madoc.errors import MadocError
+from madoc.errors import MadocError, NotAllowed
 from madoc.pipeline import calibrate_in, evaluate_folder, learn_in, read_calibration, record_named
 from madoc.pipeline.folders import ENDED, holds_run
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
@@ -14,11 +14,14 @@ from madoc.suites.cells import RECORDED
 from madoc.suites.claims import MOST_ATTEMPTS, Claim, Outcome
 
 
-def carry_out(claim: Claim, suite: Path) -> Outcome | None:
+def carry_out(claim: Claim, suite: Path, *, allow_code: bool = False) -> Outcome | None:
     """Do what a cell asks, or go on with it where an earlier process was stopped.
 
     Returns:
         How it ended; None where it was interrupted, and the next process goes on.
+
+    Raises:
+        NotAllowed: A spec names a Python file, and `allow_code` is not given.
     """
     if claim.attempts > MOST_ATTEMPTS:
         tried = (
@@ -27,7 +30,9 @@ def carry_out(claim: Claim, suite: Path) -> Outcome | None:
         return claim.end("failed", tried, 0.0)
     started = monotonic()
     try:
-        status, sentence = _done(claim, suite)
+        status, sentence = _done(claim, suite, allow_code=allow_code)
+    except NotAllowed:
+        raise  # another worker may be allowed to
     except MadocError as error:
         # A full disk or a file that is gone is no refusal: the same order may go through another time.
         kind = "failed" if isinstance(error.__cause__, OSError) else "refused"
@@ -42,7 +47,7 @@ def carry_out(claim: Claim, suite: Path) -> Outcome | None:
     return claim.end(known, sentence, monotonic() - started)  # type: ignore[arg-type]
 
 
-def _done(claim: Claim, suite: Path) -> tuple[str, str]:
+def _done(claim: Claim, suite: Path, *, allow_code: bool) -> tuple[str, str]:
     """Carry the order out: the status, and that in words."""
     folder, order = claim.folder, claim.cell.read()
     resume = holds_run(folder)
@@ -53,13 +58,15 @@ def _done(claim: Claim, suite: Path) -> tuple[str, str]:
             data.save(dataset, folder / RECORDED)
             return "finished", f"{len(dataset):,} transitions are recorded"
         case CalibrationOrder():
-            result = calibrate_in(folder, _with_recording(order, claim, suite), resume=resume, quiet=True)
+            asked = _with_recording(order, claim, suite)
+            result = calibrate_in(folder, asked, resume=resume, quiet=True, allow_code=allow_code)
             return result.status, result.sentence
         case PolicyOrder():
-            learnt = learn_in(folder, read_calibration(needed), order, resume=resume, quiet=True)
+            calibrated = read_calibration(needed, allow_code=allow_code)
+            learnt = learn_in(folder, calibrated, order, resume=resume, quiet=True)
             return learnt.status, learnt.sentence
         case EvaluationOrder():
-            evaluation = evaluate_folder(needed, order, out=folder, quiet=True)
+            evaluation = evaluate_folder(needed, order, out=folder, quiet=True, allow_code=allow_code)
             return "finished", f"{evaluation.episodes} episodes are evaluated"
 
 

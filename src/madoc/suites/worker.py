@@ -15,7 +15,7 @@ _PAUSES = (0.05, 2.0)
 """Shortest and longest pause in s before cells that wait for others are looked at again."""
 
 
-def work(suite: Path, names: Sequence[str] | None = None) -> list[Outcome] | None:
+def work(suite: Path, names: Sequence[str] | None = None, *, allow_code: bool = False) -> list[Outcome] | None:
     """Carry out cells of a suite's plans until none is left that this process could begin.
 
     Any number of processes, on any number of machines that share the folder, may do this at once: each cell is done
@@ -24,15 +24,20 @@ def work(suite: Path, names: Sequence[str] | None = None) -> list[Outcome] | Non
     Args:
         suite: The folder of the suite.
         names: Only these cells. Default: all.
+        allow_code: Run the Python files that specs of robots name.
 
     Returns:
         How the cells ended that this process did; None where it was interrupted.
+
+    Raises:
+        NotAllowed: A spec names a Python file, and `allow_code` is not given; the cell is left to others.
     """
     planned = {cell.name: cell for cell in read_plans(suite)}
-    return _work(suite, list(planned.values()) if names is None else [planned[name] for name in names], planned)
+    cells = list(planned.values()) if names is None else [planned[name] for name in names]
+    return _work(suite, cells, planned, allow_code=allow_code)
 
 
-def _work(suite: Path, cells: Sequence[Cell], known: dict[str, Cell]) -> list[Outcome] | None:
+def _work(suite: Path, cells: Sequence[Cell], known: dict[str, Cell], *, allow_code: bool) -> list[Outcome] | None:
     """The loop of `work`."""
     done: list[Outcome] = []
     in_vain: set[str] = set()
@@ -59,7 +64,7 @@ def _work(suite: Path, cells: Sequence[Cell], known: dict[str, Cell]) -> list[Ou
                 if claim is None:
                     later.append(cell)
                     continue
-                outcome = carry_out(claim, suite)
+                outcome = carry_out(claim, suite, allow_code=allow_code)
                 if outcome is None:
                     return None
                 done.append(outcome)

@@ -112,6 +112,7 @@ class Task:
         source: The files of a robot's spec as JSON, from which `robots.restore` makes the task again; None for a task
             that its name determines.
         goals: Names of the values that are drawn at a reset, hold for an episode, and end state and observation.
+        traced_reset: Whether JAX may trace `reset_noise`; not where a function of a user's own draws with NumPy.
         episodes: The task that policies learn, where a user's own robot starts, ends or is rewarded there unlike in
             its logs; None where it is this one. `for_policies` has the parameters as well.
         posture: observation -> (qpos, qvel), NaN for values not determined; None where no position is determined.
@@ -125,7 +126,7 @@ class Task:
     observe: Callable[[Batch], Batch]
     reward: Callable[[Batch, Batch, Batch], Batch]
     terminated: Callable[[Batch], Batch]
-    reset_noise: Callable[[PRNGKeyArray, int], jax.Array]
+    reset_noise: Callable[[PRNGKeyArray, int], jax.Array | np.ndarray]
     parameters: ParameterSpace
     ranges: dict[str, ParameterSpace]
     groups: int
@@ -142,6 +143,7 @@ class Task:
     source: Mapping[str, object] | None = None
     posture: Callable[[Batch], Batch] | None = None
     goals: tuple[str, ...] = ()
+    traced_reset: bool = True
     episodes: "Task | None" = None
 
     @property

@@ -1,6 +1,6 @@
 """Policies where the estimate is not sure, which parameter errors matter, and what the policies look like."""
 
-from madoc.report.film import read_film, strip
+from madoc.report.film import read_film, rendered, strip
 from madoc.report.reading import Run
 from madoc.report.sections.outcome import POLICIES
 
@@ -19,16 +19,20 @@ def robustness(run: Run) -> dict[str, object] | str:
 
 
 def film(run: Run) -> dict[str, object] | str:
-    """An episode of each policy, as a strip of frames, that of the truth in grey beside the others."""
+    """An episode of each policy, as a strip of pictures; else as one of outlines, those of the truth in grey beside."""
     seen = read_film(run.whole)
     if seen is None:
         return "No policy of this run was filmed."
     names = seen.names
     beside = names.index("truth") if "truth" in names else None
+    shown = rendered(seen)
     strips = [
-        {"title": POLICIES.get(name, (name, ""))[0], "chart": strip(seen, index, beside=beside)}
+        {
+            "title": POLICIES.get(name, (name, ""))[0],
+            "chart": shown[index] if shown else strip(seen, index, beside=beside),
+        }
         for index, name in enumerate(names)
     ]
     known = run.evaluation is not None and bool(run.evaluation.policies)
     where = "the target" if known else "the calibrated simulator"
-    return {"strips": strips, "where": where, "ghost": len(names) > 1 and beside is not None}
+    return {"strips": strips, "where": where, "ghost": not shown and len(names) > 1 and beside is not None}

@@ -1,0 +1,102 @@
+"""Pictures of a model by MuJoCo's renderer, where OpenGL is to be had without a screen; else there are none.
+
+A broken OpenGL library ends its process, so `render_process.py` draws in one of its own.
+"""
+
+import contextlib
+import ctypes.util
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, UInt8
+
+LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
+"""The ways to OpenGL without a screen, as MuJoCo's `MUJOCO_GL` names them, and the library that each needs."""
+TIMEOUT = 60.0
+"""Longest time in s that drawing may take with each of them."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera that looks at a robot from the side, at a point of its own in each frame.
+
+    Attributes:
+        centre: The points, m.
+        azimuth: Direction of view about the vertical, deg: 90 has x to the right, 180 has y to the right.
+        distance: From the camera to the point, m.
+    """
+
+    centre: Float[np.ndarray, "frames xyz"]
+    azimuth: float
+    distance: float
+
+
+def pictures(
+    model: mujoco.MjModel, states: Float[np.ndarray, "frames state"], camera: Camera, *, width: int, height: int
+) -> UInt8[np.ndarray, "frames height width 4"] | None:
+    """What a camera sees of a model in each state, in RGBA, transparent where nothing is; None without OpenGL.
+
+    The way to OpenGL is that of the environment's `MUJOCO_GL` alone where that is set, so `MUJOCO_GL=disable` draws
+    nothing.
+    """
+    # No room for its files, or no process: then there are no pictures, which is no reason for a run to fail.
+    with contextlib.suppress(OSError), tempfile.TemporaryDirectory(prefix="madoc-") as place:
+        folder = Path(place)
+        for library in _ways():
+            if not (folder / "model.mjb").exists():
+                mujoco.mj_saveModel(model, str(folder / "model.mjb"))
+                np.savez(folder / "asked.npz", states=states, size=np.array([width, height]), **vars(camera))
+            if _draw(folder, library):
+                return np.load(folder / "pictures.npy", allow_pickle=False)
+    return None
+
+
+def side_camera(
+    ends: Float[np.ndarray, "frames geoms ends xyz"], radius: Float[np.ndarray, " geoms"], fovy: float, most: float
+) -> tuple[Camera, float]:
+    """The camera from whose side all frames move most and fit, and the width of its picture by the height.
+
+    Args:
+        ends: The outlines of the frames, m.
+        radius: Radius of each geom, m.
+        fovy: Vertical angle of view, deg.
+        most: Largest ratio of width to height; the smallest is one by this.
+    """
+    low = (ends - radius[:, None, None]).min((1, 2))
+    high = (ends + radius[:, None, None]).max((1, 2))
+    along = int(np.ptp(ends[..., 1]) > np.ptp(ends[..., 0]))
+    centre = np.tile((low.min(0) + high.max(0)) / 2, (len(ends), 1))
+    middle = (low + high)[:, along] / 2
+    if np.ptp(middle) > (high - low)[:, [along, 2]].sum(1).max():  # it travels: the camera goes with it
+        centre[:, along] = middle
+    reach = np.maximum(high - centre, centre - low).max(0)
+    across, up, deep = reach[along], reach[2], reach[1 - along]
+    ratio = float(np.clip(across / max(up, 1e-9), 1.0 / most, most))
+    distance = deep + max(up, across / ratio) / np.tan(np.radians(fovy) / 2)
+    return Camera(centre, 180.0 if along else 90.0, 1.05 * max(float(distance), 1e-3)), ratio
+
+
+def _ways() -> list[str]:
+    """The values of `MUJOCO_GL` to try, the fastest first."""
+    asked = os.environ.get("MUJOCO_GL", "").lower()
+    if asked:
+        return [asked] if asked in LIBRARIES else []
+    return [way for way, library in LIBRARIES.items() if ctypes.util.find_library(library)]
+
+
+def _draw(folder: Path, way: str) -> bool:
+    """Let a process draw what the folder asks; whether it did."""
+    words = [sys.executable, "-P", str(Path(__file__).with_name("render_process.py")), str(folder)]
+    environment = os.environ | {"MUJOCO_GL": way, "PYOPENGL_PLATFORM": way}
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        done = subprocess.run(
+            words, env=environment, timeout=TIMEOUT, stdin=subprocess.DEVNULL, capture_output=True, check=False
+        )
+        return done.returncode == 0
+    return False
