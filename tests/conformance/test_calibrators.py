@@ -47,7 +47,6 @@ def small(name, **changes):
 
 METHODS = {
     **{name: small(name) for name in CALIBRATORS if name.startswith("madoc")},
-    "madoc, free running": small("madoc", starts="policy"),
     "madoc, replaying": small("madoc", starts="replay"),
     "least-squares": LeastSquares(windows=6, search_windows=3, searches=2, search_epochs=2, tolerance=0.0),
     "least-squares, windows": LeastSquares(horizon=3, windows=4, search_windows=2, search_epochs=1, tolerance=0.0),
@@ -98,7 +97,7 @@ def problem(dataset, simulator):
 
 QUICK = (
     "madoc",
-    "madoc, free running",
+    "madoc-local",
     "least-squares",
     "oted",
     "dropo",
@@ -295,7 +294,7 @@ def test_logged_starts_without_states_are_refused(method, dataset, starts):
 
 
 UNSEEING = (
-    *("madoc", "madoc, free running", "least-squares", "least-squares, estimating", "oted, free running"),
+    *("madoc", "madoc-local", "least-squares", "least-squares, estimating", "oted, free running"),
     *("cma-es, acting", "nominal", "uniform"),
 )
 

@@ -35,7 +35,6 @@ STATES = 100
 """Logged states in an epoch of grouping by physics."""
 PAPER: dict[str, object] = {
     "groups": "learned",
-    "starts": "policy",
     "features": "raw",
     "hidden": (256, 256),
     "cloning_epochs": 100,
@@ -115,7 +114,7 @@ class Madoc:
         group_count: Number of groups; None takes the most stable number, or that of the task for `learned`.
         starts: `policy` (the clone acts from resets on, as in the paper), `logged` (short rollouts of the clone from
             logged states; hidden velocities are taken from positions) or `replay` (one step from each logged state and
-            action). None takes `logged` where states are known, else `policy`.
+            action). None, as `madoc-local` has it, takes `logged` where states are known, else `policy`.
         window: Rows (s, a) that the discriminators see before s'; None takes 1 where an observation determines the
             state, as in the paper, else 3.
         sensor_noise: Noise put on simulated observations, as a share of a step's typical change. None takes the share
@@ -142,7 +141,7 @@ class Madoc:
     mixing: Mixing = "dop"
     groups: Grouping = "physics"
     group_count: Count | None = None
-    starts: StartMode | None = None
+    starts: StartMode | None = "policy"
     window: Count | None = None
     sensor_noise: NotNegative | Literal["estimated"] | None = None
     features: Features = "standardised"
