@@ -222,12 +222,13 @@ class Madoc:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
         space, best = problem.simulator.parameters, state.watch.best
         scaled, std = np.tanh(np.asarray(best.mean, np.float64)), np.exp(np.asarray(best.log_std, np.float64))
+        grouped = state.grouped == self.grouping_epochs
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
             mean=space.to_physical(scaled),
             std=(1.0 - scaled**2) * std * (space.high - space.low) / 2.0,
             groups=tuple(tuple(group) for group in groups),
-            group_stability=state.stability if self._finds_groups(state) else None,
+            group_stability=state.stability if self._finds_groups(state) and grouped else None,
             failures=state.failures,
             warnings=(*watch.warnings(state.watch, scaled, space.names), *self.collection(problem).warnings),
         )
