@@ -33,10 +33,12 @@ RECORDED = {
 """Options of `madoc record hopper-medium`, by the name of the data."""
 
 CALIBRATIONS = {
-    **{f"{method} clean": ("clean", method, 15_000, SMALL) for method in ("madoc", "madoc-s", "madoc-vdn")},
+    **{
+        f"{method} clean": ("clean", method, 15_000, SMALL)
+        for method in ("madoc", "madoc-local", "madoc-s", "madoc-vdn")
+    },
     **{f"{method} clean": ("clean", method, 15_000, SMALL) for method in ("madoc-isac", "madoc-ungrouped")},
     "madoc-paper clean": ("clean", "madoc-paper", 8_000, ["--set", "grouping_epochs=2", "cloning_epochs=2"]),
-    "madoc policy": ("clean", "madoc", 15_000, ["--starts", "policy", *SMALL]),
     "madoc replay": ("clean", "madoc", 15_000, ["--starts", "replay", *SMALL]),
     "madoc hidden": ("hidden", "madoc", 15_000, ["--starts", "policy", *SMALL]),
     "madoc noisy": ("noisy", "madoc", 15_000, SMALL),

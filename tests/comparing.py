@@ -14,10 +14,21 @@ def listed(physics):
 
 
 TINY = [
-    *("madoc.hidden=[16]", "madoc.cloning_epochs=3", "madoc.cloning_updates=5", "madoc.grouping_epochs=3"),
-    *("madoc.grouping_updates=5", "madoc.epoch_steps=100", "madoc.updates=5", "madoc.draws=5", "madoc.batch=32"),
-    *("madoc.replay_capacity=500", "madoc.agents.hidden=[16]", "madoc.agents.critic_hidden=[16]"),
-    *("madoc.agents.batch=32", "madoc.agents.actor_batch=16"),
+    *(
+        "madoc-local.hidden=[16]",
+        "madoc-local.cloning_epochs=3",
+        "madoc-local.cloning_updates=5",
+        "madoc-local.grouping_epochs=3",
+    ),
+    *(
+        "madoc-local.grouping_updates=5",
+        "madoc-local.epoch_steps=100",
+        "madoc-local.updates=5",
+        "madoc-local.draws=5",
+        "madoc-local.batch=32",
+    ),
+    *("madoc-local.replay_capacity=500", "madoc-local.agents.hidden=[16]", "madoc-local.agents.critic_hidden=[16]"),
+    *("madoc-local.agents.batch=32", "madoc-local.agents.actor_batch=16"),
 ]
 """Every stage of madoc in epochs of milliseconds."""
 

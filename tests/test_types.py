@@ -15,6 +15,7 @@ from madoc.types import entry_of
     [
         (Madoc(updates=3), "madoc"),
         (Madoc(groups="one", mixing="sum"), "madoc-s"),
+        (Madoc(starts=None, updates=3), "madoc-local"),
         (Madoc(groups="each", mixing="sum"), "madoc-vdn"),
         (Madoc(features="raw"), "madoc"),
         (Madoc.paper(updates=3), "madoc-paper"),

@@ -42,7 +42,9 @@ def test_rollouts_start_at_logged_states_where_those_are_known(log):
     blind = CalibrationProblem(
         log, simulation.make(replace(WHOLE, state_from_observation=None, posture=None), threads=1)
     )
-    assert [Madoc().collection(problem).mode for problem in (seen, hidden, blind)] == ["logged", "logged", "policy"]
+    modes = [Madoc(starts=None).collection(problem).mode for problem in (seen, hidden, blind)]
+    assert modes == ["logged", "logged", "policy"]
+    assert {Madoc().collection(problem).mode for problem in (seen, hidden, blind)} == {"policy"}
     assert [Oted()._anew(problem) for problem in (seen, hidden, blind)] == [True, False, False]
     assert [CmaEs("distribution")._acts(problem) for problem in (seen, hidden, blind)] == [False, True, True]
 

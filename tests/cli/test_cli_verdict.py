@@ -50,7 +50,7 @@ def test_auto_keeps_least_squares_where_that_explains_all(log, tmp_path, capsys)
     assert answer["holdout"]["chosen"] == answer["method"] == "least-squares"
     ran, skipped = answer["holdout"]["candidates"]
     assert ran["verdict"] == "CALIBRATED"
-    assert skipped == {"method": "madoc", "not_run": "least-squares explains the hold-out down to its noise"}
+    assert skipped == {"method": "madoc-local", "not_run": "least-squares explains the hold-out down to its noise"}
     assert answer == read(out / "result.json")
     assert read(out / "comparison.json")["candidates"] == [ran, skipped]
     assert CalibrationResult.from_json(answer).to_json() == answer
@@ -105,7 +105,7 @@ def test_a_refusal_is_a_row_and_the_next_method_runs(log, tmp_path, capsys):
     refused, ran = answer["holdout"]["candidates"]
     assert refused["method"] == "least-squares"
     assert refused["not_run"].startswith("refused: this method compares each row's next")
-    assert (ran["method"], ran["verdict"], code) == ("madoc", "DATA_REJECTED", 13)
+    assert (ran["method"], ran["verdict"], code) == ("madoc-local", "DATA_REJECTED", 13)
     assert not (tmp_path / "run" / "least-squares").exists()
 
 
@@ -114,8 +114,8 @@ def test_a_refusal_is_a_row_and_the_next_method_runs(log, tmp_path, capsys):
     [
         (["--holdout", "1.5"], "expected a share of the rows to hold out between 0 and 1, got 1.5"),
         (["--budget", "0"], "a budget of at least 1"),
-        (["--set", "updates=2"], "there are: least-squares.NAME, madoc.NAME"),
-        (["--set", "madoc.update=2"], "did you mean updates"),
+        (["--set", "updates=2"], "there are: least-squares.NAME, madoc-local.NAME"),
+        (["--set", "madoc-local.update=2"], "did you mean updates"),
     ],
 )
 def test_what_auto_cannot_do_is_refused_and_leaves_nothing(log, tmp_path, capsys, more, told):

@@ -37,7 +37,7 @@ def without_seconds(value):
 
 
 def told(folder):
-    files = ("result.json", "comparison.json", "least-squares/result.json", "madoc/result.json")
+    files = ("result.json", "comparison.json", "least-squares/result.json", "madoc-local/result.json")
     found = {name: without_seconds(json.loads((folder / name).read_text())) for name in files}
     return found | {"evidence": (folder / "evidence.npz").read_bytes()}
 
@@ -65,7 +65,7 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path):
     _, err = whole.communicate(timeout=250)
     assert whole.returncode == 12, err
     run = tmp_path / "run"
-    for waits_for in ("spec.json", "least-squares/result.json", "comparison.json", "madoc/metrics.jsonl"):
+    for waits_for in ("spec.json", "least-squares/result.json", "comparison.json", "madoc-local/metrics.jsonl"):
         process = start([*words, "--out", run, *(["--resume"] if (run / "spec.json").exists() else [])], cache)
         while not (run / waits_for).exists() and process.poll() is None:
             time.sleep(0.005)

@@ -52,7 +52,7 @@ def test_a_spring_is_recovered(name, starts):
 @pytest.mark.slow
 def test_a_two_link_arm_is_recovered():
     task = two_link_arm()
-    method = quick("madoc", patience=0)
+    method = quick("madoc-local", patience=0)
     result = calibrate(method, problem_of(task, ARM_TRUTH), key=jax.random.key(0), budget=60_000)
     assert (off(result, task, ARM_TRUTH) < TOLERANCE).all(), off(result, task, ARM_TRUTH)
 

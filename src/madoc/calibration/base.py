@@ -100,6 +100,8 @@ class Estimate:
         covariance: Covariance of the estimates, with `std` squared on its diagonal; None where it is unknown.
         interval: 95 % confidence intervals, columns low and high; None where they are unknown.
         settled: Whether the search came to its end; if not, a larger budget would change the estimate.
+        group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
+            other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
     """
 
     mean: Float[np.ndarray, " d"]
@@ -110,6 +112,7 @@ class Estimate:
     covariance: Float[np.ndarray, "d d"] | None = None
     interval: Float[np.ndarray, "d 2"] | None = None
     settled: bool = True
+    group_stability: float | None = None
 
 
 @runtime_checkable

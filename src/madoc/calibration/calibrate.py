@@ -78,6 +78,7 @@ def calibrate(
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
         combinations=[] if told is None else list(combinations(space, estimate.mean, told)),
         settled=estimate.settled,
+        group_stability=estimate.group_stability,
         problem=problem,
     )
     if folder is not None:

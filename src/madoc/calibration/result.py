@@ -51,6 +51,8 @@ class CalibrationResult:
         covariance: Covariance of the estimates in physical units, in the task's order; None where it is unknown.
         combinations: Sums and products of parameters that the log tells though it leaves each of them open.
         settled: Whether the method's search came to its end; its intervals mean nothing before.
+        group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
+            groups, 0 for chance; None where the method did not find groups.
         verdict: The judgement on held-out rows; None where none were held out.
         holdout: The numbers behind the verdict.
         problem: The data and the simulator; None in a result that was read from a file.
@@ -72,6 +74,7 @@ class CalibrationResult:
     covariance: list[list[float]] | None = None
     combinations: list[Combination] = field(default_factory=list)
     settled: bool = True
+    group_stability: float | None = None
     verdict: Verdict | None = None
     holdout: HoldOut | None = None
     problem: Annotated[CalibrationProblem | None, GetPydanticSchema(lambda kind, handler: core_schema.any_schema())] = (
@@ -163,6 +166,10 @@ class CalibrationResult:
             lines.append(
                 f"mean absolute error {self.error['mean_absolute']:.4g}, "
                 f"{self.error['mean_percent_of_range']:.2f} % of range"
+            )
+        if self.group_stability is not None:
+            lines.append(
+                f"{len(self.groups)} groups; adjusted Rand index with resampled ones {self.group_stability:.2f}"
             )
         lines += [f"told in combination: {told}" for told in self.combinations]
         return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])

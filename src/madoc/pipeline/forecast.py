@@ -56,8 +56,8 @@ def _least_squares(problem: CalibrationProblem) -> Forecast:
 
 
 def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
-    method = Madoc(groups="one", cloning_epochs=0)
-    name = "madoc"
+    method = Madoc(groups="one", starts=None, cloning_epochs=0)
+    name = "madoc-local"
     try:
         state = method.init(problem, jax.random.key(0))
         times = []

@@ -14,7 +14,7 @@ from madoc.types import MethodEntry
 
 Made = TypeVar("Made")
 
-CANDIDATES = {"least-squares": 2 / 3, "madoc": 1 / 2}
+CANDIDATES = {"least-squares": 2 / 3, "madoc-local": 1 / 2}
 """The methods that `auto` tries, in this order (seconds before minutes), with the largest share of the budget of each.
 
 What a method does not spend is left to those after it.
@@ -51,7 +51,7 @@ def make_method(
 
 
 def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator]:
-    """The candidates of `auto` by name; a hyperparameter is changed under a name such as `madoc.updates`.
+    """The candidates of `auto` by name; a hyperparameter is changed under a name such as `madoc-local.updates`.
 
     Raises:
         MadocError: A hyperparameter is named otherwise, or as `make_method`.

@@ -10,10 +10,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, PRNGKeyArray, PyTree
+from jaxtyping import Float, Int, PRNGKeyArray, PyTree
 
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.madoc import grouping, watch
+from madoc.calibration.madoc import effects, grouping, watch
 from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.agents import BLUR_RANGE, Agents, AgentSettings
 from madoc.calibration.madoc.collection import GEOMETRY, HIDDEN_WINDOW, Collection, Features, StartMode, noise_deviation
@@ -21,15 +21,20 @@ from madoc.calibration.madoc.grouping import GroupingVAE
 from madoc.calibration.madoc.value_decomposition import Mixing
 from madoc.calibration.madoc.watch import Watch
 from madoc.errors import MadocError
+from madoc.identification.states import probing_windows
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
 from madoc.learning.networks import adam, scalars
 from madoc.simulation.rollout import Walkers, out_of_step
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
-Grouping = Literal["learned", "one", "each"]
+Grouping = Literal["physics", "learned", "one", "each"]
+VOTING = 0.45
+"""Share of the epochs of grouping, the last ones, in which the VAE's groups are voted on: 90 of the authors' 200."""
+STATES = 100
+"""Logged states in an epoch of grouping by physics."""
 PAPER: dict[str, object] = {
-    "starts": "policy",
+    "groups": "learned",
     "features": "raw",
     "hidden": (256, 256),
     "cloning_epochs": 100,
@@ -68,8 +73,11 @@ class MadocState:
         clone: The running policy.
         vae: The network that embeds parameters by their effect.
         vae_optimiser: State of its optimiser.
-        schemes: Proposed groups of the last epochs of grouping.
+        schemes: Proposed groups of the last epochs of grouping by the VAE.
+        moments: What the parameters' effects have in common, in each epoch of grouping by physics.
         labels: Group of each parameter.
+        stability: Mean adjusted Rand index of the groups with those of resampled states, or with those proposed in
+            other epochs; 0 before there are groups.
         agents: Discriminators, critics and actors.
         rows: Buffer of simulated rows.
         walkers: Simulated rows that go on in the next epoch.
@@ -83,7 +91,9 @@ class MadocState:
     vae: GroupingVAE
     vae_optimiser: PyTree
     schemes: Int[np.ndarray, "votes d"]
+    moments: Float[np.ndarray, "blocks d d"]
     labels: Int[np.ndarray, " d"]
+    stability: float
     agents: Agents
     rows: replay.Replay
     walkers: Walkers
@@ -99,11 +109,12 @@ class Madoc:
 
     Attributes:
         mixing: `dop` (Madoc), `sum` (Madoc-VDN) or `independent` (Madoc-ISAC).
-        groups: `learned`, `one` agent for all (Madoc-S), or `each` parameter its own (ungrouped).
-        group_count: Number of learned groups; None takes that of the task.
+        groups: `physics` (parameters that move the same signals, by derivatives of the simulator), `learned` (by the
+            paper's VAE), `one` agent for all (Madoc-S), or `each` parameter its own (ungrouped).
+        group_count: Number of groups; None takes the most stable number, or that of the task for `learned`.
         starts: `policy` (the clone acts from resets on, as in the paper), `logged` (short rollouts of the clone from
             logged states; hidden velocities are taken from positions) or `replay` (one step from each logged state and
-            action). None takes `logged` where states are known, else `policy`.
+            action). None, as `madoc-local` has it, takes `logged` where states are known, else `policy`.
         window: Rows (s, a) that the discriminators see before s'; None takes 1 where an observation determines the
             state, as in the paper, else 3.
         sensor_noise: Noise put on simulated observations, as a share of a step's typical change. None takes the share
@@ -113,8 +124,9 @@ class Madoc:
         cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
         cloning_updates: Updates in each epoch of cloning.
         keep_cloning: Whether cloning continues during calibration, as in the paper.
-        grouping_epochs: Epochs of grouping; each spends `epoch_steps` control steps.
-        grouping_updates: Updates in each epoch of grouping.
+        grouping_epochs: Epochs of grouping, outside the budget. One spends 100 · (1 + 2 d) control steps by physics,
+            `epoch_steps` if groups are learned.
+        grouping_updates: Updates of the VAE in each epoch of grouping.
         epoch_steps: Control steps in an epoch.
         updates: Calibration updates in an epoch.
         draws: Parameter draws in an epoch; None takes 20, 100, 100 for `policy`, `logged`, `replay`.
@@ -127,9 +139,9 @@ class Madoc:
     """
 
     mixing: Mixing = "dop"
-    groups: Grouping = "learned"
+    groups: Grouping = "physics"
     group_count: Count | None = None
-    starts: StartMode | None = None
+    starts: StartMode | None = "policy"
     window: Count | None = None
     sensor_noise: NotNegative | Literal["estimated"] | None = None
     features: Features = "standardised"
@@ -137,8 +149,8 @@ class Madoc:
     cloning_epochs: CountOrZero = 40
     cloning_updates: Count = 200
     keep_cloning: bool = False
-    grouping_epochs: Count = 10
-    grouping_updates: Count = 200
+    grouping_epochs: Count = 20
+    grouping_updates: Count = 1000
     epoch_steps: Count = 1000
     updates: Count = 100
     draws: Count | None = None
@@ -185,7 +197,9 @@ class Madoc:
             clone=fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy),
             vae=vae,
             vae_optimiser=adam(self.learning_rate).init(eqx.filter(vae, eqx.is_array)),
-            schemes=np.zeros((max(1, self.grouping_epochs // 20), count), dtype=np.int64),
+            schemes=np.zeros((max(1, int(VOTING * self.grouping_epochs)), count), dtype=np.int64),
+            moments=np.zeros((self.grouping_epochs, count, count)),
+            stability=0.0,
             labels=np.arange(count) if groups == count else np.zeros(count, dtype=np.int64),
             agents=agents,
             rows=collection.empty_rows(self.replay_capacity),
@@ -200,26 +214,32 @@ class Madoc:
         """One epoch of cloning, of grouping where groups are to be learned, or of calibration."""
         if self.starts != "replay" and state.clone.epochs < self.cloning_epochs:
             return self._clone(problem, state)
-        if 1 < len(state.agents.critics.weight) < len(state.labels) and state.grouped < self.grouping_epochs:
-            return self._group(problem, state)
+        if self._finds_groups(state) and state.grouped < self.grouping_epochs:
+            return (self._group_by_physics if self.groups == "physics" else self._learn_groups)(problem, state)
         return self._calibrate(problem, state)
 
     def estimate(self, problem: CalibrationProblem, state: MadocState) -> Estimate:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
         space, best = problem.simulator.parameters, state.watch.best
         scaled, std = np.tanh(np.asarray(best.mean, np.float64)), np.exp(np.asarray(best.log_std, np.float64))
+        grouped = state.grouped == self.grouping_epochs
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
             mean=space.to_physical(scaled),
             std=(1.0 - scaled**2) * std * (space.high - space.low) / 2.0,
             groups=tuple(tuple(group) for group in groups),
+            group_stability=state.stability if self._finds_groups(state) and grouped else None,
             failures=state.failures,
             warnings=(*watch.warnings(state.watch, scaled, space.names), *self.collection(problem).warnings),
         )
 
     def embeddings(self, problem: CalibrationProblem, state: MadocState) -> np.ndarray | None:
-        """The VAE's embedding of each parameter; None before its first epoch of training."""
-        return np.asarray(state.vae.embeddings(), dtype=np.float64) if state.grouped else None
+        """A vector for each parameter, from its effects or the VAE's encoder; None before any grouping."""
+        if not state.grouped:
+            return None
+        if self.groups == "physics":
+            return effects.embedding(state.moments.sum(0))
+        return np.asarray(state.vae.embeddings(), dtype=np.float64)
 
     def collection(self, problem: CalibrationProblem) -> Collection:
         """How rows of this problem are simulated; what is None in the hyperparameters is chosen here."""
@@ -240,9 +260,18 @@ class Madoc:
         )
 
     def _group_count(self, problem: CalibrationProblem) -> int:
+        """Number of groups, or the most that can be chosen by physics."""
         count = len(problem.simulator.parameters)
-        chosen = {"one": 1, "each": count, "learned": self.group_count or problem.simulator.task.groups}
-        return min(count, chosen[self.groups])
+        if self.groups in ("one", "each"):
+            return 1 if self.groups == "one" else count
+        of_physics = self.groups == "physics"
+        return min(
+            count, self.group_count or (effects.most_groups(count) if of_physics else problem.simulator.task.groups)
+        )
+
+    def _finds_groups(self, state: MadocState) -> bool:
+        """Whether groups are to be found, rather than one of all or one for each."""
+        return 1 < len(state.agents.critics.weight) < len(state.labels)
 
     def _clone(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         of_batches, key = jax.random.split(state.key)
@@ -257,7 +286,29 @@ class Madoc:
         epoch = Epoch(metrics, stage="cloning", fraction=clone.epochs / max(1, self.cloning_epochs))
         return replace(state, clone=clone, key=key), epoch
 
-    def _group(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
+    def _group_by_physics(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
+        """The effects of all parameters at `STATES` more states of the log; groups once all have been seen."""
+        of_resampling, key = jax.random.split(state.key)
+        every = probing_windows(
+            problem.states, problem.dataset, problem.simulator, steps=1, count=self.grouping_epochs * STATES
+        )
+        seen = every.of(np.array_split(np.arange(len(every)), self.grouping_epochs)[state.grouped])
+        jacobian, failures = effects.sensitivities(problem.simulator, seen, problem.typical_change)
+        moments = state.moments.copy()
+        moments[state.grouped] = effects.shared_effects(jacobian)
+        following = replace(
+            state, moments=moments, key=key, grouped=state.grouped + 1, failures=state.failures + failures
+        )
+        if following.grouped == self.grouping_epochs:
+            seed = int(jax.random.randint(of_resampling, (), 0, 2**31 - 1))
+            found = effects.partition(moments, count=self.group_count, seed=seed)
+            following = replace(following, labels=found.labels, stability=found.stability)
+        steps = len(seen) * (1 + 2 * len(state.labels))
+        return following, Epoch(
+            {"stability": following.stability}, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=1.0
+        )
+
+    def _learn_groups(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         count, collection = len(problem.simulator.parameters), self.collection(problem)
         of_draws, of_start, of_action, of_restart, of_batches, key = jax.random.split(state.key, 6)
         draws, walkers = grouping.one_at_a_time(of_draws, count), collection.begin(count, of_start)
@@ -283,12 +334,16 @@ class Madoc:
             vae_optimiser=optimiser_state,
             schemes=schemes,
             labels=grouping.vote(schemes) if done else state.labels,
+            stability=grouping.agreement(schemes) if done else 0.0,
             rows=replay.clear(rows) if done else rows,
             key=key,
             grouped=grouped,
             failures=state.failures + rollout.failures,
         )
-        return following, Epoch({"grouping_loss": float(loss)}, control_steps=rollout.valid.size, stage="grouping")
+        steps = rollout.valid.size
+        return following, Epoch(
+            {"grouping_loss": float(loss)}, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=1.0
+        )
 
     def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)

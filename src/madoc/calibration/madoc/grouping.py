@@ -88,6 +88,11 @@ def cluster(embeddings: Float[Array | np.ndarray, "d latent"], groups: int, seed
 
     projected = PCA(min(PROJECTED, *rows.shape), svd_solver="full").fit_transform(rows)
     labels = KMeans(groups, n_init=10, random_state=seed).fit_predict(projected)
+    return by_first_appearance(labels)
+
+
+def by_first_appearance(labels: Int[np.ndarray, " d"]) -> Int[np.ndarray, " d"]:
+    """The same groups, numbered in the order in which they first appear."""
     order = {label: rank for rank, label in enumerate(dict.fromkeys(labels.tolist()))}
     return np.array([order[label] for label in labels.tolist()])
 
@@ -96,6 +101,14 @@ def vote(schemes: Int[np.ndarray, "votes d"]) -> Int[np.ndarray, " d"]:
     """The most frequent scheme; of equally frequent ones the earliest."""
     distinct, first, counts = np.unique(schemes, axis=0, return_index=True, return_counts=True)
     return distinct[np.lexsort((first, -counts))[0]]
+
+
+def agreement(schemes: Int[np.ndarray, "votes d"]) -> float:
+    """Mean adjusted Rand index between the scheme that wins the vote and all schemes; 1 if they are the same."""
+    from sklearn.metrics import adjusted_rand_score  # slow to import, and only needed here
+
+    winner = vote(schemes)
+    return float(np.mean([adjusted_rand_score(winner, scheme) for scheme in schemes]))
 
 
 def members(labels: Int[np.ndarray, " d"], groups: int) -> Bool[np.ndarray, "groups d"]:

@@ -32,9 +32,10 @@ class GroupCritics(eqx.Module):
     def values(
         self, parameters: Float[Array, "rows d"], members: Bool[Array, "groups d"]
     ) -> Float[Array, "rows groups"]:
-        """v_g(ξ^g) of every group; the parameters of other groups are replaced by 0."""
+        """v_g(ξ^g) of every group; the parameters of other groups are replaced by 0. That of an empty group is 0."""
         own = jnp.where(members[:, None], parameters[None], 0.0)
-        return eqx.filter_vmap(lambda network, rows: network(rows)[:, 0])(self.networks, own).T
+        values = eqx.filter_vmap(lambda network, rows: network(rows)[:, 0])(self.networks, own).T
+        return jnp.where(members.any(-1), values, 0.0)
 
 
 def total_value(values: Float[Array, "rows groups"], weight: Float[Array, " groups"], bias: Scalar) -> PerRow:

@@ -32,7 +32,8 @@ def grouping(run: Run) -> dict[str, object] | str:
         label="parameters in the plane of their embeddings",
         titles=(f"first component, {100 * shares[0]:.0f} % of the variance", f"second, {100 * shares[1]:.0f} %"),
     )
-    return {"chart": chart, "groups": run.result.groups if run.result else []}
+    groups, stability = (run.result.groups, run.result.group_stability) if run.result else ([], None)
+    return {"chart": chart, "groups": groups, "stability": None if stability is None else f"{stability:.2f}"}
 
 
 def correlations(run: Run) -> dict[str, object] | str:
