@@ -1,14 +1,16 @@
 """Intervals that cover what the log does not exclude, and the term that is named, from numbers chosen by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from madoc.calibration.holdout import AgainstChance, Area, ToldApart
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
-from madoc.identification.candidate_terms import INTEGRATION
+from madoc.identification.candidate_terms import INTEGRATION, TILTS
 from madoc.identification.combinations import Combination
 from madoc.identification.missing_terms import DRIFT, Alternative, MissingTerm
-from madoc.verdict.adequacy import as_likely, missing_term, numerical, widening, with_widened_intervals
+from madoc.verdict.adequacy import as_likely, likeliest, missing_term, numerical, widening, with_widened_intervals
 
 BEYOND = Alternative(("a spring",), True, {"mass": 3.0, "damping": -0.5}, {"mass": 0.0, "damping": 2.4})
 
@@ -54,6 +56,15 @@ def test_the_term_that_explains_most_is_named_among_those_as_significant():
     friction, spring = term(explained=0.2), term("a spring", t=9.0, explained=0.05, parameter="jnt_stiffness.hip")
     assert missing_term(held(spring, friction)) is friction
     assert missing_term(held(term("a spring", t=30.0, explained=0.05), friction)).cause == "a spring"
+
+
+def test_what_is_usual_is_named_before_a_tilted_base_and_another_gravity():
+    gain, tilt = term("another gain", explained=0.45), term(TILTS[0], explained=0.5, parameter="")
+    weak = replace(term("another gravity", explained=0.5, parameter="gravity"), value=-10.2, standard_error=0.01)
+    assert likeliest([tilt, weak, gain]) is gain
+    assert likeliest([replace(weak, value=-9.81), gain]).parameter == "gravity"
+    assert likeliest([replace(tilt, explained=0.9), gain]).cause == TILTS[0]
+    assert likeliest([]) is None
 
 
 def test_what_is_uncertain_or_moves_nothing_is_not_missing():

@@ -14,6 +14,7 @@ from madoc.calibration.holdout import (
     ToldApart,
 )
 from madoc.commands.answer import EXIT_CODES
+from madoc.identification.missing_terms import MissingTerm
 from madoc.verdict import WORDS, judge
 from madoc.verdict.judge import explains_all
 
@@ -85,6 +86,13 @@ def test_one_thing_wrong_changes_the_word(good, word, of_errors, change, told):
     verdict = judge(changed(good, of_errors, **change))
     assert verdict.word == word
     assert told.replace("actions?", "action" if good is PREDICTED else "actions") in verdict.sentence
+
+
+def test_a_mismatch_names_the_likeliest_term_though_it_hardly_moves_the_estimate():
+    offset = MissingTerm("an offset of the sensor", "signal_bias.hip", 0.1, 0.01, "1", 0.8, 10.0, {"mass": 0.1})
+    verdict = judge(changed(PREDICTED, LEFT_OVER, explained=0.6, missing_terms=(offset,)))
+    assert "of single terms an offset of the sensor (signal_bias.hip) is the likeliest: 0.1 ± 0.01" in verdict.sentence
+    assert verdict.sentence.endswith("{field: signal_bias, element: hip, low: 0, high: 0.2}")
 
 
 def test_correlated_residuals_of_single_steps_are_a_mismatch():

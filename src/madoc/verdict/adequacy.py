@@ -9,7 +9,7 @@ from scipy.constants import g as standard_gravity
 
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult
-from madoc.identification.candidate_terms import INTEGRATION
+from madoc.identification.candidate_terms import INTEGRATION, TILTS
 from madoc.identification.combinations import Combination
 from madoc.identification.missing_terms import DRIFT, Alternative, MissingTerm
 
@@ -44,19 +44,22 @@ def missing_term(holdout: HoldOut) -> MissingTerm | None:
 
 
 def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
-    """Of significant terms the one that explains most; None of none.
+    """Of significant terms the one that explains most, or nearly as much if that is unusual; None of none.
 
-    A gravity that is not the earth's is hardly ever the reason: a term that explains nearly as much comes first.
+    A tilted base looks like an offset of a sensor, which is more usual, and a gravity that is not the earth's like a
+    wrong mass or gain.
     """
     most = max((abs(term.t) for term in terms), default=0.0)
     significant = [term for term in terms if abs(term.t) >= AS_SIGNIFICANT * most]
-    if not significant:
-        return None
-    best = max(significant, key=lambda term: term.explained)
-    if best.parameter != "gravity" or abs(abs(best.value) - standard_gravity) <= EARTH + 2.0 * best.standard_error:
-        return best
-    near = [term for term in significant if term != best and term.explained >= NEARLY * best.explained]
-    return max(near, key=lambda term: term.explained, default=best)
+    enough = NEARLY * max((term.explained for term in significant), default=0.0)
+    likely = [term for term in significant if term.explained >= enough]
+    return max(likely, key=lambda term: (not _unusual(term), term.explained), default=None)
+
+
+def _unusual(term: MissingTerm) -> bool:
+    if term.parameter == "gravity":
+        return abs(abs(term.value) - standard_gravity) > EARTH + 2.0 * term.standard_error
+    return term.cause in TILTS
 
 
 def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:

@@ -117,19 +117,23 @@ def _missing(holdout: HoldOut) -> Verdict | None:
         )
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
     effect = " and ".join(f"{name} by {abs(term.shifts[name]):.2g}" for name in moved)
-    others = [_named(other) for other in as_likely(holdout, term)]
-    likely = f" ({' or '.join(others)} would explain nearly as much)" if others else ""
     return Verdict(
         "MODEL_MISMATCH",
         f"the model lacks {_named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
-        f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval{likely}; "
-        f"{_remedy(term)}",
+        f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
+        f"{_others(holdout, term)}; {_remedy(term)}",
         tuple(moved),
     )
 
 
 def _named(term: MissingTerm) -> str:
     return f"{term.cause} ({term.parameter})" if term.parameter else term.cause
+
+
+def _others(holdout: HoldOut, term: MissingTerm) -> str:
+    """Which other terms are as likely as the one named."""
+    others = [_named(other) for other in as_likely(holdout, term)]
+    return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
 
 
 def _value(term: MissingTerm) -> str:
@@ -183,7 +187,8 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
     if term is not None:
         sentence += (
             f"; of single terms {_named(term)} is the likeliest: {_value(term)} explains {100 * term.explained:.2g} % "
-            f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}); {_remedy(term)}"
+            f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}){_others(holdout, term)}; "
+            f"{_remedy(term)}"
         )
     return Verdict("MODEL_MISMATCH", sentence, pinned)
 
