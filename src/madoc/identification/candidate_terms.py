@@ -32,6 +32,7 @@ CAUSES = {
 }
 """What a candidate of each field stands for, in words."""
 DELAY = "actions that take effect later, by a delay or a lag of the actuator"
+EARLY = "actions that take effect before they are logged"
 SATURATION = "a drive that saturates below the limit of its actions"
 SPACING = "rows that are farther apart in time than the spec says, by another rate or a clock that drifts"
 TILTS = ("a base or a floor that is tilted towards x", "a base or a floor that is tilted towards y")

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from madoc import simulation
 from madoc.data.dataset import Dataset
-from madoc.identification.candidate_terms import INTEGRATION, Candidate, candidates, effects
+from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, Candidate, candidates, effects
 from madoc.identification.fitted_windows import (
     FITS,
     products_of,
@@ -209,9 +209,10 @@ def _terms(tests: _Tests) -> Iterator[MissingTerm]:
 
 
 def _term(candidate: Candidate, found: Score, shifts: dict[str, float]) -> MissingTerm:
+    early = candidate.cause == DELAY and found.change < 0.0
     return MissingTerm(
-        cause=candidate.cause,
-        parameter=candidate.parameter,
+        cause=EARLY if early else candidate.cause,
+        parameter="" if early else candidate.parameter,
         value=candidate.nominal + found.change * candidate.reference,
         standard_error=found.error * candidate.reference,
         unit=candidate.unit,

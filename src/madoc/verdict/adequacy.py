@@ -9,7 +9,7 @@ from scipy.constants import g as standard_gravity
 
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult
-from madoc.identification.candidate_terms import INTEGRATION, TILTS
+from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS
 from madoc.identification.combinations import Combination
 from madoc.identification.missing_terms import DRIFT, Alternative, MissingTerm
 
@@ -47,7 +47,7 @@ def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     """Of significant terms the one that explains most, or nearly as much if that is unusual; None of none.
 
     A tilted base looks like an offset of a sensor, which is more usual, and a gravity that is not the earth's like a
-    wrong mass or gain.
+    wrong mass or gain. Actions that seem to come early are more often a sign of forces that the model lacks.
     """
     most = max((abs(term.t) for term in terms), default=0.0)
     significant = [term for term in terms if abs(term.t) >= AS_SIGNIFICANT * most]
@@ -59,7 +59,7 @@ def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
 def _unusual(term: MissingTerm) -> bool:
     if term.parameter == "gravity":
         return abs(abs(term.value) - standard_gravity) > EARTH + 2.0 * term.standard_error
-    return term.cause in TILTS
+    return term.cause in (EARLY, *TILTS)
 
 
 def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:

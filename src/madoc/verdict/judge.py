@@ -15,15 +15,17 @@ from madoc.calibration.holdout import (
     Verdict,
     Word,
 )
-from madoc.identification.candidate_terms import SATURATION, SPACING, TILTS
+from madoc.identification.candidate_terms import EARLY, SATURATION, SPACING, TILTS
 from madoc.identification.combinations import Combination
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import DRIFT, MissingTerm
+from madoc.parameters import FIELDS
 from madoc.verdict.adequacy import as_likely, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END
 from madoc.verdict.statistics import NEGLIGIBLE
 
 REMEDIES = {
+    EARLY: "log each action with what was seen just before it",
     SPACING: "check control_step of the spec against the log's time column",
     SATURATION: "narrow low and high of the spec's actions to what the drive follows, or log smaller actions",
     **dict.fromkeys(TILTS, "level it, or tilt the gravity of the model (its option gravity) as the base is"),
@@ -146,7 +148,7 @@ def _remedy(term: MissingTerm) -> str:
     if not field:
         return REMEDIES[term.cause]
     high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
-    low = 0.0 if term.value >= 0.0 else -high
+    low = 0.0 if term.value >= 0.0 else max(-high, FIELDS[field].minimum)
     joints = element.split("+")
     named = f", element: {element}" if element else ""
     named = named if len(joints) == 1 else f", elements: [{', '.join(joints)}]"
