@@ -80,12 +80,14 @@ class Alternative:
         terms: Whether these are terms that the model may lack.
         shifts: By how much it moves each calibrated parameter, in half-widths of its 95 % interval.
         errors: Half of the 95 % interval of each shift, in the same unit.
+        parts: Whether it is the estimate of a part of the log.
     """
 
     causes: tuple[str, ...]
     terms: bool
     shifts: dict[str, float]
     errors: dict[str, float]
+    parts: bool = False
 
 
 @dataclass(frozen=True)
@@ -319,7 +321,8 @@ def _of_parts(drifts: Iterator[MissingTerm]) -> Iterator[Alternative]:
             shift = term.shifts[term.parameter]
             errors = {term.parameter: abs(NORMAL_95 * shift / term.t)}
             for side in (-shift, shift):
-                yield Alternative((f"{term.parameter} changing over the log",), False, {term.parameter: side}, errors)
+                causes, shifts = (f"{term.parameter} changing over the log",), {term.parameter: side}
+                yield Alternative(causes, False, shifts, errors, parts=True)
 
 
 def _of_other_windows(tests: _Tests, led: Float[np.ndarray, " d"]) -> Iterator[Alternative]:

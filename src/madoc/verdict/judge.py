@@ -123,7 +123,7 @@ def _missing(holdout: HoldOut) -> Verdict | None:
         "MODEL_MISMATCH",
         f"the model lacks {_named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
         f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
-        f"{_others(holdout, term)}; {_remedy(term)}",
+        f"{_others(holdout, term)}; {_remedy(term)}{_disagreeing(holdout)}",
         tuple(moved),
     )
 
@@ -136,6 +136,12 @@ def _others(holdout: HoldOut, term: MissingTerm) -> str:
     """Which other terms are as likely as the one named."""
     others = [_named(other) for other in as_likely(holdout, term)]
     return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
+
+
+def _disagreeing(holdout: HoldOut) -> str:
+    """Which parameters the parts of the log disagree on."""
+    names = dict.fromkeys(name for each in holdout.alternatives if each.parts for name in each.shifts)
+    return f"; parts of the log disagree on {', '.join(names)}" if names else ""
 
 
 def _value(term: MissingTerm) -> str:
