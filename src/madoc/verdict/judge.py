@@ -123,7 +123,7 @@ def _missing(holdout: HoldOut) -> Verdict | None:
         "MODEL_MISMATCH",
         f"the model lacks {_named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
         f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
-        f"{_others(holdout, term)}; {_remedy(term)}{_disagreeing(holdout)}",
+        f"{_others(holdout, term)}; {_remedy(term)}{_at_end(holdout)}{_disagreeing(holdout)}",
         tuple(moved),
     )
 
@@ -136,6 +136,12 @@ def _others(holdout: HoldOut, term: MissingTerm) -> str:
     """Which other terms are as likely as the one named."""
     others = [_named(other) for other in as_likely(holdout, term)]
     return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
+
+
+def _at_end(holdout: HoldOut) -> str:
+    """Which estimates are at an end of their range, where other terms may make up for what lies beyond it."""
+    names = ", ".join(holdout.at_end)
+    return f"; {names} at the end of the range: the true value may lie beyond it, so widen it first" if names else ""
 
 
 def _disagreeing(holdout: HoldOut) -> str:
