@@ -7,7 +7,7 @@ import pytest
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, CmaEs, LeastSquares, Madoc, Oted
 from madoc.calibration.least_squares.calibrator import horizon_of
-from madoc.calibration.madoc.collection import noise_deviation, with_sensor_noise
+from madoc.calibration.sensing import noise_deviation, with_sensor_noise
 from madoc.data import Disturbance, disturb, observed_task
 from madoc.errors import MadocError
 from madoc.simulation.rollout import Rollout
