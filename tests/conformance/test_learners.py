@@ -43,7 +43,7 @@ METHODS = {
     "dr": LEARNERS["dr"].make(**ACTING),
     "fast-sac": LEARNERS["fast-sac"].make(**FAST),
     "rlpd": LEARNERS["rlpd"].make(**FAST),
-    "h2o": LEARNERS["h2o"].make(**ACTING),
+    "h2o": LEARNERS["h2o"].make(**ACTING, judge_every=2 * EPOCH, judge_episodes=2),
     "bc": LEARNERS["bc"].make(**OFFLINE),
     "cql": LEARNERS["cql"].make(**OFFLINE, critic_hidden=(8, 8), samples=2, cloning_updates=EPOCH),
     "morec": LEARNERS["morec"].make(
