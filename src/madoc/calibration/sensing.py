@@ -1,4 +1,4 @@
-"""What methods are told of the sensors' noise, each the same, and simulated observations with it."""
+"""What methods are told of the sensors, each the same: their noise, and how many rows tell a state."""
 
 from dataclasses import replace
 from typing import Literal
@@ -8,11 +8,18 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.learning.features import HIDDEN_WINDOW, last_rows
 from madoc.simulation.rollout import Rollout
 from madoc.types import NotNegative
 
 SensorNoise = NotNegative | Literal["estimated"] | None
 """Noise relative to a step's typical change, or estimated from the log alone, or, with None, as the log declares."""
+
+
+def rows_compared(problem: CalibrationProblem) -> int:
+    """Rows that are compared at a time: one where it tells a state, or no episode has more, else `HIDDEN_WINDOW`."""
+    tells = problem.states.kind == "exact" or not len(last_rows(problem.dataset, HIDDEN_WINDOW))
+    return 1 if tells else HIDDEN_WINDOW
 
 
 def noise_deviation(problem: CalibrationProblem, share: SensorNoise) -> Float[np.ndarray, " observation"]:

@@ -28,8 +28,6 @@ StartMode = Literal["policy", "logged", "replay"]
 Features = Literal["standardised", "raw"]
 GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
 """Number of parameter draws in an epoch, and of control steps that each row is simulated under one draw, by mode."""
-HIDDEN_WINDOW = 3
-"""Window length, in rows, where velocities are hidden: two rows give a velocity, a third an acceleration."""
 
 
 @dataclass(frozen=True)
