@@ -43,7 +43,9 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", default=["hopper", "halfcheetah", "walker2d", "ant"])
     parser.add_argument("--quality", default="medium")
     parser.add_argument("--methods", nargs="+", default=["madoc"])
-    parser.add_argument("--starts", nargs="+", default=["logged"], help="for the methods that have a choice")
+    parser.add_argument(
+        "--starts", nargs="+", help="for the methods that have a choice; logged, or policy where velocities are hidden"
+    )
     parser.add_argument("--data-is", nargs="+", default=["clean"], choices=list(DATA), help="how it is disturbed")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--budget", type=int, default=300_000)
@@ -60,7 +62,8 @@ def main() -> None:
         problem = CalibrationProblem(dataset, CpuSimulator(observed_task(task, dataset), threads=arguments.threads))
         for seed, method in product(arguments.seeds, arguments.methods):
             chosen = has_starts(method)
-            for starts in arguments.starts if chosen else ["-"]:
+            usual = ["policy" if DATA[data_is][1].hidden_velocities else "logged"]
+            for starts in (arguments.starts or usual) if chosen else ["-"]:
                 words = [robot, arguments.quality, method, *([starts] if chosen else []), arguments.budget, seed]
                 words += [] if data_is == "clean" else [data_is]
                 path = arguments.results / ("-".join(map(str, words)) + ".json")

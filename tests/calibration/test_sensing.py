@@ -7,7 +7,7 @@ import pytest
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, CmaEs, LeastSquares, Madoc, Oted
 from madoc.calibration.least_squares.calibrator import horizon_of
-from madoc.calibration.madoc.collection import noise_deviation, with_sensor_noise
+from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
 from madoc.data import Disturbance, disturb, observed_task
 from madoc.errors import MadocError
 from madoc.simulation.rollout import Rollout
@@ -35,6 +35,13 @@ def test_windows_are_as_long_as_the_observation_wants(log):
     assert Madoc(starts="replay").collection(hidden).scaling.length == 1
     with pytest.raises(MadocError, match=r"no episode .* has the 301 rows of a window; take a shorter one"):
         seen.features.windows("standardised", 301)
+
+
+def test_as_many_rows_are_compared_as_tell_a_state(log):
+    problems = (problem_of(log), problem_of(log, hidden_velocities=True))
+    assert [rows_compared(problem) for problem in problems] == [1, 3]
+    unordered = problem_of(log, hidden_velocities=True, shuffled="rows")
+    assert rows_compared(unordered) == 1
 
 
 def test_rollouts_start_at_logged_states_where_those_are_known(log):

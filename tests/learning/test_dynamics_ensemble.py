@@ -9,6 +9,7 @@ from madoc.learning.dynamics_ensemble import (
     Ensemble,
     fit,
     holdout_error,
+    keep_best,
     likelihood_loss,
     training_rows,
     uncertainty_penalty,
@@ -102,3 +103,18 @@ def test_a_linear_system_is_learnt():
     after = holdout_error(ensemble, rows[0][9::10], rows[1][9::10])
     assert (after < 0.02 * before).all()
     assert len(set(after.tolist())) == 3
+
+
+def test_each_model_is_kept_where_its_error_was_smallest():
+    first, second = (Ensemble(1, 1, (), models=2, key=jax.random.key(seed)) for seed in range(2))
+    second = eqx.tree_at(lambda models: models.largest, second, jnp.full(2, 0.3))
+    # The first model's error falls by 0.5 %, which is too little to count; the second's by half.
+    kept, smallest, fell = keep_best(first, jnp.array([1.0, 1.0]), second, jnp.array([0.995, 0.5]))
+    weights, old, new = (models.networks.layers[0].weight for models in (kept, first, second))
+    np.testing.assert_array_equal(weights, jnp.stack([old[0], new[1]]))
+    np.testing.assert_array_equal(smallest, [1.0, 0.5])
+    np.testing.assert_array_equal(kept.largest, second.largest)
+    assert fell
+    kept, smallest, fell = keep_best(first, jnp.array([1.0, 1.0]), second, jnp.array([1.0, 2.0]))
+    assert eqx.tree_equal(kept, first)
+    assert not fell

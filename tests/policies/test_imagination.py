@@ -7,7 +7,7 @@ from affine import affine
 from madoc.learning.dynamics_ensemble import Ensemble
 from madoc.learning.features import Features
 from madoc.learning.networks import stack
-from madoc.policies.imagination import best_candidate, imagine, start_imagining
+from madoc.policies.imagination import WithoutNoise, best_candidate, imagine, mean_return, start_imagining
 
 FEATURES = Features(jnp.zeros(2), jnp.ones(2), jnp.array([0.5]), jnp.asarray(1.0), jnp.asarray(2.0))
 LOGGED = jnp.array([[0.0], [10.0]])
@@ -50,6 +50,18 @@ def test_the_best_candidate_by_hand():
     outcome, rewards = best_candidate(candidates, jnp.array([[0.0, 5.0], [2.0, 1.0], [1.0, 3.0]]))
     np.testing.assert_array_equal(outcome, [[4.0, 5.0], [2.0, 3.0]])
     np.testing.assert_array_equal(rewards, [2.0, 5.0])
+
+
+def test_the_mean_return_by_hand():
+    # Two rows, three steps: the first ends in its second step, and what follows is another rollout's.
+    reward = jnp.array([1.0, 10.0, 2.0, 20.0, 4.0, 40.0])
+    terminated = jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    assert mean_return(reward, terminated, rows=2) == (3.0 + 70.0) / 2
+
+
+def test_a_policy_is_judged_without_noise():
+    quiet = WithoutNoise(lambda observation, key=None: observation if key is None else -observation)
+    np.testing.assert_array_equal(quiet(LOGGED, jax.random.key(0)), LOGGED)
 
 
 def test_what_looks_most_real_is_what_happens():

@@ -5,13 +5,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from madoc.learning.features import Features
 from madoc.learning.networks import Network, PerRow, Scalar, map_stack, minimise, stack
 
 BOUNDS_WEIGHT = 0.01
 """Weight in the loss of the distance between the learnt bounds of the log variance (Chua et al., appendix A.1)."""
+LEAST_FALL = 0.01
+"""Share by which an error on held-out rows must fall to count, from MOPO's code."""
 DECAY = (2.5e-5, 1e-4)
 """Weight decay of the first layer and of the last, from MOPO's code; layers between are spaced evenly."""
 
@@ -94,6 +96,27 @@ def holdout_error(
     """Mean squared error of each model's mean on rows that it was not fitted to."""
     mean, _ = ensemble(pair)
     return ((mean - jnp.broadcast_to(target, mean.shape)) ** 2).mean((1, 2))
+
+
+def keep_best(
+    kept: Ensemble, smallest: Float[Array, " models"], latest: Ensemble, error: Float[Array, " models"]
+) -> tuple[Ensemble, Float[Array, " models"], Bool[Array, ""]]:
+    """Each model at its smallest error on held-out rows so far, those errors, and whether any has fallen.
+
+    Falls of less than `LEAST_FALL` are none. The bounds of the variance, which models share, are the latest wherever
+    one has fallen.
+    """
+    fell = error < (1.0 - LEAST_FALL) * smallest
+
+    def chosen(old: Array, new: Array) -> Array:
+        falls = fell.reshape(-1, *[1] * (old.ndim - 1))
+        return jnp.where(jnp.broadcast_to(falls, old.shape), new, old)
+
+    any_fell = fell.any()
+    networks = jax.tree.map(chosen, kept.networks, latest.networks)
+    bounds = (jnp.where(any_fell, latest.largest, kept.largest), jnp.where(any_fell, latest.smallest, kept.smallest))
+    best = eqx.tree_at(lambda models: (models.networks, models.largest, models.smallest), kept, (networks, *bounds))
+    return best, jnp.where(fell, error, smallest), any_fell
 
 
 def uncertainty_penalty(std: Float[Array, "models rows outputs"], features: Features) -> PerRow:

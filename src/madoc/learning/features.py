@@ -19,6 +19,9 @@ from madoc.errors import MadocError
 from madoc.learning.cloning import Pairs
 from madoc.types import Transitions
 
+HIDDEN_WINDOW = 3
+"""Window length, in rows, where velocities are hidden: two rows give a velocity, a third an acceleration."""
+
 
 @dataclass(frozen=True)
 class Scaling:

@@ -69,5 +69,5 @@ class BC:
         return BCState(clone, key), Epoch(metrics, updates=self.epoch_updates, stage="cloning")
 
     def policy(self, state: BCState) -> TanhGaussianPolicy:
-        """The policy learnt so far; deterministic without a key."""
+        """The latest policy, as there is nothing to judge it in; deterministic without a key."""
         return state.clone.policy

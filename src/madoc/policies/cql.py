@@ -125,5 +125,5 @@ class CQL:
         )
 
     def policy(self, state: CQLState) -> TanhGaussianPolicy:
-        """The policy learnt so far; deterministic without a key."""
+        """The latest policy, as there is nothing to judge it in; deterministic without a key."""
         return state.learner.policy

@@ -140,7 +140,7 @@ class FastSAC:
             updating = None if explores else second_thread.submit(self._update, problem, state, of_update)
             acting = UniformPolicy(problem.simulator.action_size) if explores else policy
             rolled = roll_on(problem, state.interaction, acting, of_acting, control_steps=self.epoch_steps)
-            if self.judge_every and state.updates >= judged.last + self.judge_every:
+            if judged.due(state.updates, self.judge_every):
                 spent, episodes = state.updates, self.judge_episodes
                 judged, epoch = judge(problem, policy, judged, epoch, of_judging, episodes=episodes, spent=spent)
         learner, losses = (state.learner, {}) if updating is None else updating.result()
@@ -204,4 +204,4 @@ class FastSAC:
 
     def policy(self, state: FastSACState) -> TanhGaussianPolicy:
         """The best policy so far, the latest where none was judged; deterministic without a key."""
-        return state.judged.best if state.judged.last else state.learner.policy
+        return state.judged.handed_back(state.learner.policy)

@@ -20,6 +20,7 @@ from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, explore_or_act, start_acting
+from madoc.policies.judging import Judged, judge
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
@@ -36,10 +37,11 @@ class Learning:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class H2OState:
-    """The state of H2O."""
+    """The state of H2O; `judged` counts in control steps of learning."""
 
     learning: Learning
     interaction: Interaction
+    judged: Judged
     key: PRNGKeyArray
 
 
@@ -70,6 +72,9 @@ class H2O:
         target_rate: τ of the target critics.
         learning_rate: Adam's, for everything.
         replay_capacity: Simulated rows kept.
+        judge_every: Control steps of learning after which the policy acts whole episodes, without noise, in the
+            systems it is learnt in; the best so far is what is handed back, as of SAC. 0 hands back the last.
+        judge_episodes: Episodes it is judged by. Their control steps are counted, but not against the budget.
     """
 
     hidden: Layers = (256, 256)
@@ -88,6 +93,8 @@ class H2O:
     target_rate: NotNegative = 0.005
     learning_rate: NotNegative = 3e-4
     replay_capacity: Count = 1_000_000
+    judge_every: CountOrZero = 10_000
+    judge_episodes: Count = 10
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
@@ -111,15 +118,16 @@ class H2O:
         )
         optimiser = adam(self.learning_rate).init(eqx.filter(discriminators, eqx.is_array))
         interaction = start_acting(problem, of_start, environments=self.environments, capacity=self.replay_capacity)
-        return H2OState(Learning(learner, discriminators, optimiser), interaction, key)
+        learning = Learning(learner, discriminators, optimiser)
+        return H2OState(learning, interaction, Judged.none(learner.policy), key)
 
     def step(self, problem: PolicyProblem, state: H2OState) -> tuple[H2OState, Epoch]:
-        """Act for `epoch_steps` control steps, then update."""
-        of_acting, of_update, key = jax.random.split(state.key, 3)
+        """Act for `epoch_steps` control steps, then update, then judge the policy where that is due."""
+        of_acting, of_update, key, of_judging = jax.random.split(state.key, 4)
         interaction, epoch, due = explore_or_act(
             problem,
             state.interaction,
-            self.policy(state),
+            state.learning.learner.policy,
             of_acting,
             control_steps=self.epoch_steps,
             warmup_steps=self.warmup_steps,
@@ -131,7 +139,11 @@ class H2O:
                 learning, interaction.replay, problem.logged, problem.features, of_update, due
             )
             epoch = replace(epoch, metrics=epoch.metrics | scalars(losses))
-        return H2OState(learning, interaction, key), epoch
+        judged, spent = state.judged, interaction.control_steps
+        if judged.due(spent, self.judge_every) and learning is not state.learning:
+            policy = learning.learner.policy
+            judged, epoch = judge(problem, policy, judged, epoch, of_judging, episodes=self.judge_episodes, spent=spent)
+        return H2OState(learning, interaction, judged, key), epoch
 
     @eqx.filter_jit
     def _update(
@@ -218,5 +230,5 @@ class H2O:
         return Descent.by_adam(policy=self.learning_rate, critic=self.learning_rate, target_rate=self.target_rate)
 
     def policy(self, state: H2OState) -> TanhGaussianPolicy:
-        """The policy learnt so far; deterministic without a key."""
-        return state.learning.learner.policy
+        """The best policy so far, the latest where none was judged; deterministic without a key."""
+        return state.judged.handed_back(state.learning.learner.policy)

@@ -33,6 +33,27 @@ def start_imagining(logged: Float[Array, "logged observation"], rows: int, key: 
     return ImaginedRows(_some(logged, rows, key), jnp.zeros(rows, jnp.int32))
 
 
+class WithoutNoise(eqx.Module):
+    """A policy that does what another does without a key."""
+
+    policy: Policy
+
+    def __call__(
+        self, observation: Float[Array, "*rows observation"], key: PRNGKeyArray | None = None
+    ) -> Float[Array, "*rows action"]:
+        """Actions for a batch of observations, whatever the key."""
+        return jnp.asarray(self.policy(observation))
+
+
+def mean_return(
+    reward: Float[Array, " transitions"], terminated: Float[Array, " transitions"], *, rows: int
+) -> Float[Array, ""]:
+    """Mean over rows of the sum of rewards until each first ends, of transitions flat in time and row."""
+    reward, ended = reward.reshape(-1, rows), terminated.reshape(-1, rows)
+    under_way = jnp.concatenate([jnp.ones((1, rows)), jnp.cumprod(1.0 - ended, axis=0)[:-1]])
+    return (reward * under_way).sum(0).mean()
+
+
 def best_candidate(
     candidates: Float[Array, "candidates rows outputs"], rewards: Float[Array, "candidates rows"]
 ) -> tuple[Float[Array, "rows outputs"], Float[Array, " rows"]]:
@@ -126,6 +147,7 @@ def imagine(
             "stopped": unreal.mean(),
             "penalty": uncertainty.mean(),
             "imagined_reward": reward.mean(),
+            "net_reward": row["reward"].mean(),
         }
         return ImaginedRows(state, jnp.where(again, 0, under_way.age + 1)), (row, metrics)
 

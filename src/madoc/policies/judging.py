@@ -1,4 +1,8 @@
-"""The best policy so far: learning goes up and down, so what is handed back is the policy that did best when judged."""
+"""The best policy so far: learning goes up and down, so what is handed back is the policy that did best when judged.
+
+One rule for all learners: what has something to judge in, a simulator or learnt models, hands back its best there; what
+has nothing (`bc`, `cql`) hands back its last.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -31,6 +35,19 @@ class Judged:
         """Before the first judgement."""
         return cls(policy, 0.0, 0)
 
+    def due(self, spent: int, every: int) -> bool:
+        """Whether so much was spent since the last judgement that there is to be another; never if `every` is 0."""
+        return bool(every) and spent >= self.last + every
+
+    def handed_back(self, latest: TanhGaussianPolicy) -> TanhGaussianPolicy:
+        """The best policy, the latest where none was judged."""
+        return self.best if self.last else latest
+
+    def including(self, policy: TanhGaussianPolicy, mean: float, spent: int) -> "Judged":
+        """After a policy was judged at this mean return: it is kept if no earlier one's was as high."""
+        better = not self.last or mean > self.best_return
+        return Judged(policy, mean, spent) if better else replace(self, last=spent)
+
 
 def judge(
     problem: PolicyProblem,
@@ -52,9 +69,7 @@ def judge(
     systems = problem.systems(of_systems, episodes)
     outcome = evaluate(policy, problem.simulator, systems, key=of_episodes, episodes=episodes)
     mean, acted = float(outcome.returns.mean()), int(outcome.lengths.sum())
-    better = not judged.last or mean > judged.best_return
-    kept = Judged(policy, mean, spent) if better else replace(judged, last=spent)
     metrics = epoch.metrics | {"judged_return": mean}
-    return kept, replace(
+    return judged.including(policy, mean, spent), replace(
         epoch, metrics=metrics, control_steps=epoch.control_steps + acted, unbudgeted=epoch.unbudgeted + acted
     )

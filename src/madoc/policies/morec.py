@@ -6,20 +6,21 @@ from typing import Annotated
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from pydantic import Field
 
 from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
-from madoc.learning.dynamics_ensemble import Ensemble, fit, holdout_error
+from madoc.learning.dynamics_ensemble import Ensemble, fit, holdout_error, keep_best
 from madoc.learning.dynamics_reward import Opposition, oppose, opposition
 from madoc.learning.features import Features
 from madoc.learning.networks import adam, scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.imagination import ImaginedRows, imagine, start_imagining
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
+from madoc.policies.imagination import ImaginedRows, WithoutNoise, imagine, mean_return, start_imagining
+from madoc.policies.judging import Judged
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Policy, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -28,32 +29,44 @@ class MORECState:
     """The state of MOREC.
 
     Attributes:
+        ensemble: The models; while they are fitted, as they are after the last update.
+        fitted: Each model as it was when its error on held-out rows was smallest.
+        smallest: Those errors.
+        stale: Updates since the error of any model last fell.
         elites: Indices of the models of the smallest error on held-out rows.
         opposition: Generator and discriminators; the past discriminators make up the dynamics reward.
         replay: Imagined transitions.
         under_way: Imagined rows in progress.
-        preparing: Updates of models and discriminators so far.
+        judged: The policy of the highest imagined return so far; counts in updates of the policy.
+        preparing: Updates of models and discriminators so far; those that early stopping saves count as done.
+        updates: Updates of the policy so far.
     """
 
     ensemble: Ensemble
     ensemble_optimiser: PyTree
+    fitted: Ensemble
+    smallest: Float[Array, " models"]
+    stale: int
     elites: Int[Array, " elites"]
     opposition: Opposition
     learner: ActorCritic
     replay: replay.Replay
     under_way: ImaginedRows
+    judged: Judged
     key: PRNGKeyArray
     preparing: int
+    updates: int
 
 
 @dataclass(frozen=True)
 class MOREC:
     """Model-based offline learning with reward consistency, on MOPO's penalty.
 
-    An ensemble of models is fitted to the data, then discriminators are trained against a generator; a policy is then
-    learnt by SAC on rows imagined from logged states. At every imagined step each elite model draws candidates, and
-    the one that past discriminators find most real is kept; if even that is not, the row ends. The budget counts
-    updates of the policy; those of models and discriminators come before it.
+    An ensemble of models is fitted to the data until their errors on held-out rows no longer fall, then discriminators
+    are trained against a generator; a policy is then learnt by SAC on rows imagined from logged states. At every
+    imagined step each elite model draws candidates, and the one that past discriminators find most real is kept; if
+    even that is not, the row ends. The budget counts updates of the policy; those of models and discriminators come
+    before it.
 
     The constants are the authors' where they gave them. They imagine up to 200 transitions for every update, on a GPU;
     here a tenth of that. They learn for 3 million updates, and scale each past discriminator's logits by the values,
@@ -65,7 +78,9 @@ class MOREC:
         model_hidden: Units per layer of a dynamics model.
         models: Dynamics models.
         elites: How many of them are sampled from.
-        model_updates: Updates of the models, before anything else.
+        model_updates: Most updates of the models, before anything else.
+        patience: Updates after which fitting ends if no model's error on held-out rows has fallen by 1 %, as in MOPO's
+            code; each model is then as it was at its smallest error. 0 makes all `model_updates`, and keeps the last.
         discriminator_hidden: Units per layer of a discriminator.
         discriminators: Past discriminators that make up the dynamics reward; one is kept every `epoch_updates`.
         discriminator_updates: Updates of generator and discriminator, after the models'. Chosen, not the authors'.
@@ -79,7 +94,11 @@ class MOREC:
         imagined_per_update: Imagined transitions for each update of the policy.
         imagined_rows: Rows imagined at a time.
         epoch_updates: Gradient updates per epoch.
-        holdout_every: The elites are chosen on every `holdout_every`-th logged row, which the models do not see.
+        holdout_every: Every `holdout_every`-th logged row is held out: the models do not see it, and are stopped and
+            chosen by it.
+        judge_every: Updates of the policy after which it acts in the models, without noise, from logged observations
+            to the horizon; that of the highest mean return, net of the penalty, is what is handed back. 0 hands back
+            the last.
         batch: Rows per update.
         discount: γ.
         target_rate: τ of the target critics.
@@ -93,7 +112,8 @@ class MOREC:
     model_hidden: Layers = (200, 200, 200, 200)
     models: Count = 7
     elites: Count = 5
-    model_updates: Count = 20_000
+    model_updates: Count = 100_000
+    patience: CountOrZero = 4000
     discriminator_hidden: Layers = (128, 128)
     discriminators: Count = 40
     discriminator_updates: CountOrZero = 8000
@@ -114,6 +134,7 @@ class MOREC:
     policy_learning_rate: NotNegative = 1e-4
     critic_learning_rate: NotNegative = 3e-4
     replay_capacity: Count = 100_000
+    judge_every: CountOrZero = 5000
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
@@ -136,6 +157,7 @@ class MOREC:
         keys = jax.random.split(key, 6)
         sizes = observation, action = task.observation_size, problem.simulator.action_size
         ensemble = Ensemble(*sizes, self.model_hidden, models=self.models, key=keys[0])
+        learner = fresh(*sizes, hidden=self.hidden, descent=self._descent, features=problem.features, key=keys[2])
         adversary = opposition(
             ensemble.only(jnp.asarray(0)),
             observation + action,
@@ -149,12 +171,17 @@ class MOREC:
         return MORECState(
             ensemble,
             adam(self.model_learning_rate).init(eqx.filter(ensemble, eqx.is_array)),
+            ensemble,
+            jnp.full(self.models, jnp.finfo(jnp.float32).max),
+            0,
             jnp.arange(self.elites),
             adversary,
-            fresh(*sizes, hidden=self.hidden, descent=self._descent, features=problem.features, key=keys[2]),
+            learner,
             replay.empty(self.replay_capacity, **columns, reward=(), terminated=()),
             start_imagining(problem.logged["observation"], self.imagined_rows, keys[3]),
+            Judged.none(learner.policy),
             keys[4],
+            0,
             0,
         )
 
@@ -177,20 +204,37 @@ class MOREC:
         return "fitting" if state.preparing < self.model_updates else "opposing"
 
     def _fit(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
-        """Fit the models, and choose the elites."""
-        ensemble, optimiser, elites, metrics = self._update_models(
+        """Fit the models, and choose the elites; once their errors no longer fall, take each at its smallest."""
+        ensemble, optimiser, errors, metrics = self._update_models(
             state.ensemble, state.ensemble_optimiser, problem.logged, problem.features, state.key
         )
-        state = replace(state, ensemble=ensemble, ensemble_optimiser=optimiser, elites=elites)
-        state = replace(state, preparing=state.preparing + self.epoch_updates)
-        if self._stage(state) == "opposing":
+        fitted, smallest, fell = keep_best(state.fitted, state.smallest, ensemble, errors)
+        stale = 0 if bool(fell) else state.stale + self.epoch_updates
+        preparing = state.preparing + self.epoch_updates
+        if self.patience and stale >= self.patience:
+            preparing = max(preparing, self.model_updates)
+        if preparing >= self.model_updates and self.patience:
+            ensemble, errors = fitted, smallest
+        elites = jnp.argsort(errors)[: self.elites]
+        state = replace(
+            state,
+            ensemble=ensemble,
+            ensemble_optimiser=optimiser,
+            fitted=fitted,
+            smallest=smallest,
+            stale=stale,
+            elites=elites,
+            preparing=preparing,
+        )
+        if self._stage(state) != "fitting":
             state = replace(state, opposition=replace(state.opposition, generator=ensemble.only(elites[0])))
-        return state, metrics
+        return state, metrics | {"model_error": errors[elites].mean()}
 
     @eqx.filter_jit
     def _update_models(
         self, ensemble: Ensemble, optimiser: PyTree, logged: Batch, features: Features, key: PRNGKeyArray
-    ) -> tuple[Ensemble, PyTree, Int[Array, " elites"], dict[str, Array]]:
+    ) -> tuple[Ensemble, PyTree, Float[Array, " models"], dict[str, Array]]:
+        """`epoch_updates` updates of the models, and their errors on held-out rows."""
         pair, change = features.described(logged)
         reward = (logged["reward"] - features.reward_offset) / features.reward_scale
         rows = (pair, jnp.concatenate([change, reward[:, None]], axis=-1))
@@ -205,9 +249,7 @@ class MOREC:
             holdout_every=self.holdout_every,
         )
         held_out = slice(self.holdout_every - 1, None, self.holdout_every)
-        error = holdout_error(ensemble, rows[0][held_out], rows[1][held_out])
-        elites = jnp.argsort(error)[: self.elites]
-        return ensemble, optimiser, elites, metrics | {"model_error": error[elites].mean()}
+        return ensemble, optimiser, holdout_error(ensemble, rows[0][held_out], rows[1][held_out]), metrics
 
     def _oppose(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
         """Train discriminators and their generator."""
@@ -229,17 +271,43 @@ class MOREC:
         )
 
     def _learn(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
-        """Imagine, then update the policy."""
-        of_imagination, of_updates = jax.random.split(state.key)
+        """Imagine, then update the policy, then judge it where that is due."""
+        of_imagination, of_updates, of_judging = jax.random.split(state.key, 3)
+        steps = -(-self.epoch_updates * self.imagined_per_update // self.imagined_rows)
+        under_way, rows, imagined = self._imagine(
+            problem, state, state.learner.policy, state.under_way, steps, of_imagination
+        )
+        seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
+        learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
+        updates, judged = state.updates + self.epoch_updates, state.judged
+        if judged.due(updates, self.judge_every):
+            of_starts, of_steps = jax.random.split(of_judging)
+            start = start_imagining(problem.logged["observation"], self.imagined_rows, of_starts)
+            _, acted, _ = self._imagine(problem, state, WithoutNoise(learner.policy), start, self.horizon, of_steps)
+            returns = mean_return(acted["reward"], acted["terminated"], rows=self.imagined_rows)
+            judged = judged.including(learner.policy, float(returns), updates)
+            metrics |= {"judged_return": returns}
+        following = replace(state, learner=learner, replay=seen, under_way=under_way, judged=judged, updates=updates)
+        return following, imagined | metrics
+
+    def _imagine(
+        self,
+        problem: PolicyProblem,
+        state: MORECState,
+        policy: Policy,
+        under_way: ImaginedRows,
+        steps: int,
+        key: PRNGKeyArray,
+    ) -> tuple[ImaginedRows, Batch, dict[str, Array]]:
         task = problem.simulator.task
         assert task.state_from_observation is not None
-        under_way, rows, imagined = imagine(
+        return imagine(
             state.ensemble,
             state.elites,
             state.opposition.past,
             problem.features,
-            state.learner.policy,
-            state.under_way,
+            policy,
+            under_way,
             logged=problem.logged["observation"],
             terminated=task.terminated,
             state_of=task.state_from_observation,
@@ -247,12 +315,9 @@ class MOREC:
             threshold=self.threshold,
             horizon=self.horizon,
             penalty=self.penalty,
-            steps=-(-self.epoch_updates * self.imagined_per_update // self.imagined_rows),
-            key=of_imagination,
+            steps=steps,
+            key=key,
         )
-        seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
-        learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
-        return replace(state, learner=learner, replay=seen, under_way=under_way), imagined | metrics
 
     @eqx.filter_jit
     def _update_policy(
@@ -278,5 +343,5 @@ class MOREC:
         )
 
     def policy(self, state: MORECState) -> TanhGaussianPolicy:
-        """The policy learnt so far; deterministic without a key."""
-        return state.learner.policy
+        """The best policy so far, the latest where none was judged; deterministic without a key."""
+        return state.judged.handed_back(state.learner.policy)

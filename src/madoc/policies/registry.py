@@ -81,7 +81,7 @@ _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
         "a learnt model, kept to what looks real",
         "Luo et al., MOREC",
         2024,
-        shown=("model_error", "dynamics_reward", "value_target"),
+        shown=("model_error", "net_reward", "value_target"),
     ),
     MethodEntry(
         "h2o",

@@ -119,8 +119,7 @@ class SAC:
             learner, losses = self._update(learner, interaction.replay, logged, of_update, due)
             epoch = replace(epoch, metrics=epoch.metrics | scalars(losses))
         following = replace(state, learner=learner, interaction=interaction, key=key)
-        judges = self.judge_every and interaction.control_steps >= state.judged.last + self.judge_every
-        if judges and learner is not state.learner:
+        if state.judged.due(interaction.control_steps, self.judge_every) and learner is not state.learner:
             place, spent = self._place(problem), interaction.control_steps
             judged, epoch = judge(
                 place, learner.policy, state.judged, epoch, of_judging, episodes=self.judge_episodes, spent=spent
@@ -163,4 +162,4 @@ class SAC:
 
     def policy(self, state: SACState) -> TanhGaussianPolicy:
         """The best policy so far, the latest where none was judged; deterministic without a key."""
-        return state.judged.best if state.judged.last else state.learner.policy
+        return state.judged.handed_back(state.learner.policy)

@@ -16,14 +16,16 @@ from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.madoc import effects, grouping, watch
 from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.agents import BLUR_RANGE, Agents, AgentSettings
-from madoc.calibration.madoc.collection import GEOMETRY, HIDDEN_WINDOW, Collection, Features, StartMode, noise_deviation
+from madoc.calibration.madoc.collection import GEOMETRY, Collection, Features, StartMode
 from madoc.calibration.madoc.grouping import GroupingVAE
 from madoc.calibration.madoc.value_decomposition import Mixing
 from madoc.calibration.madoc.watch import Watch
+from madoc.calibration.sensing import SensorNoise, noise_deviation
 from madoc.errors import MadocError
 from madoc.identification.states import probing_windows
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
+from madoc.learning.features import HIDDEN_WINDOW
 from madoc.learning.networks import adam, scalars
 from madoc.simulation.rollout import Walkers, out_of_step
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
@@ -143,7 +145,7 @@ class Madoc:
     group_count: Count | None = None
     starts: StartMode | None = "policy"
     window: Count | None = None
-    sensor_noise: NotNegative | Literal["estimated"] | None = None
+    sensor_noise: SensorNoise = None
     features: Features = "standardised"
     hidden: Layers = (128, 128)
     cloning_epochs: CountOrZero = 40

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.sensing import with_sensor_noise
 from madoc.learning import replay
 from madoc.learning.features import WindowScaling, unbroken, windows_ending
 from madoc.simulation.rollout import (
@@ -27,8 +28,6 @@ StartMode = Literal["policy", "logged", "replay"]
 Features = Literal["standardised", "raw"]
 GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
 """Number of parameter draws in an epoch, and of control steps that each row is simulated under one draw, by mode."""
-HIDDEN_WINDOW = 3
-"""Window length, in rows, where velocities are hidden: two rows give a velocity, a third an acceleration."""
 
 
 @dataclass(frozen=True)
@@ -149,28 +148,3 @@ class Collection:
             share = 100.0 * np.median(self.noise / self.problem.typical_change)
             sentences.append(f"simulated observations were given sensor noise of {share:.2g} % of a step's change")
         return tuple(sentences)
-
-
-def noise_deviation(
-    problem: CalibrationProblem, share: float | Literal["estimated"] | None
-) -> Float[np.ndarray, " observation"]:
-    """Standard deviation of the noise put on simulated observations; by default the data declares its share."""
-    if share == "estimated":
-        return problem.estimated_noise
-    share = problem.dataset.disturbance.noise if share is None else float(share)
-    # The logged change holds the noise of two readings; the share is that of the change without noise.
-    return share / np.sqrt(1.0 + 2.0 * share**2) * problem.typical_change
-
-
-def with_sensor_noise(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:
-    """The rollout with noise on its observations; the end of a step and the start of the next have the same noise.
-
-    The policy acted on observations without noise.
-    """
-    if not deviation.any():
-        return rollout
-    seen = rollout.transitions
-    steps, *others = np.shape(seen.observation)
-    noise = deviation * np.asarray(jax.random.normal(key, (steps + 1, *others)), np.float64)
-    noisy = replace(seen, observation=seen.observation + noise[:-1], next_observation=seen.next_observation + noise[1:])
-    return replace(rollout, transitions=noisy)

@@ -24,8 +24,10 @@ from madoc.calibration.baselines.population_search import (
     next_generation,
     replay_residuals,
 )
+from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
 from madoc.identification.windows import first_rows
 from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
+from madoc.learning.features import HIDDEN_WINDOW, unbroken, windows_ending
 from madoc.simulation.rollout import Walkers, begin, out_of_step, reset_states, roll
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
@@ -41,7 +43,8 @@ class Clouds:
     """The features by which clouds are compared, and their means over the log.
 
     Attributes:
-        of_pairs: Features of observations and actions, compared for `policy` starts.
+        of_pairs: Features of observations and actions, compared for `policy` starts; of windows of both where
+            velocities are hidden.
         of_observations: Features of observations, whose change is compared for `logged` starts.
         pair: Mean of the features of pairs over logged rows; zeros until the log has been read.
         change: Change in a step of the mean of the features of observations, over logged rows.
@@ -101,7 +104,7 @@ class CmaEs:
     objective: Literal["one-step", "distribution"] = "one-step"
     starts: Literal["logged", "policy"] | None = None
     rows: Count | None = None
-    horizon: Annotated[int, Field(ge=2)] = 10
+    horizon: Annotated[int, Field(ge=HIDDEN_WINDOW)] = 10
     features: Count = 100
     hidden: Layers = (128, 128)
     cloning_epochs: CountOrZero = 40
@@ -160,11 +163,17 @@ class CmaEs:
         starts = self.starts or ("logged" if problem.states.kind == "exact" else "policy")
         return self.objective == "distribution" and starts == "policy"
 
+    def _window(self, problem: CalibrationProblem) -> int:
+        """Rows that are compared at a time."""
+        return rows_compared(problem) if self._acts(problem) else 1
+
     def _begin_clouds(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Clouds:
         of_pairs, of_observations = jax.random.split(key)
         size, nothing = problem.simulator.task.observation_size, np.zeros(self.features)
         return Clouds(
-            of_pairs=cosine_features(of_pairs, size + problem.simulator.action_size, self.features),
+            of_pairs=cosine_features(
+                of_pairs, self._window(problem) * (size + problem.simulator.action_size), self.features
+            ),
             of_observations=cosine_features(of_observations, size, self.features),
             pair=nothing,
             change=nothing,
@@ -212,10 +221,11 @@ class CmaEs:
             clouds.of_observations.mean(self._standardised(problem, np.asarray(part)))
             for part in (changing.observation, changing.next_observation)
         )
-        pairs = np.concatenate([rows.observation, rows.action], axis=-1)
-        return replace(
-            clouds, pair=clouds.of_pairs.mean(self._standardised(problem, pairs)), change=after - before, read=1
-        )
+        if self._window(problem) > 1:
+            pairs = np.asarray(problem.features.windows("standardised", self._window(problem))[1][0])
+        else:
+            pairs = self._standardised(problem, np.concatenate([rows.observation, rows.action], axis=-1))
+        return replace(clouds, pair=clouds.of_pairs.mean(pairs), change=after - before, read=1)
 
     def _one_step(self, problem: CalibrationProblem, candidates: Candidates, key: PRNGKeyArray) -> Evaluation:
         residuals = replay_residuals(problem, candidates, key, steps=1, windows=self.rows or ROWS["one-step"])
@@ -263,10 +273,16 @@ class CmaEs:
             key=of_actions,
             restart_key=of_restarts,
         )
-        seen = np.concatenate([rollout.transitions.observation, rollout.transitions.action], axis=-1)
-        seen = np.where(rollout.valid[..., None], seen, np.nan)[1:]  # all candidates share the first observation
-        rows = np.swapaxes(seen, 0, 1).reshape(len(candidates), -1, seen.shape[-1])
-        costs = discrepancies(clouds.of_pairs(self._standardised(problem, rows)), clouds.pair)
+        noise = noise_deviation(problem, None)
+        seen = with_sensor_noise(rollout, noise, jax.random.fold_in(of_actions, 1)).transitions
+        length = self._window(problem)
+        scaling, _ = problem.features.windows("standardised", length)
+        # All candidates share the first observation.
+        windows = scaling.features(windows_ending(seen, np.arange(max(1, length - 1), len(seen)), length))[0]
+        whole = unbroken(rollout.valid, np.asarray(seen.terminated) | np.asarray(seen.truncated), length)
+        windows = np.where(whole[-len(windows) :, ..., None], windows, np.nan)
+        rows = np.swapaxes(windows, 0, 1).reshape(len(candidates), -1, windows.shape[-1])
+        costs = discrepancies(clouds.of_pairs(rows), clouds.pair)
         costs = mean_with_failures(costs[:, None])
         best = int(np.argmin(costs))
         walkers = jax.tree.map(lambda part: part[best : best + 1], after)

@@ -18,6 +18,8 @@ from madoc.calibration.baselines.dropo.likelihood import (
     moments,
     negative_log_likelihood,
     parameter_draws,
+    residual_variance,
+    shrunk,
     truncated_noise,
 )
 from madoc.calibration.baselines.population_search import (
@@ -28,6 +30,7 @@ from madoc.calibration.baselines.population_search import (
     next_generation,
     replay_residuals,
 )
+from madoc.calibration.sensing import SensorNoise, noise_deviation
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
 
 DEVIATIONS = (1e-3, 0.5)
@@ -51,13 +54,16 @@ class Dropo:
     """Maximise the likelihood of logged next states under a distribution of parameters.
 
     The authors draw 100 parameter vectors for each of a few fixed transitions. Here a generation costs population ·
-    draws · transitions control steps: draws are few, in antithetic pairs and the same for all candidates, and the few
-    transitions are drawn anew. Residuals are in units of each channel's typical change in one step, and so is ε.
+    draws · transitions control steps: draws are few and the same for all candidates, the covariance over them is
+    shrunk, and the few transitions are drawn anew. Residuals are in units of each channel's typical change in one step,
+    and so is ε, to which the variance of the sensors' noise is added.
 
     Attributes:
-        draws: Parameter vectors per candidate, S; even.
+        draws: Parameter vectors per candidate, S.
         transitions: Logged rows in a generation.
         epsilon: ε, added to the variance of every channel.
+        sensor_noise: Noise of the sensors, which is not to be taken for a spread of parameters; estimated from the log
+            alone, a share of a step's typical change, or, with None, what the data declares.
         entropy_weight: Weight of E-DROPO's entropy bonus, which keeps σ from collapsing, relative to the mean
             log-likelihood of a transition.
         population: Candidates in a generation; None takes 4 + ⌊3 ln 2d⌋.
@@ -65,9 +71,10 @@ class Dropo:
             0 never stops.
     """
 
-    draws: Annotated[int, Field(ge=2)] = 10
+    draws: Annotated[int, Field(ge=2)] = 16
     transitions: Count = 16
     epsilon: Annotated[float, Field(ge=1e-12)] = 1e-4
+    sensor_noise: SensorNoise = "estimated"
     entropy_weight: NotNegative = 0.0
     population: Annotated[int, Field(ge=4)] | None = None
     tolerance: NotNegative = 1e-4
@@ -84,12 +91,18 @@ class Dropo:
         of_candidates, of_draws, of_windows, key = jax.random.split(state.key, 4)
         candidates = evolution.ask(state.search, of_candidates, self.population)
         mean, std = distribution_of(candidates)
-        draws = parameter_draws(mean, std, truncated_noise(of_draws, self.draws // 2, mean.shape[-1]))
+        draws = parameter_draws(mean, std, truncated_noise(of_draws, self.draws, mean.shape[-1]))
         flat = replay_residuals(
             problem, draws.reshape(-1, draws.shape[-1]), of_windows, steps=1, windows=self.transitions
         )
         residuals = flat.reshape(*draws.shape[:2], *flat.shape[1:])
-        by_row = negative_log_likelihood(*moments(residuals), self.epsilon)
+        centre, covariance = moments(residuals)
+        noise = noise_deviation(problem, self.sensor_noise)
+        by_row = negative_log_likelihood(
+            centre,
+            shrunk(covariance, np.isfinite(residuals).all(-1).sum(1)),
+            residual_variance(noise, problem.typical_change, self.epsilon),
+        )
         costs = mean_with_failures(by_row) - self.entropy_weight * entropy(std)
         state, epoch = next_generation(
             state,

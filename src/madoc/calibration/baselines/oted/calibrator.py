@@ -25,8 +25,10 @@ from madoc.calibration.baselines.oted.bandit import (
 )
 from madoc.calibration.baselines.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
 from madoc.calibration.baselines.population_search import independent_estimate
+from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
+from madoc.learning.features import HIDDEN_WINDOW, last_rows, unbroken, windows_ending
 from madoc.learning.networks import Network, adam, moving_average
 from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll, unbiased_starts
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
@@ -52,6 +54,9 @@ class OtedState:
 class Oted:
     """Match the (s, a) distribution of a cloned policy's rollouts to that of the data.
 
+    Where velocities are hidden, windows of `HIDDEN_WINDOW` rows take the place of (s, a). Rows that run freely are
+    given the noise that the data says it has.
+
     Attributes:
         starts: `logged` starts rollouts anew at logged states in every epoch; with `policy`, rows go on from resets.
             None takes `logged` where states are exact, else `policy`.
@@ -75,7 +80,7 @@ class Oted:
     starts: Literal["logged", "policy"] | None = None
     draws: Annotated[int, Field(ge=2)] = 50
     rows: Count = 4
-    horizon: Annotated[int, Field(ge=2)] = 10
+    horizon: Annotated[int, Field(ge=HIDDEN_WINDOW)] = 10
     updates: Count = 50
     batch: Count = 256
     mean_rate: NotNegative = 0.3
@@ -103,13 +108,14 @@ class Oted:
         observation, action, count = task.observation_size, simulator.action_size, len(simulator.parameters)
         of_policy, of_discriminator, of_start, key = jax.random.split(key, 4)
         clone = fresh_clone(problem.dataset.transitions, self.hidden, learning_rate=self.learning_rate, key=of_policy)
-        discriminator = Network(observation + action, 1, self.hidden, key=of_discriminator)
+        pair = rows_compared(problem) * (observation + action)
+        discriminator = Network(pair, 1, self.hidden, key=of_discriminator)
         distribution = Distribution(np.zeros(count), np.full(count, np.log(self.first_std)))
         return OtedState(
             clone=clone,
             discriminator=discriminator,
             discriminator_optimiser=adam(self.learning_rate).init(eqx.filter(discriminator, eqx.is_array)),
-            rows=replay.empty(self.replay_capacity, pair=(observation + action,)),
+            rows=replay.empty(self.replay_capacity, pair=(pair,)),
             walkers=begin(self._starts(problem)[0], of_start, systems=self._systems, rows=self.rows),
             distribution=distribution,
             average=distribution,
@@ -131,9 +137,10 @@ class Oted:
         return 2 * (self.draws // 2)
 
     def _starts(self, problem: CalibrationProblem) -> tuple[Starts, Int[np.ndarray, " rows"]]:
-        """Where rollouts start, and how often the true system visits each logged row from there."""
+        """Where rollouts start, and how often the true system visits each logged window from there."""
         if not self._anew(problem):
-            return reset_states(problem.simulator), np.ones(len(problem.dataset), dtype=np.int64)
+            windows = last_rows(problem.dataset, rows_compared(problem))
+            return reset_states(problem.simulator), np.ones(len(windows), dtype=np.int64)
         states, rows = problem.states.exact()
         chosen = comparable_starts(problem.dataset, rows, self.horizon)
         return chosen_states(states[chosen]), visits(problem.dataset, rows[chosen], self.horizon)
@@ -176,14 +183,19 @@ class Oted:
             key=of_action,
             restart_key=of_restart,
         )
+        if not anew:
+            rollout = with_sensor_noise(rollout, noise_deviation(problem, None), jax.random.fold_in(of_action, 1))
+        length, seen = rows_compared(problem), rollout.transitions
+        scaling, (logged, _) = problem.features.windows("standardised", length)
         # The first pair of a row is its start, which does not depend on the draw.
-        pairs = problem.features.standardised.features(rollout.transitions)[0][1:]
-        valid = (first_lives(rollout.transitions, rollout.valid) if anew else rollout.valid)[1:]
+        pairs = scaling.features(windows_ending(seen, np.arange(max(1, length - 1), len(seen)), length))[0]
+        lives = first_lives(seen, rollout.valid) if anew else rollout.valid
+        valid = unbroken(lives, np.asarray(seen.terminated) | np.asarray(seen.truncated), length)[-len(pairs) :]
         rows = replay.add(state.rows, {"pair": replay.flatten_rows(pairs, 3)}, valid.reshape(-1))
         discriminator, optimiser_state, loss = learn(
             state.discriminator,
             state.discriminator_optimiser,
-            problem.features.windows("standardised", 1)[1][0],
+            logged,
             jnp.asarray(np.cumsum(reached), jnp.int32),
             rows,
             of_updates,

@@ -1,0 +1,45 @@
+"""What methods are told of the sensors, each the same: their noise, and how many rows tell a state."""
+
+from dataclasses import replace
+from typing import Literal
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from madoc.calibration.base import CalibrationProblem
+from madoc.learning.features import HIDDEN_WINDOW, last_rows
+from madoc.simulation.rollout import Rollout
+from madoc.types import NotNegative
+
+SensorNoise = NotNegative | Literal["estimated"] | None
+"""Noise relative to a step's typical change, or estimated from the log alone, or, with None, as the log declares."""
+
+
+def rows_compared(problem: CalibrationProblem) -> int:
+    """Rows that are compared at a time: one where it tells a state, or no episode has more, else `HIDDEN_WINDOW`."""
+    tells = problem.states.kind == "exact" or not len(last_rows(problem.dataset, HIDDEN_WINDOW))
+    return 1 if tells else HIDDEN_WINDOW
+
+
+def noise_deviation(problem: CalibrationProblem, share: SensorNoise) -> Float[np.ndarray, " observation"]:
+    """Standard deviation of the noise of observations: that which the data declares, or as told."""
+    if share == "estimated":
+        return problem.estimated_noise
+    share = problem.dataset.disturbance.noise if share is None else float(share)
+    # The logged change holds the noise of two readings; the share is that of the change without noise.
+    return share / np.sqrt(1.0 + 2.0 * share**2) * problem.typical_change
+
+
+def with_sensor_noise(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:
+    """The rollout with noise on its observations; the end of a step and the start of the next have the same noise.
+
+    The policy acted on observations without noise.
+    """
+    if not deviation.any():
+        return rollout
+    seen = rollout.transitions
+    steps, *others = np.shape(seen.observation)
+    noise = deviation * np.asarray(jax.random.normal(key, (steps + 1, *others)), np.float64)
+    noisy = replace(seen, observation=seen.observation + noise[:-1], next_observation=seen.next_observation + noise[1:])
+    return replace(rollout, transitions=noisy)
