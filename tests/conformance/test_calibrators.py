@@ -127,11 +127,13 @@ def through_all_stages(method, problem, *, key=KEY):
 
 
 def until_spent(method, problem):
-    """The epochs until the budget is spent, and the last state."""
+    """The epochs until the budget is spent or the method stops by itself, and the last state."""
     state, epochs = method.init(problem, KEY), []
     while sum(epoch.control_steps - epoch.unbudgeted for epoch in epochs) < BUDGET:
         state, epoch = method.step(problem, state)
         epochs.append(epoch)
+        if epoch.converged:
+            break
     return epochs, state
 
 
