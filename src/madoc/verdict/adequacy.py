@@ -32,7 +32,7 @@ EARTH = 0.03
 def missing_term(holdout: HoldOut) -> MissingTerm | None:
     """The likeliest term that the model certainly lacks, if such terms move the estimate by themselves or together.
 
-    None where the integration step explains most of the residuals: beside its error no other can be told.
+    None where the integration step explains much of the residuals: beside its error no lesser one can be told.
     """
     if numerical(holdout) is not None:
         return None
@@ -87,9 +87,12 @@ def _moved_together(holdout: HoldOut) -> bool:
 
 
 def numerical(holdout: HoldOut) -> MissingTerm | None:
-    """The error of the integration step, where it explains much of the residuals."""
+    """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
     term = next((term for term in holdout.missing_terms if term.cause == INTEGRATION), None)
-    return term if term is not None and abs(term.t) >= CERTAIN and term.explained >= NUMERICAL else None
+    if term is None or abs(term.t) < CERTAIN or term.explained < NUMERICAL:
+        return None
+    others = (each.explained for each in holdout.missing_terms if is_certain(each) and each.cause != DRIFT)
+    return term if max(others, default=0.0) <= term.explained else None
 
 
 def widening(alternatives: tuple[Alternative, ...], names: tuple[str, ...]) -> Float[np.ndarray, "d 2"]:
