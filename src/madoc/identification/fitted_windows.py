@@ -1,12 +1,14 @@
 """Windows of a log fitted by a simulator, parameters and initial states, as score tests need them."""
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from jaxtyping import Float
 
 from madoc.data.dataset import Dataset
 from madoc.data.timescale import stride
-from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
-from madoc.identification.linearisation import DIFFERENCE, WindowSlopes, difference_points, slopes_of_windows
+from madoc.identification.gauss_newton import Eliminated, damped_step, eliminate, triangular_factors
+from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.losses import TUNING, loss_slope, loss_value, scale_of
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
@@ -22,9 +24,11 @@ STRIDES = 20
 NEGLIGIBLE = 1e-5
 """Residual in typical changes of a step; below it there is nothing to explain."""
 FITS = 4
-"""Largest number of Gauss-Newton steps of parameters and initial states, from the estimate and from logged states."""
+"""Largest number of times that slopes are simulated in a fit, and of Gauss-Newton steps with the same slopes."""
 GAIN = 0.01
 """Share of the cost that a step must remove for another one to follow."""
+LENGTHS = 4.0 ** -np.arange(4)
+"""Lengths of a step that are tried, in whole Gauss-Newton steps."""
 _STATE_DAMPING = 1e-9
 """Relative damping of initial states, far below the rounding of their differences."""
 _DAMPING = 1e-6
@@ -47,72 +51,120 @@ def windows_of(
     return readings, states[chosen], np.asarray(dataset.transitions.action, np.float64)[rows[chosen] - 1]
 
 
-def refitted(
+@dataclass(frozen=True)
+class Fit:
+    """Parameters and initial states at which windows were simulated.
+
+    Attributes:
+        point: Parameters in [-1, 1].
+        states: The initial state of each window.
+        slopes: The residuals there, and derivatives there or near.
+        control_steps: Control steps that were simulated to find all that.
+    """
+
+    point: Float[np.ndarray, " d"]
+    states: Float[np.ndarray, "windows state"]
+    slopes: WindowSlopes
+    control_steps: int
+
+    @property
+    def unexplained(self) -> float:
+        """Median over windows of the mean squared residual that no initial state explains; infinite if all failed."""
+        if not self.slopes.whole.any():
+            return np.inf
+        fixed = _eliminated(self.slopes, np.ones_like(self.slopes.residuals)).reduced.residuals[self.slopes.whole]
+        return float(np.median((fixed**2).mean(-1)))
+
+
+def fit_windows(
     simulator: Simulator,
     readings: Readings,
     states: Float[np.ndarray, "windows state"],
     point: Float[np.ndarray, " d"],
-) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "windows state"]]:
-    """The nearest parameters that explain the windows best, those given if no step of the search helps; and states."""
-    damping, least = np.full(len(readings), _STATE_DAMPING), np.inf
-    best = (point, states)
+) -> Fit:
+    """The nearest parameters that explain the windows best, then the initial states that do at these parameters."""
+    fit = _sloped(simulator, readings, states, point, 0)
     for _ in range(FITS):
-        (around,) = slopes_at(simulator, readings, point[None], states[None])
-        if not around.whole.any():
+        before = fit.unexplained
+        fit = _descended(simulator, readings, fit)
+        if fit.unexplained >= (1.0 - GAIN) * before:
             break
-        fixed = eliminate(around, np.ones_like(around.residuals), damping).reduced.residuals[around.whole]
-        cost = float(np.median((fixed**2).mean(-1)))
-        enough = cost >= (1.0 - GAIN) * least
-        if cost < least:
-            best, least = (point, states), cost
-        if enough:
+        fit = _sloped(simulator, readings, fit.states, fit.point, fit.control_steps)
+    for _ in range(FITS):
+        before = fit.unexplained
+        fit = _with_fitted_states(simulator, readings, fit)
+        # Steps of the states change what they cannot explain only where their slopes do not hold.
+        if abs(fit.unexplained - before) <= GAIN * before:
             break
-        scale = scale_of(around.residuals[around.whole], "cauchy")
-        weights = loss_slope((around.residuals / scale) ** 2, "cauchy") * around.whole[:, None]
-        left = eliminate(around, weights, damping)
-        step = damped_step(*triangular_factors(left.reduced, 1.0, "linear"), point, _DAMPING)
-        states = states + readings.in_state_units(left.states_step(step), states.shape[1])
-        point = point + step
-    return best
+        fit = _sloped(simulator, readings, fit.states, fit.point, fit.control_steps)
+    return fit
 
 
-def with_fitted_states(
+def _sloped(
     simulator: Simulator,
     readings: Readings,
     states: Float[np.ndarray, "windows state"],
-    point: Float[np.ndarray, " k"],
-) -> Float[np.ndarray, "windows state"]:
-    """The initial states that explain each window best at these parameters; outlying readings count little."""
+    point: Float[np.ndarray, " d"],
+    spent: int,
+) -> Fit:
+    """Residuals and slopes simulated at a point, after so many control steps."""
+    (slopes,) = slopes_at(simulator, readings, point[None], states[None])
+    columns = 1 + 2 * len(point) + len(readings.spread)
+    return Fit(point, states, slopes, spent + columns * len(readings) * readings.steps)
+
+
+def _descended(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
+    """After Gauss-Newton steps for as long as each gains. All use the slopes given, which cost far more than a step."""
     for _ in range(FITS):
-        (around,) = slopes_at(simulator, readings, point[None], states[None], parameters=False)
-        noise = _noise(around, readings)
-        scaled = around.over(noise)
-        fit = eliminate(scaled, _weights(scaled), np.full(len(readings), _STATE_DAMPING))
-        moved = states + readings.in_state_units(fit.states_step(np.zeros(0)), states.shape[1])
-        after = readings.residuals(simulator, point[None], moved[None])[0, 0]
-        before, now = _costs(scaled.residuals), _costs(after / noise)
-        better = around.whole & (now < before)
-        states = np.where(better[:, None], moved, states)
-        if before[better].sum() - now[better].sum() <= GAIN * before[around.whole].sum():
+        if not fit.slopes.whole.any():
             break
-    return states
+        before = fit.unexplained
+        fit = _stepped(simulator, readings, fit)
+        if fit.unexplained >= (1.0 - GAIN) * before:
+            break
+    return fit
 
 
-def slopes_by_calibrated(
-    wide: Simulator,
-    readings: Readings,
-    at: Float[np.ndarray, " k"],
-    states: Float[np.ndarray, "windows state"],
-    count: int,
-) -> WindowSlopes:
-    """Residuals and their derivatives by the calibrated parameters and the initial states."""
-    points = np.concatenate(
-        [difference_points(at[:count]), np.broadcast_to(at[count:], (1 + 2 * count, len(at) - count))], axis=1
-    )
-    by_points = readings.residuals(wide, points, np.repeat(states[None], len(points), axis=0))[:, 0]
-    shift = readings.in_state_units(DIFFERENCE * np.eye(len(readings.spread)), states.shape[1])
-    by_shifts = readings.residuals(wide, at[None], (states + shift[:, None]).reshape(1, -1, states.shape[1]))[0]
-    return slopes_of_windows(points[:, :count], by_points, by_shifts)
+def _stepped(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
+    """After a Gauss-Newton step with the slopes given, of the length that gains most; where none gains, as before."""
+    slopes = fit.slopes
+    scale = scale_of(slopes.residuals[slopes.whole], "cauchy")
+    weights = loss_slope((slopes.residuals / scale) ** 2, "cauchy") * slopes.whole[:, None]
+    left = _eliminated(slopes, weights)
+    whole_step = damped_step(*triangular_factors(left.reduced, 1.0, "linear"), fit.point, _DAMPING)
+    of_states = readings.in_state_units(left.states_step(whole_step), fit.states.shape[1])
+    points = fit.point + LENGTHS[:, None] * whole_step
+    states = fit.states + LENGTHS[:, None, None] * of_states
+    residuals = readings.residuals(simulator, points, states)[:, 0]
+    spent = fit.control_steps + len(LENGTHS) * len(readings) * readings.steps
+    tried = [Fit(*parts, spent) for parts in zip(points, states, map(slopes.at, residuals), strict=True)]
+    return min([replace(fit, control_steps=spent), *tried], key=lambda each: each.unexplained)
+
+
+def _with_fitted_states(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
+    """With the initial states that explain each window best; outlying readings count little."""
+    for _ in range(FITS):
+        slopes, states = fit.slopes, fit.states
+        if not slopes.whole.any():
+            break
+        noise = _noise(slopes, readings)
+        scaled = slopes.over(noise)
+        step = _eliminated(scaled, _weights(scaled)).states_step(np.zeros(len(fit.point)))
+        moved = states + readings.in_state_units(step, states.shape[1])
+        after = readings.residuals(simulator, fit.point[None], moved[None])[0, 0]
+        before, now = _costs(scaled.residuals), _costs(after / noise)
+        better = slopes.whole & (now < before)
+        kept = replace(slopes, residuals=np.where(better[:, None], after, slopes.residuals))
+        spent = fit.control_steps + len(readings) * readings.steps
+        fit = Fit(fit.point, np.where(better[:, None], moved, states), kept, spent)
+        if before[better].sum() - now[better].sum() <= GAIN * before[slopes.whole].sum():
+            break
+    return fit
+
+
+def _eliminated(slopes: WindowSlopes, weights: Float[np.ndarray, "windows values"]) -> Eliminated:
+    """Residuals and derivatives without what initial states explain."""
+    return eliminate(slopes, weights, np.full(len(slopes.residuals), _STATE_DAMPING))
 
 
 def products_of(slopes: WindowSlopes, readings: Readings, count: int) -> Products | None:
@@ -127,13 +179,13 @@ def products_of(slopes: WindowSlopes, readings: Readings, count: int) -> Product
         slopes.residuals[finite], slopes.by_parameters[finite], slopes.by_states[finite], slopes.whole[finite]
     )
     scaled = kept.over(_noise(kept, readings))
-    left = eliminate(scaled, _weights(scaled), np.full(len(scaled.residuals), _STATE_DAMPING)).reduced
+    left = _eliminated(scaled, _weights(scaled)).reduced
     return Products.of(left.residuals, left.jacobian[..., :count], left.jacobian[..., count:])
 
 
 def _noise(slopes: WindowSlopes, readings: Readings) -> Float[np.ndarray, " values"]:
     """Standard deviation of each value's noise, by what no initial state explains of the residuals."""
-    alike = eliminate(slopes, np.ones_like(slopes.residuals), np.full(len(slopes.residuals), _STATE_DAMPING))
+    alike = _eliminated(slopes, np.ones_like(slopes.residuals))
     shape = (len(slopes.residuals), readings.steps + 1, len(readings.scale))
     left = alike.reduced.residuals[:, : shape[1] * shape[2]]
     noise = channel_noise(left.reshape(shape)[slopes.whole], alike.spare.reshape(shape)[slopes.whole])

@@ -1,6 +1,6 @@
 """Derivatives of residuals by central differences, whose points are simulated in one batch by `replay`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -50,6 +50,11 @@ class WindowSlopes:
         """Residuals and derivatives divided by the deviation of each value."""
         wide = deviation[:, None]
         return WindowSlopes(self.residuals / deviation, self.by_parameters / wide, self.by_states / wide, self.whole)
+
+    def at(self, residuals: Float[np.ndarray, "windows values"]) -> "WindowSlopes":
+        """The same derivatives with the residuals of a point nearby, NaN in windows whose simulation fails there."""
+        whole = self.whole & np.isfinite(residuals).all(-1)
+        return replace(self, residuals=np.where(whole[:, None], residuals, 0.0), whole=whole)
 
 
 def difference_points(point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "points d"]:

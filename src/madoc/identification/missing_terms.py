@@ -14,14 +14,7 @@ from jaxtyping import Float
 from madoc import simulation
 from madoc.data.dataset import Dataset
 from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, Candidate, candidates, effects
-from madoc.identification.fitted_windows import (
-    FITS,
-    products_of,
-    refitted,
-    slopes_by_calibrated,
-    windows_of,
-    with_fitted_states,
-)
+from madoc.identification.fitted_windows import Fit, fit_windows, products_of, windows_of
 from madoc.identification.information import NORMAL_95
 from madoc.identification.replay import Readings
 from madoc.identification.score_tests import Products, Score, deviate, joint_shift, parameter_shift, score
@@ -127,16 +120,15 @@ def suspicions(
     readings, states, before = windows_of(dataset, logged, scale, fewest=2 * (_FEWEST + len(point)))
     if len(readings) < _FEWEST + len(point):
         return Suspicions()
-    led, states = refitted(simulator, readings, states, point)
+    fit = fit_windows(simulator, readings, states, point)
+    led = fit.point
     added = list(candidates(logged, simulator, led, scale))
     space = ParameterSpace((*simulator.parameters.parameters, *(parameter for _, parameter in added)))
     wide = simulation.make(replace(simulator.task, parameters=space))
     at_nominal = np.concatenate([led, -np.ones(len(added))])
-    states = with_fitted_states(wide, readings, states, at_nominal)
-    slopes = slopes_by_calibrated(wide, readings, at_nominal, states, len(led))
-    tried, by_terms = effects(simulator, wide, readings, before, at_nominal, states, added)
-    spent = _fit_cost(readings, len(led)) + len(tried) * len(readings) * readings.steps
-    both = replace(slopes, by_parameters=np.concatenate([slopes.by_parameters, by_terms], axis=-1))
+    tried, by_terms = effects(simulator, wide, readings, before, at_nominal, fit.states, added)
+    spent = fit.control_steps + (1 + len(tried)) * len(readings) * readings.steps
+    both = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, by_terms], axis=-1))
     products = products_of(both, readings, len(led))
     if products is None or len(products) < _FEWEST + len(led):
         return Suspicions(control_steps=spent)
@@ -148,14 +140,14 @@ def suspicions(
     )
     if chosen:
         together = _with_terms(tests, chosen)
-        fit = None
+        richer = None
         if max(map(abs, together.shifts.values())) >= WORTH_FITTING:
-            fit = _fitted(tests, chosen, simulator, readings, states, led, point)
-        if fit is not None:
-            spent += _fit_cost(readings, len(led) + len(fit.terms))
-            terms = [fit.terms.get(term.parameter, term) for term in terms]
-            others.append(fit.alternative)
-        if fit is None or len(fit.terms) < len(chosen):
+            richer = _fitted(tests, chosen, simulator, readings, fit, point)
+        if richer is not None:
+            spent += richer.control_steps
+            terms = [richer.terms.get(term.parameter, term) for term in terms]
+            others.append(richer.alternative)
+        if richer is None or len(richer.terms) < len(chosen):
             others.append(together)
     return Suspicions(tuple(sorted(terms, key=lambda term: -abs(term.t))), tuple(others), spent)
 
@@ -182,17 +174,12 @@ class _Tests:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _RicherModel:
     """Terms by the name of their parameter, fitted together with the parameters, and the estimate with them."""
 
     terms: dict[str, MissingTerm]
     alternative: Alternative
-
-
-def _fit_cost(readings: Readings, count: int) -> int:
-    """Control steps of a fit of so many parameters and of initial states."""
-    columns = 1 + 2 * count + len(readings.spread)
-    return (FITS * (2 * columns + 2) + columns) * len(readings) * readings.steps
+    control_steps: int
 
 
 def _terms(tests: _Tests) -> Iterator[MissingTerm]:
@@ -271,14 +258,15 @@ def _fitted(
     chosen: list[int],
     simulator: Simulator,
     readings: Readings,
-    states: Float[np.ndarray, "windows state"],
-    led: Float[np.ndarray, " d"],
+    poorer: Fit,
     point: Float[np.ndarray, " d"],
-) -> _Fit | None:
+) -> _RicherModel | None:
     """The first of these terms fitted together with the parameters; None if a spec can say none of them.
 
     A score test is one linear step, which is too short where residuals are far from noise and so count little.
+    `poorer` is the fit without the terms.
     """
+    led = poorer.point
     changes, shift, _ = joint_shift(tests.products, [1 + tests.products.count + index for index in chosen])
     possible = [
         (tests.tried[index], parameter, float(change))
@@ -292,9 +280,8 @@ def _fitted(
     values = np.array([candidate.nominal + change * candidate.reference for candidate, _, change in possible])
     start = np.concatenate([led + shift, np.zeros(len(values))])
     start[len(led) :] = space.to_unit(np.concatenate([simulator.parameters.middle, values]))[len(led) :]
-    at, states = refitted(wide, readings, states, np.clip(start, -1.0, 1.0))
-    states = with_fitted_states(wide, readings, states, at)
-    products = products_of(slopes_by_calibrated(wide, readings, at, states, len(at)), readings, len(at))
+    fit = fit_windows(wide, readings, poorer.states, np.clip(start, -1.0, 1.0))
+    at, products = fit.point, products_of(fit.slopes, readings, len(fit.point))
     if products is None:
         return None
     step, covariance = parameter_shift(products)
@@ -311,7 +298,7 @@ def _fitted(
             term = replace(_term(candidate, found, shifts), value=value, standard_error=deviation, t=significance)
             terms[candidate.parameter] = term
     causes = tuple(_named(candidate) for candidate, _, _ in possible)
-    return _Fit(terms, Alternative(causes, True, shifts, tests.by_name(beyond)))
+    return _RicherModel(terms, Alternative(causes, True, shifts, tests.by_name(beyond)), fit.control_steps)
 
 
 def _of_parts(drifts: Iterator[MissingTerm]) -> Iterator[Alternative]:
