@@ -149,6 +149,7 @@ def suspicions(
             others.append(richer.alternative)
         if richer is None or len(richer.terms) < len(chosen):
             others.append(together)
+        others += [_with_terms(tests, [index]) for index in _rivals(tests, chosen)]
     return Suspicions(tuple(sorted(terms, key=lambda term: -abs(term.t))), tuple(others), spent)
 
 
@@ -227,14 +228,29 @@ def _chosen(tests: _Tests) -> list[int]:
     """Candidates that cannot be excluded, each the most significant beside those before it."""
     chosen: list[int] = []
     for _ in range(TOGETHER):
-        others = (index for index, each in enumerate(tests.tried) if index not in chosen and not each.known_before)
-        scores = {index: tests.score(index, chosen) for index in others}
-        significance = {index: abs(found.t) for index, found in scores.items() if found is not None}
+        significance = _significance(tests, chosen)
         best = max(significance, key=lambda index: significance[index], default=None)
         if best is None or significance[best] < SUSPICIOUS:
             break
         chosen.append(best)
     return chosen
+
+
+def _rivals(tests: _Tests, chosen: list[int]) -> list[int]:
+    """Candidates that cannot be excluded either, each in place of those chosen, which may explain the same.
+
+    Twice the difference of two terms' logarithms of the likelihood is that of their t².
+    """
+    significance = _significance(tests, [])
+    least = max(SUSPICIOUS**2, max(significance.values(), default=0.0) ** 2 - SUSPICIOUS**2)
+    return [index for index, t in significance.items() if t**2 >= least and index not in chosen]
+
+
+def _significance(tests: _Tests, beside: list[int]) -> dict[int, float]:
+    """|t| of every other candidate beside these; terms that users know well without the log are not asked for."""
+    others = (index for index, each in enumerate(tests.tried) if index not in beside and not each.known_before)
+    scores = {index: tests.score(index, beside) for index in others}
+    return {index: abs(found.t) for index, found in scores.items() if found is not None}
 
 
 def _with_terms(tests: _Tests, chosen: list[int]) -> Alternative:
