@@ -5,7 +5,7 @@ calibrated parameters can explain of the residuals is regressed on the same part
 would move the estimate are then fitted together with the parameters.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -354,7 +354,7 @@ def _fitted(
     return _RicherModel(terms, Alternative(causes, True, shifts, tests.by_name(beyond)), fit.control_steps)
 
 
-def _of_parts(drifts: Iterator[MissingTerm]) -> Iterator[Alternative]:
+def _of_parts(drifts: Iterable[MissingTerm]) -> Iterator[Alternative]:
     """Estimates of parts of the log that disagree with the whole, to either side."""
     for term in drifts:
         if abs(term.t) >= DISAGREEING:
