@@ -38,18 +38,22 @@ parameters:
 NOISE = 0.002
 
 
-def plant(folder: Path, *, friction: float = 0.0, drag: float = 0.0, late: int = 0):
-    """A log of the pendulum with a term that the model of its spec lacks, and what the tests need of it."""
+def plant(folder: Path, *, friction: float = 0.0, drag: float = 0.0, late: int = 0, damping: float = 0.1):
+    """A log of the pendulum with a term that the model of its spec lacks, and what the tests need of it.
+
+    Its damping is 0.1 N·m·s/rad in the first half of the log, and `damping` in the second.
+    """
     folder.mkdir(exist_ok=True)
     (folder / "real.xml").write_text(MODEL.format(damping=0.1, friction=friction, drag=f" {drag} 0" if drag else ""))
     (folder / "real.yaml").write_text(SPEC.replace("model.xml", "real.xml"))
     (folder / "model.xml").write_text(MODEL.format(damping=0.1, friction=0, drag=""))
     (folder / "pendulum.yaml").write_text(SPEC)
     real = simulation.make(robots.load(folder / "real.yaml").task)
-    system, random = real.bind(np.array([[0.1]])), np.random.default_rng(0)
+    systems, random = [real.bind(np.array([[value]])) for value in (0.1, damping)], np.random.default_rng(0)
     torque = np.repeat(random.uniform(-1, 1, 320), 5)
     state, angles = real.initial_state[None, None], []
     for row in range(len(torque)):
+        system = systems[2 * row // len(torque)]
         angles.append(np.asarray(system.observe(state))[0, 0])
         state = system.step(state, torque[None, None, max(0, row - late)][..., None])
     seen = np.array(angles) + NOISE * random.standard_normal((len(torque), 2))
@@ -88,3 +92,11 @@ def test_a_right_model_lacks_nothing(tmp_path):
 def test_friction_that_puts_energy_in_is_no_candidate(tmp_path):
     friction = [term for term in scores(*plant(tmp_path)) if term.parameter == "dof_frictionloss.hinge"]
     assert all(term.value >= 0 for term in friction)
+
+
+def test_a_parameter_that_changes_over_the_log_is_told_with_its_change(tmp_path):
+    dataset, simulator = plant(tmp_path, damping=0.3)
+    drifts = [term for term in scores(dataset, simulator) if term.cause == terms.DRIFT]
+    assert drifts[0].parameter == "dof_damping.hinge"
+    assert drifts[0].value == pytest.approx(0.2, abs=3.0 * drifts[0].standard_error)
+    assert drifts[0].t > 6.0
