@@ -10,7 +10,16 @@ from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.identification.candidate_terms import INTEGRATION, TILTS
 from madoc.identification.combinations import Combination
 from madoc.identification.missing_terms import DRIFT, Alternative, MissingTerm
-from madoc.verdict.adequacy import as_likely, likeliest, missing_term, numerical, widening, with_widened_intervals
+from madoc.verdict import judge
+from madoc.verdict.adequacy import (
+    as_likely,
+    coarse_step,
+    likeliest,
+    missing_term,
+    numerical,
+    widening,
+    with_widened_intervals,
+)
 
 BEYOND = Alternative(("a spring",), True, {"mass": 3.0, "damping": -0.5}, {"mass": 0.0, "damping": 2.4})
 
@@ -92,3 +101,14 @@ def test_terms_that_explain_nearly_as_much_are_as_likely():
     friction, gain = term(explained=0.5), term("another gain", explained=0.45)
     assert as_likely(held(friction, gain, term("a spring", explained=0.3)), friction) == [gain]
     assert as_likely(held(friction, term("another gain", t=4.0, explained=0.5)), friction) == []
+
+
+def test_a_coarse_integration_step_that_explains_more_is_told_first():
+    step, friction = term(INTEGRATION, t=6.0, explained=0.1, parameter=""), term(explained=0.05)
+    assert coarse_step(held(step, friction), friction) is step
+    assert (
+        "; first take a smaller timestep of the model, whose error explains 10 % (t = 6)"
+        in judge(held(step, friction)).sentence
+    )
+    assert coarse_step(held(step, friction), term(explained=0.2)) is None
+    assert coarse_step(held(replace(step, t=4.0), friction), friction) is None

@@ -71,6 +71,13 @@ def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
     ]
 
 
+def coarse_step(holdout: HoldOut, named: MissingTerm) -> MissingTerm | None:
+    """The error of the integration step, where it is as certain as the term named and explains more."""
+    step = next((term for term in holdout.missing_terms if term.cause == INTEGRATION), None)
+    coarse = step is not None and abs(step.t) >= CERTAIN and step.explained > named.explained
+    return step if coarse else None
+
+
 def is_certain(term: MissingTerm) -> bool:
     """Whether a term is so significant that it is missing, whatever it does to the estimate."""
     return term.cause != INTEGRATION and abs(term.t) >= (CERTAIN_DRIFT if term.cause == DRIFT else CERTAIN)

@@ -20,7 +20,7 @@ from madoc.identification.combinations import Combination
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import DRIFT, MissingTerm
 from madoc.parameters import FIELDS
-from madoc.verdict.adequacy import as_likely, is_certain, likeliest, missing_term, numerical
+from madoc.verdict.adequacy import as_likely, coarse_step, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END
 from madoc.verdict.statistics import NEGLIGIBLE
 
@@ -123,7 +123,7 @@ def _missing(holdout: HoldOut) -> Verdict | None:
         "MODEL_MISMATCH",
         f"the model lacks {_named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
         f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
-        f"{_others(holdout, term)}; {_remedy(term)}{_at_end(holdout)}{_disagreeing(holdout)}",
+        f"{_others(holdout, term)}; {_remedy(term)}{_coarse(holdout, term)}{_at_end(holdout)}{_disagreeing(holdout)}",
         tuple(moved),
     )
 
@@ -136,6 +136,15 @@ def _others(holdout: HoldOut, term: MissingTerm) -> str:
     """Which other terms are as likely as the one named."""
     others = [_named(other) for other in as_likely(holdout, term)]
     return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
+
+
+def _coarse(holdout: HoldOut, named: MissingTerm) -> str:
+    """That the model should be integrated more finely first, where that explains more than the term named."""
+    step = coarse_step(holdout, named)
+    if step is None:
+        return ""
+    explains = f"explains {100 * step.explained:.2g} % (t = {abs(step.t):.0f})"
+    return f"; first take a smaller timestep of the model, whose error {explains}"
 
 
 def _at_end(holdout: HoldOut) -> str:
