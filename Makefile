@@ -16,7 +16,7 @@ demo: $(RUNS)  ## the main job on an arm with an unknown load: logs, calibration
 	$(BIN)/python examples/record_logs.py $(DEMO)/reach.yaml $(DEMO)/truth.json runs/demo-logs --seed $(SEED)
 	$(BIN)/madoc run $(DEMO)/reach.yaml --data runs/demo-logs --truth $(DEMO)/truth.json --out runs/demo --seed $(SEED) \
 	  --episodes 50 --policy-budget 250000 --policy-set hidden=[64,64] environments=32 epoch_steps=1024 \
-	  steps_per_update=4 warmup_steps=5000 learning_rate=0.001 judge_every=5000 judge_episodes=50
+	  steps_per_update=4 warmup_steps=5000 judge_every=5000 judge_episodes=50
 	@echo
 	@echo "The policies at work, and which error matters to them: open runs/demo/report.html"
 	@echo "Another estimate, another policy:  $(BIN)/madoc learn runs/demo --at distribution --width 3 --budget 60s"

@@ -2,6 +2,7 @@
 
     python benchmarks/policies.py --robots hopper halfcheetah --at calibrated truth midrange --seeds 0 1 2
     python benchmarks/policies.py --methods bc cql morec --budget 20000
+    python benchmarks/policies.py --methods fast-sac --budget 300s
     python benchmarks/policies.py --methods h2o --at midrange --set updates_per_step=0.25
 
 Takes the calibrated parameters, and the spread of `distribution`, from `results/calibration`, and the logged data that
@@ -42,7 +43,7 @@ def main() -> None:
     )
     parser.add_argument("--calibrator", default="madoc-logged-300000", help="whose estimate, as results are named")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--budget", type=int, default=300_000)
+    parser.add_argument("--budget", type=budget, default=300_000, help="300000, or a time as 300s")
     parser.add_argument("--set", nargs="*", default=[], help="hyperparameters as name=value")
     parser.add_argument("--transitions", type=int, default=200_000)
     parser.add_argument("--episodes", type=int, default=20)
@@ -78,6 +79,11 @@ def main() -> None:
             print(path.name, round(row["return"]), round(row["seconds"]), flush=True)
 
 
+def budget(text: str) -> int | str:
+    """A count, or a time as Madoc reads it."""
+    return int(text) if text.isdigit() else text
+
+
 def run(method, robot: str, at: str, arguments: argparse.Namespace, seed: int) -> dict:
     """What the policy learnt there earns in the target, and what it cost."""
     simulator = CpuSimulator(tasks.make(robot, "legacy"), threads=arguments.threads)
@@ -101,6 +107,7 @@ def run(method, robot: str, at: str, arguments: argparse.Namespace, seed: int) -
     return evaluate(learnt.policy, simulator, truth, **judged).summary() | {
         "seconds": learnt.seconds,
         "control_steps": learnt.control_steps,
+        "updates": learnt.updates,
         "status": learnt.status,
         "spent": learnt.spent,
     }

@@ -146,7 +146,8 @@ def policies() -> str:
     """Return in the target of every learner, where it learnt and how, over seeds."""
     cells = defaultdict(list)
     for row in learnt():
-        cells[row["robot"], row["method"], row["at"], row["budget"], row["unit"], " ".join(row["set"])].append(row)
+        budget = row["budget"] if isinstance(row["budget"], str) else f"{row['budget']:,} {row['unit']}"
+        cells[row["robot"], row["method"], row["at"], budget, " ".join(row["set"])].append(row)
     if not cells:
         return ""
     lines = [
@@ -157,12 +158,12 @@ def policies() -> str:
         "| robot | learner | learnt at | budget | settings | seeds | return | normalized (mean ± std) | paper | s |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for (robot, method, at, budget, unit, settings), rows in sorted(cells.items()):
+    for (robot, method, at, budget, settings), rows in sorted(cells.items()):
         returns = [row["return"] for row in rows]
         normalized = [row["normalized"] for row in rows]
         spread = f" ± {np.std(normalized, ddof=1):.1f}" if len(rows) > 1 else ""
         lines.append(
-            f"| {robot} | {method} | {at} | {budget:,} {unit} | {settings} | {len(rows)} | {np.median(returns):.0f} "
+            f"| {robot} | {method} | {at} | {budget} | {settings} | {len(rows)} | {np.median(returns):.0f} "
             f"({min(returns):.0f} to {max(returns):.0f}) | {np.mean(normalized):.1f}{spread} "
             f"| {_printed_return(robot, method, at)} | {np.median([row['seconds'] for row in rows]):.0f} |"
         )
