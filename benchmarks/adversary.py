@@ -214,8 +214,8 @@ def named(result: dict[str, Any], *, everything: bool = False) -> bool:
     return re.search(result["cause"], text) is not None
 
 
-def table(results: list[dict[str, Any]]) -> str:
-    """The summary, in Markdown."""
+def summary(results: list[dict[str, Any]]) -> str:
+    """What went wrong how often, in Markdown."""
     deceptions = [result for result in results if not result["honest"] and not result["invisible"]]
     invisible = [result for result in results if result["invisible"]]
     honest = [result for result in results if result["honest"]]
@@ -223,8 +223,6 @@ def table(results: list[dict[str, Any]]) -> str:
     alarms = [result for result in honest if outcome(result) != "CALIBRATED"]
     near = [result for result in false if largest_miss(result) < HARMLESS]
     lines = [
-        f"Commits: {', '.join(sorted({result['commit'] for result in results}))}",
-        "",
         "| what | count | of |",
         "|---|---|---|",
         f"| false CALIBRATED | {len(false)} | {len(deceptions)} |",
@@ -237,6 +235,19 @@ def table(results: list[dict[str, Any]]) -> str:
         f"| refusals of honest cases | {refusals(honest)} | {len(honest)} |",
         f"| intervals that hold, honest cases | {coverage(honest)} |",
         f"| seconds, median and largest | {seconds(results)} |",
+    ]
+    return "\n".join(lines)
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """The summary, and every case, in Markdown."""
+    deceptions = [result for result in results if not result["honest"] and not result["invisible"]]
+    invisible = [result for result in results if result["invisible"]]
+    honest = [result for result in results if result["honest"]]
+    lines = [
+        f"Commits: {', '.join(sorted({result['commit'] for result in results}))}",
+        "",
+        summary(results),
         "",
         "| deception | seeds | verdicts | false CALIBRATED | largest miss, share of range | cause named | anywhere |",
         "|---|---|---|---|---|---|---|",

@@ -10,11 +10,16 @@ from collections import defaultdict
 from itertools import product
 from pathlib import Path
 
+import adversary
+import coverage
 import numpy as np
 import paper
+import rates
 import readme
 
 RESULTS = Path(__file__).parent / "results"
+SETS = ("adversary", "rates")
+"""Folders of results of one JSON file each that are shown together."""
 
 
 def main() -> None:
@@ -33,6 +38,7 @@ def measured() -> str:
         disturbed(),
         policies(),
         planted(),
+        verdicts(),
         sysid(),
         pendulum(),
         fuzz(),
@@ -217,6 +223,23 @@ def planted() -> str:
             f"({told['commit']})."
         )
     return "\n".join(lines) + "\n"
+
+
+def verdicts() -> str:
+    """What `adversary.py`, `coverage.py` and `rates.py` found."""
+    cases, logs = ([json.loads(path.read_text()) for path in sorted((RESULTS / name).glob("*.json"))] for name in SETS)
+    seeds = ", ".join(map(str, sorted({case["seed"] for case in cases})))
+    return (
+        "## Verdicts and intervals\n\n"
+        f"`python benchmarks/adversary.py`: {len(cases)} problems of seven robots, seeds {seeds}; each with `--table`. "
+        "Invisible deceptions are those that no data can show; `madoc check` names them.\n\n"
+        f"{adversary.summary(cases)}\n\n"
+        "`python benchmarks/coverage.py`: honest problems, least squares, 95 % intervals.\n\n"
+        f"{coverage.table(coverage.RESULTS)}\n\n"
+        "`python benchmarks/rates.py`: one log of a double pendulum with coarse encoders at three rates, all defaults. "
+        "Windows of 0.5 s are simulated from true states; values 5 % off the truth stand for a data sheet's.\n\n"
+        f"{rates.table(logs)}\n"
+    )
 
 
 def sysid() -> str:
