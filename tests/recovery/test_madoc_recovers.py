@@ -34,13 +34,11 @@ def off(result, task, truth):
     return 100.0 * np.abs(result.mean - space.vector(truth)) / (space.high - space.low)
 
 
-EVERY = [(name, starts) for name in ("madoc", "madoc-s", "madoc-vdn") for starts in ("logged", "replay", "policy")]
-QUICKEST = ("madoc", "logged")
+pytestmark = pytest.mark.slow  # of the spring, `tests/test_examples.py` is the quick one
 
 
-@pytest.mark.parametrize(
-    ("name", "starts"), [pytest.param(*row, marks=[] if row == QUICKEST else pytest.mark.slow) for row in EVERY]
-)
+@pytest.mark.parametrize("name", ["madoc", "madoc-s", "madoc-vdn"])
+@pytest.mark.parametrize("starts", ["logged", "replay", "policy"])
 def test_a_spring_is_recovered(name, starts):
     task = spring(max_episode_steps=100)
     budget = 120_000 if starts == "policy" else 36_000  # 120 epochs: one of free running spends 1000 steps
@@ -49,7 +47,6 @@ def test_a_spring_is_recovered(name, starts):
     assert not result.warnings
 
 
-@pytest.mark.slow
 def test_a_two_link_arm_is_recovered():
     task = two_link_arm()
     method = quick("madoc-local", patience=0)
@@ -62,7 +59,6 @@ def stiffness(low, high):
     return spring(Parameter("jnt_stiffness", "slide", low, high), max_episode_steps=100)
 
 
-@pytest.mark.slow
 def test_it_stops_by_itself_once_nothing_is_left_to_learn():
     task, truth = stiffness(1.0, 9.0), {"jnt_stiffness.slide": 4.0}
     method = quick("madoc-s", starts="replay", patience=40)
@@ -72,7 +68,6 @@ def test_it_stops_by_itself_once_nothing_is_left_to_learn():
     assert (off(result, task, truth) < TOLERANCE).all(), off(result, task, truth)
 
 
-@pytest.mark.slow
 def test_a_truth_outside_the_range_is_found_at_its_end_and_told():
     target = stiffness(1.0, 9.0)
     log = recorded(target, {"jnt_stiffness.slide": 8.0}, 5000, jax.random.key(100))
