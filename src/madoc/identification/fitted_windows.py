@@ -1,9 +1,10 @@
 """Windows of a log fitted by a simulator, parameters and initial states, as score tests need them."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from madoc.data.dataset import Dataset
 from madoc.data.timescale import stride
@@ -23,12 +24,14 @@ STRIDES = 20
 """Length of a window in strides: in longer ones small errors of the model grow beyond their slopes."""
 NEGLIGIBLE = 1e-5
 """Residual in typical changes of a step; below it there is nothing to explain."""
-FITS = 4
-"""Largest number of times that slopes are simulated in a fit, and of Gauss-Newton steps with the same slopes."""
+LINEARISATIONS = 4
+"""Largest number of times that derivatives are simulated in a fit of parameters, and again in one of initial states."""
+STEPS = 4
+"""Largest number of Gauss-Newton steps with the same derivatives."""
 GAIN = 0.01
 """Share of the cost that a step must remove for another one to follow."""
 LENGTHS = 4.0 ** -np.arange(4)
-"""Lengths of a step that are tried, in whole Gauss-Newton steps."""
+"""Lengths of a step that are tried, as shares in [0, 1] of the Gauss-Newton step."""
 _STATE_DAMPING = 1e-9
 """Relative damping of initial states, far below the rounding of their differences."""
 _DAMPING = 1e-6
@@ -43,10 +46,12 @@ def windows_of(
     They are shorter than `STRIDES` where the log has not enough rows for `fewest` of that length.
     """
     affordable = max(stride(dataset), len(dataset) // fewest - 2)
-    steps = longest_fit(dataset, logged.rows, min(STRIDES * stride(dataset), affordable))
     later = logged.rows > dataset.episode_starts[dataset.episode_of(logged.rows)]
     rows, states = logged.rows[later], logged.states[later]
-    chosen = evenly(disjoint_windows(dataset, rows, steps), WINDOWS) if len(rows) else np.zeros(0, np.int64)
+    steps, chosen = min(STRIDES * stride(dataset), affordable), np.zeros(0, np.int64)
+    if len(rows):
+        steps = longest_fit(dataset, rows, steps)
+        chosen = evenly(disjoint_windows(dataset, rows, steps), WINDOWS)
     readings = Readings.at(dataset, logged, rows[chosen], steps, scale)
     return readings, states[chosen], np.asarray(dataset.transitions.action, np.float64)[rows[chosen] - 1]
 
@@ -58,22 +63,32 @@ class Fit:
     Attributes:
         point: Parameters in [-1, 1].
         states: The initial state of each window.
-        slopes: The residuals there, and derivatives there or near.
-        control_steps: Control steps that were simulated to find all that.
+        slopes: Residuals at the point and the states, and their derivatives, at the last point where these were
+            simulated.
+        counted: Windows whose simulation succeeded at that point.
+        control_steps: Control steps simulated so far.
     """
 
     point: Float[np.ndarray, " d"]
     states: Float[np.ndarray, "windows state"]
     slopes: WindowSlopes
+    counted: Bool[np.ndarray, " windows"]
     control_steps: int
 
-    @property
+    @cached_property
     def unexplained(self) -> float:
-        """Median over windows of the mean squared residual that no initial state explains; infinite if all failed."""
-        if not self.slopes.whole.any():
+        """Median over the counted windows of the mean squared residual that no initial state explains.
+
+        It is infinite for a window whose simulation has failed since, and if none is counted.
+        """
+        if not self.counted.any():
             return np.inf
-        fixed = _eliminated(self.slopes, np.ones_like(self.slopes.residuals)).reduced.residuals[self.slopes.whole]
-        return float(np.median((fixed**2).mean(-1)))
+        left = _eliminated(self.slopes, np.ones_like(self.slopes.residuals)).reduced.residuals
+        return float(np.median(np.where(self.slopes.whole, (left**2).mean(-1), np.inf)[self.counted]))
+
+    def gains_on(self, other: "Fit") -> bool:
+        """Whether it leaves so much less unexplained than another fit that the search is to go on."""
+        return self.unexplained < (1.0 - GAIN) * other.unexplained
 
 
 def fit_windows(
@@ -82,19 +97,26 @@ def fit_windows(
     states: Float[np.ndarray, "windows state"],
     point: Float[np.ndarray, " d"],
 ) -> Fit:
-    """The nearest parameters that explain the windows best, then the initial states that do at these parameters."""
+    """A local minimum of the squared residuals over parameters and initial states, from near a given point.
+
+    Initial states are then fitted once more at its parameters, so that outlying readings count little.
+    """
     fit = _sloped(simulator, readings, states, point, 0)
-    for _ in range(FITS):
-        before = fit.unexplained
-        fit = _descended(simulator, readings, fit)
-        if fit.unexplained >= (1.0 - GAIN) * before:
+    for _ in range(LINEARISATIONS):
+        moved = _descended(simulator, readings, fit)
+        if not moved.gains_on(fit):
+            fit = replace(fit, control_steps=moved.control_steps)
             break
-        fit = _sloped(simulator, readings, fit.states, fit.point, fit.control_steps)
-    for _ in range(FITS):
+        fresh = _sloped(simulator, readings, moved.states, moved.point, moved.control_steps)
+        if not fresh.gains_on(fit):
+            fit = replace(fit, control_steps=fresh.control_steps)
+            break
+        fit = fresh
+    for _ in range(LINEARISATIONS):
         before = fit.unexplained
         fit = _with_fitted_states(simulator, readings, fit)
         # Steps of the states change what they cannot explain only where their slopes do not hold.
-        if abs(fit.unexplained - before) <= GAIN * before:
+        if not abs(fit.unexplained - before) > GAIN * before:
             break
         fit = _sloped(simulator, readings, fit.states, fit.point, fit.control_steps)
     return fit
@@ -107,26 +129,29 @@ def _sloped(
     point: Float[np.ndarray, " d"],
     spent: int,
 ) -> Fit:
-    """Residuals and slopes simulated at a point, after so many control steps."""
+    """Residuals and their derivatives simulated at a point, after `spent` control steps."""
     (slopes,) = slopes_at(simulator, readings, point[None], states[None])
     columns = 1 + 2 * len(point) + len(readings.spread)
-    return Fit(point, states, slopes, spent + columns * len(readings) * readings.steps)
+    return Fit(point, states, slopes, slopes.whole, spent + columns * len(readings) * readings.steps)
 
 
 def _descended(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
-    """After Gauss-Newton steps for as long as each gains. All use the slopes given, which cost far more than a step."""
-    for _ in range(FITS):
+    """The fit after Gauss-Newton steps for as long as each gains, all with the derivatives given.
+
+    Derivatives take 1 + 2 d + n simulations of every window, a step takes one for each of `LENGTHS`.
+    """
+    for _ in range(STEPS):
         if not fit.slopes.whole.any():
             break
-        before = fit.unexplained
-        fit = _stepped(simulator, readings, fit)
-        if fit.unexplained >= (1.0 - GAIN) * before:
-            break
+        moved = _stepped(simulator, readings, fit)
+        if not moved.gains_on(fit):
+            return replace(fit, control_steps=moved.control_steps)
+        fit = moved
     return fit
 
 
 def _stepped(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
-    """After a Gauss-Newton step with the slopes given, of the length that gains most; where none gains, as before."""
+    """The fit after a Gauss-Newton step of the length that gains most; the same point where none gains."""
     slopes = fit.slopes
     scale = scale_of(slopes.residuals[slopes.whole], "cauchy")
     weights = loss_slope((slopes.residuals / scale) ** 2, "cauchy") * slopes.whole[:, None]
@@ -137,13 +162,16 @@ def _stepped(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
     states = fit.states + LENGTHS[:, None, None] * of_states
     residuals = readings.residuals(simulator, points, states)[:, 0]
     spent = fit.control_steps + len(LENGTHS) * len(readings) * readings.steps
-    tried = [Fit(*parts, spent) for parts in zip(points, states, map(slopes.at, residuals), strict=True)]
+    tried = [
+        replace(fit, point=point, states=state, slopes=slopes.at(left), control_steps=spent)
+        for point, state, left in zip(points, states, residuals, strict=True)
+    ]
     return min([replace(fit, control_steps=spent), *tried], key=lambda each: each.unexplained)
 
 
 def _with_fitted_states(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
-    """With the initial states that explain each window best; outlying readings count little."""
-    for _ in range(FITS):
+    """The fit with the initial states that explain each window best; outlying readings count little."""
+    for _ in range(STEPS):
         slopes, states = fit.slopes, fit.states
         if not slopes.whole.any():
             break
@@ -156,7 +184,7 @@ def _with_fitted_states(simulator: Simulator, readings: Readings, fit: Fit) -> F
         better = slopes.whole & (now < before)
         kept = replace(slopes, residuals=np.where(better[:, None], after, slopes.residuals))
         spent = fit.control_steps + len(readings) * readings.steps
-        fit = Fit(fit.point, np.where(better[:, None], moved, states), kept, spent)
+        fit = replace(fit, states=np.where(better[:, None], moved, states), slopes=kept, control_steps=spent)
         if before[better].sum() - now[better].sum() <= GAIN * before[slopes.whole].sum():
             break
     return fit

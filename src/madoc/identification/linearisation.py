@@ -1,6 +1,6 @@
 """Derivatives of residuals by central differences, whose points are simulated in one batch by `replay`."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -54,7 +54,13 @@ class WindowSlopes:
     def at(self, residuals: Float[np.ndarray, "windows values"]) -> "WindowSlopes":
         """The same derivatives with the residuals of a point nearby, NaN in windows whose simulation fails there."""
         whole = self.whole & np.isfinite(residuals).all(-1)
-        return replace(self, residuals=np.where(whole[:, None], residuals, 0.0), whole=whole)
+        part = whole[:, None]
+        return WindowSlopes(
+            np.where(part, residuals, 0.0),
+            np.where(part[..., None], self.by_parameters, 0.0),
+            np.where(part[..., None], self.by_states, 0.0),
+            whole,
+        )
 
 
 def difference_points(point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "points d"]:

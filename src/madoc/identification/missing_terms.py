@@ -5,6 +5,7 @@ calibrated parameters can explain of the residuals is regressed on the same part
 would move the estimate are then fitted together with the parameters.
 """
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -70,7 +71,7 @@ class Alternative:
 
     Attributes:
         causes: What it rests on, in words.
-        terms: Whether these are terms that the model may lack.
+        terms: Whether these are the terms that the log asks for, all together.
         shifts: By how much it moves each calibrated parameter, in half-widths of its 95 % interval.
         errors: Half of the 95 % interval of each shift, in the same unit.
         parts: Whether it is the estimate of a part of the log.
@@ -134,10 +135,13 @@ def suspicions(
         return Suspicions(control_steps=spent)
     tests = _Tests(products, tuple(tried), simulator.parameters, half_widths)
     chosen, drifts = _chosen(tests), list(_drifts(tests))
+    terms, others = list(_terms(tests)), [*_of_parts(drifts), *_of_other_windows(tests, led - point)]
     if any(abs(term.t) >= DISAGREEING for term in drifts):
-        apart, more = _fitted_thirds(tests, simulator, readings, fit)
-        drifts, spent = [*drifts, *apart], spent + more
-    terms, others = [*_terms(tests), *drifts], [*_of_parts(drifts), *_of_other_windows(tests, led - point)]
+        thirds = _fitted_thirds(tests, simulator, readings, fit)
+        spent += sum(third.control_steps for third in thirds)
+        drifts = [*drifts, *_changes(tests, thirds, drifts)]
+        others += _of_thirds(tests, thirds, drifts, point)
+    terms += _most_certain(drifts)
     if chosen:
         together = _with_terms(tests, chosen)
         richer = None
@@ -149,7 +153,7 @@ def suspicions(
             others.append(richer.alternative)
         if richer is None or len(richer.terms) < len(chosen):
             others.append(together)
-        others += [_with_terms(tests, [index]) for index in _rivals(tests, chosen)]
+        others += [replace(_with_terms(tests, rivals), terms=False) for rivals in _rivals(tests, chosen)]
     return Suspicions(tuple(sorted(terms, key=lambda term: -abs(term.t))), tuple(others), spent)
 
 
@@ -224,41 +228,81 @@ def _drifts(tests: _Tests) -> Iterator[MissingTerm]:
                 yield _term(candidate, found, {row.name: found.change / float(tests.half_widths[index])})
 
 
-def _fitted_thirds(tests: _Tests, simulator: Simulator, readings: Readings, fit: Fit) -> tuple[list[MissingTerm], int]:
-    """How parameters differ between fits to the first and the last third of the log, and the control steps of these.
+@dataclass(frozen=True)
+class _Third:
+    """The estimate of a third of the log: its point in [-1, 1], the variance of that, and its degrees of freedom."""
 
-    A score test underestimates a change that leaves residuals far from noise, which count little. None where a third
-    has too few windows.
+    point: Float[np.ndarray, " d"]
+    variance: Float[np.ndarray, " d"]
+    freedom: int
+    control_steps: int
+
+
+def _fitted_thirds(tests: _Tests, simulator: Simulator, readings: Readings, fit: Fit) -> list[_Third]:
+    """Estimates of the first and of the last third of the log; none where a third has too few windows.
+
+    A score test underestimates a change that leaves residuals far from noise, which count little.
     """
-    time = np.linspace(-1.0, 1.0, len(readings))
-    found, spent = list[tuple[np.ndarray, np.ndarray]](), 0
+    time, found = np.linspace(-1.0, 1.0, len(readings)), list[_Third]()
     for third in (time < -1.0 / 3.0, time > 1.0 / 3.0):
+        if third.sum() < _FEWEST + len(fit.point):
+            return []
         part = replace(readings, actions=readings.actions[third], observed=readings.observed[third])
         own = fit_windows(simulator, part, fit.states[third], fit.point)
-        spent += own.control_steps
         products = products_of(own.slopes, part, len(own.point))
         if products is None or len(products) < _FEWEST + len(own.point):
-            return [], spent
+            return []
         step, covariance = parameter_shift(products)
-        found.append((own.point + step, np.maximum(np.diag(covariance), 0.0)))
-    (first, of_first), (last, of_last) = found
-    change, error = last - first, np.sqrt(of_first + of_last)
-    farthest = np.maximum(np.abs(first - fit.point), np.abs(last - fit.point)) / tests.half_widths
-    freedom, half = len(readings) // 3 - 1, (tests.space.high - tests.space.low) / 2.0
-    return [
-        MissingTerm(
-            DRIFT,
-            row.name,
-            float(change[index] * half[index]),
-            float(error[index] * half[index]),
-            row.unit,
-            0.0,
-            deviate(float(change[index] / error[index]), freedom),
-            {row.name: float(farthest[index])},
-        )
-        for index, row in enumerate(tests.space.parameters)
-        if error[index] > 0.0
-    ], spent
+        point, variance = np.clip(own.point + step, -1.0, 1.0), np.maximum(np.diag(covariance), 0.0)
+        found.append(_Third(point, variance, len(products) - 1, own.control_steps))
+    return found
+
+
+def _changes(tests: _Tests, thirds: list[_Third], drifts: Iterable[MissingTerm]) -> Iterator[MissingTerm]:
+    """The change of each parameter from the first third to the last; `explained` is that of its score tests."""
+    if not thirds:
+        return
+    first, last = thirds
+    explained: dict[str, float] = defaultdict(float)
+    for drift in drifts:
+        explained[drift.parameter] = max(explained[drift.parameter], drift.explained)
+    freedom = min(first.freedom, last.freedom)
+    columns = zip(tests.space.parameters, last.point - first.point, first.variance + last.variance, strict=True)
+    for index, (row, change, variance) in enumerate(columns):
+        if variance > 0.0:
+            half, error = (row.high - row.low) / 2.0, float(np.sqrt(variance))
+            yield MissingTerm(
+                cause=DRIFT,
+                parameter=row.name,
+                value=float(change) * half,
+                standard_error=error * half,
+                unit=row.unit,
+                explained=explained[row.name],
+                t=deviate(float(change) / error, freedom),
+                shifts={row.name: float(change / tests.half_widths[index])},
+            )
+
+
+def _of_thirds(
+    tests: _Tests, thirds: list[_Third], drifts: Iterable[MissingTerm], point: Float[np.ndarray, " d"]
+) -> Iterator[Alternative]:
+    """The estimates of both thirds for each parameter that certainly differs between parts of the log."""
+    disagreeing = {term.parameter for term in drifts if abs(term.t) >= DISAGREEING}
+    for third in thirds:
+        shifts = tests.by_name(third.point - point)
+        errors = tests.by_name(NORMAL_95 * np.sqrt(third.variance))
+        for name in disagreeing:
+            causes = (f"{name} changing over the log",)
+            yield Alternative(causes, False, {name: shifts[name]}, {name: errors[name]}, parts=True)
+
+
+def _most_certain(drifts: Iterable[MissingTerm]) -> Iterable[MissingTerm]:
+    """Of the changes of each parameter the most significant one."""
+    best: dict[str, MissingTerm] = {}
+    for drift in drifts:
+        if drift.parameter not in best or abs(drift.t) > abs(best[drift.parameter].t):
+            best[drift.parameter] = drift
+    return best.values()
 
 
 def _chosen(tests: _Tests) -> list[int]:
@@ -273,14 +317,18 @@ def _chosen(tests: _Tests) -> list[int]:
     return chosen
 
 
-def _rivals(tests: _Tests, chosen: list[int]) -> list[int]:
-    """Candidates that cannot be excluded either, each in place of those chosen, which may explain the same.
+def _rivals(tests: _Tests, chosen: list[int]) -> Iterator[list[int]]:
+    """The chosen candidates with one of them replaced by another that cannot be excluded in its place.
 
-    Twice the difference of two terms' logarithms of the likelihood is that of their t².
+    Twice the difference of two terms' logarithms of the likelihood is about that of their t².
     """
-    significance = _significance(tests, [])
-    least = max(SUSPICIOUS**2, max(significance.values(), default=0.0) ** 2 - SUSPICIOUS**2)
-    return [index for index, t in significance.items() if t**2 >= least and index not in chosen]
+    for place in range(len(chosen)):
+        rest = [*chosen[:place], *chosen[place + 1 :]]
+        significance = _significance(tests, rest)
+        least = max(SUSPICIOUS**2, significance.get(chosen[place], 0.0) ** 2 - SUSPICIOUS**2)
+        for index, t in significance.items():
+            if index not in chosen and t**2 >= least:
+                yield [index, *rest]
 
 
 def _significance(tests: _Tests, beside: list[int]) -> dict[int, float]:
@@ -311,15 +359,15 @@ def _fitted(
     chosen: list[int],
     simulator: Simulator,
     readings: Readings,
-    poorer: Fit,
+    without: Fit,
     point: Float[np.ndarray, " d"],
 ) -> _RicherModel | None:
     """The first of these terms fitted together with the parameters; None if a spec can say none of them.
 
     A score test is one linear step, which is too short where residuals are far from noise and so count little.
-    `poorer` is the fit without the terms.
+    `without` is the fit without the terms.
     """
-    led = poorer.point
+    led = without.point
     changes, shift, _ = joint_shift(tests.products, [1 + tests.products.count + index for index in chosen])
     possible = [
         (tests.tried[index], parameter, float(change))
@@ -333,7 +381,7 @@ def _fitted(
     values = np.array([candidate.nominal + change * candidate.reference for candidate, _, change in possible])
     start = np.concatenate([led + shift, np.zeros(len(values))])
     start[len(led) :] = space.to_unit(np.concatenate([simulator.parameters.middle, values]))[len(led) :]
-    fit = fit_windows(wide, readings, poorer.states, np.clip(start, -1.0, 1.0))
+    fit = fit_windows(wide, readings, without.states, np.clip(start, -1.0, 1.0))
     at, products = fit.point, products_of(fit.slopes, readings, len(fit.point))
     if products is None:
         return None

@@ -72,7 +72,7 @@ def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
 
 
 def coarse_step(holdout: HoldOut, named: MissingTerm) -> MissingTerm | None:
-    """The error of the integration step, where it is as certain as the term named and explains more."""
+    """The error of the integration step, where it is certain and explains more than the term named."""
     step = next((term for term in holdout.missing_terms if term.cause == INTEGRATION), None)
     coarse = step is not None and abs(step.t) >= CERTAIN and step.explained > named.explained
     return step if coarse else None

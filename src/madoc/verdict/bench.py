@@ -16,6 +16,7 @@ from madoc.data import Dataset, stride
 from madoc.diagnosis.channels import signal_names
 from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.errors import MadocError
+from madoc.identification.candidate_terms import INTEGRATION
 from madoc.identification.excitation import expected_half_widths
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
 from madoc.identification.noise import difference_noise
@@ -34,7 +35,7 @@ from madoc.verdict.two_sample import WindowView, behaviour, classify, rolled
 AT_END = 0.98
 """Position in [-1, 1] of its range; past it, to either side, a parameter counts as pinned to the end."""
 _MOST_TERMS = 5
-"""Number of missing terms that a report keeps, the most significant ones."""
+"""Number of missing terms that a report keeps, the most significant ones; the integration step's is always kept."""
 FEWEST_HELD = 10
 """Smallest number of rows held out, at least 1. With fewer, even perfect predictions could be chance."""
 _NEIGHBOURS = 5000
@@ -223,7 +224,9 @@ def judged(
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
         control_steps=control_steps + spent + doubts.control_steps,
-        missing_terms=doubts.terms[:_MOST_TERMS],
+        missing_terms=tuple(
+            term for place, term in enumerate(doubts.terms) if place < _MOST_TERMS or term.cause == INTEGRATION
+        ),
         alternatives=doubts.alternatives,
         contradictions=tuple(each.sentence for each in found if each.contradicts),
         at_end=tuple(
