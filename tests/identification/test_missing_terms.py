@@ -8,7 +8,10 @@ import pytest
 from madoc import robots, simulation
 from madoc.data import logs, typical_change
 from madoc.identification import missing_terms as terms
+from madoc.identification.candidate_terms import Candidate
+from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
+from madoc.parameters import Parameter, ParameterSpace
 
 MODEL = """
 <mujoco>
@@ -100,3 +103,17 @@ def test_a_parameter_that_changes_over_the_log_is_told_with_its_change(tmp_path)
     assert drifts[0].parameter == "dof_damping.hinge"
     assert drifts[0].value == pytest.approx(0.2, abs=3.0 * drifts[0].standard_error)
     assert drifts[0].t > 6.0
+
+
+def test_a_term_that_explains_the_same_is_a_rival():
+    random = np.random.default_rng(0)
+    friction, unrelated = random.standard_normal((2, 200, 6))
+    offset = friction + 0.1 * random.standard_normal((200, 6))
+    noise, slope = random.standard_normal((2, 200, 6))
+    columns = np.stack([offset, unrelated, friction], axis=-1)
+    products = Products.of(0.2 * friction + noise, slope[..., None], columns)
+    tried = [Candidate(cause, "", "", 0.0, 1.0, -np.inf) for cause in ("offset", "unrelated", "friction")]
+    tests = terms._Tests(products, tuple(tried), ParameterSpace((Parameter("gravity", "", -11, -9),)), np.ones(1))
+    (chosen,) = terms._chosen(tests)
+    ((rival,),) = terms._rivals(tests, [chosen])
+    assert {chosen, rival} == {0, 2}

@@ -287,7 +287,7 @@ def _of_thirds(
     tests: _Tests, thirds: list[_Third], drifts: Iterable[MissingTerm], point: Float[np.ndarray, " d"]
 ) -> Iterator[Alternative]:
     """The estimates of both thirds for each parameter that certainly differs between parts of the log."""
-    disagreeing = {term.parameter for term in drifts if abs(term.t) >= DISAGREEING}
+    disagreeing = dict.fromkeys(term.parameter for term in drifts if abs(term.t) >= DISAGREEING)
     for third in thirds:
         shifts = tests.by_name(third.point - point)
         errors = tests.by_name(NORMAL_95 * np.sqrt(third.variance))
