@@ -9,7 +9,7 @@ import pytest
 from madoc import simulation
 from madoc.data import typical_change
 from madoc.identification import fitted_windows
-from madoc.identification.fitted_windows import Fit, fit_windows, windows_of
+from madoc.identification.fitted_windows import fit_windows, windows_of
 from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.replay import Readings
 from madoc.identification.states import states_of
@@ -48,14 +48,13 @@ def test_it_counts_what_it_simulates(windows, monkeypatch):
 
 def test_a_step_on_which_windows_fail_is_not_taken(windows, monkeypatch):
     simulator, readings, states = windows
-    (at_start,) = fitted_windows.slopes_at(simulator, readings, np.zeros((1, 3)), states[None])
-    start = Fit(np.zeros(3), states, at_start, at_start.whole, 0)
-    failing = np.full((len(fitted_windows.LENGTHS), 1, *at_start.residuals.shape), np.nan)
+    start = fitted_windows._sloped(simulator, readings, states, np.zeros(3), 0)
+    failing = np.full((len(fitted_windows.LENGTHS), 1, *start.slopes.residuals.shape), np.nan)
     failing[:, :, : len(states) // 3] = 0.0  # a third of the windows would be explained without a residual
     monkeypatch.setattr(Readings, "residuals", lambda *_: failing)
     after = fitted_windows._stepped(simulator, readings, start)
     assert after.point.tolist() == [0.0, 0.0, 0.0]
-    assert after.slopes is at_start
+    assert after.slopes is start.slopes
 
 
 def test_where_every_window_fails_the_start_is_kept(windows):

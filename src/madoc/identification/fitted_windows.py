@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from madoc.data.dataset import Dataset
 from madoc.data.timescale import stride
-from madoc.identification.gauss_newton import Eliminated, damped_step, eliminate, triangular_factors
+from madoc.identification.gauss_newton import Eliminated, damped_step, eliminate, states_basis, triangular_factors
 from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.losses import TUNING, loss_slope, loss_value, scale_of
 from madoc.identification.noise import channel_noise
@@ -65,13 +65,15 @@ class Fit:
         states: The initial state of each window.
         slopes: Residuals at the point and the states, and their derivatives, at the last point where these were
             simulated.
-        counted: Windows whose simulation succeeded at that point.
+        explicable: Orthonormal columns that span what initial states explain of residuals, to first order there.
+        counted: Windows whose simulation succeeded there.
         control_steps: Control steps simulated so far.
     """
 
     point: Float[np.ndarray, " d"]
     states: Float[np.ndarray, "windows state"]
     slopes: WindowSlopes
+    explicable: Float[np.ndarray, "windows values n"]
     counted: Bool[np.ndarray, " windows"]
     control_steps: int
 
@@ -83,7 +85,8 @@ class Fit:
         """
         if not self.counted.any():
             return np.inf
-        left = _eliminated(self.slopes, np.ones_like(self.slopes.residuals)).reduced.residuals
+        residuals = self.slopes.residuals[..., None]
+        left = (residuals - self.explicable @ (np.swapaxes(self.explicable, 1, 2) @ residuals))[..., 0]
         return float(np.median(np.where(self.slopes.whole, (left**2).mean(-1), np.inf)[self.counted]))
 
     def gains_on(self, other: "Fit") -> bool:
@@ -132,7 +135,9 @@ def _sloped(
     """Residuals and their derivatives simulated at a point, after `spent` control steps."""
     (slopes,) = slopes_at(simulator, readings, point[None], states[None])
     columns = 1 + 2 * len(point) + len(readings.spread)
-    return Fit(point, states, slopes, slopes.whole, spent + columns * len(readings) * readings.steps)
+    basis, _ = states_basis(slopes.by_states, np.full(len(readings), _STATE_DAMPING))
+    explicable = basis[:, : slopes.residuals.shape[1]]
+    return Fit(point, states, slopes, explicable, slopes.whole, spent + columns * len(readings) * readings.steps)
 
 
 def _descended(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:

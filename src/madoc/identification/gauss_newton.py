@@ -117,6 +117,21 @@ class Eliminated:
         return -(self.response[..., 0] + self.response[..., 1:] @ step)
 
 
+def states_basis(
+    by_states: Float[np.ndarray, "windows values n"], damping: Float[np.ndarray, " windows"]
+) -> tuple[Float[np.ndarray, "windows rows n"], Float[np.ndarray, "windows n n"]]:
+    """Q and R of every window's derivatives by its initial state, with rows below for the damping √λ D.
+
+    What a window's initial state explains of its residuals is Q Qᵀ r, of which the first `values` rows are meant.
+    """
+    windows, _, states = by_states.shape
+    lengths = np.linalg.norm(by_states, axis=1)
+    lengths = np.maximum(lengths, np.maximum(_SHORTEST * lengths.max(-1, keepdims=True), np.finfo(float).tiny ** 0.25))
+    damped = np.zeros((windows, states, states))
+    damped[:, np.arange(states), np.arange(states)] = np.sqrt(damping)[:, None] * lengths
+    return thin_qr(np.concatenate([by_states, damped], axis=1))
+
+
 def eliminate(
     slopes: WindowSlopes, weights: Float[np.ndarray, "windows values"], damping: Float[np.ndarray, " windows"]
 ) -> Eliminated:
@@ -125,14 +140,9 @@ def eliminate(
     `weights` are those of the squared residuals. A window's state step p minimises ‖r + Js p‖² + λ ‖D p‖², with its
     `damping` λ and the columns' lengths D.
     """
-    windows, values, states = slopes.by_states.shape
     root = np.sqrt(weights)[..., None]
-    by_states = root * slopes.by_states
-    lengths = np.linalg.norm(by_states, axis=1)
-    lengths = np.maximum(lengths, np.maximum(_SHORTEST * lengths.max(-1, keepdims=True), np.finfo(float).tiny ** 0.25))
-    damped = np.zeros((windows, states, states))
-    damped[:, np.arange(states), np.arange(states)] = np.sqrt(damping)[:, None] * lengths
-    basis, factor = thin_qr(np.concatenate([by_states, damped], axis=1))
+    basis, factor = states_basis(root * slopes.by_states, damping)
+    windows, values, states = slopes.by_states.shape
     others = root * np.concatenate([slopes.residuals[..., None], slopes.by_parameters], axis=-1)
     padded = np.concatenate([others, np.zeros((windows, states, others.shape[-1]))], axis=1)
     within = np.swapaxes(basis, 1, 2) @ padded
