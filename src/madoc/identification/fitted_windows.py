@@ -168,8 +168,8 @@ def _stepped(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
     residuals = readings.residuals(simulator, points, states)[:, 0]
     spent = fit.control_steps + len(LENGTHS) * len(readings) * readings.steps
     tried = [
-        replace(fit, point=point, states=state, slopes=slopes.at(left), control_steps=spent)
-        for point, state, left in zip(points, states, residuals, strict=True)
+        replace(fit, point=point, states=state, slopes=slopes.at(residual), control_steps=spent)
+        for point, state, residual in zip(points, states, residuals, strict=True)
     ]
     return min([replace(fit, control_steps=spent), *tried], key=lambda each: each.unexplained)
 
