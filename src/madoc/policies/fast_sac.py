@@ -7,7 +7,7 @@ What differs from `sac`, which is the paper's (arXiv 1812.05905), and where it c
 - Updates run while the environments act, as in Parallel Q-Learning: of two cores neither waits. The policy that acts is
   the one from before the epoch's updates, and updates see the rows from before the epoch, so results do not depend on
   timing.
-- The learning rate is three times that of `sac`, as each update counts for more.
+- The learning rate is three times that of `sac`: of these two, the one with the higher return after as many updates.
 - The policy is updated once for every `policy_delay` updates of the critics (TD3, Fujimoto et al. 2018,
   arXiv 1802.09477).
 - Networks see observations standardised by the mean and deviation of all that were seen (SimBa, Lee et al. 2024,

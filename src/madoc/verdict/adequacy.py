@@ -21,8 +21,6 @@ MOVES = 0.5
 """Shift of a parameter in half-widths of its 95 % interval; a term that moves all by less may be left out."""
 NUMERICAL = 0.3
 """Share of squared residuals explained by the integration step; above it they are no mismatch of the model."""
-NUMERICAL_T = 4.0
-"""|t| from which that counts. Every model has such an error, so it needs less evidence than a term that is missing."""
 AS_SIGNIFICANT = 0.6
 """|t| over that of the most significant term; among terms above it the one that explains most is named."""
 NEARLY = 0.8
@@ -98,7 +96,7 @@ def _moved_together(holdout: HoldOut) -> bool:
 def numerical(holdout: HoldOut) -> MissingTerm | None:
     """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
     term = next((term for term in holdout.missing_terms if term.cause == INTEGRATION), None)
-    if term is None or abs(term.t) < NUMERICAL_T or term.explained < NUMERICAL:
+    if term is None or abs(term.t) < CERTAIN or term.explained < NUMERICAL:
         return None
     others = (each.explained for each in holdout.missing_terms if is_certain(each) and each.cause != DRIFT)
     return term if max(others, default=0.0) <= term.explained else None
