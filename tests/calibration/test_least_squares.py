@@ -135,6 +135,13 @@ def test_central_differences_are_one_sided_where_the_box_ends():
     np.testing.assert_allclose(found.jacobian, [[[3.0, 0.0]]], atol=1e-9)
 
 
+def test_a_jump_beside_the_point_is_no_slope():
+    points = difference_points(np.zeros(1))
+    slope, jump = 2.0 * points[:, 0], np.where(points[:, 0] > 0.5 * DIFFERENCE, 7.0, 0.0)
+    found = linearise(points, np.stack([slope, slope + jump, slope - jump], axis=-1)[:, None])
+    np.testing.assert_allclose(found.jacobian[0, :, 0], [2.0, 2.0, 2.0])
+
+
 def test_windows_that_failed_under_any_parameter_are_left_out_of_the_slopes():
     points = difference_points(np.zeros(1))
     residuals = np.zeros((3, 2, 1))

@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float
 DIFFERENCE = 1e-4
 """Half width of a central difference in [-1, 1]. Its truncation error is 1e-8 of the third derivative; rounding of next
 states (1e-16, and the solver's 1e-10 at contacts) divided by it is below 1e-6 of a typical derivative."""
+TORN = 0.5
+"""Difference of the two one-sided derivatives, relative to the larger, above which a value jumps or bends in between."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,19 @@ def slopes_of_windows(
 def _central(
     points: Float[np.ndarray, "points d"], residuals: Float[np.ndarray, "points windows values"]
 ) -> Float[np.ndarray, "derivatives windows values"]:
-    """Differences of residuals divided by those of the points: d of them, or none for a point without neighbours."""
+    """Differences of residuals divided by those of the points: d of them, or none for a point without neighbours.
+
+    Where a contact begins between a point and its neighbour, a difference across it says nothing of the slope, and one
+    window's would outweigh all others: of central and one-sided derivatives the smallest is taken there.
+    """
     count = len(points) // 2
-    width = np.diagonal(points[1 : count + 1] - points[count + 1 :])
-    return (residuals[1 : count + 1] - residuals[count + 1 :]) / width[:, None, None]
+    here, above, below = residuals[0], residuals[1 : count + 1], residuals[count + 1 :]
+    to_above = np.diagonal(points[1 : count + 1] - points[0])[:, None, None]
+    to_below = np.diagonal(points[0] - points[count + 1 :])[:, None, None]
+    central = (above - below) / (to_above + to_below)
+    with np.errstate(divide="ignore", invalid="ignore"):  # one width is 0 where the box ends
+        ahead, behind = (above - here) / to_above, (here - below) / to_below
+        torn = np.abs(ahead - behind) > TORN * np.maximum(np.abs(ahead), np.abs(behind))
+    torn &= (to_above > 0.0) & (to_below > 0.0)
+    one_sided = np.where(np.abs(ahead) < np.abs(behind), ahead, behind)
+    return np.where(torn & (np.abs(one_sided) < np.abs(central)), one_sided, central)
