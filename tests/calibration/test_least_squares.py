@@ -135,6 +135,11 @@ def test_central_differences_are_one_sided_where_the_box_ends():
     np.testing.assert_allclose(found.jacobian, [[[3.0, 0.0]]], atol=1e-9)
 
 
+def test_an_end_of_the_box_within_rounding_is_no_jump():
+    points = difference_points(np.array([1.0 - 1e-16]))
+    np.testing.assert_allclose(linearise(points, 3.0 * points[:, None]).jacobian, [[[3.0]]])
+
+
 def test_a_jump_beside_the_point_is_no_slope():
     points = difference_points(np.zeros(1))
     slope, jump = 2.0 * points[:, 0], np.where(points[:, 0] > 0.5 * DIFFERENCE, 7.0, 0.0)

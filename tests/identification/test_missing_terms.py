@@ -9,8 +9,10 @@ from madoc import robots, simulation
 from madoc.data import logs, typical_change
 from madoc.identification import missing_terms as terms
 from madoc.identification.candidate_terms import Candidate
+from madoc.identification.drifts import DRIFT
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
+from madoc.identification.term_tests import TermTests
 from madoc.parameters import Parameter, ParameterSpace
 
 MODEL = """
@@ -99,7 +101,7 @@ def test_friction_that_puts_energy_in_is_no_candidate(tmp_path):
 
 def test_a_parameter_that_changes_over_the_log_is_told_with_its_change(tmp_path):
     dataset, simulator = plant(tmp_path, damping=0.3)
-    drifts = [term for term in scores(dataset, simulator) if term.cause == terms.DRIFT]
+    drifts = [term for term in scores(dataset, simulator) if term.cause == DRIFT]
     assert drifts[0].parameter == "dof_damping.hinge"
     assert drifts[0].value == pytest.approx(0.2, abs=3.0 * drifts[0].standard_error)
     assert drifts[0].t > 6.0
@@ -113,7 +115,7 @@ def test_a_term_that_explains_the_same_is_a_rival():
     columns = np.stack([offset, unrelated, friction], axis=-1)
     products = Products.of(0.2 * friction + noise, slope[..., None], columns)
     tried = [Candidate(cause, "", "", 0.0, 1.0, -np.inf) for cause in ("offset", "unrelated", "friction")]
-    tests = terms._Tests(products, tuple(tried), ParameterSpace((Parameter("gravity", "", -11, -9),)), np.ones(1))
+    tests = TermTests(products, tuple(tried), ParameterSpace((Parameter("gravity", "", -11, -9),)), np.ones(1))
     (chosen,) = terms._chosen(tests)
     ((rival,),) = terms._rivals(tests, [chosen])
     assert {chosen, rival} == {0, 2}

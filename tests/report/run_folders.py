@@ -16,7 +16,7 @@ from madoc.calibration.holdout import (
     Tried,
 )
 from madoc.identification.combinations import Combination
-from madoc.identification.missing_terms import Alternative, MissingTerm
+from madoc.identification.term_tests import Alternative, MissingTerm
 
 PARAMETERS = {
     "gravity": (-9.9, 0.2, -30.0, 0.0, "m/s²", -9.81),

@@ -9,7 +9,8 @@ from madoc.calibration.holdout import AgainstChance, Area, ToldApart
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.identification.candidate_terms import INTEGRATION, TILTS
 from madoc.identification.combinations import Combination
-from madoc.identification.missing_terms import DRIFT, Alternative, MissingTerm
+from madoc.identification.drifts import DRIFT
+from madoc.identification.term_tests import Alternative, MissingTerm
 from madoc.verdict import judge
 from madoc.verdict.adequacy import (
     as_likely,

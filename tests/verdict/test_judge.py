@@ -14,7 +14,7 @@ from madoc.calibration.holdout import (
     ToldApart,
 )
 from madoc.commands.answer import EXIT_CODES
-from madoc.identification.missing_terms import MissingTerm
+from madoc.identification.term_tests import MissingTerm
 from madoc.verdict import WORDS, judge
 from madoc.verdict.judge import explains_all
 

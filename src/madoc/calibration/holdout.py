@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
-from madoc.identification.missing_terms import Alternative, MissingTerm
+from madoc.identification.term_tests import Alternative, MissingTerm
 
 Word = Literal["CALIBRATED", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
 

@@ -9,7 +9,7 @@ DIFFERENCE = 1e-4
 """Half width of a central difference in [-1, 1]. Its truncation error is 1e-8 of the third derivative; rounding of next
 states (1e-16, and the solver's 1e-10 at contacts) divided by it is below 1e-6 of a typical derivative."""
 TORN = 0.5
-"""Difference of the two one-sided derivatives, relative to the larger, above which a value jumps or bends in between."""
+"""Difference of the one-sided derivatives relative to the larger one, above which a value jumps or bends there."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,9 @@ def _central(
     to_above = np.diagonal(points[1 : count + 1] - points[0])[:, None, None]
     to_below = np.diagonal(points[0] - points[count + 1 :])[:, None, None]
     central = (above - below) / (to_above + to_below)
-    with np.errstate(divide="ignore", invalid="ignore"):  # one width is 0 where the box ends
+    inside = np.minimum(to_above, to_below) > 0.5 * DIFFERENCE  # at an end of the box one width is about 0
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ahead, behind = (above - here) / to_above, (here - below) / to_below
         torn = np.abs(ahead - behind) > TORN * np.maximum(np.abs(ahead), np.abs(behind))
-    torn &= (to_above > 0.0) & (to_below > 0.0)
     one_sided = np.where(np.abs(ahead) < np.abs(behind), ahead, behind)
-    return np.where(torn & (np.abs(one_sided) < np.abs(central)), one_sided, central)
+    return np.where(inside & torn & (np.abs(one_sided) < np.abs(central)), one_sided, central)

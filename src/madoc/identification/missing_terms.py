@@ -5,8 +5,7 @@ calibrated parameters can explain of the residuals is regressed on the same part
 would move the estimate are then fitted together with the parameters.
 """
 
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,74 +13,32 @@ from jaxtyping import Float
 
 from madoc import simulation
 from madoc.data.dataset import Dataset
-from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, Candidate, candidates, effects
+from madoc.identification.candidate_terms import INTEGRATION, Candidate, candidates, effects
+from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import Fit, fit_windows, products_of, windows_of
 from madoc.identification.information import NORMAL_95
 from madoc.identification.replay import Readings
-from madoc.identification.score_tests import Products, Score, deviate, joint_shift, parameter_shift, score
+from madoc.identification.score_tests import deviate, joint_shift, parameter_shift
 from madoc.identification.states import LoggedStates
+from madoc.identification.term_tests import (
+    DISAGREEING,
+    FEWEST,
+    SUSPICIOUS,
+    Alternative,
+    MissingTerm,
+    TermTests,
+    term_of,
+)
 from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
 
-SUSPICIOUS = 2.0
-"""|t| from which a term cannot be excluded: 5 % of terms that are not missing reach it by chance."""
-DISAGREEING = 3.0
-"""|t| from which parts of the log, or windows of another length, give another estimate: one in 370 does by chance."""
 TOGETHER = 4
 """Largest number of terms whose common effect on the estimate is computed."""
 WORTH_FITTING = 0.5
 """Shift of a parameter in half-widths of its 95 % interval, from which terms are fitted with the parameters."""
 MOST_FITTED = 2
 """Largest number of terms that are fitted together with the parameters."""
-DRIFT = "a value that changes over the log"
 OTHER_WINDOWS = "windows of another length, which give another estimate"
-_FEWEST = 12
-"""Fewest windows beyond the number of parameters for which a standard error is worth anything."""
-
-
-@dataclass(frozen=True)
-class MissingTerm:
-    """A term that the model lacks, as the residuals suggest it.
-
-    Attributes:
-        cause: What the term stands for, in words.
-        parameter: The parameter of the spec that adds it, as `dof_frictionloss.hinge`; empty if there is none.
-        value: Its estimated value, in `unit`: of a parameter its value in the model.
-        standard_error: Of the value.
-        unit: Unit of the value.
-        explained: Share of the squared residuals that it explains, those of initial states and parameters taken away.
-        t: Its change from the model over the standard error, as the normal deviate of the same probability.
-        shifts: By how much each calibrated parameter would move if the term were included, in half-widths of its
-            95 % interval.
-    """
-
-    cause: str
-    parameter: str
-    value: float
-    standard_error: float
-    unit: str
-    explained: float
-    t: float
-    shifts: dict[str, float]
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """Another estimate that the log does not exclude: of a model with more terms, or of other parts of the log.
-
-    Attributes:
-        causes: What it rests on, in words.
-        terms: Whether these are the terms that the log asks for, all together.
-        shifts: By how much it moves each calibrated parameter, in half-widths of its 95 % interval.
-        errors: Half of the 95 % interval of each shift, in the same unit.
-        parts: Whether it is the estimate of a part of the log.
-    """
-
-    causes: tuple[str, ...]
-    terms: bool
-    shifts: dict[str, float]
-    errors: dict[str, float]
-    parts: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,8 +75,8 @@ def suspicions(
         half_widths: Half of each parameter's 95 % interval in [-1, 1].
         scale: Typical change of each signal in a step.
     """
-    readings, states, before = windows_of(dataset, logged, scale, fewest=2 * (_FEWEST + len(point)))
-    if len(readings) < _FEWEST + len(point):
+    readings, states, before = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)))
+    if len(readings) < FEWEST + len(point):
         return Suspicions()
     fit = fit_windows(simulator, readings, states, point)
     led = fit.point
@@ -131,17 +88,13 @@ def suspicions(
     spent = fit.control_steps + (1 + len(tried)) * len(readings) * readings.steps
     both = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, by_terms], axis=-1))
     products = products_of(both, readings, len(led))
-    if products is None or len(products) < _FEWEST + len(led):
+    if products is None or len(products) < FEWEST + len(led):
         return Suspicions(control_steps=spent)
-    tests = _Tests(products, tuple(tried), simulator.parameters, half_widths)
-    chosen, drifts = _chosen(tests), list(_drifts(tests))
-    terms, others = list(_terms(tests)), [*_of_parts(drifts), *_of_other_windows(tests, led - point)]
-    if any(abs(term.t) >= DISAGREEING for term in drifts):
-        thirds = _fitted_thirds(tests, simulator, readings, fit)
-        spent += sum(third.control_steps for third in thirds)
-        drifts = [*drifts, *_changes(tests, thirds, drifts)]
-        others += _of_thirds(tests, thirds, drifts, point)
-    terms += _most_certain(drifts)
+    tests = TermTests(products, tuple(tried), simulator.parameters, half_widths)
+    drifts, others, of_thirds = drifts_of(tests, simulator, readings, fit, point)
+    spent += of_thirds
+    terms, others = [*_terms(tests), *drifts], [*others, *_of_other_windows(tests, led - point)]
+    chosen = _chosen(tests)
     if chosen:
         together = _with_terms(tests, chosen)
         richer = None
@@ -158,27 +111,6 @@ def suspicions(
 
 
 @dataclass(frozen=True)
-class _Tests:
-    """What score tests need: products of residuals and derivatives, the candidates, and the scale of shifts."""
-
-    products: Products
-    tried: tuple[Candidate, ...]
-    space: ParameterSpace
-    half_widths: Float[np.ndarray, " d"]
-
-    def score(self, index: int, beside: Sequence[int] = ()) -> Score | None:
-        """The score of a candidate beside others; None if there is none, or if its value would not be physical."""
-        first = 1 + self.products.count
-        found, candidate = score(self.products, first + index, [first + other for other in beside]), self.tried[index]
-        below = found is not None and candidate.nominal + found.change * candidate.reference < candidate.least
-        return None if below else found
-
-    def by_name(self, values: Float[np.ndarray, " d"]) -> dict[str, float]:
-        """Values in [-1, 1] of each parameter, by name and in half-widths."""
-        return dict(zip(self.space.names, (values / self.half_widths).tolist(), strict=True))
-
-
-@dataclass(frozen=True)
 class _RicherModel:
     """Terms by the name of their parameter, fitted together with the parameters, and the estimate with them."""
 
@@ -187,7 +119,7 @@ class _RicherModel:
     control_steps: int
 
 
-def _terms(tests: _Tests) -> Iterator[MissingTerm]:
+def _terms(tests: TermTests) -> Iterator[MissingTerm]:
     """The score test of every candidate whose value is physical.
 
     If the error of the integration step is significant, it is taken away before the others are tested.
@@ -199,113 +131,10 @@ def _terms(tests: _Tests) -> Iterator[MissingTerm]:
             continue
         if candidate.cause == INTEGRATION and abs(found.t) >= SUSPICIOUS:
             beside = [index]
-        yield _term(candidate, found, tests.by_name(found.shifts))
+        yield term_of(candidate, found, tests.by_name(found.shifts))
 
 
-def _term(candidate: Candidate, found: Score, shifts: dict[str, float]) -> MissingTerm:
-    early = candidate.cause == DELAY and found.change < 0.0
-    return MissingTerm(
-        cause=EARLY if early else candidate.cause,
-        parameter="" if early else candidate.parameter,
-        value=candidate.nominal + found.change * candidate.reference,
-        standard_error=found.error * candidate.reference,
-        unit=candidate.unit,
-        explained=found.explained,
-        t=found.t,
-        shifts=shifts,
-    )
-
-
-def _drifts(tests: _Tests) -> Iterator[MissingTerm]:
-    """How each parameter changes over the log: in a straight line, in its first third, and in its last."""
-    time = np.linspace(-1.0, 1.0, len(tests.products))
-    shapes = [shape - np.mean(shape) for shape in (time, time < -1.0 / 3.0, time > 1.0 / 3.0)]
-    for index, row in enumerate(tests.space.parameters):
-        candidate = Candidate(DRIFT, row.name, row.unit, 0.0, (row.high - row.low) / 2.0, -np.inf)
-        for shape in shapes:
-            found = score(tests.products, 1 + index, shape=shape)
-            if found is not None:
-                yield _term(candidate, found, {row.name: found.change / float(tests.half_widths[index])})
-
-
-@dataclass(frozen=True)
-class _Third:
-    """The estimate of a third of the log: its point in [-1, 1], the variance of that, and its degrees of freedom."""
-
-    point: Float[np.ndarray, " d"]
-    variance: Float[np.ndarray, " d"]
-    freedom: int
-    control_steps: int
-
-
-def _fitted_thirds(tests: _Tests, simulator: Simulator, readings: Readings, fit: Fit) -> list[_Third]:
-    """Estimates of the first and of the last third of the log; none where a third has too few windows.
-
-    A score test underestimates a change that leaves residuals far from noise, which count little.
-    """
-    time, found = np.linspace(-1.0, 1.0, len(readings)), list[_Third]()
-    for third in (time < -1.0 / 3.0, time > 1.0 / 3.0):
-        if third.sum() < _FEWEST + len(fit.point):
-            return []
-        part = replace(readings, actions=readings.actions[third], observed=readings.observed[third])
-        own = fit_windows(simulator, part, fit.states[third], fit.point)
-        products = products_of(own.slopes, part, len(own.point))
-        if products is None or len(products) < _FEWEST + len(own.point):
-            return []
-        step, covariance = parameter_shift(products)
-        point, variance = np.clip(own.point + step, -1.0, 1.0), np.maximum(np.diag(covariance), 0.0)
-        found.append(_Third(point, variance, len(products) - 1, own.control_steps))
-    return found
-
-
-def _changes(tests: _Tests, thirds: list[_Third], drifts: Iterable[MissingTerm]) -> Iterator[MissingTerm]:
-    """The change of each parameter from the first third to the last; `explained` is that of its score tests."""
-    if not thirds:
-        return
-    first, last = thirds
-    explained: dict[str, float] = defaultdict(float)
-    for drift in drifts:
-        explained[drift.parameter] = max(explained[drift.parameter], drift.explained)
-    freedom = min(first.freedom, last.freedom)
-    columns = zip(tests.space.parameters, last.point - first.point, first.variance + last.variance, strict=True)
-    for index, (row, change, variance) in enumerate(columns):
-        if variance > 0.0:
-            half, error = (row.high - row.low) / 2.0, float(np.sqrt(variance))
-            yield MissingTerm(
-                cause=DRIFT,
-                parameter=row.name,
-                value=float(change) * half,
-                standard_error=error * half,
-                unit=row.unit,
-                explained=explained[row.name],
-                t=deviate(float(change) / error, freedom),
-                shifts={row.name: float(change / tests.half_widths[index])},
-            )
-
-
-def _of_thirds(
-    tests: _Tests, thirds: list[_Third], drifts: Iterable[MissingTerm], point: Float[np.ndarray, " d"]
-) -> Iterator[Alternative]:
-    """The estimates of both thirds for each parameter that certainly differs between parts of the log."""
-    disagreeing = dict.fromkeys(term.parameter for term in drifts if abs(term.t) >= DISAGREEING)
-    for third in thirds:
-        shifts = tests.by_name(third.point - point)
-        errors = tests.by_name(NORMAL_95 * np.sqrt(third.variance))
-        for name in disagreeing:
-            causes = (f"{name} changing over the log",)
-            yield Alternative(causes, False, {name: shifts[name]}, {name: errors[name]}, parts=True)
-
-
-def _most_certain(drifts: Iterable[MissingTerm]) -> Iterable[MissingTerm]:
-    """Of the changes of each parameter the most significant one."""
-    best: dict[str, MissingTerm] = {}
-    for drift in drifts:
-        if drift.parameter not in best or abs(drift.t) > abs(best[drift.parameter].t):
-            best[drift.parameter] = drift
-    return best.values()
-
-
-def _chosen(tests: _Tests) -> list[int]:
+def _chosen(tests: TermTests) -> list[int]:
     """Candidates that cannot be excluded, each the most significant beside those before it."""
     chosen: list[int] = []
     for _ in range(TOGETHER):
@@ -317,7 +146,7 @@ def _chosen(tests: _Tests) -> list[int]:
     return chosen
 
 
-def _rivals(tests: _Tests, chosen: list[int]) -> Iterator[list[int]]:
+def _rivals(tests: TermTests, chosen: list[int]) -> Iterator[list[int]]:
     """The chosen candidates with one of them replaced by another that cannot be excluded in its place.
 
     Twice the difference of two terms' logarithms of the likelihood is about that of their t².
@@ -331,14 +160,14 @@ def _rivals(tests: _Tests, chosen: list[int]) -> Iterator[list[int]]:
                 yield [index, *rest]
 
 
-def _significance(tests: _Tests, beside: list[int]) -> dict[int, float]:
+def _significance(tests: TermTests, beside: list[int]) -> dict[int, float]:
     """|t| of every other candidate beside these; terms that users know well without the log are not asked for."""
     others = (index for index, each in enumerate(tests.tried) if index not in beside and not each.known_before)
     scores = {index: tests.score(index, beside) for index in others}
     return {index: abs(found.t) for index, found in scores.items() if found is not None}
 
 
-def _with_terms(tests: _Tests, chosen: list[int]) -> Alternative:
+def _with_terms(tests: TermTests, chosen: list[int]) -> Alternative:
     """The estimate of the model with these terms, by linear regression.
 
     The error of the integration step counts as uncertain by all of its effect, as that changes with the length of
@@ -350,12 +179,12 @@ def _with_terms(tests: _Tests, chosen: list[int]) -> Alternative:
         if tests.tried[index].cause == INTEGRATION:
             alone = tests.score(index)
             error = np.hypot(error, 0.0 if alone is None else alone.shifts)
-    causes = tuple(dict.fromkeys(_named(tests.tried[index]) for index in chosen))
+    causes = tuple(dict.fromkeys(_name(tests.tried[index]) for index in chosen))
     return Alternative(causes, True, tests.by_name(shift), tests.by_name(error))
 
 
 def _fitted(
-    tests: _Tests,
+    tests: TermTests,
     chosen: list[int],
     simulator: Simulator,
     readings: Readings,
@@ -396,24 +225,13 @@ def _fitted(
         value, deviation = float(physical[place]), float(error[place]) * (parameter.high - parameter.low) / 2.0
         if found is not None and deviation > 0.0:
             significance = deviate((value - candidate.nominal) / deviation, found.freedom)
-            term = replace(_term(candidate, found, shifts), value=value, standard_error=deviation, t=significance)
+            term = replace(term_of(candidate, found, shifts), value=value, standard_error=deviation, t=significance)
             terms[candidate.parameter] = term
-    causes = tuple(_named(candidate) for candidate, _, _ in possible)
+    causes = tuple(_name(candidate) for candidate, _, _ in possible)
     return _RicherModel(terms, Alternative(causes, True, shifts, tests.by_name(beyond)), fit.control_steps)
 
 
-def _of_parts(drifts: Iterable[MissingTerm]) -> Iterator[Alternative]:
-    """Estimates of parts of the log that disagree with the whole, to either side."""
-    for term in drifts:
-        if abs(term.t) >= DISAGREEING:
-            shift = term.shifts[term.parameter]
-            errors = {term.parameter: abs(NORMAL_95 * shift / term.t)}
-            for side in (-shift, shift):
-                causes, shifts = (f"{term.parameter} changing over the log",), {term.parameter: side}
-                yield Alternative(causes, False, shifts, errors, parts=True)
-
-
-def _of_other_windows(tests: _Tests, led: Float[np.ndarray, " d"]) -> Iterator[Alternative]:
+def _of_other_windows(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[Alternative]:
     """The estimate of these windows, where it disagrees with the given one, from which `led` has led to them."""
     step, covariance = parameter_shift(tests.products)
     shifts = tests.by_name(led + step)
@@ -426,5 +244,5 @@ def _of_other_windows(tests: _Tests, led: Float[np.ndarray, " d"]) -> Iterator[A
         yield Alternative((OTHER_WINDOWS,), False, {name: shifts[name] for name in apart}, beyond)
 
 
-def _named(candidate: Candidate) -> str:
+def _name(candidate: Candidate) -> str:
     return f"{candidate.cause} ({candidate.parameter})" if candidate.parameter else candidate.cause

@@ -11,7 +11,8 @@ from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult
 from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS
 from madoc.identification.combinations import Combination
-from madoc.identification.missing_terms import DRIFT, Alternative, MissingTerm
+from madoc.identification.drifts import DRIFT
+from madoc.identification.term_tests import Alternative, MissingTerm
 
 CERTAIN = 5.0
 """|t| from which a term is missing; by chance one in two million is larger where residuals are normal."""

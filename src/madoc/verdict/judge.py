@@ -17,8 +17,9 @@ from madoc.calibration.holdout import (
 )
 from madoc.identification.candidate_terms import EARLY, SATURATION, SPACING, TILTS
 from madoc.identification.combinations import Combination
+from madoc.identification.drifts import DRIFT
 from madoc.identification.information import OPEN
-from madoc.identification.missing_terms import DRIFT, MissingTerm
+from madoc.identification.term_tests import MissingTerm
 from madoc.parameters import FIELDS
 from madoc.verdict.adequacy import as_likely, coarse_step, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from madoc.identification.combinations import Combination
-from madoc.identification.missing_terms import Alternative, MissingTerm
+from madoc.identification.term_tests import Alternative, MissingTerm
 from madoc.report.reading import Run
 from madoc.report.words import interval_words, number, parameter_title, percent
 from madoc.verdict.adequacy import is_certain

@@ -1,0 +1,145 @@
+"""Whether parameters change over the log: by score tests, and by estimates of its first and of its last third."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from madoc.identification.candidate_terms import Candidate
+from madoc.identification.fitted_windows import Fit, fit_windows, products_of
+from madoc.identification.information import NORMAL_95
+from madoc.identification.replay import Readings
+from madoc.identification.score_tests import deviate, parameter_shift, score
+from madoc.identification.term_tests import DISAGREEING, FEWEST, Alternative, MissingTerm, TermTests, term_of
+from madoc.simulation.base import Simulator
+
+DRIFT = "a value that changes over the log"
+
+
+def drifts_of(
+    tests: TermTests, simulator: Simulator, readings: Readings, fit: Fit, point: Float[np.ndarray, " d"]
+) -> tuple[list[MissingTerm], list[Alternative], int]:
+    """The most significant change of each parameter over the log, and the estimates of parts that disagree.
+
+    Thirds of the log are fitted by themselves only where a score test says that a parameter changes.
+
+    Args:
+        tests: Score tests of the log.
+        simulator: The model with its calibrated parameters.
+        readings: The windows that the tests are of.
+        fit: What they were fitted by.
+        point: The estimate in [-1, 1], from which shifts count.
+
+    Returns:
+        The changes, the other estimates, and the control steps that were simulated.
+    """
+    drifts, spent = list(_drifts(tests)), 0
+    others = list(_of_parts(drifts))
+    if any(abs(term.t) >= DISAGREEING for term in drifts):
+        thirds = _fitted_thirds(tests, simulator, readings, fit)
+        spent = sum(third.control_steps for third in thirds)
+        drifts += list(_changes(tests, thirds, drifts))
+        others += _of_thirds(tests, thirds, drifts, point)
+    return list(_most_certain(drifts)), others, spent
+
+
+def _drifts(tests: TermTests) -> Iterator[MissingTerm]:
+    """How each parameter changes over the log: in a straight line, in its first third, and in its last."""
+    time = np.linspace(-1.0, 1.0, len(tests.products))
+    shapes = [shape - np.mean(shape) for shape in (time, time < -1.0 / 3.0, time > 1.0 / 3.0)]
+    for index, row in enumerate(tests.space.parameters):
+        candidate = Candidate(DRIFT, row.name, row.unit, 0.0, (row.high - row.low) / 2.0, -np.inf)
+        for shape in shapes:
+            found = score(tests.products, 1 + index, shape=shape)
+            if found is not None:
+                yield term_of(candidate, found, {row.name: found.change / float(tests.half_widths[index])})
+
+
+@dataclass(frozen=True)
+class _Third:
+    """The estimate of a third of the log: its point in [-1, 1], the variance of that, and its degrees of freedom."""
+
+    point: Float[np.ndarray, " d"]
+    variance: Float[np.ndarray, " d"]
+    freedom: int
+    control_steps: int
+
+
+def _fitted_thirds(tests: TermTests, simulator: Simulator, readings: Readings, fit: Fit) -> list[_Third]:
+    """Estimates of the first and of the last third of the log; none where a third has too few windows.
+
+    A score test underestimates a change that leaves residuals far from noise, which count little.
+    """
+    time, found = np.linspace(-1.0, 1.0, len(readings)), list[_Third]()
+    for third in (time < -1.0 / 3.0, time > 1.0 / 3.0):
+        if third.sum() < FEWEST + len(fit.point):
+            return []
+        part = replace(readings, actions=readings.actions[third], observed=readings.observed[third])
+        own = fit_windows(simulator, part, fit.states[third], fit.point)
+        products = products_of(own.slopes, part, len(own.point))
+        if products is None or len(products) < FEWEST + len(own.point):
+            return []
+        step, covariance = parameter_shift(products)
+        point, variance = np.clip(own.point + step, -1.0, 1.0), np.maximum(np.diag(covariance), 0.0)
+        found.append(_Third(point, variance, len(products) - 1, own.control_steps))
+    return found
+
+
+def _changes(tests: TermTests, thirds: list[_Third], drifts: Iterable[MissingTerm]) -> Iterator[MissingTerm]:
+    """The change of each parameter from the first third to the last; `explained` is that of its score tests."""
+    if not thirds:
+        return
+    first, last = thirds
+    explained: dict[str, float] = defaultdict(float)
+    for drift in drifts:
+        explained[drift.parameter] = max(explained[drift.parameter], drift.explained)
+    freedom = min(first.freedom, last.freedom)
+    columns = zip(tests.space.parameters, last.point - first.point, first.variance + last.variance, strict=True)
+    for index, (row, change, variance) in enumerate(columns):
+        if variance > 0.0:
+            half, error = (row.high - row.low) / 2.0, float(np.sqrt(variance))
+            yield MissingTerm(
+                cause=DRIFT,
+                parameter=row.name,
+                value=float(change) * half,
+                standard_error=error * half,
+                unit=row.unit,
+                explained=explained[row.name],
+                t=deviate(float(change) / error, freedom),
+                shifts={row.name: float(change / tests.half_widths[index])},
+            )
+
+
+def _of_thirds(
+    tests: TermTests, thirds: list[_Third], drifts: Iterable[MissingTerm], point: Float[np.ndarray, " d"]
+) -> Iterator[Alternative]:
+    """The estimates of both thirds for each parameter that certainly differs between parts of the log."""
+    disagreeing = dict.fromkeys(term.parameter for term in drifts if abs(term.t) >= DISAGREEING)
+    for third in thirds:
+        shifts = tests.by_name(third.point - point)
+        errors = tests.by_name(NORMAL_95 * np.sqrt(third.variance))
+        for name in disagreeing:
+            causes = (f"{name} changing over the log",)
+            yield Alternative(causes, False, {name: shifts[name]}, {name: errors[name]}, parts=True)
+
+
+def _most_certain(drifts: Iterable[MissingTerm]) -> Iterable[MissingTerm]:
+    """Of the changes of each parameter the most significant one."""
+    best: dict[str, MissingTerm] = {}
+    for drift in drifts:
+        if drift.parameter not in best or abs(drift.t) > abs(best[drift.parameter].t):
+            best[drift.parameter] = drift
+    return best.values()
+
+
+def _of_parts(drifts: Iterable[MissingTerm]) -> Iterator[Alternative]:
+    """Estimates of parts of the log that disagree with the whole, to either side."""
+    for term in drifts:
+        if abs(term.t) >= DISAGREEING:
+            shift = term.shifts[term.parameter]
+            errors = {term.parameter: abs(NORMAL_95 * shift / term.t)}
+            for side in (-shift, shift):
+                causes, shifts = (f"{term.parameter} changing over the log",), {term.parameter: side}
+                yield Alternative(causes, False, shifts, errors, parts=True)

@@ -1,0 +1,99 @@
+"""What score tests of a log say of single terms: the tests, the terms they find, and other estimates they allow."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from madoc.identification.candidate_terms import DELAY, EARLY, Candidate
+from madoc.identification.score_tests import Products, Score, score
+from madoc.parameters import ParameterSpace
+
+SUSPICIOUS = 2.0
+"""|t| from which a term cannot be excluded: 5 % of terms that are not missing reach it by chance."""
+DISAGREEING = 3.0
+"""|t| from which parts of the log, or windows of another length, give another estimate: one in 370 does by chance."""
+FEWEST = 12
+"""Fewest windows beyond the number of parameters for which a standard error is worth anything."""
+
+
+@dataclass(frozen=True)
+class MissingTerm:
+    """A term that the model lacks, as the residuals suggest it.
+
+    Attributes:
+        cause: What the term stands for, in words.
+        parameter: The parameter of the spec that adds it, as `dof_frictionloss.hinge`; empty if there is none.
+        value: Its estimated value, in `unit`: of a parameter its value in the model.
+        standard_error: Of the value.
+        unit: Unit of the value.
+        explained: Share of the squared residuals that it explains, those of initial states and parameters taken away.
+        t: Its change from the model over the standard error, as the normal deviate of the same probability.
+        shifts: By how much each calibrated parameter would move if the term were included, in half-widths of its
+            95 % interval.
+    """
+
+    cause: str
+    parameter: str
+    value: float
+    standard_error: float
+    unit: str
+    explained: float
+    t: float
+    shifts: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another estimate that the log does not exclude: of a model with more terms, or of other parts of the log.
+
+    Attributes:
+        causes: What it rests on, in words.
+        terms: Whether these are the terms that the log asks for, all together.
+        shifts: By how much it moves each calibrated parameter, in half-widths of its 95 % interval.
+        errors: Half of the 95 % interval of each shift, in the same unit.
+        parts: Whether it is the estimate of a part of the log.
+    """
+
+    causes: tuple[str, ...]
+    terms: bool
+    shifts: dict[str, float]
+    errors: dict[str, float]
+    parts: bool = False
+
+
+@dataclass(frozen=True)
+class TermTests:
+    """What score tests need: products of residuals and derivatives, the candidates, and the scale of shifts."""
+
+    products: Products
+    tried: tuple[Candidate, ...]
+    space: ParameterSpace
+    half_widths: Float[np.ndarray, " d"]
+
+    def score(self, index: int, beside: Sequence[int] = ()) -> Score | None:
+        """The score of a candidate beside others; None if there is none, or if its value would not be physical."""
+        first = 1 + self.products.count
+        found, candidate = score(self.products, first + index, [first + other for other in beside]), self.tried[index]
+        below = found is not None and candidate.nominal + found.change * candidate.reference < candidate.least
+        return None if below else found
+
+    def by_name(self, values: Float[np.ndarray, " d"]) -> dict[str, float]:
+        """Values in [-1, 1] of each parameter, by name and in half-widths."""
+        return dict(zip(self.space.names, (values / self.half_widths).tolist(), strict=True))
+
+
+def term_of(candidate: Candidate, found: Score, shifts: dict[str, float]) -> MissingTerm:
+    """A candidate as its score test finds it; a delay below 0 has a cause of its own, `EARLY`."""
+    early = candidate.cause == DELAY and found.change < 0.0
+    return MissingTerm(
+        cause=EARLY if early else candidate.cause,
+        parameter="" if early else candidate.parameter,
+        value=candidate.nominal + found.change * candidate.reference,
+        standard_error=found.error * candidate.reference,
+        unit=candidate.unit,
+        explained=found.explained,
+        t=found.t,
+        shifts=shifts,
+    )
