@@ -26,6 +26,7 @@ def rewritten(text: str, calibrations: Sequence[dict], policies: Sequence[dict])
     """
     tables: dict[str, Callable[[], str]] = {
         "errors": lambda: errors(calibrations),
+        "minutes": lambda: minutes(policies),
         "returns": lambda: returns(policies),
     }
     return _MARKED.sub(lambda found: found[1] + tables[found[2]]() + found[3], text)
@@ -49,6 +50,20 @@ def errors(rows: Sequence[dict]) -> str:
         printed = paper.printed("table-10", f"{robot}-medium", "madoc")
         assert printed is not None
         lines.append(f"| {name} | {ours} | {printed[0]:.2f} |")
+    return "\n".join(lines) + "\n"
+
+
+def minutes(rows: Sequence[dict]) -> str:
+    """Median return of the default learner at calibrated parameters, after the longest wall time it was given."""
+    cells = defaultdict[str, defaultdict[str, list[float]]](lambda: defaultdict(list))
+    for row in rows:
+        if (row["method"], row["at"], row["set"]) == ("fast-sac", "calibrated", []):
+            cells[row["robot"]][row["budget"]].append(row["return"])
+    lines = ["| robot | wall time | return | seeds |", "|---|---|---|---|"]
+    for robot, name in NAMES.items():
+        budget, found = max(cells[robot].items(), key=lambda cell: float(cell[0].removesuffix("s")))
+        earned = f"{np.median(found):.0f} ({min(found):.0f} to {max(found):.0f})"
+        lines.append(f"| {name} | {budget.removesuffix('s')} s | {earned} | {len(found)} |")
     return "\n".join(lines) + "\n"
 
 
