@@ -16,6 +16,7 @@ from madoc.identification.term_tests import DISAGREEING, FEWEST, Alternative, Mi
 from madoc.simulation.base import Simulator
 
 DRIFT = "a value that changes over the log"
+"""The cause of a missing term that is a parameter itself, as it changes."""
 
 
 def drifts_of(
