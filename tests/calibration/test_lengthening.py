@@ -10,6 +10,7 @@ from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares
 from madoc.calibration.least_squares.lengthening import (
     continued,
+    enough,
     hopeless,
     horizon_of,
     lengthened,
@@ -92,12 +93,24 @@ def test_longer_windows_may_leave_as_much_noise_as_the_first_and_no_echo(pendulu
     assert not noise_alone(replace(longer, autocorrelation=0.151), shorter, 16)
 
 
-def test_a_search_is_hopeless_from_its_second_step_on(pendulum):
+def test_a_search_is_hopeless_from_its_third_step_on(pendulum):
+    shorter, longer = (replace(each, explained=len(each.rows)) for each in searches_of(problem_of(pendulum)))
+    shorter = replace(shorter, bread=np.eye(3), meat=np.eye(3))
+    quiet = replace(longer, bread=4.0 * np.eye(3), meat=4.0 * np.eye(3), deviation=1.9 * shorter.deviation, epochs=3)
+    loud, wide = replace(quiet, deviation=2.1 * shorter.deviation), replace(quiet, meat=100.0 * np.eye(3))
+    assert not hopeless(quiet, shorter, shorter)
+    for each in (loud, wide):
+        assert hopeless(each, shorter, shorter)
+        assert not hopeless(replace(each, epochs=2), shorter, shorter)
+
+
+def test_windows_are_not_lengthened_where_too_few_would_be_explained(pendulum):
     shorter, longer = searches_of(problem_of(pendulum))
-    loud = replace(longer, deviation=2.1 * shorter.deviation)
-    assert not hopeless(replace(loud, epochs=1), shorter)
-    assert hopeless(replace(loud, epochs=2), shorter)
-    assert not hopeless(replace(longer, deviation=1.9 * shorter.deviation, epochs=2), shorter)
+    count = len(longer.rows)
+    assert enough(longer, replace(shorter, explained=len(shorter.rows)))
+    fewest = (10 + 3) / count  # ten windows more than parameters
+    assert enough(longer, replace(shorter, explained=int(np.ceil(fewest * len(shorter.rows)))))
+    assert not enough(longer, replace(shorter, explained=int((fewest - 1.0 / count) * len(shorter.rows))))
 
 
 def test_longer_windows_say_more_if_intervals_are_narrower_and_as_many_are_explained(pendulum):

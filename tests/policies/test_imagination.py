@@ -55,8 +55,8 @@ def test_the_best_candidate_by_hand():
 def test_the_mean_return_by_hand():
     # Two rows, three steps: the first ends in its second step, and what follows is another rollout's.
     reward = jnp.array([1.0, 10.0, 2.0, 20.0, 4.0, 40.0])
-    terminated = jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    assert mean_return(reward, terminated, rows=2) == (3.0 + 70.0) / 2
+    ended = jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    assert mean_return(reward, ended, rows=2) == (3.0 + 70.0) / 2
 
 
 def test_a_policy_is_judged_without_noise():
@@ -74,10 +74,11 @@ def test_what_looks_most_real_is_what_happens():
         assert not rows["terminated"].any()
 
 
-def test_what_looks_unreal_ends():
+def test_what_looks_unreal_starts_again_and_is_marked_but_is_no_fall():
     # even the better candidate, change 1, has D = sigmoid(-3), r = 0.0486 < 0.1
     under_way, rows, metrics = imagined(slope=-3.0, steps=1)
-    assert rows["terminated"].all()
+    assert rows["stopped"].all()
+    assert not rows["terminated"].any()
     assert metrics["stopped"] == 1.0
     assert set(np.asarray(under_way.observation)[:, 0].tolist()) <= {0.0, 10.0}
     assert (np.asarray(under_way.age) == 0).all()

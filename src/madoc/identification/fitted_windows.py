@@ -102,9 +102,12 @@ def fit_windows(
 ) -> Fit:
     """A local minimum of the squared residuals over parameters and initial states, from near a given point.
 
-    Initial states are then fitted once more at its parameters, so that outlying readings count little.
+    Initial states are fitted alone before, as logged ones are noisy and their slopes are the cheaper ones, and once
+    more at the parameters found, so that outlying readings count little.
     """
-    fit = _sloped(simulator, readings, states, point, 0)
+    unknown = np.zeros((len(readings), readings.observed[0].size, len(point)))
+    fit = _settled(simulator, readings, _sloped(simulator, readings, states, point, 0, by_parameters=unknown))
+    fit = _sloped_by_parameters(simulator, readings, fit)
     for _ in range(LINEARISATIONS):
         moved = _descended(simulator, readings, fit)
         if not moved.gains_on(fit):
@@ -115,14 +118,8 @@ def fit_windows(
             fit = replace(fit, control_steps=fresh.control_steps)
             break
         fit = fresh
-    for _ in range(LINEARISATIONS):
-        before = fit.unexplained
-        fit = _with_fitted_states(simulator, readings, fit)
-        # Steps of the states change what they cannot explain only where their slopes do not hold.
-        if not abs(fit.unexplained - before) > GAIN * before:
-            break
-        fit = _sloped(simulator, readings, fit.states, fit.point, fit.control_steps)
-    return fit
+    settled = _settled(simulator, readings, fit)
+    return settled if settled.explicable is fit.explicable else _sloped_by_parameters(simulator, readings, settled)
 
 
 def _sloped(
@@ -131,13 +128,35 @@ def _sloped(
     states: Float[np.ndarray, "windows state"],
     point: Float[np.ndarray, " d"],
     spent: int,
+    *,
+    by_parameters: Float[np.ndarray, "windows values d"] | None = None,
 ) -> Fit:
-    """Residuals and their derivatives simulated at a point, after `spent` control steps."""
-    (slopes,) = slopes_at(simulator, readings, point[None], states[None])
-    columns = 1 + 2 * len(point) + len(readings.spread)
-    basis, _ = states_basis(slopes.by_states, np.full(len(readings), _STATE_DAMPING))
-    explicable = basis[:, : slopes.residuals.shape[1]]
-    return Fit(point, states, slopes, explicable, slopes.whole, spent + columns * len(readings) * readings.steps)
+    """Residuals and their derivatives simulated at a point, after `spent` control steps.
+
+    Derivatives by parameters are not simulated where they are given.
+    """
+    known = by_parameters is not None
+    (slopes,) = slopes_at(simulator, readings, point[None], states[None], parameters=not known)
+    columns = 1 + len(readings.spread) + (0 if known else 2 * len(point))
+    if by_parameters is not None:
+        slopes = replace(slopes, by_parameters=np.where(slopes.whole[:, None, None], by_parameters, 0.0))
+    spent += columns * len(readings) * readings.steps
+    return Fit(point, states, slopes, _explicable(slopes), slopes.whole, spent)
+
+
+def _sloped_by_parameters(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
+    """The fit with derivatives by parameters simulated anew; windows that fail there are left out."""
+    (slopes,) = slopes_at(simulator, readings, fit.point[None], fit.states[None], initial_states=False)
+    spent = fit.control_steps + (1 + 2 * len(fit.point)) * len(readings) * readings.steps
+    residuals = np.where(slopes.whole[:, None], fit.slopes.residuals, np.nan)
+    both = replace(fit.slopes, by_parameters=slopes.by_parameters).at(residuals)
+    return replace(fit, slopes=both, counted=fit.counted & slopes.whole, control_steps=spent)
+
+
+def _explicable(slopes: WindowSlopes) -> Float[np.ndarray, "windows values n"]:
+    """Orthonormal columns that span what initial states explain of each window's residuals, to first order."""
+    basis, _ = states_basis(slopes.by_states, np.full(len(slopes.residuals), _STATE_DAMPING))
+    return basis[:, : slopes.residuals.shape[1]]
 
 
 def _descended(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
@@ -172,6 +191,19 @@ def _stepped(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
         for point, state, residual in zip(points, states, residuals, strict=True)
     ]
     return min([replace(fit, control_steps=spent), *tried], key=lambda each: each.unexplained)
+
+
+def _settled(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
+    """The fit with fitted initial states, by whose derivatives are simulated anew for as long as that changes it."""
+    for _ in range(LINEARISATIONS):
+        before = fit.unexplained
+        fit = _with_fitted_states(simulator, readings, fit)
+        # Steps of the states change what they cannot explain only where their slopes do not hold.
+        if not abs(fit.unexplained - before) > GAIN * before:
+            break
+        kept = fit.slopes.by_parameters
+        fit = _sloped(simulator, readings, fit.states, fit.point, fit.control_steps, by_parameters=kept)
+    return fit
 
 
 def _with_fitted_states(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:

@@ -112,21 +112,24 @@ def slopes_at(
     states: Float[np.ndarray, "points windows state"],
     *,
     parameters: bool = True,
+    initial_states: bool = True,
 ) -> list[WindowSlopes]:
     """Residuals and their derivatives around every point's parameters and initial states, in two batches.
 
     Differences by parameters are central, because confidence intervals are computed from them; those by the many state
-    values are one-sided. Without `parameters` there are only the latter, and d is 0. It takes
-    points · windows · (1 + 2 d + n) · steps control steps.
+    values are one-sided. Without `parameters` there are only the latter, and d is 0; without `initial_states` only the
+    former, and n is 0. It takes points · windows · (1 + 2 d + n) · steps control steps.
     """
     count, windows, size = states.shape
     around = np.stack([difference_points(point) if parameters else point[None] for point in points])
     each = around.shape[1]
     by_points = readings.residuals(simulator, around.reshape(-1, points.shape[1]), np.repeat(states, each, axis=0))
-    shift = readings.in_state_units(DIFFERENCE * np.eye(len(readings.spread)), size)
-    shifted = states[:, None] + shift[:, None]
-    by_shifts = readings.residuals(simulator, points, shifted.reshape(count, -1, size))
     by_points = by_points.reshape(count, each, windows, -1)
+    by_shifts = np.zeros((count, 0, *by_points.shape[2:]))
+    if initial_states:
+        shift = readings.in_state_units(DIFFERENCE * np.eye(len(readings.spread)), size)
+        shifted = states[:, None] + shift[:, None]
+        by_shifts = readings.residuals(simulator, points, shifted.reshape(count, -1, size))
     return [slopes_of_windows(*parts) for parts in zip(around, by_points, by_shifts, strict=True)]
 
 

@@ -46,10 +46,10 @@ class WithoutNoise(eqx.Module):
 
 
 def mean_return(
-    reward: Float[Array, " transitions"], terminated: Float[Array, " transitions"], *, rows: int
+    reward: Float[Array, " transitions"], ended: Float[Array, " transitions"], *, rows: int
 ) -> Float[Array, ""]:
     """Mean over rows of the sum of rewards until each first ends, of transitions flat in time and row."""
-    reward, ended = reward.reshape(-1, rows), terminated.reshape(-1, rows)
+    reward, ended = reward.reshape(-1, rows), ended.reshape(-1, rows)
     under_way = jnp.concatenate([jnp.ones((1, rows)), jnp.cumprod(1.0 - ended, axis=0)[:-1]])
     return (reward * under_way).sum(0).mean()
 
@@ -98,14 +98,16 @@ def imagine(
         terminated: Whether the task ends at a state.
         state_of: The state at an observation.
         samples: Number of next states drawn from each elite.
-        threshold: A row whose best dynamics reward is below ends there, as if it had fallen.
+        threshold: A row whose best dynamics reward is below looks unreal; it is `stopped` and restarts.
         horizon: Number of steps after which a row restarts.
         penalty: λ of MOPO, the weight of the models' uncertainty in the reward.
         steps: Number of steps.
         key: Randomness.
 
     Returns:
-        The rows after the last step, the transitions flat in time and row, and metrics.
+        The rows after the last step, the transitions flat in time and row, and metrics. Transitions have a column more
+        than logged ones, `stopped`: those that look unreal are not to be learnt from, as nothing is known of what
+        follows them.
     """
     low, high = logged.min(0), logged.max(0)
     low, high = low - (high - low), high + (high - low)
@@ -130,14 +132,15 @@ def imagine(
         following = jnp.clip(following, jnp.broadcast_to(low, following.shape), jnp.broadcast_to(high, following.shape))
         uncertainty = uncertainty_penalty(std, features)
         reward = features.reward_offset + features.reward_scale * outcome[:, -1]
-        unreal = reality < threshold
-        ends = terminated(state_of(following)) | unreal
+        unreal, fell = reality < threshold, terminated(state_of(following))
+        ends = fell | unreal
         row = {
             "observation": observation,
             "action": action,
             "reward": reward - penalty * uncertainty,
             "next_observation": following,
-            "terminated": ends.astype(jnp.float32),
+            "terminated": fell.astype(jnp.float32),
+            "stopped": unreal.astype(jnp.float32),
         }
         again = ends | (under_way.age + 1 >= horizon)
         fresh = _some(logged, len(observation), of_restart)

@@ -86,7 +86,7 @@ class MOREC:
         discriminator_updates: Updates of generator and discriminator, after the models'. Chosen, not the authors'.
         noise: Standard deviation of the noise on the discriminators' inputs, in units of a step's change. Chosen.
         samples: Next states drawn from each elite.
-        threshold: An imagined row whose best dynamics reward is below ends there.
+        threshold: A rollout ends before a step whose best dynamics reward is below, which is not learnt from.
         horizon: Longest imagined rollout, in control steps.
         penalty: λ of MOPO, on rewards and state changes in their units. The authors chose it by dataset: 15 for Hopper
             medium, 0.5 for HalfCheetah and Walker2d medium; 2.5 is their code's default.
@@ -277,14 +277,21 @@ class MOREC:
         under_way, rows, imagined = self._imagine(
             problem, state, state.learner.policy, state.under_way, steps, of_imagination
         )
-        seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
+        stopped = rows.pop("stopped")
+        seen = replay.add(state.replay, rows, stopped == 0.0)
+        if not int(seen.written):
+            raise MadocError(
+                f"MOREC: every row imagined so far looks unreal (dynamics reward below {self.threshold:g}), so there is "
+                "nothing to learn from; lower threshold, or give the models more updates"
+            )
         learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
         updates, judged = state.updates + self.epoch_updates, state.judged
         if judged.due(updates, self.judge_every):
             of_starts, of_steps = jax.random.split(of_judging)
             start = start_imagining(problem.logged["observation"], self.imagined_rows, of_starts)
             _, acted, _ = self._imagine(problem, state, WithoutNoise(learner.policy), start, self.horizon, of_steps)
-            returns = mean_return(acted["reward"], acted["terminated"], rows=self.imagined_rows)
+            ended = jnp.maximum(acted["terminated"], acted["stopped"])
+            returns = mean_return(acted["reward"], ended, rows=self.imagined_rows)
             judged = judged.including(learner.policy, float(returns), updates)
             metrics |= {"judged_return": returns}
         following = replace(state, learner=learner, replay=seen, under_way=under_way, judged=judged, updates=updates)

@@ -16,6 +16,7 @@ from madoc.calibration.least_squares.lengthening import (
     LENGTHS,
     READINGS,
     continued,
+    enough,
     hopeless,
     horizon_of,
     lengthened,
@@ -262,13 +263,14 @@ class LeastSquares:
         if state.finished:
             return state
         if not self._unknown(problem).settled(search):
-            lost = hopeless(search, searches[0]) or search.epochs >= self.search_epochs
+            lost = hopeless(search, searches[0], searches[state.best]) or search.epochs >= self.search_epochs
             return _finished(state, state.best) if length and lost else state
         if length and not self._noise_alone(problem, state, length):
             return _finished(state, 0)
         if length and not tells_more(search, searches[state.best]):
             return _finished(state, state.best)
-        if length + 1 == len(searches) or float(search.deviation.max()) < sentences.EXACT:
+        last = length + 1 == len(searches) or not enough(searches[length + 1], search)
+        if last or float(search.deviation.max()) < sentences.EXACT:
             return _finished(state, length)
         longer = _with(state, length + 1, continued(searches[length + 1], search))
         return replace(longer, stage="lengthening", best=length, length=length + 1)

@@ -27,8 +27,10 @@ FEWEST = 10
 AS_WELL = 1.2
 """Ratio of a channel's noise to that of the first windows, at least 1; above it longer windows show model errors."""
 HOPELESS = 2.0
-"""Ratio as of `AS_WELL`; above it a search ends before it has settled, but not at its first step, whose states are
-still inexact."""
+"""Ratio as of `AS_WELL`; above it a search ends before it has settled."""
+FIRST_STEPS = 3
+"""Number of steps after which a search on longer windows may end before it has settled: until then initial states are
+inexact."""
 LEFT_OUT = 0.1
 """Share in [0, 1] of windows; longer windows are refused if more than this share of them is newly unexplained."""
 CHANCE = 3.0
@@ -83,9 +85,19 @@ def _states_at(search: SearchState, rows: Int[np.ndarray, " windows"]) -> Float[
     return search.states[:1, np.argsort(search.rows)[np.searchsorted(np.sort(search.rows), rows)]].copy()
 
 
-def hopeless(longer: SearchState, first: SearchState) -> bool:
-    """Whether a search finds so much more noise than the first that it need not go on."""
-    return longer.epochs >= 2 and bool((longer.deviation > HOPELESS * first.deviation).any())
+def hopeless(longer: SearchState, first: SearchState, best: SearchState) -> bool:
+    """Whether a search on longer windows need not go on until it settles.
+
+    It finds so much more noise than the first, or tells no more than the best so far.
+    """
+    if longer.epochs < FIRST_STEPS:
+        return False
+    return bool((longer.deviation > HOPELESS * first.deviation).any()) or not tells_more(longer, best)
+
+
+def enough(longer: SearchState, shorter: SearchState) -> bool:
+    """Whether there are enough longer windows if initial states explain as large a share of them as of shorter ones."""
+    return round(shorter.explained / len(shorter.rows) * len(longer.rows)) >= FEWEST + longer.point.shape[1]
 
 
 def noise_alone(longer: SearchState, first: SearchState, readings: int) -> bool:
