@@ -45,10 +45,11 @@ def test_the_order_of_rows_does_not_matter():
     np.testing.assert_allclose(discrepancies(clouds[:, rng.permutation(30)], wanted), discrepancies(clouds, wanted))
 
 
-def test_rows_that_failed_are_left_out():
+def test_rows_that_failed_are_left_out_of_the_mean_and_bring_no_cloud_nearer():
+    # Mean and variance are those of the two rows left, but three were simulated: 3 · (1 - 3)² / (1 + ridge).
     clouds = np.array([[[0.0], [2.0], [np.nan]], [[np.nan], [np.nan], [np.nan]]])
     found = discrepancies(clouds, np.array([3.0]))
-    assert found[0] == pytest.approx(8.0 / (1.0 + RIDGE))
+    assert found[0] == pytest.approx(12.0 / (1.0 + RIDGE))
     assert np.isnan(found[1])
 
 

@@ -77,10 +77,17 @@ def test_a_blur_at_its_smallest_is_told_by_the_reward():
     assert float(unsure.best.mean[0]) == pytest.approx(0.7) and unsure.best_mismatch < 0.4 * SMALLEST
 
 
-def test_a_blur_at_its_largest_says_nothing_yet():
-    watch = watched(settled(blur=LARGEST), 10, blur=LARGEST, estimate=0.7)
+def test_rewards_at_their_bound_under_the_largest_blur_say_nothing_yet():
+    watch = watched(settled(blur=LARGEST, at_bound=0.9), 10, blur=LARGEST, at_bound=0.9, size=3.0, estimate=0.7)
     assert float(watch.best.mean[0]) == pytest.approx(0.7)
     assert watch.milestone_epoch == watch.epochs
+
+
+def test_under_the_largest_blur_a_mismatch_that_rises_is_no_progress():
+    watch = settled(blur=LARGEST, size=1.0, estimate=0.1)
+    rising = watched(watch, 40, blur=LARGEST, size=6.0, estimate=0.7)
+    assert float(rising.best.mean[0]) == pytest.approx(0.1)
+    assert rising.milestone_epoch == SETTLING
 
 
 def test_a_blur_at_which_nothing_can_be_told_does_not_count():

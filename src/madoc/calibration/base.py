@@ -99,7 +99,8 @@ class Estimate:
         warnings: Reasons to doubt the estimate, one sentence each.
         covariance: Covariance of the estimates, with `std` squared on its diagonal; None where it is unknown.
         interval: 95 % confidence intervals, columns low and high; None where they are unknown.
-        settled: Whether the search came to its end; if not, a larger budget would change the estimate.
+        settled: False where the method can tell that its search is not at its end, so that a larger budget would change
+            the estimate: least squares until its steps are small, Madoc until its discriminators can have settled.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
     """

@@ -50,7 +50,7 @@ class CalibrationResult:
         error: `mean_absolute`, `mean_percent_of_range` and `per_parameter`; None where the truth was not given.
         covariance: Covariance of the estimates in physical units, in the task's order; None where it is unknown.
         combinations: Sums and products of parameters that the log tells though it leaves each of them open.
-        settled: Whether the method's search came to its end; its intervals mean nothing before.
+        settled: False where the method can tell that its search is not at its end; its intervals mean nothing before.
         group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
             groups, 0 for chance; None where the method did not find groups.
         verdict: The judgement on held-out rows; None where none were held out.
@@ -169,7 +169,7 @@ class CalibrationResult:
             )
         if self.group_stability is not None:
             lines.append(
-                f"{len(self.groups)} groups; adjusted Rand index with resampled ones {self.group_stability:.2f}"
+                f"{len(self.groups)} groups; adjusted Rand index with those found again {self.group_stability:.2f}"
             )
         lines += [f"told in combination: {told}" for told in self.combinations]
         return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])

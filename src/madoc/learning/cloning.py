@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import optax
-from jaxtyping import Float, PRNGKeyArray, PyTree
+from jaxtyping import PRNGKeyArray, PyTree
 
 from madoc.learning.networks import Actions, Observations, Scalar, adam, minimise
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy, log_density
@@ -26,18 +26,8 @@ class Clone:
     epochs: int
 
 
-def fresh_clone(
-    logged: Transitions,
-    hidden: tuple[int, ...],
-    *,
-    learning_rate: float,
-    key: PRNGKeyArray,
-    scale: Float[np.ndarray, " observation"] | None = None,
-) -> Clone:
-    """An untrained clone that standardises observations by their logged mean and by `scale`.
-
-    Without a `scale`, the standard deviation of each channel is taken, but at least 0.001.
-    """
+def fresh_clone(logged: Transitions, hidden: tuple[int, ...], *, learning_rate: float, key: PRNGKeyArray) -> Clone:
+    """An untrained clone that standardises observations by their logged mean and standard deviation, at least 0.001."""
     observation = np.asarray(logged.observation)
     policy = TanhGaussianPolicy(
         observation.shape[-1],
@@ -45,7 +35,7 @@ def fresh_clone(
         hidden,
         key=key,
         offset=observation.mean(0),
-        scale=np.maximum(observation.std(0), 1e-3) if scale is None else scale,
+        scale=np.maximum(observation.std(0), 1e-3),
     )
     return Clone(policy, adam(learning_rate).init(eqx.filter(policy, eqx.is_array)), 0)
 

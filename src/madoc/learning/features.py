@@ -130,6 +130,11 @@ class WindowScaling:
         """Number of features of a window, and of the observation after it."""
         return self.length * len(self.scaling.pair_offset), len(self.next_scale)
 
+    @property
+    def last_row(self) -> int:
+        """Place of the last row's features in those of a window of raw features, in which rows follow one another."""
+        return (self.length - 1) * len(self.scaling.pair_offset)
+
     def features(
         self, windows: Transitions
     ) -> tuple[Float[np.ndarray, "*rows window"], Float[np.ndarray, "*rows observation"]]:

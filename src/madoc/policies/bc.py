@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 
 import jax
-import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from madoc.data.dataset import spread_of
 from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, require_data
@@ -50,8 +48,7 @@ class BC:
         dataset = require_data(problem, rows=self.batch, outcomes=False)
         of_policy, key = jax.random.split(key)
         logged = dataset.transitions
-        scale = spread_of(np.asarray(logged.observation))
-        clone = fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy, scale=scale)
+        clone = fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy)
         return BCState(clone, key)
 
     def step(self, problem: PolicyProblem, state: BCState) -> tuple[BCState, Epoch]:

@@ -281,8 +281,8 @@ class MOREC:
         seen = replay.add(state.replay, rows, stopped == 0.0)
         if not int(seen.written):
             raise MadocError(
-                f"MOREC: every row imagined so far looks unreal (dynamics reward below {self.threshold:g}), so there is "
-                "nothing to learn from; lower threshold, or give the models more updates"
+                f"MOREC: every row imagined so far looks unreal (dynamics reward below {self.threshold:g}), so there "
+                "is nothing to learn from; lower threshold, or give the models more updates"
             )
         learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
         updates, judged = state.updates + self.epoch_updates, state.judged

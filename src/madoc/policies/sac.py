@@ -25,9 +25,10 @@ class SACState:
     """The state of SAC.
 
     Attributes:
-        best: The policy with the highest mean return so far.
-        best_return: Its mean return.
-        judged: Control steps of learning at the last evaluation; 0 before the first.
+        learner: Policy, critics and their optimisers.
+        interaction: The replay, and the episodes under way in the simulator.
+        judged: The best policy so far, and when it was judged, in control steps.
+        key: The random key.
     """
 
     learner: ActorCritic

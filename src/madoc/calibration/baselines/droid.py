@@ -80,5 +80,5 @@ class Droid:
         )
 
     def estimate(self, problem: CalibrationProblem, state: SearchState) -> Estimate:
-        """The mean of the search, and the covariance of its last candidates: the paper's randomization."""
+        """The mean of the search, and the covariance of its next candidates: the paper's randomization."""
         return estimate_from_search(problem, state)

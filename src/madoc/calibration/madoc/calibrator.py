@@ -31,8 +31,10 @@ from madoc.simulation.rollout import Walkers, out_of_step
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 Grouping = Literal["physics", "learned", "one", "each"]
-VOTING = 0.45
-"""Share of the epochs of grouping, the last ones, in which the VAE's groups are voted on: 90 of the authors' 200."""
+VOTING = 0.05
+"""Share in [0, 1] of the epochs of grouping, the last ones, in which the VAE's groups are voted on; the authors'."""
+VOTES = 10
+"""Number of votes in each of these epochs: the authors take about 9, at random, in 1000 updates."""
 STATES = 100
 """Logged states in an epoch of grouping by physics."""
 PAPER: dict[str, object] = {
@@ -75,7 +77,7 @@ class MadocState:
         clone: The running policy.
         vae: The network that embeds parameters by their effect.
         vae_optimiser: State of its optimiser.
-        schemes: Proposed groups of the last epochs of grouping by the VAE.
+        schemes: Groups proposed in the last epochs of grouping by the VAE.
         moments: What the parameters' effects have in common, in each epoch of grouping by physics.
         labels: Group of each parameter.
         stability: Mean adjusted Rand index of the groups with those of resampled states, or with those proposed in
@@ -126,8 +128,8 @@ class Madoc:
         cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
         cloning_updates: Updates in each epoch of cloning.
         keep_cloning: Whether cloning continues during calibration, as in the paper.
-        grouping_epochs: Epochs of grouping, outside the budget. One spends 100 · (1 + 2 d) control steps by physics,
-            `epoch_steps` if groups are learned.
+        grouping_epochs: Epochs of grouping, outside the budget. One spends at most 100 · (1 + 2 d) control steps by
+            physics, `epoch_steps` if groups are learned.
         grouping_updates: Updates of the VAE in each epoch of grouping.
         epoch_steps: Control steps in an epoch.
         updates: Calibration updates in an epoch.
@@ -175,7 +177,8 @@ class Madoc:
         """The paper's constants (appendix C and the authors' code): 1000 epochs of 1000 steps and updates.
 
         The authors' prior is a squared distance of means; Eq. (13)'s KL is kept here. Their code draws a
-        parameter vector every 100 control steps of one walker; so does this, for ten walkers at a time.
+        parameter vector every 100 control steps of one walker; so does this, for ten walkers at a time. Networks have
+        the paper's two hidden layers, where their code has three in discriminators and VAE.
         """
         return cls(**(PAPER | changes))  # type: ignore[arg-type]
 
@@ -183,8 +186,10 @@ class Madoc:
         """Fresh networks, empty buffers, rows at their starts.
 
         Raises:
-            MadocError: Rows are to start at logged states, but those cannot be rebuilt.
+            MadocError: Rows are to start at logged states, but those cannot be rebuilt, or the data's next observations
+                are shuffled.
         """
+        problem.require_pairs()
         count, groups, collection = (
             len(problem.simulator.parameters),
             self._group_count(problem),
@@ -199,7 +204,7 @@ class Madoc:
             clone=fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy),
             vae=vae,
             vae_optimiser=adam(self.learning_rate).init(eqx.filter(vae, eqx.is_array)),
-            schemes=np.zeros((max(1, int(VOTING * self.grouping_epochs)), count), dtype=np.int64),
+            schemes=np.zeros((self._voting * VOTES, count), dtype=np.int64),
             moments=np.zeros((self.grouping_epochs, count, count)),
             stability=0.0,
             labels=np.arange(count) if groups == count else np.zeros(count, dtype=np.int64),
@@ -233,6 +238,7 @@ class Madoc:
             group_stability=state.stability if self._finds_groups(state) and grouped else None,
             failures=state.failures,
             warnings=(*watch.warnings(state.watch, scaled, space.names), *self.collection(problem).warnings),
+            settled=watch.settled(state.watch),
         )
 
     def embeddings(self, problem: CalibrationProblem, state: MadocState) -> np.ndarray | None:
@@ -270,6 +276,11 @@ class Madoc:
         return min(
             count, self.group_count or (effects.most_groups(count) if of_physics else problem.simulator.task.groups)
         )
+
+    @property
+    def _voting(self) -> int:
+        """Number of epochs of grouping in which the VAE's groups are voted on."""
+        return max(1, int(VOTING * self.grouping_epochs))
 
     def _finds_groups(self, state: MadocState) -> bool:
         """Whether groups are to be found, rather than one of all or one for each."""
@@ -316,19 +327,25 @@ class Madoc:
         draws, walkers = grouping.one_at_a_time(of_draws, count), collection.begin(count, of_start)
         rollout, _ = collection.roll(state.clone.policy, draws, walkers, (of_action, of_restart))
         rows = collection.remember(state.rows, rollout, draws, np.arange(count))
-        vae, optimiser_state, loss = grouping.train(
-            state.vae,
-            state.vae_optimiser,
-            rows,
-            of_batches,
-            optimiser=adam(self.learning_rate),
-            batch=self.batch,
-            count=self.grouping_updates,
-        )
         grouped, schemes = state.grouped + 1, state.schemes
-        if grouped > self.grouping_epochs - len(schemes):
-            scheme = grouping.cluster(vae.embeddings(), self._group_count(problem), seed=grouped)
-            schemes = np.concatenate([schemes[1:], scheme[None]])
+        voting = grouped > self.grouping_epochs - self._voting
+        parts = VOTES if voting else 1
+        vae, optimiser_state, losses = state.vae, state.vae_optimiser, []
+        for key_of_part in jax.random.split(of_batches, parts):
+            vae, optimiser_state, loss = grouping.train(
+                vae,
+                optimiser_state,
+                rows,
+                key_of_part,
+                optimiser=adam(self.learning_rate),
+                batch=self.batch,
+                count=-(-self.grouping_updates // parts),
+                state_at=None if collection.scaling.scaling.difference else collection.scaling.last_row,
+            )
+            losses.append(loss)
+            if voting:
+                scheme = grouping.cluster(vae.embeddings(), self._group_count(problem), seed=grouped)
+                schemes = np.concatenate([schemes[1:], scheme[None]])
         done = grouped == self.grouping_epochs
         following = replace(
             state,
@@ -344,7 +361,11 @@ class Madoc:
         )
         steps = rollout.valid.size
         return following, Epoch(
-            {"grouping_loss": float(loss)}, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=1.0
+            {"grouping_loss": float(np.mean(losses))},
+            control_steps=steps,
+            unbudgeted=steps,
+            stage="grouping",
+            fraction=1.0,
         )
 
     def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
@@ -355,6 +376,11 @@ class Madoc:
         walkers = collection.begin(systems, of_start) if fresh else state.walkers
         rollout, walkers = collection.roll(state.clone.policy, draws, walkers, (of_action, of_restart))
         rows = collection.remember(state.rows, rollout, draws, np.zeros(systems, np.int64))
+        if not int(rows.written):
+            raise MadocError(
+                f"madoc: every row simulated so far diverged or ended within {collection.scaling.length} steps, so there "
+                "is nothing to compare with the log; narrow the ranges of the parameters"
+            )
         agents, device_metrics = self.agents.update(
             state.agents,
             rows,

@@ -17,10 +17,11 @@ PROJECTED = 3
 
 
 class GroupingVAE(eqx.Module):
-    """Encoder: identity -> embedding. Decoder: (s, a, ξ_i, embedding) -> s'.
+    """Encoder: identity -> embedding. Decoder: (s, a, ξ_i, embedding) -> s' - s.
 
     Eq. (10) without its KL term, as the paper trains it (appendix C): nothing is generated from the embedding, which
-    only has to distinguish parameters, so it is the encoder's mean.
+    only has to distinguish parameters, so it is the encoder's mean. The paper writes s'; the authors' code predicts the
+    change, as this does, in which the parameter's effect does not vanish beside the state.
     """
 
     encoder: Network
@@ -38,16 +39,16 @@ class GroupingVAE(eqx.Module):
         return self.encoder(jnp.eye(int(self.encoder.layers[0].in_features)))
 
     def __call__(self, pair: Array, value: Array, identity: Array) -> Observations:
-        """The predicted features of s', given the value (in [-1, 1]) of the varied parameter, and its index."""
+        """The predicted features of s' - s, given the value (in [-1, 1]) of the varied parameter, and its index."""
         repeated = jnp.repeat(value[:, None], LATENT, axis=1)
         return self.decoder(jnp.concatenate([pair, repeated, self.embeddings()[identity]], axis=-1))
 
 
 def reconstruction_loss(
-    vae: GroupingVAE, pair: Array, following: Array, value: Array, identity: Int[Array, " rows"]
+    vae: GroupingVAE, pair: Array, change: Array, value: Array, identity: Int[Array, " rows"]
 ) -> Scalar:
-    """The first term of Eq. (10) with a unit-variance decoder: mean squared error of s'."""
-    return jnp.mean((vae(pair, value, identity) - following) ** 2)
+    """The first term of Eq. (10) with a unit-variance decoder: mean squared error of s' - s."""
+    return jnp.mean((vae(pair, value, identity) - change) ** 2)
 
 
 @eqx.filter_jit
@@ -60,14 +61,21 @@ def train(
     optimiser: optax.GradientTransformation,
     batch: int,
     count: int,
+    state_at: int | None = None,
 ) -> tuple[GroupingVAE, PyTree, Scalar]:
-    """`count` updates on simulated rows; also the mean loss."""
+    """`count` updates on simulated rows; also the mean loss.
+
+    `state_at` is the place of s in the features of (s, a) where those of s' are s' itself; None where they are s' - s.
+    """
 
     def loss_of(vae: GroupingVAE, key: PRNGKeyArray) -> Scalar:
         drawn = replay.sample(rows, key, batch)
         identity = drawn["identity"].astype(jnp.int32)
         value = jnp.take_along_axis(drawn["parameters"], identity[:, None], axis=1)[:, 0]
-        return reconstruction_loss(vae, drawn["pair"], drawn["following"], value, identity)
+        change = drawn["following"]
+        if state_at is not None:
+            change = change - drawn["pair"][:, state_at : state_at + change.shape[1]]
+        return reconstruction_loss(vae, drawn["pair"], change, value, identity)
 
     return minimise(loss_of, vae, optimiser_state, key, optimiser=optimiser, count=count)
 

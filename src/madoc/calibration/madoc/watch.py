@@ -60,9 +60,9 @@ def observe(
 ) -> Watch:
     """The watch after one more epoch, whose estimate is kept unless an earlier mismatch was clearly lower.
 
-    Mismatches are compared once the discriminators have settled and the blur is below its upper limit, provided that
-    the mean |reward| is near `steered_to`, its set value, or the blur is at its lower limit. Before that, and without
-    a blur (`steered_to` is then 0), the latest estimate is kept.
+    Mismatches are compared once the discriminators have settled, provided that the mean |reward| is near `steered_to`,
+    its set value, or the blur is at its lower limit. Before that, without a blur (`steered_to` is then 0), and while
+    rewards are at their bound under the largest blur, the latest estimate is kept.
     """
     blur, size, at_bound = metrics["blur"], metrics["reward_size"], metrics["reward_at_bound"]
     mismatch = blur * size / steered_to if steered_to else size
@@ -71,7 +71,8 @@ def observe(
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
     watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, at_bound=at_bound)
     smallest, largest = blur_range
-    if not steered_to or watch.epochs <= SETTLING or blur > 0.99 * largest:
+    immeasurable = blur > 0.99 * largest and at_bound > SATURATED
+    if not steered_to or watch.epochs <= SETTLING or immeasurable:
         return _mark(replace(watch, best=average, best_mismatch=mismatch))
     if size < LEAST_REWARD * steered_to and blur > 1.01 * smallest:
         return watch
@@ -93,10 +94,15 @@ def stalled(watch: Watch, patience: int) -> str | None:
     return f"the mismatch of simulated and logged rows has stayed at {watch.best_mismatch:.3g} for {waited} epochs"
 
 
+def settled(watch: Watch) -> bool:
+    """Whether there were enough epochs for the discriminators to say anything."""
+    return watch.epochs >= SETTLING
+
+
 def warnings(watch: Watch, scaled: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
     """Warnings about the estimate `scaled` (d,) in [-1, 1], one sentence each."""
     sentences = []
-    if watch.epochs < SETTLING:
+    if not settled(watch):
         sentences.append(
             f"{watch.epochs} epochs of calibration are fewer than the {SETTLING} in which the discriminators settle; "
             "give it a larger budget"

@@ -55,7 +55,8 @@ def discrepancies(
     """Squared Mahalanobis distance n (m - w)ᵀ S⁻¹ (m - w) of the mean m of each cloud of n rows from the wanted w.
 
     S is the covariance of rows about the mean of their cloud, pooled over clouds, with a small ridge. Rows that failed
-    (NaN) are left out; the distance of a cloud in which all rows failed is NaN.
+    (NaN) are left out of the mean but counted in n, so that no cloud comes nearer by failing; the distance of a cloud
+    in which all rows failed is NaN.
     """
     valid = np.isfinite(features).all(-1)
     count = valid.sum(1)
@@ -65,7 +66,7 @@ def discrepancies(
     ridge = RIDGE * np.trace(covariance) / len(covariance) + _SMALLEST_VARIANCE
     gap = mean - wanted
     solved = np.linalg.solve(covariance + ridge * np.eye(len(covariance)), np.nan_to_num(gap).T).T
-    return count * (gap * solved).sum(-1)
+    return np.where(count > 0, features.shape[1], np.nan) * (gap * solved).sum(-1)
 
 
 def adjusted(

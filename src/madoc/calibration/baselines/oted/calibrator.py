@@ -26,11 +26,21 @@ from madoc.calibration.baselines.oted.bandit import (
 from madoc.calibration.baselines.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
 from madoc.calibration.baselines.population_search import independent_estimate
 from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
+from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
 from madoc.learning.features import HIDDEN_WINDOW, last_rows, unbroken, windows_ending
 from madoc.learning.networks import Network, adam, moving_average
-from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll, unbiased_starts
+from madoc.simulation.rollout import (
+    Starts,
+    Walkers,
+    begin,
+    chosen_states,
+    out_of_step,
+    reset_states,
+    roll,
+    unbiased_starts,
+)
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
@@ -111,12 +121,13 @@ class Oted:
         pair = rows_compared(problem) * (observation + action)
         discriminator = Network(pair, 1, self.hidden, key=of_discriminator)
         distribution = Distribution(np.zeros(count), np.full(count, np.log(self.first_std)))
+        walkers = begin(self._starts(problem)[0], of_start, systems=self._systems, rows=self.rows)
         return OtedState(
             clone=clone,
             discriminator=discriminator,
             discriminator_optimiser=adam(self.learning_rate).init(eqx.filter(discriminator, eqx.is_array)),
             rows=replay.empty(self.replay_capacity, pair=(pair,)),
-            walkers=begin(self._starts(problem)[0], of_start, systems=self._systems, rows=self.rows),
+            walkers=walkers if self._anew(problem) else out_of_step(walkers, task.max_episode_steps),
             distribution=distribution,
             average=distribution,
             key=key,
@@ -192,6 +203,11 @@ class Oted:
         lives = first_lives(seen, rollout.valid) if anew else rollout.valid
         valid = unbroken(lives, np.asarray(seen.terminated) | np.asarray(seen.truncated), length)[-len(pairs) :]
         rows = replay.add(state.rows, {"pair": replay.flatten_rows(pairs, 3)}, valid.reshape(-1))
+        if not int(rows.written):
+            raise MadocError(
+                f"oted: every row simulated so far diverged or ended within {length} steps, so there is nothing to compare "
+                "with the log; narrow the ranges of the parameters"
+            )
         discriminator, optimiser_state, loss = learn(
             state.discriminator,
             state.discriminator_optimiser,

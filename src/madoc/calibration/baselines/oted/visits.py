@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from madoc.data import Dataset
 from madoc.identification.windows import first_rows
 from madoc.learning import replay
+from madoc.learning.dynamics_reward import discriminator_loss
 from madoc.learning.networks import Network, minimise
 from madoc.types import Transitions
 
@@ -46,13 +47,6 @@ def first_lives(seen: Transitions, valid: Bool[np.ndarray, "steps *rows"]) -> Bo
     return valid & ~np.logical_or.accumulate(earlier, axis=0)
 
 
-def discriminator_loss(
-    discriminator: Network, logged: Float[Array, "batch pair"], simulated: Float[Array, "batch pair"]
-) -> Float[Array, ""]:
-    """Cross-entropy of logged (1) against simulated (0) pairs: its logit becomes log p_data(s, a) / p_sim(s, a)."""
-    return jax.nn.softplus(-discriminator(logged)).mean() + jax.nn.softplus(discriminator(simulated)).mean()
-
-
 @eqx.filter_jit
 def log_ratio(discriminator: Network, pairs: Float[Array, "*rows pair"]) -> Float[Array, "*rows"]:
     """The discriminator's estimate of log p_data(s, a) / p_sim(s, a)."""
@@ -74,6 +68,7 @@ def learn(
 ) -> tuple[Network, PyTree, Float[Array, ""]]:
     """`count` updates of the discriminator on logged and simulated pairs; also the mean loss.
 
+    Its cross-entropy leads its logit to log p_data(s, a) / p_sim(s, a).
     `reached` is the running sum of the weights with which logged pairs are drawn.
     """
 
@@ -81,6 +76,7 @@ def learn(
         of_logged, of_simulated = jax.random.split(key)
         drawn = jax.random.randint(of_logged, (batch,), 0, reached[-1])
         chosen = logged[jnp.searchsorted(reached, drawn, side="right")]
-        return discriminator_loss(discriminator, chosen, replay.sample(rows, of_simulated, batch)["pair"])
+        simulated = replay.sample(rows, of_simulated, batch)["pair"]
+        return discriminator_loss(discriminator(chosen)[:, 0], discriminator(simulated)[:, 0])
 
     return minimise(loss_of, discriminator, optimiser_state, key, optimiser=optimiser, count=count)
