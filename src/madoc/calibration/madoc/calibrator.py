@@ -378,8 +378,8 @@ class Madoc:
         rows = collection.remember(state.rows, rollout, draws, np.zeros(systems, np.int64))
         if not int(rows.written):
             raise MadocError(
-                f"madoc: every row simulated so far diverged or ended within {collection.scaling.length} steps, so there "
-                "is nothing to compare with the log; narrow the ranges of the parameters"
+                f"madoc: every row simulated so far diverged or ended within {collection.scaling.length} steps, so "
+                "there is nothing to compare with the log; narrow the ranges of the parameters"
             )
         agents, device_metrics = self.agents.update(
             state.agents,

@@ -205,8 +205,8 @@ class Oted:
         rows = replay.add(state.rows, {"pair": replay.flatten_rows(pairs, 3)}, valid.reshape(-1))
         if not int(rows.written):
             raise MadocError(
-                f"oted: every row simulated so far diverged or ended within {length} steps, so there is nothing to compare "
-                "with the log; narrow the ranges of the parameters"
+                f"oted: every row simulated so far diverged or ended within {length} steps, so there is nothing "
+                "to compare with the log; narrow the ranges of the parameters"
             )
         discriminator, optimiser_state, loss = learn(
             state.discriminator,
