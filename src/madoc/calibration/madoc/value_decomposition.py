@@ -32,14 +32,8 @@ class GroupCritics(eqx.Module):
     def values(
         self, parameters: Float[Array, "rows d"], members: Bool[Array, "groups d"]
     ) -> Float[Array, "rows groups"]:
-        """v_g(ξ^g) of every group; the parameters of other groups are replaced by 0. That of an empty group is 0.
-
-        A network's first weights are as large as d inputs need, so a group's own inputs are multiplied by √(d / size):
-        its value then starts as steep as that of a network of its own size.
-        """
-        size = jnp.maximum(members.sum(-1), 1)
-        steeper = jnp.sqrt(parameters.shape[1] / size)[:, None, None]
-        own = jnp.where(members[:, None], parameters[None], 0.0) * steeper
+        """v_g(ξ^g) of every group; the parameters of other groups are replaced by 0. That of an empty group is 0."""
+        own = jnp.where(members[:, None], parameters[None], 0.0)
         values = eqx.filter_vmap(lambda network, rows: network(rows)[:, 0])(self.networks, own).T
         return jnp.where(members.any(-1), values, 0.0)
 
