@@ -7,6 +7,7 @@ import pytest
 from suite_files import CELL
 
 from madoc.commands.main import main
+from madoc.suites.cells import write_plan
 from madoc.suites.claims import claimed
 from madoc.suites.planning import plan_of
 from madoc.suites.worker import work
@@ -43,9 +44,12 @@ def test_from_plan_to_report(suite, place, capsys):
 
 
 def test_a_suite_starts_its_workers_and_more_seeds_repeat_nothing(suite, place, capsys):
-    file, out = suite(CELL + "    grid: {seed: 0..1}\n"), place / "out"
+    out, (foreign,) = place / "out", plan_of(suite(CELL + "    seed: 9\n", "another.yaml")).cells
+    write_plan(out, "another", [foreign])
+    file = suite(CELL + "    grid: {seed: 0..1}\n")
     code, ended = told(capsys, "suite", file, "--out", out, "--workers", 1, "--quiet")
     assert (code, ended["ended"]) == (0, {"finished": 2})
+    assert not foreign.folder(out).exists()  # a cell of another suite that shares the folder
     before = {path: path.stat().st_mtime_ns for path in out.glob("cells/*/outcome.json")}
     file = suite(CELL + "    grid: {seed: 0..2}\n")
     with claimed(plan_of(file).cells[2], out) as claim:

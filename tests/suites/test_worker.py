@@ -122,13 +122,26 @@ def test_blocked_cells_wait_and_vain_ones_are_left(planned):
 
 
 def test_a_worker_leaves_code_to_those_that_are_allowed_to_run_it(planned, place):
+    (place / "plain.yaml").write_text((place / "spring.yaml").read_text())
     with (place / "spring.yaml").open("a") as spec:
         spec.write("python: task.py\n")
     (place / "task.py").write_text("def reward(place): return -abs(place)\n")
     with pytest.raises(MadocError, match=r"the spec names the Python file task.py"):
         planned(CELL)
-    out, (cell,) = planned(CELL, allow_code=True)
+    other = CELL.replace("spring.yaml", "plain.yaml")
+    out, (cell, plain) = planned(CELL + other, allow_code=True)
     with pytest.raises(NotAllowed, match="pass --allow-code"):
         work(out)
     assert outcome_of(cell, out) is None
+    assert outcome_of(plain, out).usable  # what needs no code is done all the same
     assert [outcome.status for outcome in work(out, allow_code=True)] == ["finished"]
+
+
+def test_a_worker_of_one_plan_leaves_the_cells_of_the_others(planned, place, monkeypatch):
+    out, (first, second) = planned(CELL + "    grid: {seed: 0..1}\n")
+    write_plan(out, "another", [second])
+    monkeypatch.setattr("madoc.suites.worker.carry_out", lambda claim, *_, **__: claim.end("finished", "done", 0.0))
+    assert len(work(out, plan="another")) == 1
+    assert outcome_of(first, out) is None
+    with pytest.raises(MadocError, match=r"unknown plan of .* 'anothr'; did you mean another"):
+        work(out, plan="anothr")

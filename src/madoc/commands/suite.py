@@ -88,9 +88,9 @@ class Suite:
         if self.executor == "ray":
             from madoc.suites.on_ray import run_on_ray
 
-            whole = run_on_ray(out, standing, workers=self.workers, address=self.address, **options)
+            whole = run_on_ray(out, standing, plan=plan.name, workers=self.workers, address=self.address, **options)
         else:
-            whole = run_locally(out, standing, workers=workers, **options)
+            whole = run_locally(out, standing, plan=plan.name, workers=workers, **options)
         return _told(standing, plan, out, whole=whole)
 
     def _reported(self, plan: "Plan", standing: "Standing", out: Path) -> Answer:
