@@ -117,6 +117,8 @@ def test_the_schema(capsys, tmp_path):
         (["spec"], "expected the spec file of a robot, as madoc spec robot.yaml"),
         (["spec", "nothing.yaml"], "nothing.yaml, which does not exist"),
         (["init", "nothing.xml"], "there is no model file nothing.xml: it is missing"),
+        (["init", "."], "there is no model file .: it is a directory"),
+        (["init", ""], "there is no model file .: it is a directory"),
         (["calibrate", "nothing.yaml", "--data", "x.npz"], "nothing.yaml, which does not exist"),
         (["calibrate", "nothing", "--data", "x.npz"], "unknown task 'nothing'"),
     ],

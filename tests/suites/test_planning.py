@@ -48,6 +48,12 @@ def test_a_cell_is_named_by_what_its_files_hold_and_not_by_where_they_are(suite,
     assert names(moved / "suite.yaml") != [before]
 
 
+def test_a_folder_whose_name_is_a_date_is_a_folder(suite, place):
+    (place / "log.npz").rename(place / "2024-05-01")
+    (cell,) = plan_of(suite(CELL.replace("log.npz", "2024-05-01"))).cells
+    assert cell.read().source.paths == (str(place / "2024-05-01"),)
+
+
 def test_stages_that_several_cells_need_are_there_once(suite):
     text = "  - record: {name: hopper-medium, transitions: 1000}\n    budget: 900\n    evaluate: 2\n"
     text += "    grid: {learn: [{method: bc, budget: 10}, {method: sac, budget: 500, at: truth}], seed: 0..1}\n"

@@ -64,6 +64,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_CODES["interrupted"]
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more is written, not even at exit
+    except RuntimeError as error:
+        if "home directory" not in str(error):  # what pathlib says of ~ and an unknown user
+            raise
+        return _refused("a path begins with ~ and the name of no user of this machine; write the folder out")
     except OSError as error:  # a full disk, a folder that may not be written to, a name that is too long
         where = "" if error.filename is None else f" at {error.filename!r:.200}"
         reason = error.strerror or str(error)

@@ -17,7 +17,7 @@ from madoc.robots.validation import Part, refused_with_line
 GRID, ROBOTS, DATA = "grid", "robots", "data"
 """Keys of an entry that are no options: values to multiply out, and logs of several robots of one kind."""
 
-_RANGE = re.compile(r"\s*(-?\d+)\s*\.\.\s*(-?\d+)?\s*")
+_RANGE = re.compile(r"\s*(-?\d{1,18})\s*\.\.\s*(-?\d{1,18})?\s*")
 _LARGEST = 1_000_000
 """Largest number of combinations of one entry."""
 
@@ -141,7 +141,11 @@ def _robots(value: object, document: Document, place: Place, folder: Path) -> di
     found: list[str] = []
     for number, pattern in enumerate(patterns):
         where = (*place, number) if isinstance(value, list) else place
-        logs = _matching(folder, pattern)
+        try:
+            logs = _matching(folder, pattern)
+        except ValueError as error:
+            sentence = f"{pattern} is no pattern of files; ** stands alone between slashes"
+            raise document.error(where, sentence) from error
         if not logs:
             raise document.error(where, f"there is no file or folder {pattern}; each robot's logs are one")
         if twice := next((log for log in logs if log in found), None):
