@@ -119,6 +119,7 @@ def test_the_schema(capsys, tmp_path):
         (["init", "nothing.xml"], "there is no model file nothing.xml: it is missing"),
         (["init", "."], "there is no model file .: it is a directory"),
         (["init", ""], "there is no model file .: it is a directory"),
+        (["calibrate", "hopper", "--data", ""], "expected the log after --data, got nothing"),
         (["calibrate", "nothing.yaml", "--data", "x.npz"], "nothing.yaml, which does not exist"),
         (["calibrate", "nothing", "--data", "x.npz"], "unknown task 'nothing'"),
     ],

@@ -8,6 +8,10 @@ from madoc.commands.main import main
 GRID = CELL + "    grid:\n"
 
 
+HOPPER = "  - record: {name: hopper-medium}\n"
+REWARDED = CELL.replace("spring.yaml", "rewarded.yaml")
+
+
 def changed(old, new):
     assert old in CELL
     return CELL.replace(old, new)
@@ -41,6 +45,21 @@ def changed(old, new):
         (CELL + "    evaluate: 3\n", 8, "evaluate: belongs to learn:"),
         (CELL + "    robots: [log.npz, other.npz]\n", 8, "robots: and data: both name logs"),
         (CELL.replace("    data: log.npz\n", "    robots: arm-*\n"), 4, "there is no file or folder arm-*"),
+        (CELL + "    format: tape\n", 8, "unknown format 'tape'"),
+        (CELL + "    max_transitions: 0\n", 8, "at least 1 transition to keep, got 0"),
+        (changed("log.npz", "''"), 4, "expected the log after --data, got nothing"),
+        (CELL + "    truth: strange.json\n", 8, "unknown parameter of spring in the truth 'gravty'"),
+        (HOPPER + "    learn: sac\n    evaluate: {draws: 0}\n", 5, "at least 1 draw, got 0"),
+        (HOPPER + "    learn: sac\n    evaluate: {truth: strange.json}\n", 5, "'gravty'; did you mean gravity?"),
+        (HOPPER + "    learn: {method: sac, truth: strange.json}\n", 4, "'gravty'; did you mean gravity?"),
+        (HOPPER + "    learn: {method: sac, share: 0.5}\n", 4, "are of at: distribution; leave them out"),
+        (HOPPER + "    learn: {method: sac,\n      width: 2}\n", 5, "are of at: distribution; leave them out"),
+        (HOPPER + "    hide_velocities: true\n    learn: h2o\n", 5, "h2o learns from whole observations"),
+        (HOPPER.replace("}", ", hide_velocities: true}") + "    learn: h2o\n", 4, "h2o learns from whole observations"),
+        (HOPPER.replace("}", ", friction: -1}"), 3, "friction as a positive multiple of the model's, got -1"),
+        (HOPPER + "    task: ant\n", 3, "hopper-medium is a recording of hopper, and task: another"),
+        ("  - {task: hopper, data: a.hdf5, learn: {method: sac, at: truth}}\n", 3, "the true parameters are not known"),
+        (REWARDED + "    learn: {method: rlpd}\n", 8, "no log has the goals of spring: wanted"),
         ("  - {record: hopper-mdium}\n", 3, "did you mean medium?"),
         ("madoc: 1\ncells: []\n", 2, "at least 1 item"),
         ("madoc: 2\ncells: []\n", 1, "expected 1 in madoc, got 2"),
@@ -49,6 +68,10 @@ def changed(old, new):
     ],
 )
 def test_a_mistake_is_one_sentence_with_its_line(suite, place, capsys, text, line, sentence):
+    (place / "strange.json").write_text('{"gravty": -9.81}')
+    (place / "a.hdf5").write_bytes(b"")
+    goals = 'reward: -abs(place)\ngoals: [{name: wanted, drawn: "uniform(-1, 1)"}]\n'
+    (place / "rewarded.yaml").write_text((place / "spring.yaml").read_text() + goals)
     assert main(["suite", str(suite(text)), "--out", str(place / "out")]) == 2
     out, err = capsys.readouterr()
     assert out == ""

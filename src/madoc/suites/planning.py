@@ -84,7 +84,10 @@ class _Planner:
             with self._inside("record", asked):
                 checks.check_recording(recording)
             needs = self._put("record", recording, None, asked, stored(recording)).name
-            given |= {"data": [f"{needs}/{RECORDED}"], "task": given.get("task", recording.name.partition("-")[0])}
+            robot = recording.name.partition("-")[0]
+            if given.get("task", robot) != robot:
+                raise Misfit("record", f"{recording.name} is a recording of {robot}, and task: another; leave it out")
+            given |= {"data": [f"{needs}/{RECORDED}"], "task": robot}
         known = [*keys_of(CalibrationOrder), *PARTS, ROBOTS, GRID]
         if unknown := next((key for key in given if key not in known), None):
             raise Misfit(unknown, f"unknown key {unknown!r}; {nearest_hint(unknown, known)}")
@@ -105,13 +108,15 @@ class _Planner:
         seed = calibrating.search.seed
         order = self._part(PolicyOrder, "learn", parts["learn"], asked, seed=seed)
         with self._inside("learn", asked):
-            checks.check_policy(order, calibrating.search, calibrating.task, allow_code=self.allow_code)
+            recording = self.cells[calibration.needs].read() if calibration.needs else None
+            assert recording is None or isinstance(recording, RecordOrder)
+            checks.check_policy(order, calibrating, recording, allow_code=self.allow_code)
         policy = self._put("learn", order, calibration.name, asked, stored(order))
         if "evaluate" not in parts:
             return policy
         evaluation = self._part(EvaluationOrder, "evaluate", parts["evaluate"], asked)
         with self._inside("evaluate", asked):
-            checks.check_evaluation(evaluation)
+            checks.check_evaluation(evaluation, calibrating, allow_code=self.allow_code)
         return self._put("evaluate", evaluation, policy.name, asked, stored(evaluation))
 
     def _put(self, kind: Kind, order: Order, needs: str | None, asked: Combination, told: dict[str, Any]) -> Cell:
@@ -147,7 +152,9 @@ class _Planner:
         if not recorded and "data" in located:
             paths = [located["data"]] if isinstance(located["data"], str) else located["data"]
             if isinstance(paths, list):
-                located["data"] = [(isinstance(path, str) and _located(self.folder, path)) or path for path in paths]
+                located["data"] = [
+                    _located(self.folder, path) or path if path and isinstance(path, str) else path for path in paths
+                ]
         return located
 
     def _is_there(self, path: str) -> bool:
