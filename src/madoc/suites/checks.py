@@ -180,7 +180,7 @@ def content_of_log(path: str, *, own: bool) -> str:
     """
     place = Path(path)
     if place.is_dir():
-        files = sorted(file for file in place.rglob("*") if file.is_file())
+        files = _files_of(place, own=own)
         if not files:
             raise MadocError(f"the folder {path} holds no files; name one with logs")
         return hashed([[str(file.relative_to(place)), content_of_file(str(file))] for file in files])
@@ -192,6 +192,16 @@ def content_of_log(path: str, *, own: bool) -> str:
 
     recognise(place)
     return path
+
+
+def _files_of(folder: Path, *, own: bool) -> list[Path]:
+    """The files of a folder of logs that count: no hidden ones, and of a user's own robot those that are read."""
+    if own:
+        from madoc.data.logs import files_of  # reads data formats, which only folders need
+
+        return files_of(folder)
+    visible = (file for file in folder.rglob("*") if not any(p.startswith(".") for p in file.relative_to(folder).parts))
+    return sorted(file for file in visible if file.is_file())
 
 
 @cache

@@ -158,12 +158,13 @@ def _robots(value: object, document: Document, place: Place, folder: Path) -> di
 
 @lru_cache(maxsize=256)
 def _matching(folder: Path, pattern: str) -> list[str]:
-    """The files and folders that a pattern names, in the order of their names."""
+    """The files and folders that a pattern names, in the order of their names; hidden ones only where it says so."""
     path = Path(pattern).expanduser()
     if not any(mark in pattern for mark in "*?["):
         return [pattern] if (folder / path).exists() else []
     base = Path(path.anchor) if path.is_absolute() else folder
-    return sorted(str(match) for match in base.glob(str(path.relative_to(path.anchor))))
+    found = base.glob(str(path.relative_to(path.anchor)))
+    return sorted(str(match) for match in found if path.name.startswith(".") or not match.name.startswith("."))
 
 
 def _names(logs: list[str]) -> list[str]:
