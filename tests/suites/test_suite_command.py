@@ -58,6 +58,17 @@ def test_a_suite_starts_its_workers_and_more_seeds_repeat_nothing(suite, place, 
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
+def test_the_command_for_the_report_may_run_code_where_the_suite_may(suite, place, capsys):
+    file, out = suite(CELL), place / "out"
+    with claimed(plan_of(file).cells[0], out) as claim:
+        claim.end("finished", "done by another", 0.0)
+    words = ["suite", str(file), "--out", str(out)]
+    assert main(words) == 0
+    assert f"report: madoc suite {file} --out {out} --report\n" in capsys.readouterr().out
+    assert main([*words, "--allow-code"]) == 0
+    assert f"report: madoc suite {file} --out {out} --report --allow-code\n" in capsys.readouterr().out
+
+
 def test_a_worker_needs_a_plan(place, capsys, monkeypatch):
     monkeypatch.setattr("madoc.suites.process.take_core", lambda: None)
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(place))

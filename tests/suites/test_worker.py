@@ -1,4 +1,5 @@
 import json
+import os
 import threading
 from dataclasses import replace
 
@@ -6,7 +7,7 @@ import pytest
 from suite_files import CELL
 
 from madoc.errors import MadocError, NotAllowed
-from madoc.suites import stages
+from madoc.suites import process, stages
 from madoc.suites.cells import write_plan
 from madoc.suites.claims import MOST_ATTEMPTS, claimed, outcome_of, try_again
 from madoc.suites.planning import plan_of
@@ -40,6 +41,20 @@ def test_a_refusal_is_kept_with_its_sentence_and_others_go_on(planned):
     assert [outcome.status for outcome in work(out)] == ["refused", "finished"]
     assert "velocities" in outcome_of(refused, out).sentence
     assert outcome_of(done, out).usable
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system knows no affinity")
+def test_a_user_without_a_name_takes_a_core(tmp_path, monkeypatch):
+    taken = []
+    monkeypatch.setattr(process, "_held", [])
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    for name in ("LOGNAME", "USER", "LNAME", "USERNAME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3})
+    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: taken.append(cores))
+    assert process.take_core() == 2
+    assert taken == [{2}]
 
 
 def test_only_one_of_two_claims_gets_a_cell(planned):

@@ -91,7 +91,7 @@ class Suite:
             whole = run_on_ray(out, standing, plan=plan.name, workers=self.workers, address=self.address, **options)
         else:
             whole = run_locally(out, standing, plan=plan.name, workers=workers, **options)
-        return _told(standing, plan, out, whole=whole)
+        return _told(standing, plan, out, whole=whole, allow_code=self.permission.allow_code)
 
     def _reported(self, plan: "Plan", standing: "Standing", out: Path) -> Answer:
         """Leave the page and the tables."""
@@ -121,7 +121,7 @@ def _listed(standing: "Standing", out: Path, workers: int) -> Answer:
     return Answer(answer, (*lines(listed), told.sentence(workers)))
 
 
-def _told(standing: "Standing", plan: "Plan", out: Path, *, whole: bool) -> Answer:
+def _told(standing: "Standing", plan: "Plan", out: Path, *, whole: bool, allow_code: bool) -> Answer:
     """How the suite ended."""
     counts = dict(standing.counts)
     status = "finished" if whole else "interrupted"
@@ -132,7 +132,8 @@ def _told(standing: "Standing", plan: "Plan", out: Path, *, whole: bool) -> Answ
     )
     shown = reasons[:10] + ((f"and {len(reasons) - 10} more",) if len(reasons) > 10 else ())
     told = ", ".join(f"{count:,} {name}" for name, count in counts.items())
-    end = f"report: madoc suite {plan.file} --out {out} --report" if whole else "go on with the same command"
+    report = f"report: madoc suite {plan.file} --out {out} --report{' --allow-code' if allow_code else ''}"
+    end = report if whole else "go on with the same command"
     lines = (*shown, f"{len(standing.cells):,} cells: {told}", end)
     answer = {"status": status, "folder": str(out), "cells": len(standing.cells), "ended": counts}
     return Answer(answer, lines, "diverged" if whole and "failed" in counts else status)
