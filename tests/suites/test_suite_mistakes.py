@@ -1,5 +1,7 @@
 """A mistake in a suite file is one sentence with its line, and nothing is started."""
 
+import shutil
+
 import pytest
 from suite_files import CELL
 
@@ -9,6 +11,7 @@ GRID = CELL + "    grid:\n"
 
 
 HOPPER = "  - record: {name: hopper-medium}\n"
+ROBOTS = CELL.replace("data: log.npz", "robots: {}").replace("{windows: 4}", "{{windows: 4}}")
 REWARDED = CELL.replace("spring.yaml", "rewarded.yaml")
 
 
@@ -33,7 +36,16 @@ def changed(old, new):
         (CELL + "    parameters: [body_mass.cat]\n", 8, "unknown parameter of spring.yaml 'body_mass.cat'"),
         (changed("windows: 4", "windows: 2024-05-01"), 7, "windows of least-squares"),
         (changed("400", "2024-05-01"), 6, "expected a budget such as 300000, 300s, 15min or 2h, got '2024-05-01'"),
-        (CELL.replace("    data: log.npz\n", "    robots: a**b/*\n"), 4, "a**b/*"),
+        (ROBOTS.format("a**b/*"), 4, "a**b/*"),
+        (GRID + "      robots: [log.npz, other.npz]\n", 9, "robots: stands beside grid:, not in it"),
+        (GRID + "      grid: {seed: 0..2}\n", 9, "grid: stands beside grid:, not in it"),
+        (CELL + "    seed: 0..3\n", 8, "in seed, got '0..3'; ranges and lists of values go under grid:"),
+        (CELL + "    seed: [0, 1]\n", 8, "in seed, got [0, 1]; ranges and lists of values go under grid:"),
+        (HOPPER + "    learn: [sac, bc]\n", 4, "got ['sac', 'bc']; ranges and lists of values go under grid:"),
+        (changed("log.npz", ""), 4, "expected a path or a list of paths in data, got nothing"),
+        (changed("log.npz", "{a: 1}"), 4, "expected a path or a list of paths in data, got keys and values"),
+        (CELL + "    parameters: 3\n", 8, "expected a name or a list of names in parameters, got 3"),
+        (ROBOTS.format("[log.npz, same/log.npz]"), 3, "within this entry; the logs of log.npz and same are equal"),
         (GRID + f"      seed: 0..{'9' * 5000}\n", 9, "expected a list of values or a range as 0..4 for seed"),
         (GRID + "      seed: []\n", 9, "at least one value for seed, got an empty list"),
         (GRID + "      seed: 3..1\n", 9, "ends before it begins"),
@@ -70,6 +82,8 @@ def changed(old, new):
 def test_a_mistake_is_one_sentence_with_its_line(suite, place, capsys, text, line, sentence):
     (place / "strange.json").write_text('{"gravty": -9.81}')
     (place / "a.hdf5").write_bytes(b"")
+    (place / "same").mkdir()
+    shutil.copy(place / "log.npz", place / "same" / "log.npz")
     goals = 'reward: -abs(place)\ngoals: [{name: wanted, drawn: "uniform(-1, 1)"}]\n'
     (place / "rewarded.yaml").write_text((place / "spring.yaml").read_text() + goals)
     assert main(["suite", str(suite(text)), "--out", str(place / "out")]) == 2

@@ -17,7 +17,8 @@ from madoc.robots.validation import Part, refused_with_line
 GRID, ROBOTS, DATA = "grid", "robots", "data"
 """Keys of an entry that are no options: values to multiply out, and logs of several robots of one kind."""
 
-_RANGE = re.compile(r"\s*(-?\d{1,18})\s*\.\.\s*(-?\d{1,18})?\s*")
+RANGE = re.compile(r"\s*(-?\d{1,18})\s*\.\.\s*(-?\d{1,18})?\s*")
+"""Whole numbers from the first to the last, as `0..4`."""
 _LARGEST = 1_000_000
 """Largest number of combinations of one entry."""
 
@@ -87,6 +88,8 @@ def _of_entry(index: int, entry: dict[str, object], document: Document, folder: 
     grid = entry.pop(GRID, {})
     if not isinstance(grid, dict):
         raise document.error((*at, GRID), "expected keys with lists of values in grid, as `seed: 0..4`")
+    if nested := next((key for key in (ROBOTS, GRID) if key in grid), None):
+        raise document.error((*at, GRID, nested), f"{nested}: stands beside grid:, not in it")
     robots = _robots(entry.pop(ROBOTS), document, (*at, ROBOTS), folder) if ROBOTS in entry else {}
     if robots and (DATA in entry or DATA in grid):
         raise document.error((*at, ROBOTS), "robots: and data: both name logs; keep one")
@@ -116,7 +119,7 @@ def _of_entry(index: int, entry: dict[str, object], document: Document, folder: 
 
 def _values(key: str, values: object, document: Document, place: Place) -> list[object]:
     """The values of one key of a grid: a list, or a range of whole numbers as `0..4`, both ends included."""
-    if isinstance(values, str) and (ends := _RANGE.fullmatch(values)):
+    if isinstance(values, str) and (ends := RANGE.fullmatch(values)):
         first = int(ends[1])
         if ends[2] is None:
             raise document.error(place, f"the range {values} of {key} has no end; write both, as {first}..{first + 4}")

@@ -70,7 +70,9 @@ class _Planner:
         line = self.document.line(asked.places[""])
         if cell.name in self._lines:
             what = "within this entry" if self._lines[cell.name] == line else f"on line {self._lines[cell.name]}"
-            raise self.document.error(asked.places[""], f"two cells ask for exactly the same: this one and one {what}")
+            which = f"; the logs of {cell.robot} and {asked.robot} are equal" if cell.robot and asked.robot else ""
+            sentence = f"two cells ask for exactly the same: this one and one {what}{which}"
+            raise self.document.error(asked.places[""], sentence)
         self._lines[cell.name] = line
         self.cells[cell.name] = replace(cell, wanted=True)
 
