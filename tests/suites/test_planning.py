@@ -87,6 +87,7 @@ def test_stages_that_several_cells_need_are_there_once(suite):
     by_name = {cell.name: position for position, cell in enumerate(cells)}
     assert all(by_name[cell.needs] < by_name[cell.name] for cell in cells if cell.needs)
     assert {cell.read().seed for cell in cells if cell.kind == "learn"} == {0, 1}  # that of the calibration
+    assert all(checks.name_of(cell.kind, cell.read(), cell.needs) == cell.name for cell in cells)
 
 
 def test_robots_are_named_by_what_tells_their_paths_apart(suite, place):

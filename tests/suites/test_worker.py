@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import threading
 from dataclasses import replace
 
@@ -55,6 +56,24 @@ def test_a_user_without_a_name_takes_a_core(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: taken.append(cores))
     assert process.take_core() == 2
     assert taken == [{2}]
+
+
+@pytest.mark.parametrize("change", ["a range", "a mistake", "another log", "no log"])
+def test_what_has_changed_since_it_was_planned_stands_under_no_old_name(planned, place, change):
+    out, (cell,) = planned(CELL)
+    spec = (place / "spring.yaml").read_text()
+    match change:
+        case "a range":
+            (place / "spring.yaml").write_text(spec.replace("high: ", "high: 1"))
+        case "a mistake":
+            (place / "spring.yaml").write_text(spec.replace("high: ", "hgih: "))
+        case "another log":
+            shutil.copy(place / "other.npz", place / "log.npz")
+        case "no log":
+            (place / "log.npz").unlink()
+    assert [outcome.status for outcome in work(out)] == ["failed"]
+    assert outcome_of(cell, out).sentence.startswith("since this cell was planned a file that it names has changed")
+    assert not (cell.folder(out) / "spec.json").exists()
 
 
 def test_only_one_of_two_claims_gets_a_cell(planned):

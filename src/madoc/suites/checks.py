@@ -30,8 +30,8 @@ from madoc.pipeline.refusals import check_order, check_search, method_of
 from madoc.policies import LEARNERS, require_reward
 from madoc.runs.budget import read_budget
 from madoc.runs.files import read_json
-from madoc.suites.cells import hashed
-from madoc.suites.options import Misfit
+from madoc.suites.cells import Kind, hashed
+from madoc.suites.options import Misfit, Order, stored
 from madoc.tasks import TASKS, Task
 
 
@@ -163,6 +163,31 @@ def _check_truth(truth: Path | None, calibration: CalibrationOrder, allow_code: 
         search = calibration.search
         with under("truth"):
             _truth(truth, calibration.task, search.physics, search.parameters, allow_code)
+
+
+def name_of(kind: Kind, order: Order, needs: str | None, *, allow_code: bool = False) -> str:
+    """The name of the cell of an order: a hash of what that asks, and of the content of the files that it names.
+
+    Raises:
+        MadocError: A file cannot be read.
+        NotAllowed: A spec names a Python file, and `allow_code` is not given.
+    """
+    told = stored(order)
+    if isinstance(order, CalibrationOrder):
+        told["task"] = content_of_robot(order.task, allow_code=allow_code)
+        own = order.task not in TASKS
+        logs = [needs] if needs else [content_of_log(path, own=own) for path in order.source.paths]
+        told["source"] = {key: value for key, value in told["source"].items() if key != "paths"} | {"logs": logs}
+    truth = getattr(order, "truth", None)
+    if truth is not None:
+        told["truth"] = content_of_file(str(truth))
+    return hashed(kind, told, needs)
+
+
+def forget_contents() -> None:
+    """Read the files that cells name anew from here on, as they may have changed."""
+    for content in (content_of_robot, content_of_log, content_of_file):
+        content.cache_clear()
 
 
 @cache
