@@ -101,6 +101,7 @@ def test_a_mistake_is_one_sentence_with_its_line(suite, place, capsys, text, lin
         ("--workers -1", "at least 1 worker"),
         ("--workers 0 --executor ray", "at least 1 worker"),
         ("--address auto", "add --executor ray"),
+        ("--executor ray --address auto --workers 2", "--workers is of a cluster that madoc starts"),
         ("--dry-run --report", "choose one"),
         ("--parquet", "add --report"),
     ],

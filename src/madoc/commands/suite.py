@@ -66,6 +66,11 @@ class Suite:
             raise MadocError(f"expected at least 1 worker, or 0 to leave them to madoc worker, got {self.workers}")
         if self.address is not None and self.executor != "ray":
             raise MadocError(f"--address {self.address} names a Ray cluster; add --executor ray")
+        if self.address is not None and self.workers is not None:
+            raise MadocError(
+                "--workers is of a cluster that madoc starts; the one at --address does as many cells as it has CPUs; "
+                "leave --workers out"
+            )
         if self.dry_run and self.report:
             raise MadocError("--dry-run says what will be done, --report what was done; choose one")
         if self.parquet and not self.report:

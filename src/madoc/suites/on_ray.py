@@ -21,6 +21,7 @@ from madoc.runs.interruption import interruptible
 from madoc.runs.progress import display
 from madoc.suites.cells import Cell
 from madoc.suites.claims import MOST_ATTEMPTS
+from madoc.suites.local import usual_workers
 from madoc.suites.standing import Standing
 
 if TYPE_CHECKING:
@@ -166,7 +167,7 @@ def _cluster(workers: int | None, address: str | None) -> Iterator["ModuleType"]
         common: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR, "configure_logging": False}
         if address is None:
             common |= {
-                "num_cpus": workers or len(os.sched_getaffinity(0)),
+                "num_cpus": workers or usual_workers(),
                 "include_dashboard": False,
                 "_node_ip_address": "127.0.0.1",  # nobody outside this machine is spoken to
                 "object_store_memory": _OBJECT_STORE,
