@@ -10,7 +10,7 @@ from suite_files import CELL
 from madoc.errors import MadocError, NotAllowed
 from madoc.suites import process, stages
 from madoc.suites.cells import write_plan
-from madoc.suites.claims import MOST_ATTEMPTS, claimed, outcome_of, try_again
+from madoc.suites.claims import MOST_ATTEMPTS, attempts_of, claimed, outcome_of, try_again
 from madoc.suites.planning import plan_of
 from madoc.suites.standing import Standing
 from madoc.suites.worker import work
@@ -167,6 +167,7 @@ def test_a_worker_leaves_code_to_those_that_are_allowed_to_run_it(planned, place
     with pytest.raises(NotAllowed, match="pass --allow-code"):
         work(out)
     assert outcome_of(cell, out) is None
+    assert attempts_of(cell, out) == 0
     assert outcome_of(plain, out).usable  # what needs no code is done all the same
     assert [outcome.status for outcome in work(out, allow_code=True)] == ["finished"]
 

@@ -120,7 +120,7 @@ def _spec(order: RunOrder, machine: Machine, out: Path) -> dict[str, object]:
     if order.policy_at != "calibrated" and not LEARNERS[order.learner].needs_parameters:
         raise MadocError(f"{order.learner} does not learn at given parameters; leave out --policy-at {order.policy_at}")
     require_no_goals(machine.task, order.learner)
-    require_velocities(order.learner, order.reading.disturbance, order.name)
+    require_velocities(order.learner, order.reading.disturbance, f"the data of {order.name}")
     if order.policy_budget is not None:
         read_budget(order.policy_budget, entry_of(learner, LEARNERS).unit)
     resolved = {

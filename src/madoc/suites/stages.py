@@ -34,6 +34,7 @@ def carry_out(claim: Claim, suite: Path, *, allow_code: bool = False) -> Outcome
     try:
         status, sentence = _done(claim, suite, allow_code=allow_code)
     except NotAllowed:
+        claim.take_back()
         raise  # another worker may be allowed to
     except MadocError as error:
         # A full disk, or a file that is gone or changed, is no refusal: the same order may go through another time.
