@@ -14,6 +14,7 @@ from ruamel.yaml import YAML
 
 from madoc import robots
 from madoc.commands.main import main
+from madoc.parameters import FIELDS
 from madoc.robots.document import yaml_text
 from madoc.suites.planning import plan_of
 
@@ -111,6 +112,12 @@ def load_spec(block):
 
 
 RUN = {"shell": run_shell, "python": run_python, "yaml": load_yaml}
+
+
+def test_every_field_of_a_parameter_is_explained():
+    page = (DOCS / "how-to" / "own-robot.md").read_text()
+    first_columns = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    assert set(FIELDS) <= {name for column in first_columns for name in re.findall("`(.*?)`", column)}
 
 
 def test_measured_tables_are_there():

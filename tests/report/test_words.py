@@ -46,6 +46,7 @@ def test_counts_keep_thousands_apart():
         ("gravity", "gravity"),
         ("body_mass.torso", "torso mass"),
         ("dof_damping.left+right", "left+right damping"),
+        ("dof_drag.knee", "knee drag"),
         ("knee_damping", "knee damping"),
         ("site_size.tip", "tip site size"),
     ],

@@ -27,8 +27,8 @@ def test_a_task_does_its_cell_and_no_other_and_says_when_another_process_has_it(
     write_plan(place / "out", "suite", cells)
     with claimed(cells[1], place / "out"):
         monkeypatch.setattr(on_ray.time, "sleep", lambda seconds: None)
-        assert on_ray.do_cell(str(place / "out"), cells[1].name) == ""
-    assert on_ray.do_cell(str(place / "out"), cells[0].name) == "finished"
+        assert on_ray.do_cell(str(place / "out"), cells[1].name, "suite") == ""
+    assert on_ray.do_cell(str(place / "out"), cells[0].name, "suite") == "finished"
     assert outcome_of(cells[1], place / "out") is None
 
 

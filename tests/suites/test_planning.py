@@ -4,6 +4,7 @@ import pytest
 from suite_files import CELL
 
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
+from madoc.suites import checks
 from madoc.suites.cells import read_plans, write_plan
 from madoc.suites.options import keys_of
 from madoc.suites.planning import plan_of
@@ -41,11 +42,39 @@ def test_a_cell_is_named_by_what_its_files_hold_and_not_by_where_they_are(suite,
     assert names(moved / "suite.yaml") == [before]
     shutil.copy(place / "other.npz", moved / "log.npz")  # another log under the same name
     # What was read is remembered for as long as a process plans: a file does not change while it does.
-    from madoc.suites import checks
-
     checks.content_of_file.cache_clear()
     checks.content_of_log.cache_clear()
     assert names(moved / "suite.yaml") != [before]
+
+
+def test_files_that_are_not_read_make_no_other_cell(suite, place):
+    (place / "logs").mkdir()
+    (place / "log.npz").rename(place / "logs" / "log.npz")
+    text = CELL.replace("log.npz", "logs")
+    (before,) = names(suite(text))
+    for name in (".DS_Store", "README.md", "notes.txt", ".trash/log.npz", "out/plans/suite.jsonl", "out/suite.csv"):
+        (place / "logs" / name).parent.mkdir(exist_ok=True, parents=True)
+        (place / "logs" / name).write_text("not a log")
+    (place / "logs" / "out" / "cells").mkdir()
+    checks.content_of_log.cache_clear()
+    assert names(suite(text)) == [before]
+    shutil.copy(place / "other.npz", place / "logs" / "other.npz")
+    checks.content_of_log.cache_clear()
+    assert names(suite(text)) != [before]
+
+
+def test_hidden_files_of_a_folder_are_no_part_of_a_log_of_madocs_robots(tmp_path):
+    (tmp_path / "data.hdf5").write_bytes(b"1")
+    before = checks.content_of_log(str(tmp_path), own=False)
+    (tmp_path / ".DS_Store").write_bytes(b"2")
+    checks.content_of_log.cache_clear()
+    assert checks.content_of_log(str(tmp_path), own=False) == before
+
+
+def test_a_folder_whose_name_is_a_date_is_a_folder(suite, place):
+    (place / "log.npz").rename(place / "2024-05-01")
+    (cell,) = plan_of(suite(CELL.replace("log.npz", "2024-05-01"))).cells
+    assert cell.read().source.paths == (str(place / "2024-05-01"),)
 
 
 def test_stages_that_several_cells_need_are_there_once(suite):
@@ -58,12 +87,16 @@ def test_stages_that_several_cells_need_are_there_once(suite):
     by_name = {cell.name: position for position, cell in enumerate(cells)}
     assert all(by_name[cell.needs] < by_name[cell.name] for cell in cells if cell.needs)
     assert {cell.read().seed for cell in cells if cell.kind == "learn"} == {0, 1}  # that of the calibration
+    assert all(checks.name_of(cell.kind, cell.read(), cell.needs) == cell.name for cell in cells)
 
 
 def test_robots_are_named_by_what_tells_their_paths_apart(suite, place):
     for number in (1, 2):
         (place / "fleet" / f"arm-{number}").mkdir(parents=True)
         shutil.copy(place / ("log.npz", "other.npz")[number - 1], place / "fleet" / f"arm-{number}" / "log.npz")
+    (place / "fleet" / ".DS_Store").write_text("not a robot")
+    folders = plan_of(suite(CELL.replace("data: log.npz", "robots: fleet/*"))).cells
+    assert [cell.robot for cell in folders] == ["arm-1", "arm-2"]
     cells = plan_of(suite(CELL.replace("data: log.npz", "robots: fleet/*/log.npz"))).cells
     assert [cell.robot for cell in cells] == ["arm-1", "arm-2"]
     assert all(cell.read().source.paths[0].endswith(f"{cell.robot}/log.npz") for cell in cells)

@@ -7,6 +7,7 @@ import pytest
 from suite_files import CELL
 
 from madoc.commands.main import main
+from madoc.suites.cells import write_plan
 from madoc.suites.claims import claimed
 from madoc.suites.planning import plan_of
 from madoc.suites.worker import work
@@ -43,15 +44,29 @@ def test_from_plan_to_report(suite, place, capsys):
 
 
 def test_a_suite_starts_its_workers_and_more_seeds_repeat_nothing(suite, place, capsys):
-    file, out = suite(CELL + "    grid: {seed: 0..1}\n"), place / "out"
+    out, (foreign,) = place / "out", plan_of(suite(CELL + "    seed: 9\n", "another.yaml")).cells
+    write_plan(out, "another", [foreign])
+    file = suite(CELL + "    grid: {seed: 0..1}\n")
     code, ended = told(capsys, "suite", file, "--out", out, "--workers", 1, "--quiet")
     assert (code, ended["ended"]) == (0, {"finished": 2})
+    assert not foreign.folder(out).exists()  # a cell of another suite that shares the folder
     before = {path: path.stat().st_mtime_ns for path in out.glob("cells/*/outcome.json")}
     file = suite(CELL + "    grid: {seed: 0..2}\n")
     with claimed(plan_of(file).cells[2], out) as claim:
         claim.end("finished", "done by another", 0.0)
     assert told(capsys, "suite", file, "--out", out, "--quiet")[1]["ended"] == {"finished": 3}
     assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_the_command_for_the_report_may_run_code_where_the_suite_may(suite, place, capsys):
+    file, out = suite(CELL), place / "out"
+    with claimed(plan_of(file).cells[0], out) as claim:
+        claim.end("finished", "done by another", 0.0)
+    words = ["suite", str(file), "--out", str(out)]
+    assert main(words) == 0
+    assert f"report: madoc suite {file} --out {out} --report\n" in capsys.readouterr().out
+    assert main([*words, "--allow-code"]) == 0
+    assert f"report: madoc suite {file} --out {out} --report --allow-code\n" in capsys.readouterr().out
 
 
 def test_a_worker_needs_a_plan(place, capsys, monkeypatch):

@@ -1,4 +1,6 @@
 import json
+import os
+import shutil
 import threading
 from dataclasses import replace
 
@@ -6,9 +8,9 @@ import pytest
 from suite_files import CELL
 
 from madoc.errors import MadocError, NotAllowed
-from madoc.suites import stages
+from madoc.suites import process, stages
 from madoc.suites.cells import write_plan
-from madoc.suites.claims import MOST_ATTEMPTS, claimed, outcome_of, try_again
+from madoc.suites.claims import MOST_ATTEMPTS, attempts_of, claimed, outcome_of, try_again
 from madoc.suites.planning import plan_of
 from madoc.suites.standing import Standing
 from madoc.suites.worker import work
@@ -40,6 +42,38 @@ def test_a_refusal_is_kept_with_its_sentence_and_others_go_on(planned):
     assert [outcome.status for outcome in work(out)] == ["refused", "finished"]
     assert "velocities" in outcome_of(refused, out).sentence
     assert outcome_of(done, out).usable
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system knows no affinity")
+def test_a_user_without_a_name_takes_a_core(tmp_path, monkeypatch):
+    taken = []
+    monkeypatch.setattr(process, "_held", [])
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    for name in ("LOGNAME", "USER", "LNAME", "USERNAME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3})
+    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: taken.append(cores))
+    assert process.take_core() == 2
+    assert taken == [{2}]
+
+
+@pytest.mark.parametrize("change", ["a range", "a mistake", "another log", "no log"])
+def test_what_has_changed_since_it_was_planned_stands_under_no_old_name(planned, place, change):
+    out, (cell,) = planned(CELL)
+    spec = (place / "spring.yaml").read_text()
+    match change:
+        case "a range":
+            (place / "spring.yaml").write_text(spec.replace("high: ", "high: 1"))
+        case "a mistake":
+            (place / "spring.yaml").write_text(spec.replace("high: ", "hgih: "))
+        case "another log":
+            shutil.copy(place / "other.npz", place / "log.npz")
+        case "no log":
+            (place / "log.npz").unlink()
+    assert [outcome.status for outcome in work(out)] == ["failed"]
+    assert outcome_of(cell, out).sentence.startswith("since this cell was planned a file that it names has changed")
+    assert not (cell.folder(out) / "spec.json").exists()
 
 
 def test_only_one_of_two_claims_gets_a_cell(planned):
@@ -122,13 +156,27 @@ def test_blocked_cells_wait_and_vain_ones_are_left(planned):
 
 
 def test_a_worker_leaves_code_to_those_that_are_allowed_to_run_it(planned, place):
+    (place / "plain.yaml").write_text((place / "spring.yaml").read_text())
     with (place / "spring.yaml").open("a") as spec:
         spec.write("python: task.py\n")
     (place / "task.py").write_text("def reward(place): return -abs(place)\n")
     with pytest.raises(MadocError, match=r"the spec names the Python file task.py"):
         planned(CELL)
-    out, (cell,) = planned(CELL, allow_code=True)
+    other = CELL.replace("spring.yaml", "plain.yaml")
+    out, (cell, plain) = planned(CELL + other, allow_code=True)
     with pytest.raises(NotAllowed, match="pass --allow-code"):
         work(out)
     assert outcome_of(cell, out) is None
+    assert attempts_of(cell, out) == 0
+    assert outcome_of(plain, out).usable  # what needs no code is done all the same
     assert [outcome.status for outcome in work(out, allow_code=True)] == ["finished"]
+
+
+def test_a_worker_of_one_plan_leaves_the_cells_of_the_others(planned, place, monkeypatch):
+    out, (first, second) = planned(CELL + "    grid: {seed: 0..1}\n")
+    write_plan(out, "another", [second])
+    monkeypatch.setattr("madoc.suites.worker.carry_out", lambda claim, *_, **__: claim.end("finished", "done", 0.0))
+    assert len(work(out, plan="another")) == 1
+    assert outcome_of(first, out) is None
+    with pytest.raises(MadocError, match=r"unknown plan of .* 'anothr'; did you mean another"):
+        work(out, plan="anothr")

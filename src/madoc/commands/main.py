@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import re
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -50,6 +51,8 @@ Commands = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line; its exit code. A user's mistake is one sentence on standard error and code 2."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal that lacks a letter shows its number instead
+        sys.stdout.reconfigure(errors="backslashreplace")
     code = 0
     try:
         command = _parse(sys.argv[1:] if arguments is None else list(arguments))
@@ -64,6 +67,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_CODES["interrupted"]
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more is written, not even at exit
+    except RuntimeError as error:
+        if "home directory" not in str(error):  # what pathlib says of ~ and an unknown user
+            raise
+        return _refused("a path begins with ~ and the name of no user of this machine; write the folder out")
     except OSError as error:  # a full disk, a folder that may not be written to, a name that is too long
         where = "" if error.filename is None else f" at {error.filename!r:.200}"
         reason = error.strerror or str(error)
@@ -102,6 +109,7 @@ def _parse(arguments: Sequence[str]) -> Command:
 
 def _one_sentence(box: str) -> str:
     """A box drawn by tyro as one sentence: its first paragraph, a suggestion if any, and where to read on."""
+    box = re.sub("-{10,}", "─" * 10, box)  # the rule between paragraphs where the terminal has ASCII alone
     lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:-1]]
     paragraphs = [" ".join(text.split()) for text in "\n".join(lines).split("─" * 10) if text.strip("─\n ")]
     paragraphs = [text.strip("─ ") for text in paragraphs]
@@ -129,7 +137,8 @@ def _calm() -> Iterator[None]:
 def _print(answer: Answer, *, as_json: bool) -> None:
     """Print an answer on standard output."""
     if as_json:
-        print(json_text(dict(answer.json), what="the answer"), flush=True)
+        ascii_only = (sys.stdout.encoding or "utf-8").lower() not in ("utf-8", "utf8")
+        print(json_text(dict(answer.json), what="the answer", ascii_only=ascii_only), flush=True)
         return
     from rich.console import Console
 

@@ -31,7 +31,7 @@ class Init:
         from madoc import robots
         from madoc.robots.init import write_spec
 
-        out = self.out or self.model.with_suffix(".yaml")
+        out = self.out or self.model.parent / f"{self.model.stem or 'robot'}.yaml"
         write_spec(self.model, out)
         robot = robots.load(out)
         counts = {

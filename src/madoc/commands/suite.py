@@ -66,6 +66,11 @@ class Suite:
             raise MadocError(f"expected at least 1 worker, or 0 to leave them to madoc worker, got {self.workers}")
         if self.address is not None and self.executor != "ray":
             raise MadocError(f"--address {self.address} names a Ray cluster; add --executor ray")
+        if self.address is not None and self.workers is not None:
+            raise MadocError(
+                "--workers is of a cluster that madoc starts; the one at --address does as many cells as it has CPUs; "
+                "leave --workers out"
+            )
         if self.dry_run and self.report:
             raise MadocError("--dry-run says what will be done, --report what was done; choose one")
         if self.parquet and not self.report:
@@ -88,10 +93,10 @@ class Suite:
         if self.executor == "ray":
             from madoc.suites.on_ray import run_on_ray
 
-            whole = run_on_ray(out, standing, workers=self.workers, address=self.address, **options)
+            whole = run_on_ray(out, standing, plan=plan.name, workers=self.workers, address=self.address, **options)
         else:
-            whole = run_locally(out, standing, workers=workers, **options)
-        return _told(standing, plan, out, whole=whole)
+            whole = run_locally(out, standing, plan=plan.name, workers=workers, **options)
+        return _told(standing, plan, out, whole=whole, allow_code=self.permission.allow_code)
 
     def _reported(self, plan: "Plan", standing: "Standing", out: Path) -> Answer:
         """Leave the page and the tables."""
@@ -121,7 +126,7 @@ def _listed(standing: "Standing", out: Path, workers: int) -> Answer:
     return Answer(answer, (*lines(listed), told.sentence(workers)))
 
 
-def _told(standing: "Standing", plan: "Plan", out: Path, *, whole: bool) -> Answer:
+def _told(standing: "Standing", plan: "Plan", out: Path, *, whole: bool, allow_code: bool) -> Answer:
     """How the suite ended."""
     counts = dict(standing.counts)
     status = "finished" if whole else "interrupted"
@@ -132,7 +137,8 @@ def _told(standing: "Standing", plan: "Plan", out: Path, *, whole: bool) -> Answ
     )
     shown = reasons[:10] + ((f"and {len(reasons) - 10} more",) if len(reasons) > 10 else ())
     told = ", ".join(f"{count:,} {name}" for name, count in counts.items())
-    end = f"report: madoc suite {plan.file} --out {out} --report" if whole else "go on with the same command"
+    report = f"report: madoc suite {plan.file} --out {out} --report{' --allow-code' if allow_code else ''}"
+    end = report if whole else "go on with the same command"
     lines = (*shown, f"{len(standing.cells):,} cells: {told}", end)
     answer = {"status": status, "folder": str(out), "cells": len(standing.cells), "ended": counts}
     return Answer(answer, lines, "diverged" if whole and "failed" in counts else status)

@@ -25,6 +25,8 @@ class Worker:
 
     folder: Annotated[Positional[Path], arg(metavar="SUITE")]
     """The folder of a suite, as `madoc suite` names it."""
+    plan: str | None = None
+    """Do only the cells of this plan: the name of a suite file, without .yaml. Default: of all in the folder."""
     attached: bool = False
     """Stop when standard input closes, as it does when the process that started this one ends."""
     permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
@@ -39,7 +41,7 @@ class Worker:
         prepare(self.folder)
         from madoc.suites.worker import work  # computes numbers, on the core that was taken
 
-        done = work(self.folder, allow_code=self.permission.allow_code)
+        done = work(self.folder, plan=self.plan, allow_code=self.permission.allow_code)
         if done is None:
             return Answer({"status": "interrupted"}, ("interrupted; the next worker goes on",), "interrupted")
         counts = Counter(outcome.status for outcome in done)

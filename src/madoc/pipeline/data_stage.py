@@ -78,7 +78,7 @@ class Machine:
                 raise unknown_name(f"parameter of {self.task.name} in the truth", name, known)
         missing = [name for name in calibrated.parameters.names if name not in truth]
         if missing:
-            raise MadocError(f"the truth has no value for {missing[0]}; add it, or leave it out of --parameters")
+            raise MadocError(f"the truth has no value for {missing[0]}; add it, or do not calibrate that")
 
     def stored(self) -> dict[str, object]:
         """The entry of a user's own robot in `spec.json`, from which it is restored; nothing for one of Madoc's."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from madoc import simulation
 from madoc.data import Dataset
+from madoc.data.disturbance import Disturbance
 from madoc.errors import MadocError, unknown_name
 from madoc.parameters import ParameterDistribution
 from madoc.pipeline.calibrated import Calibrated
@@ -95,6 +96,14 @@ def require_no_goals(task: Task, method: str) -> None:
         )
 
 
+def require_velocities(method: str, disturbance: Disturbance, log: str) -> None:
+    """Raise MadocError for a learner that learns from logged data where the velocities of that are hidden."""
+    if disturbance.hidden_velocities and LEARNERS[method].needs_data:
+        raise MadocError(
+            f"{method} learns from whole observations, and {log} hides velocities; take a method that needs no data"
+        )
+
+
 def _logged(calibrated: Calibrated, method: str) -> Dataset:
     """The data of a calibration, for a learner that learns from it."""
     if calibrated.source is None:
@@ -103,11 +112,7 @@ def _logged(calibrated: Calibrated, method: str) -> Dataset:
             "give it the run folder of the calibration"
         )
     dataset = load_source(calibrated.source, calibrated.machine, seed=calibrated.result.seed)
-    if dataset.disturbance.hidden_velocities:
-        raise MadocError(
-            f"{method} learns from whole observations, and {dataset.origin} hides velocities; "
-            "take a method that needs no data"
-        )
+    require_velocities(method, dataset.disturbance, dataset.origin)
     return dataset
 
 

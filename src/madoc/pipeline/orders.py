@@ -55,7 +55,7 @@ class Source:
     reading: Annotated[Reading, arg(name="")] = field(default_factory=Reading)
 
     def __post_init__(self) -> None:
-        if not self.paths:
+        if not self.paths or not all(self.paths):
             raise MadocError("expected the log after --data, got nothing; name a file or a folder")
 
     def absolute(self) -> "Source":

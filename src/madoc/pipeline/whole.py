@@ -12,7 +12,7 @@ from madoc.pipeline.data_stage import Machine, load_source, read_truth, record_n
 from madoc.pipeline.evaluation_stage import evaluate_folder
 from madoc.pipeline.export_stage import export_run
 from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
-from madoc.pipeline.learning_stage import learn_in, require_no_goals
+from madoc.pipeline.learning_stage import learn_in, require_no_goals, require_velocities
 from madoc.pipeline.methods import hyperparameters, make_method
 from madoc.pipeline.orders import (
     CalibrationOrder,
@@ -25,7 +25,7 @@ from madoc.pipeline.orders import (
     Source,
     parse_settings,
 )
-from madoc.pipeline.refusals import check_order
+from madoc.pipeline.refusals import check_order, check_search
 from madoc.policies import LEARNERS, require_reward
 from madoc.report.records import Summary, read_object, read_record
 from madoc.robots import is_spec_path
@@ -109,15 +109,23 @@ def _spec(order: RunOrder, machine: Machine, out: Path) -> dict[str, object]:
             raise MadocError(f"expected at least 1 {what}, got {value}")
     asked = _calibration_order(order, Source(order.data or (order.name,)))
     check_order(asked, out)
+    check_search(order.search, machine.task, order.name)
+    truth = read_truth(order.truth)
+    if truth is not None:
+        calibrated = order.search.parameters or machine.task.parameters.names
+        machine.check_truth(truth, machine.task.with_parameters(list(calibrated)))
     if order.policy_at != "distribution" and order.drawing != Drawing():
         raise MadocError("--policy.share and --policy.width are of --policy-at distribution; leave them out, or add it")
     learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
+    if order.policy_at != "calibrated" and not LEARNERS[order.learner].needs_parameters:
+        raise MadocError(f"{order.learner} does not learn at given parameters; leave out --policy-at {order.policy_at}")
     require_no_goals(machine.task, order.learner)
+    require_velocities(order.learner, order.reading.disturbance, f"the data of {order.name}")
     if order.policy_budget is not None:
         read_budget(order.policy_budget, entry_of(learner, LEARNERS).unit)
     resolved = {
         "command": "run",
-        "truth": read_truth(order.truth),
+        "truth": truth,
         "hyperparameters": {name: hyperparameters(method) for name, method in methods_for(asked).items()},
         "policy_hyperparameters": hyperparameters(learner),
     }

@@ -17,8 +17,8 @@ TONES = {
 _FIELD_WORDS = {
     "body_mass": "mass",
     "body_mass_and_inertia": "mass, inertia",
-    "body_length": "length",
     "dof_damping": "damping",
+    "dof_drag": "drag",
     "dof_armature": "armature",
     "dof_frictionloss": "dry friction",
     "jnt_stiffness": "stiffness",

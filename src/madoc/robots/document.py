@@ -138,3 +138,7 @@ class _Constructor(RoundTripConstructor):
         else:
             return True
         raise _Refusal(problem=problem, problem_mark=key_node.start_mark)
+
+
+# A date in a file, as the name of a folder of logs may be one, is text like any other word.
+_Constructor.add_constructor("tag:yaml.org,2002:timestamp", RoundTripConstructor.construct_yaml_str)

@@ -85,7 +85,7 @@ def mistake(detail: ErrorDetails, place: Place, known: list[str]) -> str:
     expected = _WORDS.get(kind, expected)
     if kind == "string_pattern_mismatch" and place == ("name",):
         expected = "a name of letters, digits, _ . and -"
-    return f"expected {expected} in {what}, got {_shown(got)}"
+    return f"expected {expected} in {what}, got {shown(got)}"
 
 
 def _keys(part: type) -> list[str]:
@@ -100,7 +100,8 @@ def _place(detail: ErrorDetails) -> Place:
     return tuple(part for part in detail["loc"] if part != "[key]")
 
 
-def _shown(value: object) -> str:
+def shown(value: object) -> str:
+    """A value of a file in a sentence."""
     if isinstance(value, dict):
         return "keys and values"
     if value is None or value == []:

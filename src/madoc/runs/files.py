@@ -53,14 +53,14 @@ def write_json(path: Path, value: object) -> None:
         stream.write(content.encode())
 
 
-def json_text(value: object, *, what: str, indent: int | None = None) -> str:
-    """Strict JSON on one line, or indented.
+def json_text(value: object, *, what: str, indent: int | None = None, ascii_only: bool = False) -> str:
+    """Strict JSON on one line, or indented; with `ascii_only` other letters are written as numbers.
 
     Raises:
         MadocError: JSON cannot express `value`; the sentence names the place inside `what`.
     """
     try:
-        return json.dumps(value, allow_nan=False, indent=indent, ensure_ascii=False)
+        return json.dumps(value, allow_nan=False, indent=indent, ensure_ascii=ascii_only)
     except (TypeError, ValueError) as error:
         place = _unwritable(value, what) or f"{what}: {error}"
         raise MadocError(f"cannot write as JSON: {place}") from error

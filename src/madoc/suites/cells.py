@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
 from madoc.runs.files import replacing
 from madoc.suites.options import Order, adapter
@@ -83,15 +83,24 @@ def write_plan(suite: Path, name: str, cells: Iterable[Cell]) -> None:
             stream.write(json.dumps(cell.to_json(), ensure_ascii=False).encode() + b"\n")
 
 
-def read_plans(suite: Path) -> list[Cell]:
-    """The cells of all plans in a suite's folder, each once, in their order.
+def read_plans(suite: Path, name: str | None = None) -> list[Cell]:
+    """The cells of the plans in a suite's folder, each once, in their order.
+
+    Args:
+        suite: The folder of the suite.
+        name: Only the cells of this plan. Default: of all.
 
     Raises:
-        MadocError: There is no plan, or one is damaged.
+        MadocError: There is no plan, or none of that name, or one is damaged.
     """
     files = sorted((suite / "plans").glob("*.jsonl"))
     if not files:
         raise MadocError(f"there is no plan of a suite in {suite}; make one with: madoc suite SUITE.yaml --out {suite}")
+    if name is not None:
+        names = [file.stem for file in files]
+        if name not in names:
+            raise unknown_name(f"plan of {suite}", name, names)
+        files = [file for file in files if file.stem == name]
     cells: dict[str, Cell] = {}
     for file in files:
         for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):

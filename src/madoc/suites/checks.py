@@ -6,17 +6,19 @@ Each answer is kept, so that ten thousand cells of one robot and one method cost
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from madoc import robots
 from madoc.calibration import CALIBRATORS
-from madoc.errors import MadocError
+from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.keys import check_seed
 from madoc.pipeline.methods import candidates_for, make_method
 from madoc.pipeline.orders import (
     AUTO,
     CalibrationOrder,
+    Drawing,
     EvaluationOrder,
     PolicyOrder,
     RecordOrder,
@@ -28,8 +30,8 @@ from madoc.pipeline.refusals import check_order, check_search, method_of
 from madoc.policies import LEARNERS, require_reward
 from madoc.runs.budget import read_budget
 from madoc.runs.files import read_json
-from madoc.suites.cells import hashed
-from madoc.suites.options import Misfit
+from madoc.suites.cells import Kind, hashed
+from madoc.suites.options import Misfit, Order, stored
 from madoc.tasks import TASKS, Task
 
 
@@ -64,19 +66,36 @@ def check_calibration(order: CalibrationOrder, *, recorded: bool, allow_code: bo
         check_seed(search.seed)
     with under("holdout" if order.holdout is not None and not 0 < order.holdout < 1 else "budget"):
         check_order(order)
+    with under("format"):
+        _check_format(order.source.reading.format)
+    with under("max_transitions"):
+        rows = order.source.max_transitions
+        if rows is not None and rows < 1:
+            raise MadocError(f"expected at least 1 transition to keep, got {rows}")
     if not recorded:
         with under("data"):
             for path in order.source.paths:
                 content_of_log(path, own=task.source is not None)
-    _check_truth(order)
+    _check_truth(order.truth, order, allow_code)
 
 
-def check_policy(order: PolicyOrder, search: Search, task: str, *, allow_code: bool = False) -> None:
+def check_policy(
+    order: PolicyOrder, calibration: CalibrationOrder, recording: RecordOrder | None = None, *, allow_code: bool = False
+) -> None:
     """Refuse a policy that cannot be learnt of a calibrated robot.
+
+    Args:
+        order: The policy.
+        calibration: The calibration that it needs.
+        recording: What that takes; None where it takes a log.
+        allow_code: Run Python files that specs of robots name.
 
     Raises:
         Misfit: Names the key.
     """
+    from madoc.pipeline.learning_stage import require_no_goals, require_velocities  # reads data formats too
+
+    task = _robot(calibration.task, calibration.search.physics, allow_code)
     with under("method"):
         entry = _learner(order.method, ())
     with under("set"):
@@ -86,11 +105,21 @@ def check_policy(order: PolicyOrder, search: Search, task: str, *, allow_code: b
     with under("at"):
         if not entry and order.at != "calibrated":
             raise MadocError(f"{order.method} does not learn at given parameters; leave out at: {order.at}")
+        truths = (order.truth, calibration.truth, recording)
+        if order.at == "truth" and not any(truths) and not _may_tell_truth(calibration.source.paths):
+            raise MadocError("the true parameters are not known here; add truth: FILE.json")
+    with under("share" if order.drawing.share != Drawing().share else "width"):
+        if order.at != "distribution" and order.drawing != Drawing():
+            raise MadocError("share: and width: are of at: distribution; leave them out")
     with under(""):
-        require_reward(_robot(task, search.physics, allow_code))
+        require_reward(task)
+    with under("method"):
+        require_no_goals(task, order.method)
+        for disturbance in (calibration.source.reading.disturbance, *((recording.disturbance,) if recording else ())):
+            require_velocities(order.method, disturbance, "the data of this cell")
     with under("seed"):
         check_seed(order.seed)
-    _check_truth(order)
+    _check_truth(order.truth, calibration, allow_code)
 
 
 def check_recording(order: RecordOrder) -> None:
@@ -107,29 +136,58 @@ def check_recording(order: RecordOrder) -> None:
     with under("transitions"):
         if order.transitions < 1:
             raise MadocError(f"expected at least 1 transition, got {order.transitions}")
+    with under("friction"):
+        replace(order.disturbance, friction=order.friction)
     with under("seed"):
         check_seed(order.seed)
 
 
-def check_evaluation(order: EvaluationOrder) -> None:
-    """Refuse an evaluation of no episodes.
+def check_evaluation(order: EvaluationOrder, calibration: CalibrationOrder, *, allow_code: bool = False) -> None:
+    """Refuse an evaluation of no episodes or draws, of a policy for a calibrated robot.
 
     Raises:
         Misfit: Names the key.
     """
-    with under("episodes"):
-        if order.episodes < 1:
-            raise MadocError(f"expected at least 1 episode, got {order.episodes}")
+    for key, what, count in (("episodes", "episode", order.episodes), ("draws", "draw", order.draws)):
+        with under(key):
+            if count < 1:
+                raise MadocError(f"expected at least 1 {what}, got {count}")
     with under("seed"):
         check_seed(order.seed)
-    _check_truth(order)
+    _check_truth(order.truth, calibration, allow_code)
 
 
-def _check_truth(order: CalibrationOrder | PolicyOrder | EvaluationOrder) -> None:
-    """Refuse a file of true parameters that cannot be read."""
-    if order.truth is not None:
+def _check_truth(truth: Path | None, calibration: CalibrationOrder, allow_code: bool) -> None:
+    """Refuse a file of true parameters that cannot be read, or does not fit what is calibrated."""
+    if truth is not None:
+        search = calibration.search
         with under("truth"):
-            content_of_file(str(order.truth))
+            _truth(truth, calibration.task, search.physics, search.parameters, allow_code)
+
+
+def name_of(kind: Kind, order: Order, needs: str | None, *, allow_code: bool = False) -> str:
+    """The name of the cell of an order: a hash of what that asks, and of the content of the files that it names.
+
+    Raises:
+        MadocError: A file cannot be read.
+        NotAllowed: A spec names a Python file, and `allow_code` is not given.
+    """
+    told = stored(order)
+    if isinstance(order, CalibrationOrder):
+        told["task"] = content_of_robot(order.task, allow_code=allow_code)
+        own = order.task not in TASKS
+        logs = [needs] if needs else [content_of_log(path, own=own) for path in order.source.paths]
+        told["source"] = {key: value for key, value in told["source"].items() if key != "paths"} | {"logs": logs}
+    truth = getattr(order, "truth", None)
+    if truth is not None:
+        told["truth"] = content_of_file(str(truth))
+    return hashed(kind, told, needs)
+
+
+def forget_contents() -> None:
+    """Read the files that cells name anew from here on, as they may have changed."""
+    for content in (content_of_robot, content_of_log, content_of_file):
+        content.cache_clear()
 
 
 @cache
@@ -147,7 +205,7 @@ def content_of_log(path: str, *, own: bool) -> str:
     """
     place = Path(path)
     if place.is_dir():
-        files = sorted(file for file in place.rglob("*") if file.is_file())
+        files = _files_of(place, own=own)
         if not files:
             raise MadocError(f"the folder {path} holds no files; name one with logs")
         return hashed([[str(file.relative_to(place)), content_of_file(str(file))] for file in files])
@@ -159,6 +217,16 @@ def content_of_log(path: str, *, own: bool) -> str:
 
     recognise(place)
     return path
+
+
+def _files_of(folder: Path, *, own: bool) -> list[Path]:
+    """The files of a folder of logs that count: no hidden ones, and of a user's own robot those that are read."""
+    if own:
+        from madoc.data.logs import files_of  # reads data formats, which only folders need
+
+        return files_of(folder)
+    visible = (file for file in folder.rglob("*") if not any(p.startswith(".") for p in file.relative_to(folder).parts))
+    return sorted(file for file in visible if file.is_file())
 
 
 @cache
@@ -185,6 +253,33 @@ def _robot(task: str, physics: str | None, allow_code: bool) -> Task:
 @cache
 def _ranges(task: str, physics: str | None, parameters: tuple[str, ...], level: str, allow_code: bool) -> None:
     check_search(Search(parameters=parameters, level=level), _robot(task, physics, allow_code), Path(task).name)
+
+
+@cache
+def _truth(file: Path, task: str, physics: str | None, parameters: tuple[str, ...], allow_code: bool) -> None:
+    from madoc.pipeline.data_stage import Machine, read_truth
+
+    robot = _robot(task, physics, allow_code)
+    values = read_truth(file) or {}
+    Machine(robot).check_truth(values, robot.with_parameters(list(parameters or robot.parameters.names)))
+
+
+@cache
+def _check_format(name: str | None) -> None:
+    if name is None:
+        return
+    from madoc.data.formats import FORMATS
+
+    if name not in FORMATS:
+        raise unknown_name("format", name, FORMATS)
+
+
+@cache
+def _may_tell_truth(paths: tuple[str, ...]) -> bool:
+    """Whether a log may hold the true parameters: only a file that Madoc wrote does."""
+    from madoc.data.native import recognises
+
+    return any(recognises(Path(path)) for path in paths)
 
 
 @cache

@@ -66,6 +66,10 @@ class Claim:
         self.attempts = _futile(folder) + 1
         write_json(folder / _ATTEMPTS, {"count": self.attempts, "logged": _progress(folder)})
 
+    def take_back(self) -> None:
+        """Count this attempt for nothing, as the cell was not begun."""
+        write_json(self.folder / _ATTEMPTS, {"count": self.attempts - 1, "logged": _progress(self.folder)})
+
     def end(self, status: Ending, sentence: str, seconds: float) -> Outcome:
         """Write down how the cell ended."""
         outcome = Outcome(status, sentence, round(seconds, 3), self.attempts, socket.gethostname(), self._fresh)

@@ -17,7 +17,8 @@ from madoc.robots.validation import Part, refused_with_line
 GRID, ROBOTS, DATA = "grid", "robots", "data"
 """Keys of an entry that are no options: values to multiply out, and logs of several robots of one kind."""
 
-_RANGE = re.compile(r"\s*(-?\d+)\s*\.\.\s*(-?\d+)?\s*")
+RANGE = re.compile(r"\s*(-?\d{1,18})\s*\.\.\s*(-?\d{1,18})?\s*")
+"""Whole numbers from the first to the last, as `0..4`."""
 _LARGEST = 1_000_000
 """Largest number of combinations of one entry."""
 
@@ -87,6 +88,8 @@ def _of_entry(index: int, entry: dict[str, object], document: Document, folder: 
     grid = entry.pop(GRID, {})
     if not isinstance(grid, dict):
         raise document.error((*at, GRID), "expected keys with lists of values in grid, as `seed: 0..4`")
+    if nested := next((key for key in (ROBOTS, GRID) if key in grid), None):
+        raise document.error((*at, GRID, nested), f"{nested}: stands beside grid:, not in it")
     robots = _robots(entry.pop(ROBOTS), document, (*at, ROBOTS), folder) if ROBOTS in entry else {}
     if robots and (DATA in entry or DATA in grid):
         raise document.error((*at, ROBOTS), "robots: and data: both name logs; keep one")
@@ -116,7 +119,7 @@ def _of_entry(index: int, entry: dict[str, object], document: Document, folder: 
 
 def _values(key: str, values: object, document: Document, place: Place) -> list[object]:
     """The values of one key of a grid: a list, or a range of whole numbers as `0..4`, both ends included."""
-    if isinstance(values, str) and (ends := _RANGE.fullmatch(values)):
+    if isinstance(values, str) and (ends := RANGE.fullmatch(values)):
         first = int(ends[1])
         if ends[2] is None:
             raise document.error(place, f"the range {values} of {key} has no end; write both, as {first}..{first + 4}")
@@ -141,7 +144,11 @@ def _robots(value: object, document: Document, place: Place, folder: Path) -> di
     found: list[str] = []
     for number, pattern in enumerate(patterns):
         where = (*place, number) if isinstance(value, list) else place
-        logs = _matching(folder, pattern)
+        try:
+            logs = _matching(folder, pattern)
+        except ValueError as error:
+            sentence = f"{pattern} is no pattern of files; ** stands alone between slashes"
+            raise document.error(where, sentence) from error
         if not logs:
             raise document.error(where, f"there is no file or folder {pattern}; each robot's logs are one")
         if twice := next((log for log in logs if log in found), None):
@@ -154,12 +161,13 @@ def _robots(value: object, document: Document, place: Place, folder: Path) -> di
 
 @lru_cache(maxsize=256)
 def _matching(folder: Path, pattern: str) -> list[str]:
-    """The files and folders that a pattern names, in the order of their names."""
+    """The files and folders that a pattern names, in the order of their names; hidden ones only where it says so."""
     path = Path(pattern).expanduser()
     if not any(mark in pattern for mark in "*?["):
         return [pattern] if (folder / path).exists() else []
     base = Path(path.anchor) if path.is_absolute() else folder
-    return sorted(str(match) for match in base.glob(str(path.relative_to(path.anchor))))
+    found = base.glob(str(path.relative_to(path.anchor)))
+    return sorted(str(match) for match in found if path.name.startswith(".") or not match.name.startswith("."))
 
 
 def _names(logs: list[str]) -> list[str]:

@@ -27,13 +27,14 @@ def usual_workers() -> int:
 
 
 def run_locally(
-    suite: Path, standing: Standing, *, workers: int, quiet: bool = False, allow_code: bool = False
+    suite: Path, standing: Standing, *, plan: str, workers: int, quiet: bool = False, allow_code: bool = False
 ) -> bool:
     """Do what is left of a suite with workers of this machine.
 
     Args:
         suite: The folder of the suite, with its plan.
         standing: How far it is.
+        plan: Name of the plan that has its cells.
         workers: Number of processes.
         quiet: Show no progress.
         allow_code: Workers may run the Python files that specs of robots name.
@@ -47,7 +48,7 @@ def run_locally(
     with (
         interruptible() as interruption,
         display(suite.name, unit="cells", quiet=quiet) as show,
-        _crew(suite, min(workers, len(standing.runnable)), allow_code=allow_code) as crew,
+        _crew(suite, plan, min(workers, len(standing.runnable)), allow_code=allow_code) as crew,
     ):
         while standing.runnable:
             show(standing.moment())
@@ -65,8 +66,8 @@ def run_locally(
 class Crew:
     """The processes of some workers; each writes to a log of its own in the suite's folder."""
 
-    def __init__(self, suite: Path, workers: int, *, allow_code: bool = False) -> None:
-        self._suite, self._futile, self._allow_code = suite, 0, allow_code
+    def __init__(self, suite: Path, plan: str, workers: int, *, allow_code: bool = False) -> None:
+        self._suite, self._plan, self._futile, self._allow_code = suite, plan, 0, allow_code
         self._logs = suite / "logs"
         self._logs.mkdir(exist_ok=True)
         self._processes = {number: self._start(number) for number in range(workers)}
@@ -110,6 +111,7 @@ class Crew:
         # Its standard input is our end of a pipe that says nothing: it closes when we end, however that happens.
         # A session of its own keeps Ctrl-C for us alone: we pass it on once.
         words = [sys.executable, "-m", "madoc", "worker", str(self._suite), "--attached", "--quiet"]
+        words += [f"--plan={self._plan}"]
         words += ["--allow-code"] if self._allow_code else []
         with (self._logs / f"worker-{number}.log").open("ab") as log:
             return subprocess.Popen(
@@ -126,9 +128,9 @@ class Crew:
 
 
 @contextmanager
-def _crew(suite: Path, workers: int, *, allow_code: bool) -> Iterator[Crew]:
+def _crew(suite: Path, plan: str, workers: int, *, allow_code: bool) -> Iterator[Crew]:
     """Workers for a block; none is left after it."""
-    crew = Crew(suite, workers, allow_code=allow_code)
+    crew = Crew(suite, plan, workers, allow_code=allow_code)
     try:
         yield crew
     finally:

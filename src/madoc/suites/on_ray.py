@@ -21,6 +21,7 @@ from madoc.runs.interruption import interruptible
 from madoc.runs.progress import display
 from madoc.suites.cells import Cell
 from madoc.suites.claims import MOST_ATTEMPTS
+from madoc.suites.local import usual_workers
 from madoc.suites.standing import Standing
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ def run_on_ray(
     suite: Path,
     standing: Standing,
     *,
+    plan: str,
     workers: int | None,
     address: str | None,
     quiet: bool = False,
@@ -48,6 +50,7 @@ def run_on_ray(
     Args:
         suite: The folder of the suite, with its plan.
         standing: How far it is.
+        plan: Name of the plan that has its cells.
         workers: How many cells are done at a time, where the cluster is started for this suite.
         address: An existing cluster; None starts one on this machine and ends it afterwards.
         quiet: Show no progress.
@@ -64,7 +67,7 @@ def run_on_ray(
         _cluster(workers, address) as ray,
         display(f"{suite.name} on Ray", unit="cells", quiet=quiet) as show,
     ):
-        tasks = _Tasks(ray, suite.resolve(), allow_code=allow_code)
+        tasks = _Tasks(ray, suite.resolve(), plan, allow_code=allow_code)
         while standing.runnable:
             show(standing.moment())
             if interruption.asked:
@@ -77,7 +80,7 @@ def run_on_ray(
     return True
 
 
-def do_cell(suite: str, name: str, allow_code: bool = False) -> str:
+def do_cell(suite: str, name: str, plan: str, allow_code: bool = False) -> str:
     """One task: do a cell of a suite, in a process of the cluster.
 
     Returns:
@@ -90,7 +93,7 @@ def do_cell(suite: str, name: str, allow_code: bool = False) -> str:
 
     until = time.monotonic() + _WAIT
     while time.monotonic() < until:
-        done = work(Path(suite), [name], allow_code=allow_code)
+        done = work(Path(suite), [name], plan=plan, allow_code=allow_code)
         if done is None:
             return "interrupted"
         if done:
@@ -104,8 +107,8 @@ def do_cell(suite: str, name: str, allow_code: bool = False) -> str:
 class _Tasks:
     """The tasks of a suite that Ray has been given."""
 
-    def __init__(self, ray: "ModuleType", suite: Path, *, allow_code: bool = False) -> None:
-        self._ray, self._suite, self._allow_code = ray, str(suite), allow_code
+    def __init__(self, ray: "ModuleType", suite: Path, plan: str, *, allow_code: bool = False) -> None:
+        self._ray, self._suite, self._plan, self._allow_code = ray, str(suite), plan, allow_code
         self._do = ray.remote(num_cpus=1, max_retries=MOST_ATTEMPTS)(do_cell)
         self._given: dict[str, Any] = {}
 
@@ -113,7 +116,7 @@ class _Tasks:
         """Give Ray every cell that can start, and again one whose task ended without an end of the cell."""
         for cell in standing.runnable:
             if cell.name not in self._given and _can_start(cell, standing):
-                self._given[cell.name] = self._do.remote(self._suite, cell.name, self._allow_code)
+                self._given[cell.name] = self._do.remote(self._suite, cell.name, self._plan, self._allow_code)
         if not self._given:
             time.sleep(_LOOK)
             return
@@ -164,7 +167,7 @@ def _cluster(workers: int | None, address: str | None) -> Iterator["ModuleType"]
         common: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR, "configure_logging": False}
         if address is None:
             common |= {
-                "num_cpus": workers or len(os.sched_getaffinity(0)),
+                "num_cpus": workers or usual_workers(),
                 "include_dashboard": False,
                 "_node_ip_address": "127.0.0.1",  # nobody outside this machine is spoken to
                 "object_store_memory": _OBJECT_STORE,

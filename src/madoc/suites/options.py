@@ -11,7 +11,8 @@ from tyro.conf import Suppress
 
 from madoc.errors import MadocError, nearest_hint
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
-from madoc.robots.validation import mistake
+from madoc.robots.validation import mistake, shown
+from madoc.suites.grid import RANGE
 
 Order = RecordOrder | CalibrationOrder | PolicyOrder | EvaluationOrder
 Kind = TypeVar("Kind", RecordOrder, CalibrationOrder, PolicyOrder, EvaluationOrder)
@@ -20,8 +21,8 @@ Path = tuple[str, ...]
 _SUPPRESSED = get_args(Suppress[int])[1:]
 _SETTINGS = "set"
 """Key of hyperparameters, which are `name=value` on the command line and keys and values in a file."""
-_LISTS = ("data", "parameters")
-"""Keys whose value is a list, or a single text for a list of one."""
+_LISTS = {"data": "a path or a list of paths", "parameters": "a name or a list of names"}
+"""Keys whose value is a list, or a single text for a list of one, and that in words."""
 
 
 class Misfit(MadocError):
@@ -76,7 +77,7 @@ def build(order: type[Kind], given: Mapping[str, object]) -> Kind:
     except ValidationError as error:
         detail = error.errors()[0]
         key = _key_at(keys, tuple(part for part in detail["loc"] if isinstance(part, str)))
-        raise Misfit(key, mistake(detail, (key,), list(keys))) from error
+        raise Misfit(key, mistake(detail, (key,), list(keys)) + _grid_hint(key, given.get(key))) from error
 
 
 @functools.cache
@@ -109,7 +110,18 @@ def _bare(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _listed(key: str, value: object) -> object:
-    return [value] if key in _LISTS and isinstance(value, str) else value
+    """A single text of a key that takes several as a list of one."""
+    if key not in _LISTS or isinstance(value, list):
+        return value
+    if not isinstance(value, str):
+        raise Misfit(key, f"expected {_LISTS[key]} in {key}, got {shown(value)}")
+    return [value]
+
+
+def _grid_hint(key: str, value: object) -> str:
+    """Where several values of one key are written, after the refusal of several where one stands."""
+    several = isinstance(value, list) or (isinstance(value, str) and RANGE.fullmatch(value))
+    return "; ranges and lists of values go under grid:" if several and key not in _LISTS else ""
 
 
 def _settings(value: object) -> list[list[str]]:

@@ -11,7 +11,7 @@ from madoc.errors import nearest_hint
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
 from madoc.robots.document import Document
 from madoc.suites import checks
-from madoc.suites.cells import RECORDED, Cell, Kind, hashed
+from madoc.suites.cells import RECORDED, Cell, Kind
 from madoc.suites.grid import GRID, ROBOTS, Combination, combinations, read_suite
 from madoc.suites.options import Misfit, Order, build, keys_of, stored
 from madoc.tasks import TASKS
@@ -70,7 +70,9 @@ class _Planner:
         line = self.document.line(asked.places[""])
         if cell.name in self._lines:
             what = "within this entry" if self._lines[cell.name] == line else f"on line {self._lines[cell.name]}"
-            raise self.document.error(asked.places[""], f"two cells ask for exactly the same: this one and one {what}")
+            which = f"; the logs of {cell.robot} and {asked.robot} are equal" if cell.robot and asked.robot else ""
+            sentence = f"two cells ask for exactly the same: this one and one {what}{which}"
+            raise self.document.error(asked.places[""], sentence)
         self._lines[cell.name] = line
         self.cells[cell.name] = replace(cell, wanted=True)
 
@@ -83,18 +85,17 @@ class _Planner:
             recording = self._part(RecordOrder, "record", record, asked)
             with self._inside("record", asked):
                 checks.check_recording(recording)
-            needs = self._put("record", recording, None, asked, stored(recording)).name
-            given |= {"data": [f"{needs}/{RECORDED}"], "task": given.get("task", recording.name.partition("-")[0])}
+            needs = self._put("record", recording, None, asked).name
+            robot = recording.name.partition("-")[0]
+            if given.get("task", robot) != robot:
+                raise Misfit("record", f"{recording.name} is a recording of {robot}, and task: another; leave it out")
+            given |= {"data": [f"{needs}/{RECORDED}"], "task": robot}
         known = [*keys_of(CalibrationOrder), *PARTS, ROBOTS, GRID]
         if unknown := next((key for key in given if key not in known), None):
             raise Misfit(unknown, f"unknown key {unknown!r}; {nearest_hint(unknown, known)}")
         order = build(CalibrationOrder, self._located(given, recorded=needs is not None))
         checks.check_calibration(order, recorded=needs is not None, allow_code=self.allow_code)
-        told = stored(order) | {"task": checks.content_of_robot(order.task, allow_code=self.allow_code)}
-        own = order.task not in TASKS
-        logs = [needs] if needs else [checks.content_of_log(path, own=own) for path in order.source.paths]
-        told["source"] = {key: value for key, value in told["source"].items() if key != "paths"} | {"logs": logs}
-        return self._put("calibrate", order, needs, asked, told)
+        return self._put("calibrate", order, needs, asked)
 
     def _policy(self, parts: Mapping[str, object], calibration: Cell, asked: Combination) -> Cell:
         """The policy of a combination, and its evaluation if that is asked for too."""
@@ -105,21 +106,20 @@ class _Planner:
         seed = calibrating.search.seed
         order = self._part(PolicyOrder, "learn", parts["learn"], asked, seed=seed)
         with self._inside("learn", asked):
-            checks.check_policy(order, calibrating.search, calibrating.task, allow_code=self.allow_code)
-        policy = self._put("learn", order, calibration.name, asked, stored(order))
+            recording = self.cells[calibration.needs].read() if calibration.needs else None
+            assert recording is None or isinstance(recording, RecordOrder)
+            checks.check_policy(order, calibrating, recording, allow_code=self.allow_code)
+        policy = self._put("learn", order, calibration.name, asked)
         if "evaluate" not in parts:
             return policy
         evaluation = self._part(EvaluationOrder, "evaluate", parts["evaluate"], asked)
         with self._inside("evaluate", asked):
-            checks.check_evaluation(evaluation)
-        return self._put("evaluate", evaluation, policy.name, asked, stored(evaluation))
+            checks.check_evaluation(evaluation, calibrating, allow_code=self.allow_code)
+        return self._put("evaluate", evaluation, policy.name, asked)
 
-    def _put(self, kind: Kind, order: Order, needs: str | None, asked: Combination, told: dict[str, Any]) -> Cell:
+    def _put(self, kind: Kind, order: Order, needs: str | None, asked: Combination) -> Cell:
         """The cell of an order, the same for all combinations that ask for the same."""
-        truth = getattr(order, "truth", None)
-        if truth is not None:
-            told = told | {"truth": checks.content_of_file(str(truth))}
-        name = hashed(kind, told, needs)
+        name = checks.name_of(kind, order, needs, allow_code=self.allow_code)
         cell = Cell(name, kind, stored(order), needs, asked.entry, asked.robot, wanted=False)
         return self.cells.setdefault(name, cell)
 
@@ -147,7 +147,9 @@ class _Planner:
         if not recorded and "data" in located:
             paths = [located["data"]] if isinstance(located["data"], str) else located["data"]
             if isinstance(paths, list):
-                located["data"] = [(isinstance(path, str) and _located(self.folder, path)) or path for path in paths]
+                located["data"] = [
+                    _located(self.folder, path) or path if path and isinstance(path, str) else path for path in paths
+                ]
         return located
 
     def _is_there(self, path: str) -> bool:

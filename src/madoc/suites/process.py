@@ -1,6 +1,5 @@
 """What a worker process sets for itself before it computes: a core of its own, and where compiled code is kept."""
 
-import getpass
 import os
 import platform
 import tempfile
@@ -33,7 +32,7 @@ def take_core() -> int | None:
     if _held or not hasattr(os, "sched_setaffinity"):
         return None
     cores = sorted(os.sched_getaffinity(0))
-    folder = Path(tempfile.gettempdir()) / f"madoc-cores-{getpass.getuser()}"
+    folder = Path(tempfile.gettempdir()) / f"madoc-cores-{os.getuid()}"  # in a container it may have no name
     folder.mkdir(mode=0o700, exist_ok=True)
     for core in cores if len(cores) > 1 else ():
         lock = filelock.FileLock(folder / f"{core}.lock", timeout=0, thread_local=False)

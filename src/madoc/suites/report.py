@@ -10,6 +10,7 @@ from madoc.errors import MadocError
 from madoc.report.page import write_page
 from madoc.report.words import TONES
 from madoc.runs.files import write_json
+from madoc.suites.cells import Cell
 from madoc.suites.fleet import Fleet, fleets, ranges
 from madoc.suites.listing import asked
 from madoc.suites.planning import Plan
@@ -24,11 +25,11 @@ _TONES = {"finished": "good", "converged": "good", "diverged": "bad", "failed": 
 
 @dataclass(frozen=True)
 class Group:
-    """Cells that ask for the same but for their seed.
+    """Cells that ask for the same, and need cells that do, but for their seeds.
 
     Attributes:
         kind: `calibrate`, `learn` or `evaluate`.
-        asks: What they ask, by the keys of a suite file.
+        asks: What they and the cells that they need ask, by the keys of a suite file.
         seeds: Number of cells.
         words: Number of cells by verdict, or else by how they ended.
         error: Median, lowest and highest error in % of the ranges, where the truth is known.
@@ -50,14 +51,14 @@ class Group:
 def write_report(
     plan: Plan, standing: Standing, suite: Path, *, command: str, parquet: bool = False
 ) -> dict[str, Path]:
-    """Leave `report.html` and `results.csv` in the folder of a suite, and `fleet.json` where several robots are in it.
+    """Leave `SUITE.html` and `SUITE.csv` in the folder of a suite, and `SUITE-fleet.json` where it has several robots.
 
     Args:
         plan: The suite.
         standing: How far it is.
         suite: Its folder.
         command: What runs the cells that were not run.
-        parquet: Leave `results.parquet` too.
+        parquet: Leave `SUITE.parquet` too.
 
     Returns:
         The files by what they are.
@@ -83,13 +84,14 @@ def write_report(
 
 
 def groups(results: Sequence[Result]) -> list[Group]:
-    """The cells that ask for the same but for their seed, each group as a row."""
+    """The cells that ask for the same but for their seeds, each group as a row."""
+    cells = {result.cell.name: result.cell for result in results}
     alike = defaultdict[tuple[str, str], list[Result]](list)
     for result in results:
         if result.cell.kind == "record" or result.cell.robot:
             continue
-        alike[result.cell.kind, _asks(result)].append(result)
-    return [_group(kind, asks, members) for (kind, asks), members in alike.items()]
+        alike[result.cell.kind, _asks(result.cell, cells, short=False)].append(result)
+    return [_group(kind, _asks(members[0].cell, cells), members) for (kind, _), members in alike.items()]
 
 
 def _group(kind: str, asks: str, members: Sequence[Result]) -> Group:
@@ -109,18 +111,20 @@ def _group(kind: str, asks: str, members: Sequence[Result]) -> Group:
     )
 
 
-def _asks(result: Result) -> str:
-    """What a cell asks but for its seed, in words; of a policy, without the hash of the calibration it needs."""
-    values = {key: value for key, value in asked(result.cell).items() if key not in ("seed", "needs")}
-    if "data" in values and result.cell.needs:
-        del values["data"]
-    return " ".join(f"{key}={_short(value)}" for key, value in values.items())
+def _asks(cell: Cell, cells: Mapping[str, Cell], *, short: bool = True) -> str:
+    """What the cells that a cell needs ask, and then the cell itself, in words, all but for their seeds."""
+    told_before = ("needs", "robot", "data") if cell.needs else ()
+    values = {key: value for key, value in asked(cell).items() if key not in ("seed", *told_before)}
+    own = " ".join(f"{key}={_short(value) if short else value}" for key, value in values.items())
+    needed = _asks(cells[cell.needs], cells, short=short) if cell.needs else ""
+    return "; ".join(text for text in (needed, own) if text)
 
 
 def _short(value: object) -> str:
+    """A value in words; of an absolute path its last two parts."""
     if isinstance(value, list):
         return ",".join(_short(part) for part in value)
-    return Path(value).name if isinstance(value, str) and value.startswith("/") else str(value)
+    return "/".join(Path(value).parts[-2:]) if isinstance(value, str) and value.startswith("/") else str(value)
 
 
 def _middle(values: Sequence[float]) -> tuple[float, float, float] | None:
@@ -142,6 +146,7 @@ def _context(
 ) -> dict[str, object]:
     """What the template shows."""
     single = [result for result in results if result.cell.kind != "record"]
+    cells = {result.cell.name: result.cell for result in results}
     return {
         "title": plan.name,
         "file": plan.file.name,
@@ -149,7 +154,7 @@ def _context(
         "cells": len(results),
         "groups": groups(results),
         "fleets": [_drawn(fleet) for fleet in found],
-        "results": [_line(result) for result in single[:LARGEST_PAGE]],
+        "results": [_line(result, cells) for result in single[:LARGEST_PAGE]],
         "omitted": max(0, len(single) - LARGEST_PAGE),
         "reasons": Counter(
             f"{result.status}: {result.sentence}" for result in results if result.status in ("refused", "failed")
@@ -160,13 +165,12 @@ def _context(
     }
 
 
-def _line(result: Result) -> dict[str, object]:
+def _line(result: Result, cells: Mapping[str, Cell]) -> dict[str, object]:
     """A single cell on the page."""
     reason = str(result.verdict.sentence) if result.verdict is not None else result.sentence
-    name = f"{result.cell.robot} " if result.cell.robot else ""
     return {
         "cell": result.cell.name,
-        "asks": name + _asks(result),
+        "asks": _asks(result.cell, cells),
         "seed": asked(result.cell).get("seed", 0),
         "word": _word(result),
         "reason": reason,

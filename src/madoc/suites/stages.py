@@ -10,8 +10,10 @@ from madoc.errors import MadocError, NotAllowed
 from madoc.pipeline import calibrate_in, evaluate_folder, learn_in, read_calibration, record_named
 from madoc.pipeline.folders import ENDED, holds_run
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
-from madoc.suites.cells import RECORDED
+from madoc.suites.cells import RECORDED, Cell
+from madoc.suites.checks import forget_contents, name_of
 from madoc.suites.claims import MOST_ATTEMPTS, Claim, Outcome
+from madoc.suites.options import Order
 
 
 def carry_out(claim: Claim, suite: Path, *, allow_code: bool = False) -> Outcome | None:
@@ -32,10 +34,11 @@ def carry_out(claim: Claim, suite: Path, *, allow_code: bool = False) -> Outcome
     try:
         status, sentence = _done(claim, suite, allow_code=allow_code)
     except NotAllowed:
+        claim.take_back()
         raise  # another worker may be allowed to
     except MadocError as error:
-        # A full disk or a file that is gone is no refusal: the same order may go through another time.
-        kind = "failed" if isinstance(error.__cause__, OSError) else "refused"
+        # A full disk, or a file that is gone or changed, is no refusal: the same order may go through another time.
+        kind = "failed" if isinstance(error, _Changed) or isinstance(error.__cause__, OSError) else "refused"
         return claim.end(kind, str(error), monotonic() - started)  # type: ignore[arg-type]
     except Exception as error:
         (claim.folder / "failure.txt").write_text(traceback.format_exc(), encoding="utf-8")
@@ -50,6 +53,7 @@ def carry_out(claim: Claim, suite: Path, *, allow_code: bool = False) -> Outcome
 def _done(claim: Claim, suite: Path, *, allow_code: bool) -> tuple[str, str]:
     """Carry the order out: the status, and that in words."""
     folder, order = claim.folder, claim.cell.read()
+    _require_unchanged(claim.cell, order, allow_code=allow_code)
     resume = holds_run(folder)
     needed = suite / "cells" / (claim.cell.needs or "")
     match order:
@@ -68,6 +72,23 @@ def _done(claim: Claim, suite: Path, *, allow_code: bool) -> tuple[str, str]:
         case EvaluationOrder():
             evaluation = evaluate_folder(needed, order, out=folder, quiet=True, allow_code=allow_code)
             return "finished", f"{evaluation.episodes} episodes are evaluated"
+
+
+class _Changed(MadocError):
+    """A file that a cell names is not what it was when the cell was planned and named."""
+
+
+def _require_unchanged(cell: Cell, order: Order, *, allow_code: bool) -> None:
+    """Refuse a cell whose name no longer tells what its files hold, so that no result stands under a wrong name."""
+    forget_contents()
+    try:
+        name = name_of(cell.kind, order, cell.needs, allow_code=allow_code)
+    except NotAllowed:
+        raise
+    except MadocError as error:
+        raise _Changed(f"since this cell was planned a file that it names has changed: {error}") from error
+    if name != cell.name:
+        raise _Changed("since this cell was planned a file that it names has changed; run madoc suite again")
 
 
 def _with_recording(order: CalibrationOrder, claim: Claim, suite: Path) -> CalibrationOrder:

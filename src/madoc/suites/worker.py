@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 
+from madoc.errors import NotAllowed
 from madoc.suites.cells import Cell, read_plans
 from madoc.suites.claims import Outcome, attempts_of, claimed, outcome_of
 from madoc.suites.stages import carry_out
@@ -15,7 +16,9 @@ _PAUSES = (0.05, 2.0)
 """Shortest and longest pause in s before cells that wait for others are looked at again."""
 
 
-def work(suite: Path, names: Sequence[str] | None = None, *, allow_code: bool = False) -> list[Outcome] | None:
+def work(
+    suite: Path, names: Sequence[str] | None = None, *, plan: str | None = None, allow_code: bool = False
+) -> list[Outcome] | None:
     """Carry out cells of a suite's plans until none is left that this process could begin.
 
     Any number of processes, on any number of machines that share the folder, may do this at once: each cell is done
@@ -24,15 +27,17 @@ def work(suite: Path, names: Sequence[str] | None = None, *, allow_code: bool = 
     Args:
         suite: The folder of the suite.
         names: Only these cells. Default: all.
+        plan: Only the cells of this plan. Default: of all.
         allow_code: Run the Python files that specs of robots name.
 
     Returns:
         How the cells ended that this process did; None where it was interrupted.
 
     Raises:
-        NotAllowed: A spec names a Python file, and `allow_code` is not given; the cell is left to others.
+        NotAllowed: A spec names a Python file, and `allow_code` is not given; the cell is left to others, and all
+            that could be done without it is done.
     """
-    planned = {cell.name: cell for cell in read_plans(suite)}
+    planned = {cell.name: cell for cell in read_plans(suite, plan)}
     cells = list(planned.values()) if names is None else [planned[name] for name in names]
     return _work(suite, cells, planned, allow_code=allow_code)
 
@@ -40,6 +45,7 @@ def work(suite: Path, names: Sequence[str] | None = None, *, allow_code: bool = 
 def _work(suite: Path, cells: Sequence[Cell], known: dict[str, Cell], *, allow_code: bool) -> list[Outcome] | None:
     """The loop of `work`."""
     done: list[Outcome] = []
+    not_allowed: NotAllowed | None = None
     in_vain: set[str] = set()
     waiting, pause, patient = deque(cells), _PAUSES[0], True
     while waiting:
@@ -64,7 +70,12 @@ def _work(suite: Path, cells: Sequence[Cell], known: dict[str, Cell], *, allow_c
                 if claim is None:
                     later.append(cell)
                     continue
-                outcome = carry_out(claim, suite, allow_code=allow_code)
+                try:
+                    outcome = carry_out(claim, suite, allow_code=allow_code)
+                except NotAllowed as error:
+                    not_allowed = not_allowed or error
+                    in_vain.add(cell.name)
+                    continue
                 if outcome is None:
                     return None
                 done.append(outcome)
@@ -76,4 +87,6 @@ def _work(suite: Path, cells: Sequence[Cell], known: dict[str, Cell], *, allow_c
             pause = min(2 * pause, _PAUSES[1])
         patient = progressed
         waiting = later
+    if not_allowed is not None:
+        raise not_allowed
     return done

@@ -63,6 +63,8 @@ _PROSE = frozenset(("readme", "license", "notes", "changelog"))
 """Names, without their endings, of files that are no logs even where their endings are those of logs."""
 _OF_A_RUN = ("metrics.jsonl", "result.json")
 """Files that, beside spec.json, mark a run folder of Madoc."""
+_OF_A_SUITE = ("plans", "cells")
+"""Folders that mark the folder of a suite of Madoc."""
 
 
 def read(
@@ -97,6 +99,27 @@ def read(
     return dataset
 
 
+def files_of(folder: Path) -> list[Path]:
+    """The files of a folder that count for what `read` makes of it, in the order of their names.
+
+    Hidden files, prose and what is often kept beside logs do not count, nor does anything that Madoc itself has left.
+    """
+    visible = sorted(
+        file
+        for file in folder.rglob("*")
+        if file.is_file() and not any(part.startswith(".") for part in file.relative_to(folder).parts)
+    )
+    if lerobot_reader.recognises(folder) or is_minari(folder):
+        return visible
+    return [
+        file
+        for file in visible
+        if file.stem.lower() not in _PROSE
+        and file.suffix.lower() not in _NOT_LOGS
+        and not _is_of_a_run_folder(file, folder)
+    ]
+
+
 def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
     """The runs of a file or folder, and the files in it that no reader reads."""
     if not source.is_dir():
@@ -109,23 +132,15 @@ def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
         return LOG_FORMATS["lerobot"].read(source, wanted), []
     if is_minari(source):
         return LOG_FORMATS["minari"].read(source, wanted), []
-    files = sorted(
-        file
-        for file in source.rglob("*")
-        if file.is_file()
-        and file.stem.lower() not in _PROSE
-        and not any(part.startswith(".") for part in file.relative_to(source).parts)
-        and not _is_of_a_run_folder(file, source)
-    )
     runs: list[Run] = []
     ignored: list[str] = []
-    for file in files:
+    for file in files_of(source):
         name, suffix = file.relative_to(source).as_posix(), file.suffix.lower()
         if suffix in _BY_SUFFIX:
             require_file(file)
             read_runs = _BY_SUFFIX[suffix].read(file, wanted)
             runs += [replace(run, name=run.name.replace(file.name, name, 1)) for run in read_runs]
-        elif suffix not in _NOT_LOGS:
+        else:
             ignored.append(name)
     if not runs:
         raise MadocError(f"expected logs in the folder {source} (files that end in {_SUFFIX_LIST}), got none")
@@ -133,10 +148,12 @@ def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
 
 
 def _is_of_a_run_folder(file: Path, source: Path) -> bool:
-    """Whether a file is in a run folder of Madoc, whose arrays are no logs."""
+    """Whether a file is in a run folder or the folder of a suite of Madoc, whose arrays and tables are no logs."""
     folders = (folder for folder in file.parents if folder.is_relative_to(source))
     return any(
-        (folder / "spec.json").is_file() and any((folder / name).is_file() for name in _OF_A_RUN) for folder in folders
+        ((folder / "spec.json").is_file() and any((folder / name).is_file() for name in _OF_A_RUN))
+        or all((folder / name).is_dir() for name in _OF_A_SUITE)
+        for folder in folders
     )
 
 
@@ -150,4 +167,4 @@ def _distinct(runs: list[Run]) -> list[Run]:
     return named
 
 
-__all__ = ["LOG_FORMATS", "LogFormat", "Run", "Table", "read"]
+__all__ = ["LOG_FORMATS", "LogFormat", "Run", "Table", "files_of", "read"]

@@ -1,0 +1,46 @@
+"""What the command line does of itself, whatever the command."""
+
+import io
+import json
+import sys
+
+import pytest
+
+from madoc.commands.answer import Answer
+from madoc.commands.main import _one_sentence, main
+
+
+@pytest.mark.parametrize("line", ["report ~nosuchuser/run", "record hopper-medium --out ~nosuchuser/log.npz"])
+def test_the_home_of_a_user_that_is_not_there_is_one_sentence(line, capsys):
+    assert main(line.split()) == 2
+    sentence = "madoc: a path begins with ~ and the name of no user of this machine; write the folder out\n"
+    assert capsys.readouterr().err == sentence
+
+
+def test_other_errors_are_not_taken_for_that(monkeypatch):
+    def broken(self):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr("madoc.commands.lists.Tasks.run", broken)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        main(["tasks"])
+
+
+def test_letters_that_a_terminal_lacks_are_shown_as_numbers(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    monkeypatch.setattr("madoc.commands.lists.Tasks.run", lambda self: Answer({"unit": "µ°"}, ("µ°",)))
+    assert main(["tasks"]) == 0
+    assert main(["tasks", "--json"]) == 0
+    text, answer = written.getvalue().splitlines()
+    assert text == rb"\xb5\xb0"
+    assert json.loads(answer) == {"unit": "µ°"}
+
+
+def test_a_box_of_ascii_is_one_sentence_as_well():
+    rule = "-" * 40
+    lines = ["Parsing error", "Unrecognized options:", "--budgt", rule, "Perhaps you meant:", "--budget", rule]
+    box = "\n".join([*lines, "For full helptext, run:", "madoc calibrate --help", " \n"])
+    told = "Unrecognized options: --budgt; Perhaps you meant: --budget; see madoc calibrate --help"
+    assert _one_sentence(box) == told
+    assert _one_sentence(box.replace("-" * 10, "─" * 10)) == told
