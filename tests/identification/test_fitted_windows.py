@@ -21,7 +21,7 @@ def windows():
     """Windows of an exact log of the spring, logged initial states, and its simulator."""
     task = spring(max_episode_steps=100)
     simulator, dataset = simulation.make(task, threads=1), recorded(task, SPRING_TRUTH, 2000, jax.random.key(0))
-    readings, states, _ = windows_of(dataset, states_of(dataset, simulator), typical_change(dataset), fewest=30)
+    readings, states, _, _ = windows_of(dataset, states_of(dataset, simulator), typical_change(dataset), fewest=30)
     return simulator, readings, states
 
 
@@ -78,5 +78,5 @@ def test_slopes_at_another_point_leave_out_windows_that_fail_there():
 def test_episodes_of_ten_rows_have_windows_behind_their_first_row():
     task = spring(max_episode_steps=10)
     dataset, simulator = recorded(task, SPRING_TRUTH, 2000, jax.random.key(0)), simulation.make(task, threads=1)
-    readings, _, _ = windows_of(dataset, states_of(dataset, simulator), typical_change(dataset), fewest=30)
+    readings, _, _, _ = windows_of(dataset, states_of(dataset, simulator), typical_change(dataset), fewest=30)
     assert readings.steps == 9

@@ -115,7 +115,7 @@ def test_a_term_that_explains_the_same_is_a_rival():
     columns = np.stack([offset, unrelated, friction], axis=-1)
     products = Products.of(0.2 * friction + noise, slope[..., None], columns)
     tried = [Candidate(cause, "", "", 0.0, 1.0, -np.inf) for cause in ("offset", "unrelated", "friction")]
-    tests = TermTests(products, tuple(tried), ParameterSpace((Parameter("gravity", "", -11, -9),)), np.ones(1))
+    tests = TermTests(products, tuple(tried), ParameterSpace((Parameter("gravity", "", -11, -9),)), np.ones(1), np.zeros(len(products), int))
     (chosen,) = terms._chosen(tests)
     ((rival,),) = terms._rivals(tests, [chosen])
     assert {chosen, rival} == {0, 2}

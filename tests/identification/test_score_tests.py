@@ -14,10 +14,11 @@ def test_a_change_and_its_error():
     """y = -2 z + noise of ±0.1 that is orthogonal to z: the change is 2, and its error that of the noise."""
     found = score(Products.of(-2.0 * EFFECT + NOISE, ONES, EFFECT[..., None]), 2)
     assert found.change == pytest.approx(2.0)
-    # Without window w the change moves by z_w · e_w / (z · z - z_w · z_w) = ±0.2 / (8 - 2); times 3/4 of 4 squares.
-    assert found.error == pytest.approx(np.sqrt(3 / 4 * 4) * 0.2 / 6)
+    # Without window w the change moves by z_w · e_w / (z · z - z_w · z_w) = ±0.2 / (8 - 2); times 3/4 of 4 squares,
+    # and times 4/3, as one of four degrees of freedom is the parameter's.
+    assert found.error == pytest.approx(np.sqrt(4 / 3 * 3 / 4 * 4) * 0.2 / 6)
     assert found.explained == pytest.approx(32.0 / 32.08)
-    assert found.freedom == pytest.approx(3.0)  # four windows that tell alike
+    assert found.freedom == pytest.approx(2.0)  # four windows that tell alike, less one and the parameter
     assert found.shifts == pytest.approx([0.0])  # the effect has no part along the parameter's
 
 

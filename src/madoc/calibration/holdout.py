@@ -133,6 +133,7 @@ class Judged:
         control_steps: Control steps that were simulated for this record.
         missing_terms: Terms that the model may lack, the most significant first.
         alternatives: Other estimates that the log does not exclude, which the intervals cover.
+        tested: False where the log should tell whether the model lacks a term, but is too short for that.
         at_end: Parameters estimated at an end of their range that is no physical bound.
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
         candidates: The methods that were compared on this hold-out; None where only one was run.
@@ -149,6 +150,7 @@ class Judged:
     control_steps: int
     missing_terms: tuple[MissingTerm, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
+    tested: bool = True
     at_end: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
     candidates: tuple[Tried | NotRun, ...] | None = None

@@ -38,6 +38,8 @@ SPACING = "rows that are farther apart in time than the spec says, by another ra
 TILTS = ("a base or a floor that is tilted towards x", "a base or a floor that is tilted towards y")
 INTEGRATION = "the error of the model's integration step"
 _KNOWN_BEFORE = ("body_mass", "body_com")
+_STILL = 1e-9
+"""Standard deviation of a joint's position below which it does not move, so that nothing tells of a spring."""
 _CHANGE = 1e-3
 """Change of a candidate, as a share of what would balance the joint's typical torque, for its one-sided difference."""
 _SATURATED = 0.3
@@ -137,8 +139,8 @@ def _references(logged: LoggedStates, simulator: Simulator, joint: Any) -> dict[
         "dof_damping": torque / fast,
         "dof_armature": float(inertia.mean()),
     }
-    far = max(float(position[:, int(joint.qposadr[0])].std()), 1e-9)
-    return references | ({"jnt_stiffness": torque / far} if len(joint.damping) == 1 else {})
+    far = float(position[:, int(joint.qposadr[0])].std())
+    return references | ({"jnt_stiffness": torque / far} if len(joint.damping) == 1 and far > _STILL else {})
 
 
 def _candidate(

@@ -1,4 +1,4 @@
-"""Whether parameters change over the log: by score tests, and by estimates of its first and of its last third."""
+"""Whether parameters change over the log: by score tests, between runs, and from its first third to its last."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -11,12 +11,22 @@ from madoc.identification.candidate_terms import Candidate
 from madoc.identification.fitted_windows import Fit, fit_windows, products_of
 from madoc.identification.information import NORMAL_95
 from madoc.identification.replay import Readings
-from madoc.identification.score_tests import deviate, parameter_shift, score
-from madoc.identification.term_tests import DISAGREEING, FEWEST, Alternative, MissingTerm, TermTests, term_of
+from madoc.identification.score_tests import deviate, parameter_shift, score, variances_by_group
+from madoc.identification.term_tests import (
+    DISAGREEING,
+    FEWEST,
+    SUSPICIOUS,
+    Alternative,
+    MissingTerm,
+    TermTests,
+    term_of,
+)
 from madoc.simulation.base import Simulator
 
 DRIFT = "a value that changes over the log"
 """The cause of a missing term that is a parameter itself, as it changes."""
+FEWEST_RUNS = 3
+"""Fewest degrees of freedom of a variance between runs; with fewer, runs of their own motions would seem to differ."""
 
 
 def drifts_of(
@@ -38,12 +48,14 @@ def drifts_of(
     """
     drifts, spent = list(_drifts(tests)), 0
     others = list(_of_parts(drifts))
+    between, of_runs = _between_runs(tests)
+    others += of_runs
     if any(abs(term.t) >= DISAGREEING for term in drifts):
-        thirds = _fitted_thirds(tests, simulator, readings, fit)
+        thirds = _fitted_thirds(simulator, readings, fit)
         spent = sum(third.control_steps for third in thirds)
         drifts += list(_changes(tests, thirds, drifts))
         others += _of_thirds(tests, thirds, drifts, point)
-    return list(_most_certain(drifts)), others, spent
+    return list(_most_certain([*drifts, *between])), others, spent
 
 
 def _drifts(tests: TermTests) -> Iterator[MissingTerm]:
@@ -58,6 +70,35 @@ def _drifts(tests: TermTests) -> Iterator[MissingTerm]:
                 yield term_of(candidate, found, {row.name: found.change / float(tests.half_widths[index])})
 
 
+def _between_runs(tests: TermTests) -> tuple[list[MissingTerm], list[Alternative]]:
+    """Parameters that differ from run to run, and estimates that cover how much.
+
+    Where all windows are alike, the variance of an estimate by leaving out runs is that by leaving out windows, and
+    their ratio has Fisher's distribution.
+    """
+    from scipy.stats import f as fisher  # slow to import, and only tests of terms need it
+    from scipy.stats import norm
+
+    terms, others = list[MissingTerm](), list[Alternative]()
+    if len(np.unique(tests.runs)) <= FEWEST_RUNS:
+        return terms, others
+    by_run, freedom = variances_by_group(tests.products, tests.runs)
+    by_window, windows = variances_by_group(tests.products, np.arange(len(tests.products)))
+    for index, row in enumerate(tests.space.parameters):
+        if freedom[index] < FEWEST_RUNS or not by_window[index] > 0.0:
+            continue
+        chance = fisher.sf(by_run[index] / by_window[index], freedom[index], windows[index])
+        t = float(norm.isf(max(float(chance), np.finfo(float).tiny)))
+        half, error = (row.high - row.low) / 2.0, float(np.sqrt(by_run[index]))
+        deviation = error * float(np.sqrt(freedom[index] + 1.0))
+        shift = {row.name: deviation / float(tests.half_widths[index])}
+        terms.append(MissingTerm(DRIFT, row.name, deviation * half, error * half, row.unit, 0.0, t, shift))
+        if t >= SUSPICIOUS:  # then windows of a run are not independent, and intervals are to be those of runs
+            errors = {row.name: NORMAL_95 * error / float(tests.half_widths[index])}
+            others.append(Alternative((f"{row.name} changing from run to run",), False, {row.name: 0.0}, errors, True))
+    return terms, others
+
+
 @dataclass(frozen=True)
 class _Third:
     """The estimate of a third of the log: its point in [-1, 1], the variance of that, and its degrees of freedom."""
@@ -68,7 +109,7 @@ class _Third:
     control_steps: int
 
 
-def _fitted_thirds(tests: TermTests, simulator: Simulator, readings: Readings, fit: Fit) -> list[_Third]:
+def _fitted_thirds(simulator: Simulator, readings: Readings, fit: Fit) -> list[_Third]:
     """Estimates of the first and of the last third of the log; none where a third has too few windows.
 
     A score test underestimates a change that leaves residuals far from noise, which count little.

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from madoc.data.dataset import Dataset
 from madoc.data.timescale import stride
@@ -19,7 +19,8 @@ from madoc.identification.windows import disjoint_windows, evenly, longest_fit
 from madoc.simulation.base import Simulator
 
 WINDOWS = 120
-"""Largest number of windows that are simulated; their standard errors vary by about 10 % with so many."""
+"""Largest number of windows that are simulated, unless more are needed for as many parameters; standard errors vary by
+about 10 % with so many."""
 STRIDES = 20
 """Length of a window in strides: in longer ones small errors of the model grow beyond their slopes."""
 NEGLIGIBLE = 1e-5
@@ -40,20 +41,26 @@ _DAMPING = 1e-6
 
 def windows_of(
     dataset: Dataset, logged: LoggedStates, scale: Float[np.ndarray, " observation"], *, fewest: int
-) -> tuple[Readings, Float[np.ndarray, "windows state"], Float[np.ndarray, "windows action"]]:
-    """Windows that share no observation, guesses of their initial states, and the actions before them.
+) -> tuple[
+    Readings, Float[np.ndarray, "windows state"], Float[np.ndarray, "windows action"], Int[np.ndarray, " windows"]
+]:
+    """Windows that share no observation, guesses of their initial states, the actions before them, and their episodes.
 
-    They are shorter than `STRIDES` where the log has not enough rows for `fewest` of that length.
+    They are shorter than `STRIDES` where the log has not enough rows for `fewest` of that length, or where the episode
+    of its median row is shorter.
     """
-    affordable = max(stride(dataset), len(dataset) // fewest - 2)
+    lengths = dataset.episode_ends - dataset.episode_starts
+    usual = max(1, int(np.median(np.repeat(lengths, lengths))) - 1)  # a window has an action before it
+    affordable = min(max(stride(dataset), len(dataset) // fewest - 2), usual)
     later = logged.rows > dataset.episode_starts[dataset.episode_of(logged.rows)]
     rows, states = logged.rows[later], logged.states[later]
     steps, chosen = min(STRIDES * stride(dataset), affordable), np.zeros(0, np.int64)
     if len(rows):
         steps = longest_fit(dataset, rows, steps)
-        chosen = evenly(disjoint_windows(dataset, rows, steps), WINDOWS)
+        chosen = evenly(disjoint_windows(dataset, rows, steps), max(WINDOWS, fewest))
     readings = Readings.at(dataset, logged, rows[chosen], steps, scale)
-    return readings, states[chosen], np.asarray(dataset.transitions.action, np.float64)[rows[chosen] - 1]
+    before = np.asarray(dataset.transitions.action, np.float64)[rows[chosen] - 1]
+    return readings, states[chosen], before, dataset.episode_of(rows[chosen])
 
 
 @dataclass(frozen=True)
@@ -237,8 +244,8 @@ def products_of(slopes: WindowSlopes, readings: Readings, count: int) -> Product
 
     They are in units of the noise, and residuals far beyond it, as where a contact begins, count little.
     """
-    finite = slopes.whole & np.isfinite(slopes.by_parameters).all((1, 2))
-    if not finite.any() or np.abs(slopes.residuals[finite]).max() < NEGLIGIBLE:
+    finite = slopes.finite
+    if not finite.any() or negligible(slopes):
         return None
     kept = WindowSlopes(
         slopes.residuals[finite], slopes.by_parameters[finite], slopes.by_states[finite], slopes.whole[finite]
@@ -246,6 +253,12 @@ def products_of(slopes: WindowSlopes, readings: Readings, count: int) -> Product
     scaled = kept.over(_noise(kept, readings))
     left = _eliminated(scaled, _weights(scaled)).reduced
     return Products.of(left.residuals, left.jacobian[..., :count], left.jacobian[..., count:])
+
+
+def negligible(slopes: WindowSlopes) -> bool:
+    """Whether there are residuals, and none of them is worth an explanation."""
+    finite = slopes.finite
+    return bool(finite.any()) and float(np.abs(slopes.residuals[finite]).max()) < NEGLIGIBLE
 
 
 def _noise(slopes: WindowSlopes, readings: Readings) -> Float[np.ndarray, " values"]:

@@ -48,6 +48,11 @@ class WindowSlopes:
     by_states: Float[np.ndarray, "windows values n"]
     whole: Bool[np.ndarray, " windows"]
 
+    @property
+    def finite(self) -> Bool[np.ndarray, " windows"]:
+        """Windows in which no simulation failed and every derivative is finite."""
+        return self.whole & np.isfinite(self.by_parameters).all((1, 2))
+
     def over(self, deviation: Float[np.ndarray, " values"]) -> "WindowSlopes":
         """Residuals and derivatives divided by the deviation of each value."""
         wide = deviation[:, None]

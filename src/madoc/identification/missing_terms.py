@@ -15,7 +15,7 @@ from madoc import simulation
 from madoc.data.dataset import Dataset
 from madoc.identification.candidate_terms import INTEGRATION, Candidate, candidates, effects
 from madoc.identification.drifts import drifts_of
-from madoc.identification.fitted_windows import Fit, fit_windows, products_of, windows_of
+from madoc.identification.fitted_windows import Fit, fit_windows, negligible, products_of, windows_of
 from madoc.identification.information import NORMAL_95
 from madoc.identification.replay import Readings
 from madoc.identification.score_tests import deviate, joint_shift, parameter_shift
@@ -38,6 +38,8 @@ WORTH_FITTING = 0.5
 """Shift of a parameter in half-widths of its 95 % interval, from which terms are fitted with the parameters."""
 MOST_FITTED = 2
 """Largest number of terms that are fitted together with the parameters."""
+DIVERGING = 0.1
+"""Share in [0, 1] of windows; a candidate with which more of them diverge is not tested."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
 
 
@@ -49,11 +51,13 @@ class Suspicions:
         terms: Candidates with a physical sign, such as friction that takes energy out, the most significant first.
         alternatives: Other estimates that it does not exclude.
         control_steps: Control steps that were simulated to find that out.
+        tested: Whether there were enough windows to find anything.
     """
 
     terms: tuple[MissingTerm, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
     control_steps: int = 0
+    tested: bool = True
 
 
 def suspicions(
@@ -75,9 +79,9 @@ def suspicions(
         half_widths: Half of each parameter's 95 % interval in [-1, 1].
         scale: Typical change of each signal in a step.
     """
-    readings, states, before = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)))
+    readings, states, before, runs = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)))
     if len(readings) < FEWEST + len(point):
-        return Suspicions()
+        return Suspicions(tested=False)
     fit = fit_windows(simulator, readings, states, point)
     led = fit.point
     added = list(candidates(logged, simulator, led, scale))
@@ -86,11 +90,14 @@ def suspicions(
     at_nominal = np.concatenate([led, -np.ones(len(added))])
     tried, by_terms = effects(simulator, wide, readings, before, at_nominal, fit.states, added)
     spent = fit.control_steps + (1 + len(tried)) * len(readings) * readings.steps
+    if fit.slopes.whole.any():
+        diverges = (~np.isfinite(by_terms).all(1)[fit.slopes.whole]).mean(0) > DIVERGING
+        by_terms[..., diverges] = 0.0  # so that a term which most windows cannot bear is not tested, but others are
     both = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, by_terms], axis=-1))
-    products = products_of(both, readings, len(led))
+    products, counted = products_of(both, readings, len(led)), both.finite
     if products is None or len(products) < FEWEST + len(led):
-        return Suspicions(control_steps=spent)
-    tests = TermTests(products, tuple(tried), simulator.parameters, half_widths)
+        return Suspicions(control_steps=spent, tested=negligible(both))
+    tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
     drifts, others, of_thirds = drifts_of(tests, simulator, readings, fit, point)
     spent += of_thirds
     terms, others = [*_terms(tests), *drifts], [*others, *_of_other_windows(tests, led - point)]
@@ -106,7 +113,8 @@ def suspicions(
             others.append(richer.alternative)
         if richer is None or len(richer.terms) < len(chosen):
             others.append(together)
-        others += [replace(_with_terms(tests, rivals), terms=False) for rivals in _rivals(tests, chosen)]
+        further = [*_rivals(tests, chosen), *_further(tests, chosen)]
+        others += [replace(_with_terms(tests, rivals), terms=False) for rivals in further]
     return Suspicions(tuple(sorted(terms, key=lambda term: -abs(term.t))), tuple(others), spent)
 
 
@@ -158,6 +166,13 @@ def _rivals(tests: TermTests, chosen: list[int]) -> Iterator[list[int]]:
         for index, t in significance.items():
             if index not in chosen and t**2 >= least:
                 yield [index, *rest]
+
+
+def _further(tests: TermTests, chosen: list[int]) -> Iterator[list[int]]:
+    """The chosen candidates with one more that cannot be excluded beside them, as they are at most `TOGETHER`."""
+    for index, t in _significance(tests, chosen).items():
+        if t >= SUSPICIOUS:
+            yield [index, *chosen]
 
 
 def _significance(tests: TermTests, beside: list[int]) -> dict[int, float]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 REACH = 3.0
 """Length of a column of derivatives in a window relative to the median window's; a window with more is shrunk to it."""
@@ -67,7 +67,8 @@ class Score:
         error: Its standard error.
         explained: Share of the squared residuals that it explains, those of initial states and parameters taken away.
         shifts: How it moves each calibrated parameter, in [-1, 1].
-        freedom: Degrees of freedom of the standard error: the number of windows that tell of the term, less one.
+        freedom: Degrees of freedom of the standard error: the number of windows that tell of the term, less one and the
+            columns included.
     """
 
     change: float
@@ -124,12 +125,14 @@ def score(
     if (without <= _DISTINCT * power).any():
         return None
     error = float(_jackknife(((left + change * alone) / without)[:, None])[0, 0]) ** 0.5
+    # Windows are left out at the same coefficients of the columns included, which have been fitted to all of them.
+    error *= np.sqrt(len(each) / max(1, len(each) - len(included)))
     squares = total[0, 0] - 2.0 * fitted @ total[included, 0] + fitted @ total[np.ix_(included, included)] @ fitted
     own_columns = products.parameters
     response = _solved(total[np.ix_(own_columns, own_columns)], mixed.sum(0)[: products.count])
     if not error > 0.0:
         return None
-    freedom = max(1.0, power**2 / float((alone**2).sum()) - 1.0)
+    freedom = max(1.0, power**2 / float((alone**2).sum()) - 1.0 - len(included))
     return Score(change, error, change**2 * power / float(squares), -response * change, freedom)
 
 
@@ -149,6 +152,24 @@ def joint_shift(
 def parameter_shift(products: Products) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
     """The step to the parameters that explain the windows best, in [-1, 1], and its covariance."""
     return _regression(products.bounded(products.parameters), products.parameters)
+
+
+def variances_by_group(
+    products: Products, groups: Int[np.ndarray, " windows"]
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """Variance of each parameter's estimate by leaving out one group of windows at a time, and its degrees of freedom.
+
+    These are the number of groups that tell of the parameter, less one.
+    """
+    columns = products.parameters
+    each = products.bounded(columns)
+    summed = np.stack([each[groups == group].sum(0) for group in np.unique(groups)])
+    _, covariance = _regression(summed, columns)
+    inner = summed[:, columns][:, :, columns]
+    directions = _solved(inner.sum(0), np.eye(len(columns)))
+    alone = np.einsum("jd,gjk,kd->gd", directions, inner, directions)
+    effective = alone.sum(0) ** 2 / np.maximum((alone**2).sum(0), np.finfo(float).tiny)
+    return np.maximum(np.diag(covariance), 0.0), effective - 1.0
 
 
 def _regression(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from madoc.identification.candidate_terms import DELAY, EARLY, Candidate
 from madoc.identification.score_tests import Products, Score, score
@@ -65,12 +65,16 @@ class Alternative:
 
 @dataclass(frozen=True)
 class TermTests:
-    """What score tests need: products of residuals and derivatives, the candidates, and the scale of shifts."""
+    """What score tests need: products of residuals and derivatives, the candidates, and the scale of shifts.
+
+    `runs` are the episodes that the windows are from.
+    """
 
     products: Products
     tried: tuple[Candidate, ...]
     space: ParameterSpace
     half_widths: Float[np.ndarray, " d"]
+    runs: Int[np.ndarray, " windows"]
 
     def score(self, index: int, beside: Sequence[int] = ()) -> Score | None:
         """The score of a candidate beside others; None if there is none, or if its value would not be physical."""

@@ -38,7 +38,7 @@ def missing_term(holdout: HoldOut) -> MissingTerm | None:
     if numerical(holdout) is not None:
         return None
     certain = [term for term in holdout.missing_terms if is_certain(term)]
-    moving = [term for term in certain if max(map(abs, term.shifts.values())) >= MOVES]
+    moving = [term for term in certain if moves_certainly(term)]
     if certain and not moving and _moved_together(holdout):
         moving = [term for term in holdout.missing_terms if term.cause not in (DRIFT, INTEGRATION)]
     return likeliest(moving)
@@ -82,6 +82,11 @@ def coarse_step(holdout: HoldOut, named: MissingTerm) -> MissingTerm | None:
 def is_certain(term: MissingTerm) -> bool:
     """Whether a term is so significant that it is missing, whatever it does to the estimate."""
     return term.cause != INTEGRATION and abs(term.t) >= (CERTAIN_DRIFT if term.cause == DRIFT else CERTAIN)
+
+
+def moves_certainly(term: MissingTerm) -> bool:
+    """Whether a term is certainly missing and would move a parameter by itself."""
+    return is_certain(term) and max(map(abs, term.shifts.values())) >= MOVES
 
 
 def _moved_together(holdout: HoldOut) -> bool:

@@ -26,7 +26,7 @@ from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
-from madoc.verdict.adequacy import widening
+from madoc.verdict.adequacy import moves_certainly, widening
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
@@ -35,7 +35,8 @@ from madoc.verdict.two_sample import WindowView, behaviour, classify, rolled
 AT_END = 0.98
 """Position in [-1, 1] of its range; past it, to either side, a parameter counts as pinned to the end."""
 _MOST_TERMS = 5
-"""Number of missing terms that a report keeps, the most significant ones; the integration step's is always kept."""
+"""Number of missing terms that a report keeps, the most significant ones; besides them the integration step's and all
+that a verdict rests on are kept."""
 FEWEST_HELD = 10
 """Smallest number of rows held out, at least 1. With fewer, even perfect predictions could be chance."""
 _NEIGHBOURS = 5000
@@ -225,9 +226,12 @@ def judged(
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
         control_steps=control_steps + spent + doubts.control_steps,
         missing_terms=tuple(
-            term for place, term in enumerate(doubts.terms) if place < _MOST_TERMS or term.cause == INTEGRATION
+            term
+            for place, term in enumerate(doubts.terms)
+            if place < _MOST_TERMS or term.cause == INTEGRATION or moves_certainly(term)
         ),
         alternatives=doubts.alternatives,
+        tested=doubts.tested,
         contradictions=tuple(each.sentence for each in found if each.contradicts),
         at_end=tuple(
             row.name

@@ -60,6 +60,8 @@ GAINED = 0.75
 """Share in [0, 1] of the possible gain over mid-range on the hold-out; with less, an estimate is no improvement."""
 WORTH_GAINING = 0.05
 """Share in [0, 1] of mid-range's error that parameters can remove; below it mid-range is as good."""
+_MOST_NAMED = 3
+"""Largest number of terms that a sentence names beside the likeliest."""
 SEPARABLE = 0.65
 """Area under the curve in [0.5, 1]; above it simulated rows differ from logged ones. Rollouts of a cloned policy in the
 true simulator have about 0.55."""
@@ -67,6 +69,8 @@ true simulator have about 0.55."""
 
 def judge(holdout: HoldOut, *, settled: bool = True, combinations: Sequence[Combination] = ()) -> Verdict:
     """The first verdict that applies: rejected data, a mismatch, open parameters, no improvement; else calibrated.
+
+    A log that is too short to tell whether the model lacks a term leaves its parameters open.
 
     Args:
         holdout: What the hold-out says of the estimate.
@@ -80,6 +84,7 @@ def judge(holdout: HoldOut, *, settled: bool = True, combinations: Sequence[Comb
         or _mismatch(holdout)
         or _outside(holdout)
         or _open(holdout, combinations)
+        or _untested(holdout)
         or _no_improvement(holdout)
         or (None if settled else Verdict("NO_IMPROVEMENT", f"{_how_good(holdout)}, but {UNSETTLED}"))
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and every parameter is known to within half of its range")
@@ -135,7 +140,7 @@ def _named(term: MissingTerm) -> str:
 
 def _others(holdout: HoldOut, term: MissingTerm) -> str:
     """Which other terms are as likely as the one named."""
-    others = [_named(other) for other in as_likely(holdout, term)]
+    others = [_named(other) for other in as_likely(holdout, term)][:_MOST_NAMED]
     return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
 
 
@@ -186,7 +191,7 @@ def _contradicted(holdout: HoldOut) -> Verdict | None:
 
 def _outside(holdout: HoldOut) -> Verdict | None:
     """An estimate at the end of its range, beyond which the true value may lie."""
-    if not holdout.at_end or isinstance(holdout, ToldApart):
+    if not holdout.at_end:
         return None
     return Verdict(
         "MODEL_MISMATCH",
@@ -264,12 +269,29 @@ def _open(holdout: HoldOut, combinations: Sequence[Combination]) -> Verdict | No
     )
 
 
+def _untested(holdout: HoldOut) -> Verdict | None:
+    if holdout.tested:
+        return None
+    return Verdict(
+        "NOT_IDENTIFIABLE",
+        f"{_how_good(holdout)}, but the log has too few windows that the model can follow to tell whether it lacks "
+        "anything; log more, or in longer runs",
+    )
+
+
 def _no_improvement(holdout: HoldOut) -> Verdict | None:
     if isinstance(holdout, ToldApart):
         sentence = _no_better_areas(holdout.area_at_mid_range, holdout.area_at_estimate)
     else:
-        sentence = _no_better_errors(holdout.errors)
+        sentence = "" if _mid_range_was_right(holdout) else _no_better_errors(holdout.errors)
     return Verdict("NO_IMPROVEMENT", sentence) if sentence else None
+
+
+def _mid_range_was_right(holdout: Predicted | Fitted) -> bool:
+    """Whether the interval of every parameter holds mid-range, and both explain the hold-out down to its noise."""
+    inside = all(abs(value) <= holdout.interval_shares[name] for name, value in holdout.estimate.items())
+    errors, noise = (*holdout.errors.mid_range, *holdout.errors.estimate), holdout.errors.noise
+    return inside and not _beyond_noise(errors, (*noise, *noise))
 
 
 def _no_better_errors(errors: PredictionErrors) -> str:
@@ -305,7 +327,8 @@ def _no_better_areas(before: Area, after: Area) -> str:
 
 def _how_good(holdout: HoldOut) -> str:
     if not isinstance(holdout, ToldApart):
-        return _how_small(holdout.errors)
+        confirmed = ", and mid-range is confirmed: every interval holds it" if _mid_range_was_right(holdout) else ""
+        return f"{_how_small(holdout.errors)}{confirmed}"
     return (
         "a classifier tells rows of the simulator from those held out with an area of "
         f"{_area(holdout.area_at_estimate)}, after {_area(holdout.area_at_mid_range)} at mid-range (0.5 is chance)"
@@ -344,4 +367,4 @@ def _steps(count: int) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %" if np.isfinite(share) else "?"
+    return f"{100 * share:.{2 if share < 0.995 else 3}g} %" if np.isfinite(share) else "?"

@@ -102,7 +102,9 @@ def _single_steps(bench: Bench, point: Float[np.ndarray, " d"]) -> _SingleSteps:
     if len(first):
         slopes = sensors.own_slopes(bench.simulator, held, point, rows[first], scale)
         unexplained = residuals - explanation
-        noise = sensors.consecutive_noise(unexplained[first], unexplained[first + 1], slopes)
+        # Both are lower bounds: what is explained of a channel at rest is its own noise in the reading before.
+        parts = (sensors.consecutive_noise(part[first], part[first + 1], slopes) for part in (unexplained, residuals))
+        noise = np.maximum(*parts)
         spent += len(first) * (1 + len(scale))
     together = autocorrelation(residuals[first], residuals[first + 1])
     return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise, spent)
