@@ -32,6 +32,24 @@ def test_the_time_scale_depends_neither_on_the_rate_nor_on_noise(rate: float, no
     assert log.time_scale / rate == pytest.approx(PERIOD / 6.0, rel=0.05, abs=1.1 / rate)
 
 
+def test_the_time_scale_of_a_long_log_is_that_of_all_of_it() -> None:
+    """At 500 Hz the robot rests for 44 s, which are 22,000 rows, and swings for as long; lags are 11 % apart."""
+    log = swinging(500.0, seconds=88.0)
+    half = log.episode_starts[1]
+    angle, following = (np.array(part) for part in (log.transitions.observation, log.transitions.next_observation))
+    angle[:half], following[:half] = 0.0, 0.0
+    rested = replace(log, transitions=replace(log.transitions, observation=angle, next_observation=following))
+    assert rested.time_scale / 500.0 == pytest.approx(PERIOD / 6.0, rel=0.11)
+
+
+def test_a_motion_whose_period_is_that_of_thinned_rows_is_seen_in_all_of_its_poses() -> None:
+    """At 10 Hz a period is twenty rows, of which one is compared: 1 - cos φ is 0.41 after three rows, 0.69 after four.
+
+    From the first of every twenty rows alone the angle has changed by sin φ, whose square is 0.65 after three.
+    """
+    assert swinging(10.0, seconds=40_000.0, episodes=1).time_scale == 4
+
+
 def test_a_stride_is_a_twentieth_of_it_and_a_row_at_least() -> None:
     assert (stride(swinging(30.0)), stride(swinging(300.0))) == (1, 5)
     lost = replace(swinging(300.0), disturbance=Disturbance(shuffled="rows"))

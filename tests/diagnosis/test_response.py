@@ -68,3 +68,10 @@ def test_positions_in_degrees_without_velocities(told):
     found = told(columns, POSITIONS)[0]
     assert [where for where, _ in found] == ["shoulder_torque", "elbow_torque"]
     assert all(what.endswith("anywhere in the ranges of the parameters: degrees for radians?") for _, what in found)
+
+
+def test_an_action_that_is_always_zero_has_no_response(told):
+    found, (shoulder, elbow) = told(recorded() | {"shoulder_torque": np.zeros(1200)})
+    assert (shoulder.gain, shoulder.gain_error, shoulder.lag, shoulder.certain) == (0.0, 0.0, 0.0, False)
+    assert elbow.certain
+    assert found == []

@@ -44,3 +44,15 @@ def test_speeds_that_are_two_rows_late(told):
     assert late
     assert [where for where, _ in found if where.endswith("speed")] == ["shoulder_speed", "elbow_speed"]
     assert all(what.startswith("it comes 0.0") for where, what in found if where.endswith("speed"))
+
+
+@pytest.mark.parametrize("trembling", [0.0, 1e-9])
+def test_joints_that_move_in_one_part_of_the_log_alone(told, trembling):
+    """They go up and down once, from 22 s to 23 s of a minute; without that part nothing is left to regress on."""
+    time = 0.02 * np.arange(3000)
+    phase = 2.0 * np.pi * np.clip(time - 22.0, 0.0, 1.0)
+    columns = {"time": time, "shoulder_torque": np.zeros(3000), "elbow_torque": np.zeros(3000)}
+    for name in ("shoulder", "elbow"):
+        columns[name] = 0.1 * (1.0 - np.cos(phase)) + trembling * np.sin(time)
+        columns[f"{name}_speed"] = 0.2 * np.pi * np.sin(phase) + trembling * np.cos(time)
+    assert told(columns) == ([], False)

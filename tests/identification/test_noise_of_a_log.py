@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import numpy as np
 
@@ -16,3 +18,8 @@ def test_noise_is_told_from_motion():
     for share in (0.01, 0.1):
         noisy = disturb(clean, Disturbance(noise=share), task, jax.random.key(1))
         np.testing.assert_allclose(regression_noise(noisy), share * change, rtol=0.15)
+
+
+def test_episodes_of_one_row_tell_no_noise():
+    rows = recorded(pendulum(), TRUTH, 50, jax.random.key(0))
+    assert regression_noise(replace(rows, episode_starts=np.arange(50))).tolist() == [0.0, 0.0]

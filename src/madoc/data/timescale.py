@@ -1,14 +1,14 @@
 """A robot's own time scale, from its log, so that nothing depends on the rate at which the log was written."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from madoc.data.dataset import Dataset, spread_of
 
 STEPS = 20
 """Number of steps of comparison in a time scale, 1 or more. Rows that are closer together are taken together."""
-_MOST_ROWS = 20_000
-"""Largest number of rows that a time scale is computed from; more would hardly change a variance."""
+_MOST_PAIRS = 20_000
+"""Largest number of pairs of rows that a mean squared change is computed from; more would hardly change it."""
 _LAGS = 96
 """Number of lags that are tried, spaced evenly in their logarithm."""
 
@@ -23,7 +23,7 @@ def time_scale(dataset: Dataset) -> int:
     to row it does not depend on the rate of the log, nor on noise that is smaller than the motion. It is at most half
     of the longest episode, and 1 where the order of rows is lost.
     """
-    observation = np.asarray(dataset.transitions.observation, np.float64)[:_MOST_ROWS]
+    observation = np.asarray(dataset.transitions.observation, np.float64)
     episode = dataset.episode_of(np.arange(len(observation)))
     rows = np.bincount(episode)
     means = np.stack([np.bincount(episode, weights=column) / rows for column in observation.T], axis=-1)
@@ -34,12 +34,23 @@ def time_scale(dataset: Dataset) -> int:
         return 1
     found = np.full(int(moving.sum()), longest)
     for lag in np.unique(np.geomspace(1, longest, _LAGS).round().astype(np.int64))[::-1].tolist():
-        pairs = np.flatnonzero(episode[lag:] == episode[:-lag])
+        pairs = _thinned(np.flatnonzero(episode[lag:] == episode[:-lag]))
         if len(pairs):
             change = observation[pairs + lag][:, moving] - observation[pairs][:, moving]
             found = np.where((change**2).mean(0) >= variance[moving], lag, found)
     slow = found[found > 1]
     return int(np.quantile(slow if len(slow) else found, 0.25, method="lower"))
+
+
+def _thinned(pairs: Int[np.ndarray, " pairs"]) -> Int[np.ndarray, " kept"]:
+    """At most `_MOST_PAIRS` of the pairs, from all of the log: one at random of each of so many equal parts.
+
+    The draw is always the same. Pairs at equal distances would see a periodic motion in the same few poses alone.
+    """
+    if len(pairs) <= _MOST_PAIRS:
+        return pairs
+    places = np.arange(_MOST_PAIRS) + np.random.default_rng(0).random(_MOST_PAIRS)
+    return pairs[(places * (len(pairs) / _MOST_PAIRS)).astype(np.int64)]
 
 
 def stride(dataset: Dataset) -> int:

@@ -55,7 +55,8 @@ class Response:
         joint: The joint and its action.
         gain: Change of the joint's velocity in a control step over that of the action, in [-1, 1].
         gain_error: Standard error of the gain.
-        lag: Time from an action to the acceleration it causes, beyond that of a command held for a control step, s.
+        lag: Time from an action to the acceleration it causes, beyond that of a command held for a control step, s; 0
+            where the gain is 0.
         lag_error: Standard error of the lag, s.
         share: Share in [0, 1] of the acceleration's variance, beyond what the state explains, that the action explains.
     """
@@ -192,7 +193,9 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     for at, joint in enumerate(joints):
         estimates, share = _regressed(design, motion.change[kept, at], own[at])
         gains = estimates.sum(-1)
-        lags = simulator.control_step * ((estimates @ windows[at]) / gains - motion.ahead[at])
+        taken = np.full(len(gains), motion.ahead[at])
+        taken = np.divide(estimates @ windows[at], gains, out=taken, where=gains != 0.0)
+        lags = simulator.control_step * (taken - motion.ahead[at])
         found.append(Response(joint, float(gains[0]), _jackknife(gains), float(lags[0]), _jackknife(lags), share))
     return tuple(found)
 

@@ -159,15 +159,21 @@ class _Fit:
 
 
 def _fitted(pair: _Pair, control_step: float) -> _Fit | None:
-    """The regression of a position's change on its speed; None where it explains too little, or rests on too few."""
+    """The regression of a position's change on its speed; None where it explains too little, or rests on too few.
+
+    It rests on too few as well where the joint moves in a single part of the log: without that part, nothing is left.
+    """
     stretches = _stretches(pair, max(2, round(STRETCH / control_step)))
     if len(stretches) < _FEWEST:
         return None
     products = np.stack([part.T @ part for part in np.array_split(stretches, _BLOCKS)])
     whole = products.sum(0)
-    if np.linalg.matrix_rank(whole[:-1, :-1], hermitian=True) < len(whole) - 1:
+    estimates = np.stack([whole, *(whole - products)])  # of the whole log, and without each of its parts
+    inputs = len(whole) - 1
+    rounding = np.finfo(float).eps * inputs * np.linalg.norm(whole[:-1, :-1], 2)
+    if np.linalg.matrix_rank(estimates[:, :-1, :-1], tol=rounding, hermitian=True).min() < inputs:
         return None
-    solutions = np.stack([np.linalg.solve(each[:-1, :-1], each[:-1, -1]) for each in (whole, *(whole - products))])
+    solutions = np.stack([np.linalg.solve(each[:-1, :-1], each[:-1, -1]) for each in estimates])
     if solutions[0] @ whole[:-1, -1] < _EXPLAINED * whole[-1, -1]:
         return None
     errors = np.sqrt((_BLOCKS - 1) * solutions[1:].var(0))

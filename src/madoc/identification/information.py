@@ -161,13 +161,11 @@ def identifiability(uncertainty: Uncertainty, names: tuple[str, ...]) -> tuple[s
     return tuple(sentences)
 
 
-def correlated_pairs(
-    correlation: Float[np.ndarray, "d d"], names: tuple[str, ...], threshold: float = _CORRELATED
-) -> list[tuple[str, str, float]]:
-    """Pairs of parameters whose estimates correlate by more than the threshold, strongest first."""
+def correlated_pairs(correlation: Float[np.ndarray, "d d"], names: tuple[str, ...]) -> list[tuple[str, str, float]]:
+    """Pairs of parameters whose estimates can hardly be told apart, strongest correlation first."""
     rows, columns = np.triu_indices(len(names), 1)
     strong = [(names[i], names[j], float(correlation[i, j])) for i, j in zip(rows, columns, strict=True)]
-    return sorted((pair for pair in strong if abs(pair[2]) > threshold), key=lambda pair: -abs(pair[2]))
+    return sorted((pair for pair in strong if abs(pair[2]) > _CORRELATED), key=lambda pair: -abs(pair[2]))
 
 
 def _sum_of_products(around: Linearisation, weights: Float[np.ndarray, "windows values"]) -> Float[np.ndarray, "d d"]:

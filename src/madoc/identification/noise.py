@@ -47,13 +47,18 @@ def regression_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:
 
     A reading that is too high raises what is predicted from it: of s' = f(s, a) + e' - F e, fitted by a regression on
     s, a and their products, the residuals of consecutive rows have the covariance -F σ². What the regression cannot
-    follow has the same sign in consecutive rows and hides noise smaller than itself, so this is a lower bound.
+    follow has the same sign in consecutive rows and hides noise smaller than itself, so this is a lower bound. Where no
+    row has one of its episode before it, none is seen.
     """
     logged = dataset.transitions
     observation, action, following = (
         np.asarray(part)[:_MOST_ROWS] for part in (logged.observation, logged.action, logged.next_observation)
     )
     count = observation.shape[1]
+    inner = np.ones(len(observation), dtype=bool)
+    inner[dataset.episode_starts[dataset.episode_starts < len(observation)]] = False
+    if not inner.any():
+        return np.zeros(count)
     columns = np.concatenate([observation, action], axis=-1)
     scale = spread_of(columns)
     columns = (columns - columns.mean(0)) / scale
@@ -62,8 +67,6 @@ def regression_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:
     weights = np.linalg.lstsq(inputs, following, rcond=None)[0]
     residual = following - inputs @ weights
     slope = np.diagonal(weights[:count]) / scale[:count]
-    inner = np.ones(len(residual), dtype=bool)
-    inner[dataset.episode_starts[dataset.episode_starts < len(residual)]] = False
     shared = (residual[1:] * residual[:-1])[inner[1:]].mean(0)
     steep = np.abs(slope) > _LEAST_SLOPE
     return np.sqrt(np.maximum(0.0, np.where(steep, -shared / np.where(steep, slope, 1.0), 0.0)))
