@@ -9,7 +9,7 @@ from madoc import robots, simulation
 from madoc.data import logs, typical_change
 from madoc.identification import missing_terms as terms
 from madoc.identification.candidate_terms import Candidate
-from madoc.identification.drifts import DRIFT
+from madoc.identification.drifts import DRIFT, _between_runs
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
 from madoc.identification.term_tests import TermTests
@@ -107,6 +107,40 @@ def test_a_parameter_that_changes_over_the_log_is_told_with_its_change(tmp_path)
     assert drifts[0].t > 6.0
 
 
+def test_a_log_that_is_cut_into_short_stretches_is_tested_all_the_same(tmp_path):
+    dataset, simulator = plant(tmp_path, friction=0.05)
+    starts = np.append(0, np.arange(80, len(dataset), 8))  # one stretch of 80 rows, all others of 8
+    short = dataset.take(np.arange(len(dataset)), starts=starts)
+    best = scores(short, simulator)[0]
+    assert best.parameter == "dof_frictionloss.hinge"
+    assert best.value == pytest.approx(0.05, abs=3.0 * best.standard_error)
+
+
+def test_too_short_a_log_is_not_tested(tmp_path):
+    dataset, simulator = plant(tmp_path)
+    few = dataset.take(np.arange(20), starts=np.array([0]))
+    point, states = np.zeros(1), states_of(few, simulator)
+    assert not terms.suspicions(few, states, simulator, point, np.array([0.01]), typical_change(few)).tested
+
+
+def test_a_parameter_that_alternates_from_run_to_run_is_told():
+    """Its mean is the same in both halves and all thirds of the log."""
+    random = np.random.default_rng(0)
+    runs, slope = np.repeat(np.arange(12), 10), random.standard_normal((120, 6))
+    for apart in (0.0, 0.5):
+        value = apart * (-1.0) ** runs[:, None]
+        products = Products.of(
+            slope * value + 0.5 * random.standard_normal((120, 6)), slope[..., None], np.zeros((120, 6, 0))
+        )
+        space = ParameterSpace((Parameter("gravity", "", -11, -9),))
+        (term,), others = _between_runs(TermTests(products, (), space, np.array([0.01]), runs))
+        assert (term.cause, term.parameter) == (DRIFT, "gravity")
+        assert (term.t > 5.0) == (apart > 0.0)
+        assert bool(others) == (apart > 0.0)
+    assert term.value == pytest.approx(0.5, rel=0.2)  # the range is 2 wide, so 0.5 in [-1, 1] is 0.5 m/s²
+    assert others[0].errors["gravity"] == pytest.approx(1.96 * 0.5 / np.sqrt(11) / 0.01, rel=0.2)
+
+
 def test_a_term_that_explains_the_same_is_a_rival():
     random = np.random.default_rng(0)
     friction, unrelated = random.standard_normal((2, 200, 6))
@@ -115,7 +149,13 @@ def test_a_term_that_explains_the_same_is_a_rival():
     columns = np.stack([offset, unrelated, friction], axis=-1)
     products = Products.of(0.2 * friction + noise, slope[..., None], columns)
     tried = [Candidate(cause, "", "", 0.0, 1.0, -np.inf) for cause in ("offset", "unrelated", "friction")]
-    tests = TermTests(products, tuple(tried), ParameterSpace((Parameter("gravity", "", -11, -9),)), np.ones(1), np.zeros(len(products), int))
+    tests = TermTests(
+        products,
+        tuple(tried),
+        ParameterSpace((Parameter("gravity", "", -11, -9),)),
+        np.ones(1),
+        np.zeros(len(products), int),
+    )
     (chosen,) = terms._chosen(tests)
     ((rival,),) = terms._rivals(tests, [chosen])
     assert {chosen, rival} == {0, 2}

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from madoc.identification.score_tests import Products, deviate, joint_shift, parameter_shift, score
+from madoc.identification.score_tests import (
+    Products,
+    deviate,
+    joint_shift,
+    parameter_shift,
+    score,
+    variances_by_group,
+)
 
 EFFECT = np.array([[1.0, 1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, -1.0]])
 NOISE = 0.1 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, 1.0], [-1.0, -1.0]])
@@ -66,3 +73,16 @@ def test_a_ratio_counts_less_with_few_degrees_of_freedom():
     assert deviate(12.706, 1.0) == pytest.approx(1.96, abs=1e-3)
     assert deviate(-12.706, 1.0) == pytest.approx(-1.96, abs=1e-3)
     assert deviate(1.96, 1e6) == pytest.approx(1.96, abs=1e-3)
+
+
+def test_leaving_out_runs_shows_what_differs_between_them():
+    """Runs of three windows each, whose values of p are ±1: windows of a run err together, so four runs count."""
+    signs = np.repeat([1.0, -1.0, 1.0, -1.0], 3)
+    ones = np.ones((12, 2, 1))
+    products = Products.of(np.tile(signs[:, None], (1, 2)), ones, np.zeros((12, 2, 0)))
+    by_run, freedom = variances_by_group(products, np.repeat(np.arange(4), 3))
+    by_window, windows = variances_by_group(products, np.arange(12))
+    # Without run g of four the mean moves by ±1 · 6 / (24 - 6), without one window of twelve by ±2 / 22.
+    assert by_run == pytest.approx([3 / 4 * 4 * (1 / 3) ** 2])
+    assert by_window == pytest.approx([11 / 12 * 12 * (1 / 11) ** 2])
+    assert (freedom, windows) == (pytest.approx([3.0]), pytest.approx([11.0]))

@@ -159,6 +159,42 @@ def test_rows_alone_are_judged_by_the_classifier(word, before, after):
     assert judge(replace(TOLD_APART, area_at_mid_range=at_mid_range, area_at_estimate=at_estimate)).word == word
 
 
+@pytest.mark.parametrize("good", [PREDICTED, FITTED, TOLD_APART])
+def test_what_could_not_be_tested_or_stands_at_an_end_is_not_calibrated(good):
+    untested = judge(replace(good, tested=False))
+    assert untested.word == "NOT_IDENTIFIABLE"
+    assert "too few windows that the model can follow to tell whether it lacks anything" in untested.sentence
+    assert judge(replace(good, at_end=("mass",))).word == "MODEL_MISMATCH"
+
+
+@EITHER
+def test_a_right_guess_is_confirmed_where_intervals_hold_it(good):
+    no_gain = {
+        "mid_range": errors(0.1, 0.4),
+        "relative": 1.0,
+        "relative_interval": (0.98, 1.02),
+        "nearby_relative": 0.99,
+    }
+    near = {"mass": 0.005, "damping": -0.1}
+    verdict = judge(changed(good, no_gain, estimate=near))
+    assert verdict.word == "CALIBRATED"
+    assert "is 100 % of mid-range's" in verdict.sentence and "mid-range is confirmed" in verdict.sentence
+    assert judge(changed(good, no_gain)).word == "NO_IMPROVEMENT"  # 0.2 is 20 half-widths from mid-range
+    loud = no_gain | {"mid_range": errors(0.1, 0.8)}
+    assert judge(changed(good, loud, estimate=near)).word == "NO_IMPROVEMENT"
+
+
+@EITHER
+def test_a_sentence_names_three_other_terms_at_most(good):
+    terms = tuple(
+        MissingTerm("Coulomb friction", f"dof_frictionloss.j{joint}", 0.1, 0.01, "N·m", 0.3, 9.0, {"mass": 2.0})
+        for joint in range(6)
+    )
+    verdict = judge(changed(good, missing_terms=terms))
+    assert verdict.word == "MODEL_MISMATCH"
+    assert verdict.sentence.count(" or Coulomb friction") == 2
+
+
 def test_every_word_has_an_exit_code_of_its_own():
     codes = [EXIT_CODES[word] for word in WORDS]
     assert len(set(codes)) == len(codes)
