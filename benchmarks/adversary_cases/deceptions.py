@@ -104,6 +104,17 @@ _PENDULUM = (
     Case(PENDULUM, "limit", Plant(limit=0.5), cause=LIMIT),
     Case(PENDULUM, "drift-damping", Plant(by_run=tuple({"damping": d} for d in (0.15, 0.2, 0.25))), cause=DRIFT),
     Case(PENDULUM, "drift-friction", Plant(by_run=tuple({"friction": f} for f in (0.2, 0.1, 0.0))), cause=DRIFT),
+    Case(
+        PENDULUM,
+        "runs-alternate",
+        Plant(by_run=({"damping": 0.22}, {"damping": 0.28}) * 6),
+        Log(runs=12, seconds=3.0),
+        cause=DRIFT,
+    ),
+    *(
+        Case(PENDULUM, f"friction-{size}-stretches", Plant({"friction": size}), Log(dropped=0.2), cause=FRICTION)
+        for size in (0.05, 0.1)
+    ),
     Case(PENDULUM, "filtered-speed", log=Log(velocities="filtered"), cause=LATE),
     Case(PENDULUM, "clock-drift", Plant(drift=0.08), Log(nominal_time=True), cause=CLOCK),
     Case(
@@ -142,6 +153,7 @@ _ARM = (
     Case(ARM, "rate-5", Plant(spacing=1.05), cause=RATE),
     Case(ARM, "gravity", spec=Spec({"gravity": 0.0}), cause=GRAVITY),
     Case(ARM, "payload", Plant({"payload": 0.2}), cause=INERTIA),
+    Case(ARM, "runs-alternate", Plant(by_run=({}, {"payload": 0.1}) * 3), cause=DRIFT),
     Case(ARM, "runs-payload", Plant(by_run=tuple({"payload": p} for p in (0.0, 0.1, 0.2))), cause=DRIFT),
     Case(ARM, "inertia", Plant({"armature_shoulder": 0.03, "armature_elbow": 0.02}), cause=INERTIA),
     Case(ARM, "spring", Plant({"spring_elbow": 0.8}), cause=SPRING),

@@ -46,6 +46,8 @@ _SPECIAL = (
             ("dropped", Plant(), Log(dropped=0.02), Spec()),
         )
     ),
+    Case(PENDULUM, "at-mid-range", Plant({"length": 0.5, "damping": 0.25})),
+    *(Case(robot, "stretches", log=Log(dropped=0.2)) for robot in (PENDULUM, ARM)),
     Case(PENDULUM, "many", spec=Spec(free=_LONG)),
     Case(PENDULUM, "many-noisy", log=Log(noise=0.02), spec=Spec(free=_LONG)),
     Case(PENDULUM, "friction", spec=Spec(free=("length", "damping", "friction"))),
