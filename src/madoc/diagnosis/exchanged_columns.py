@@ -1,7 +1,7 @@
 """Columns of a log that are exchanged or reversed against the spec: the log, replayed with them put right."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -27,7 +27,24 @@ MOST_STEPS = 60_000
 _BEYOND = 1.05
 """Largest action over the largest logged one, or over the range; sensors of current read more than the range."""
 _NEGLIGIBLE = 1e-3
-"""Error in typical changes of a step, up to which the log is predicted exactly."""
+"""Error in typical changes of a step, up to which the log is predicted exactly, so that nothing is to be corrected."""
+
+
+@dataclass(frozen=True)
+class _Correction:
+    """A mistake that a log may have, and what corrects it.
+
+    Attributes:
+        mistake: What may be wrong, in words.
+        of_actions: Whether columns of actions are corrected, else of observations.
+        order: The column that belongs in each place.
+        sign: What each column is multiplied by in its new place.
+    """
+
+    mistake: str
+    of_actions: bool
+    order: Int[np.ndarray, " width"]
+    sign: Float[np.ndarray, " width"]
 
 
 def exchanged_columns(
@@ -49,18 +66,21 @@ def exchanged_columns(
         scale: Typical change of each signal in a step.
         contradicts: Whether the finding is to say that no estimate from this log is to be trusted.
     """
-    mistakes = _mistakes(dataset, simulator, exchanged=True)
+    corrections = _corrections(dataset, simulator, exchanged=True)
     affordable = MOST_STEPS // (steps * len(points))
-    if affordable < FEWEST_WINDOWS * len(mistakes):
-        mistakes = _mistakes(dataset, simulator, exchanged=False)
-    count = min(WINDOWS, max(FEWEST_WINDOWS, affordable // max(1, len(mistakes))))
-    as_logged, spent = _error(dataset, simulator, points, steps, scale, count)
+    if affordable < FEWEST_WINDOWS * len(corrections):
+        corrections = _corrections(dataset, simulator, exchanged=False)
+    count = min(WINDOWS, max(FEWEST_WINDOWS, affordable // max(1, len(corrections))))
+    replayed = _replayed(dataset, simulator, steps, count)
+    as_logged, spent = _error(replayed, simulator, points, steps, scale, count)
+    if as_logged <= _NEGLIGIBLE:
+        return (), spent
     better: dict[str, float] = {}
-    for mistake, put_right in mistakes.items():
-        error, more = _error(put_right, simulator, points, steps, scale, count)
+    for correction in corrections:
+        error, more = _error(_put_right(replayed, simulator, correction), simulator, points, steps, scale, count)
         spent += more
         if error < BETTER * as_logged:
-            better[mistake] = error
+            better[correction.mistake] = error
     if not better:
         return (), spent
     least = min(better.values())
@@ -69,6 +89,18 @@ def exchanged_columns(
         f"{' or '.join(likely)}; put right, the log is predicted {as_logged / max(least, _NEGLIGIBLE):.2g} times better"
     )
     return (Finding("warning", what, "columns", "correct the spec or the log", contradicts=contradicts),), spent
+
+
+def _replayed(dataset: Dataset, simulator: Simulator, steps: int, count: int) -> Dataset:
+    """At most `count` windows of `steps` rows, each with the rows of its pending actions before it as an episode.
+
+    Where no episode is as long, they are shorter. Every mistake is put right in these rows alone.
+    """
+    _, rows = logged_states(dataset, simulator.task)
+    steps, before = longest_fit(dataset, rows, steps), simulator.task.pending
+    first = rows[evenly(first_rows(dataset, rows, steps), count)]
+    taken = first[:, None] + np.arange(-before, steps)
+    return dataset.take(taken.ravel(), np.arange(len(first)) * taken.shape[1])
 
 
 def _error(
@@ -89,40 +121,54 @@ def _error(
     return float(np.median(sizes, axis=1).min()), len(points) * len(chosen) * steps
 
 
-def _mistakes(dataset: Dataset, simulator: Simulator, *, exchanged: bool) -> dict[str, Dataset]:
-    """What may be wrong, and the log without it: each action or joint reversed and, if asked for, any two exchanged.
+def _corrections(dataset: Dataset, simulator: Simulator, *, exchanged: bool) -> list[_Correction]:
+    """What corrects each action or joint that may be reversed and, if asked for, any two that may be exchanged.
 
-    A log whose actions would leave their range is none.
+    A correction after which the log's actions leave their range is none.
     """
-    logged, channels = dataset.transitions, simulator.task.actions
-    action, names = np.asarray(logged.action, np.float64), action_names(simulator.task)
-    middle = np.array([(row.high + row.low) / 2.0 for row in channels] or 0.0)
-    half = np.array([(row.high - row.low) / 2.0 for row in channels] or 1.0)
-    limit, found = _BEYOND * max(1.0, float(np.abs(action).max())), dict[str, Dataset]()
-    of_actions = {name: [index] for index, name in enumerate(names)}
-    for what, order, sign in _corrections("action", of_actions, len(names), exchanged):
-        corrected = ((action * half + middle)[:, order] * sign - middle) / half
-        if np.abs(corrected).max() <= limit:
-            found[what] = replace(dataset, transitions=replace(logged, action=corrected))
-    for what, order, sign in _corrections("joint", _joints(simulator), simulator.task.observation_size, exchanged):
-        now, then = (np.asarray(each)[:, order] * sign for each in (logged.observation, logged.next_observation))
-        found[what] = replace(dataset, transitions=replace(logged, observation=now, next_observation=then))
-    return found
+    action, names = np.asarray(dataset.transitions.action, np.float64), action_names(simulator.task)
+    ends = np.stack([action.min(0), action.max(0)])
+    limit = _BEYOND * max(1.0, float(np.abs(ends).max()))
+    of_actions = _of_columns("action", {name: [index] for index, name in enumerate(names)}, len(names), exchanged)
+    of_joints = _of_columns("joint", _joints(simulator), simulator.task.observation_size, exchanged)
+    possible = (each for each in of_actions if np.abs(_corrected_actions(ends, simulator, each)).max() <= limit)
+    return [*possible, *of_joints]
 
 
-def _corrections(
-    kind: str, columns: dict[str, list[int]], width: int, exchanged: bool
-) -> Iterator[tuple[str, Int[np.ndarray, " width"], Float[np.ndarray, " width"]]]:
-    """What may be wrong, and the order and the signs of the columns that correct it."""
+def _of_columns(kind: str, columns: dict[str, list[int]], width: int, exchanged: bool) -> Iterator[_Correction]:
+    """Corrections of the named actions or joints, each with its columns of `width`."""
     for name, own in columns.items():
         sign = np.ones(width)
         sign[own] = -1.0
-        yield f"the {kind} {name} has the other sign", np.arange(width), sign
+        yield _Correction(f"the {kind} {name} has the other sign", kind == "action", np.arange(width), sign)
     if exchanged:
         for (one, first), (other, second) in combinations(columns.items(), 2):
             order = np.arange(width)
             order[[*first, *second]] = [*second, *first]
-            yield f"the {kind}s {one} and {other} are exchanged", order, np.ones(width)
+            yield _Correction(f"the {kind}s {one} and {other} are exchanged", kind == "action", order, np.ones(width))
+
+
+def _put_right(dataset: Dataset, simulator: Simulator, correction: _Correction) -> Dataset:
+    """The log without a mistake."""
+    logged = dataset.transitions
+    if correction.of_actions:
+        action = _corrected_actions(np.asarray(logged.action, np.float64), simulator, correction)
+        return replace(dataset, transitions=replace(logged, action=action))
+    now, then = (
+        np.asarray(each)[:, correction.order] * correction.sign
+        for each in (logged.observation, logged.next_observation)
+    )
+    return replace(dataset, transitions=replace(logged, observation=now, next_observation=then))
+
+
+def _corrected_actions(
+    action: Float[np.ndarray, "rows action"], simulator: Simulator, correction: _Correction
+) -> Float[np.ndarray, "rows action"]:
+    """Actions with their columns corrected in the units of the spec, not in [-1, 1] of each column's range."""
+    channels = simulator.task.actions
+    middle = np.array([(row.high + row.low) / 2.0 for row in channels] or 0.0)
+    half = np.array([(row.high - row.low) / 2.0 for row in channels] or 1.0)
+    return ((action * half + middle)[:, correction.order] * correction.sign - middle) / half
 
 
 def _joints(simulator: Simulator) -> dict[str, list[int]]:
