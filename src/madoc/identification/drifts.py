@@ -89,12 +89,13 @@ def _between_runs(tests: TermTests) -> tuple[list[MissingTerm], list[Alternative
             continue
         chance = fisher.sf(by_run[index] / by_window[index], freedom[index], windows[index])
         t = float(norm.isf(max(float(chance), np.finfo(float).tiny)))
-        half, error = (row.high - row.low) / 2.0, float(np.sqrt(by_run[index]))
-        deviation = error * float(np.sqrt(freedom[index] + 1.0))
-        shift = {row.name: deviation / float(tests.half_widths[index])}
+        beyond = max(0.0, float(by_run[index] - by_window[index]))
+        deviation, error = np.sqrt([(freedom[index] + 1.0) * beyond, by_run[index]]).tolist()
+        half, half_width = (row.high - row.low) / 2.0, float(tests.half_widths[index])
+        shift = {row.name: deviation / half_width}
         terms.append(MissingTerm(DRIFT, row.name, deviation * half, error * half, row.unit, 0.0, t, shift))
-        if t >= SUSPICIOUS:  # then windows of a run are not independent, and intervals are to be those of runs
-            errors = {row.name: NORMAL_95 * error / float(tests.half_widths[index])}
+        if t >= SUSPICIOUS:  # then an interval is to hold the value of any run
+            errors = {row.name: NORMAL_95 * float(np.hypot(deviation, error)) / half_width}
             others.append(Alternative((f"{row.name} changing from run to run",), False, {row.name: 0.0}, errors, True))
     return terms, others
 
