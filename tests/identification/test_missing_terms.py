@@ -141,6 +141,16 @@ def test_a_parameter_that_alternates_from_run_to_run_is_told():
     assert others[0].errors["gravity"] == pytest.approx(1.96 * 0.5 * np.sqrt(1.0 + 1.0 / 11.0) / 0.01, rel=0.2)
 
 
+def test_runs_that_repeat_one_motion_agree_and_are_no_sign_of_a_change():
+    random = np.random.default_rng(0)
+    slope, residuals = (np.tile(random.standard_normal((8, 6)), (12, 1)) for _ in range(2))
+    products = Products.of(residuals, slope[..., None], np.zeros((96, 6, 0)))
+    space = ParameterSpace((Parameter("gravity", "", -11, -9),))
+    tests = TermTests(products, (), space, np.array([0.01]), np.repeat(np.arange(12), 8))
+    (term,), others = _between_runs(tests)
+    assert (term.t, others) == (0.0, [])
+
+
 def test_a_term_that_explains_the_same_is_a_rival():
     random = np.random.default_rng(0)
     friction, unrelated = random.standard_normal((2, 200, 6))

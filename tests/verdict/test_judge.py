@@ -182,6 +182,8 @@ def test_a_right_guess_is_confirmed_where_intervals_hold_it(good):
     assert judge(changed(good, no_gain)).word == "NO_IMPROVEMENT"  # 0.2 is 20 half-widths from mid-range
     loud = no_gain | {"mid_range": errors(0.1, 0.8)}
     assert judge(changed(good, loud, estimate=near)).word == "NO_IMPROVEMENT"
+    stuck = no_gain | {"nearby_relative": 0.5}
+    assert judge(changed(good, stuck, estimate={"mass": 0.0, "damping": 0.0})).word == "NO_IMPROVEMENT"
 
 
 @EITHER

@@ -88,7 +88,8 @@ def _between_runs(tests: TermTests) -> tuple[list[MissingTerm], list[Alternative
         if freedom[index] < FEWEST_RUNS or not by_window[index] > 0.0:
             continue
         chance = fisher.sf(by_run[index] / by_window[index], freedom[index], windows[index])
-        t = float(norm.isf(max(float(chance), np.finfo(float).tiny)))
+        # Runs that agree better than by chance, as where all repeat one motion, are no sign of a change.
+        t = float(norm.isf(np.clip(chance, np.finfo(float).tiny, 0.5)))
         beyond = max(0.0, float(by_run[index] - by_window[index]))
         deviation, error = np.sqrt([(freedom[index] + 1.0) * beyond, by_run[index]]).tolist()
         half, half_width = (row.high - row.low) / 2.0, float(tests.half_widths[index])

@@ -50,10 +50,13 @@ def windows_of(
     of its median row is shorter.
     """
     lengths = dataset.episode_ends - dataset.episode_starts
-    usual = max(1, int(np.median(np.repeat(lengths, lengths))) - 1)  # a window has an action before it
+    age = logged.rows - dataset.episode_starts[dataset.episode_of(logged.rows)]
+    earliest = max(
+        1, int(age.min(initial=len(dataset)))
+    )  # behind the actions that are pending, and one action at least
+    usual = max(1, int(np.median(np.repeat(lengths, lengths))) - earliest)
     affordable = min(max(stride(dataset), len(dataset) // fewest - 2), usual)
-    later = logged.rows > dataset.episode_starts[dataset.episode_of(logged.rows)]
-    rows, states = logged.rows[later], logged.states[later]
+    rows, states = logged.rows[age > 0], logged.states[age > 0]
     steps, chosen = min(STRIDES * stride(dataset), affordable), np.zeros(0, np.int64)
     if len(rows):
         steps = longest_fit(dataset, rows, steps)

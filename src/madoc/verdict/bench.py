@@ -26,7 +26,7 @@ from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
-from madoc.verdict.adequacy import moves_certainly, widening
+from madoc.verdict.adequacy import is_certain, widening
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
@@ -36,7 +36,7 @@ AT_END = 0.98
 """Position in [-1, 1] of its range; past it, to either side, a parameter counts as pinned to the end."""
 _MOST_TERMS = 5
 """Number of missing terms that a report keeps, the most significant ones; besides them the integration step's and all
-that a verdict rests on are kept."""
+that are certain are kept, as a verdict rests on them."""
 FEWEST_HELD = 10
 """Smallest number of rows held out, at least 1. With fewer, even perfect predictions could be chance."""
 _NEIGHBOURS = 5000
@@ -202,7 +202,8 @@ def judged(
         half, spent = np.minimum(half, fitted), spent + more
     own = half if interval is None else np.maximum((interval[:, 1] - interval[:, 0]) / (space.high - space.low), 1e-9)
     doubts = Suspicions()
-    if bench.states.kind != "unknown" and problem.dataset.disturbance.shuffled == "none":
+    ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
+    if bench.states.kind != "unknown" and problem.dataset.disturbance.shuffled == "none" and ordered:
         doubts = suspicions(problem.dataset, bench.states, problem.simulator, point, own, bench.change)
     found = problem.dataset.findings
     if bench.simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none":
@@ -228,7 +229,7 @@ def judged(
         missing_terms=tuple(
             term
             for place, term in enumerate(doubts.terms)
-            if place < _MOST_TERMS or term.cause == INTEGRATION or moves_certainly(term)
+            if place < _MOST_TERMS or term.cause == INTEGRATION or is_certain(term)
         ),
         alternatives=doubts.alternatives,
         tested=doubts.tested,

@@ -19,6 +19,7 @@ from madoc.identification.candidate_terms import EARLY, SATURATION, SPACING, TIL
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
 from madoc.identification.information import OPEN
+from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import MissingTerm
 from madoc.parameters import FIELDS
 from madoc.verdict.adequacy import as_likely, coarse_step, is_certain, likeliest, missing_term, numerical
@@ -288,10 +289,13 @@ def _no_improvement(holdout: HoldOut) -> Verdict | None:
 
 
 def _mid_range_was_right(holdout: Predicted | Fitted) -> bool:
-    """Whether the interval of every parameter holds mid-range, and both explain the hold-out down to its noise."""
+    """Whether the interval of every parameter holds mid-range, and nothing nearby explains the hold-out better."""
     inside = all(abs(value) <= holdout.interval_shares[name] for name, value in holdout.estimate.items())
-    errors, noise = (*holdout.errors.mid_range, *holdout.errors.estimate), holdout.errors.noise
-    return inside and not _beyond_noise(errors, (*noise, *noise))
+    errors, noise = holdout.errors, holdout.errors.noise
+    as_good = errors.nearby_relative > 1.0 - WORTH_GAINING
+    other_windows = any(each.causes == (OTHER_WINDOWS,) for each in holdout.alternatives)
+    beyond = _beyond_noise((*errors.mid_range, *errors.estimate), (*noise, *noise))
+    return inside and as_good and not other_windows and not beyond
 
 
 def _no_better_errors(errors: PredictionErrors) -> str:

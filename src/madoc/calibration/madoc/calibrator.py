@@ -130,7 +130,7 @@ class Madoc:
         keep_cloning: Whether cloning continues during calibration, as in the paper.
         grouping_epochs: Epochs of grouping, outside the budget. One spends at most 100 · (1 + 2 d) control steps by
             physics, `epoch_steps` if groups are learned.
-        grouping_updates: Updates of the VAE in each epoch of grouping.
+        grouping_updates: Updates of the VAE in each epoch of grouping, rounded up to tens while groups are voted on.
         epoch_steps: Control steps in an epoch.
         updates: Calibration updates in an epoch.
         draws: Parameter draws in an epoch; None takes 20, 100, 100 for `policy`, `logged`, `replay`.
