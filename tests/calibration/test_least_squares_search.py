@@ -8,12 +8,10 @@ import pytest
 
 from madoc import simulation
 from madoc.calibration import CalibrationProblem
-from madoc.calibration.least_squares import unknown_starts
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.plan import Outcome, Plan
-from madoc.calibration.least_squares.search import Search, chosen, width_of
+from madoc.calibration.least_squares.search import Search, chosen
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
-from madoc.identification.linearisation import DIFFERENCE
 from madoc.identification.losses import ALL_FAILED
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import windows_at
@@ -101,29 +99,8 @@ def test_known_windows_leave_the_residuals_of_a_replay():
     problem, rows = CalibrationProblem(log, simulation.make(SPRING, threads=1)), np.array([3, 30])
     point = np.zeros((1, len(SPRING.parameters)))
     starts = KnownStarts.at(problem, rows, np.zeros(2, bool), 4, "linear")
-    (plan,) = starts.plans(point, np.zeros((1, 0, 0)), np.ones(1), np.ones((1, 0)), refining=True, width=0.0)
+    (plan,) = starts.plans(point, np.zeros((1, 0, 0)), np.ones(1), np.ones((1, 0)), refining=True)
     windows = windows_at(log, log.transitions.observation[rows], rows, 4)
     expected = window_residuals(problem.simulator, windows, point, problem.typical_change)[0]
     np.testing.assert_array_equal(plan.residuals, expected)
     assert (plan.steps[-1] == 0.0).all()
-
-
-def test_differences_by_initial_states_are_as_wide_as_the_noise_and_halve_with_every_step(monkeypatch):
-    log = recorded(SPRING, SPRING_TRUTH, 200, jax.random.key(0))
-    problem = CalibrationProblem(log, simulation.make(SPRING, threads=1))
-    search = Search(UnknownStarts, "cauchy", 8, 10, 1, 10, 8, 1e-7)
-    state = replace(search.init(problem, jax.random.key(0)), deviation=np.array([0.01, 0.03]), refining=1)
-    assert width_of(state) == pytest.approx(0.04)
-    assert width_of(replace(state, epochs=2)) == pytest.approx(0.01)
-    starts, seen = UnknownStarts.at(problem, state.rows, state.touching, 8, "cauchy"), []
-    once = unknown_starts.slopes_at
-    monkeypatch.setattr(
-        unknown_starts, "slopes_at", lambda *given, widths: seen.append(widths) or once(*given, widths=widths)
-    )
-    starts.plans(state.point, state.states, np.ones(1), np.ones((1, 10)), refining=True, width=0.04)
-    states = problem.states.states
-    change = 1.4826 * np.median(np.abs(np.diff(states[np.linspace(0, 199, 200, dtype=int)], axis=0)), axis=0)
-    assert seen[0] == pytest.approx(0.04 * change / states.std(0), rel=0.05)
-    exact = replace(state, deviation=np.zeros(2))
-    starts.plans(state.point, state.states, np.ones(1), np.ones((1, 10)), refining=True, width=width_of(exact))
-    assert (seen[1] == DIFFERENCE).all()

@@ -113,13 +113,11 @@ def slopes_at(
     *,
     parameters: bool = True,
     initial_states: bool = True,
-    widths: Float[np.ndarray, " physical"] | None = None,
 ) -> list[WindowSlopes]:
     """Residuals and their derivatives around every point's parameters and initial states, in two batches.
 
     Differences by parameters are central, because confidence intervals are computed from them; those by the many state
-    values are one-sided, as wide as `widths` in standard deviations of each value over the log, by default
-    `DIFFERENCE`. Without `parameters` there are only the latter, and d is 0; without `initial_states` only the
+    values are one-sided. Without `parameters` there are only the latter, and d is 0; without `initial_states` only the
     former, and n is 0. It takes points · windows · (1 + 2 d + n) · steps control steps.
     """
     count, windows, size = states.shape
@@ -127,13 +125,12 @@ def slopes_at(
     each = around.shape[1]
     by_points = readings.residuals(simulator, around.reshape(-1, points.shape[1]), np.repeat(states, each, axis=0))
     by_points = by_points.reshape(count, each, windows, -1)
-    by_shifts, sizes = np.zeros((count, 0, *by_points.shape[2:])), np.zeros(0)
+    by_shifts = np.zeros((count, 0, *by_points.shape[2:]))
     if initial_states:
-        sizes = np.full(len(readings.spread), DIFFERENCE) if widths is None else widths
-        shift = readings.in_state_units(np.diag(sizes), size)
+        shift = readings.in_state_units(DIFFERENCE * np.eye(len(readings.spread)), size)
         shifted = states[:, None] + shift[:, None]
         by_shifts = readings.residuals(simulator, points, shifted.reshape(count, -1, size))
-    return [slopes_of_windows(*parts, sizes) for parts in zip(around, by_points, by_shifts, strict=True)]
+    return [slopes_of_windows(*parts) for parts in zip(around, by_points, by_shifts, strict=True)]
 
 
 def _observations(

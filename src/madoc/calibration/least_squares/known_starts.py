@@ -100,9 +100,8 @@ class KnownStarts:
         state_damping: Float[np.ndarray, "searches 0"],
         *,
         refining: bool,
-        width: float,
     ) -> list[Plan]:
-        """Central differences around every search's point, in one batch; no initial state is differentiated."""
+        """Central differences around every search's point, in one batch."""
         around = np.stack([difference_points(point) for point in points])
         residuals = self._residuals(around)
         return [self._plan(*each) for each in zip(around, residuals, damping.tolist(), strict=True)]

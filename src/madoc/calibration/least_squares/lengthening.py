@@ -76,9 +76,8 @@ def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, 
 
 
 def continued(longer: SearchState, shorter: SearchState) -> SearchState:
-    """The longer search with the parameters, the initial states and the noise of the shorter one."""
-    states = _states_at(shorter, longer.rows)
-    return replace(longer, point=shorter.point[:1].copy(), states=states, deviation=shorter.deviation)
+    """The longer search with the parameters and initial states of the shorter one."""
+    return replace(longer, point=shorter.point[:1].copy(), states=_states_at(shorter, longer.rows))
 
 
 def _states_at(search: SearchState, rows: Int[np.ndarray, " windows"]) -> Float[np.ndarray, "1 windows state"]:

@@ -21,9 +21,6 @@ DAMPING_RANGE = (1e-10, 1e10)
 """Smallest and largest relative damping of the parameters' step; it is clipped to them."""
 STATE_DAMPING_RANGE = (1e-9, 1e6)
 """Smallest and largest relative damping of an initial state's step; it is clipped to them."""
-OF_NOISE = 2.0
-"""Width of differences by initial states at the first step, in standard deviations of the noise; it halves with every
-further step."""
 LITTLE = 5e-3
 """Share in [0, 1] of the cost; after a step that saves less, unknown initial states count as settled too."""
 _SMALLEST = 1e-100
@@ -132,8 +129,7 @@ class Search:
         windows = self.starts.at(problem, state.rows[:count], state.touching[:count], self.horizon, self.loss)
         points, states = state.point[:running], state.states[:running, :count]
         damping, state_damping = state.damping[:running], state.state_damping[:running, :count]
-        refining, width = bool(state.refining), width_of(state)
-        plans = windows.plans(points, states, damping, state_damping, refining=refining, width=width)
+        plans = windows.plans(points, states, damping, state_damping, refining=bool(state.refining))
         outcomes = windows.outcomes(plans, states)
         new = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}
         for index, (plan, outcome) in enumerate(zip(plans, outcomes, strict=True)):
@@ -211,15 +207,6 @@ class Search:
         if self.starts.waiting:
             searches["damping"] = np.full(self.searches, FIRST_DAMPING)
         return replace(state, **searches, refining=1, waiting=self.starts.waiting, epochs=0)
-
-
-def width_of(state: SearchState) -> float:
-    """Width of the next differences by initial states, in typical changes of a step.
-
-    Where contacts begin, residuals jump and bend within the error that an initial state still has, and a narrow
-    difference says nothing of where the minimum is. So they begin as wide as the noise is, and become narrow.
-    """
-    return OF_NOISE * float(np.median(state.deviation)) * 0.5**state.epochs
 
 
 def chosen(outcome: Outcome, *, waiting: bool) -> tuple[int, float]:

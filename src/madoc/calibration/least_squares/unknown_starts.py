@@ -15,12 +15,11 @@ from madoc.calibration.least_squares.statistics import autocorrelation, clipped_
 from madoc.errors import MadocError
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.information import at_least_noise, bread, jackknife_meat, least_share
-from madoc.identification.linearisation import DIFFERENCE, WindowSlopes
-from madoc.identification.losses import NORMAL_MAD, TUNING, Loss, curvature_share, loss_slope, loss_value
+from madoc.identification.linearisation import WindowSlopes
+from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope, loss_value
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
-from madoc.identification.states import LoggedStates
-from madoc.identification.windows import disjoint_windows, evenly
+from madoc.identification.windows import disjoint_windows
 from madoc.simulation.base import Simulator
 
 FOLLOWED = (1.0, 0.3, 0.0)
@@ -31,10 +30,6 @@ LIKE_NOISE = 1.5
 """Cost of a window, in squared standard deviations; noise alone rarely exceeds it, as its mean is 0.8."""
 ROUNDING = 1e-8
 """Noise in typical changes of a channel; smaller residuals are rounding errors."""
-WIDEST = 0.2
-"""Largest width of a difference by an initial state, in standard deviations over the log."""
-_STEPS = 5000
-"""Largest number of rows from which typical steps of states are computed."""
 _SUFFICIENT = 0.02
 """Share in [0, 1] of the information about every direction that the trusted windows need; else all are trusted."""
 _LEAST_DAMPING = 1e-9
@@ -49,7 +44,6 @@ class UnknownStarts:
         simulator: The simulator.
         readings: Actions and observations of the windows.
         loss: Loss of residuals in standard deviations of the noise.
-        typical_step: Typical change of each value of (qpos, qvel) in a step, in standard deviations over the log.
         unknown: Whether initial states are unknown.
         failed_cost: Cost at which every window fails.
         stuck: Damping at which steps are so short that their length no longer shows how far the minimum is.
@@ -59,7 +53,6 @@ class UnknownStarts:
     simulator: Simulator
     readings: Readings
     loss: Loss
-    typical_step: Float[np.ndarray, " physical"]
     unknown: ClassVar[bool] = True
     failed_cost: ClassVar[float] = FAILED_WINDOW
     stuck: ClassVar[float] = 1e3
@@ -76,7 +69,7 @@ class UnknownStarts:
     ) -> "UnknownStarts":
         """The windows that begin at the given rows; `touching` is of no use, as windows without a fit are left out."""
         readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
-        return cls(problem.simulator, readings, loss, _typical_step(problem.states, readings.spread))
+        return cls(problem.simulator, readings, loss)
 
     @staticmethod
     def touched(
@@ -118,11 +111,9 @@ class UnknownStarts:
         state_damping: Float[np.ndarray, "searches windows"],
         *,
         refining: bool,
-        width: float,
     ) -> list[Plan]:
         """Differences around every search's point and initial states, in one batch each."""
-        widths = np.clip(width * self.typical_step, DIFFERENCE, WIDEST)
-        slopes = slopes_at(self.simulator, self.readings, points, states, widths=widths)
+        slopes = slopes_at(self.simulator, self.readings, points, states)
         searches = zip(slopes, points, damping.tolist(), state_damping, strict=True)
         return [self._plan(*each, refining=refining) for each in searches]
 
@@ -233,12 +224,3 @@ class UnknownStarts:
         with np.errstate(invalid="ignore", over="ignore"):
             cost = scale**2 * loss_value((residuals / scale) ** 2, self.loss).mean(-1)
         return np.where(np.isfinite(cost), np.minimum(cost, FAILED_WINDOW), FAILED_WINDOW)
-
-
-def _typical_step(logged: LoggedStates, spread: Float[np.ndarray, " physical"]) -> Float[np.ndarray, " physical"]:
-    """Robust deviation of the change of (qpos, qvel) between consecutive rows, in units of its spread over the log."""
-    first = evenly(np.flatnonzero(np.diff(logged.rows) == 1), _STEPS)
-    if not len(first):
-        return np.ones(len(spread))
-    change = np.abs(logged.states[first + 1] - logged.states[first])[:, : len(spread)]
-    return NORMAL_MAD * np.median(change, axis=0) / spread

@@ -186,10 +186,8 @@ class Madoc:
         """Fresh networks, empty buffers, rows at their starts.
 
         Raises:
-            MadocError: Rows are to start at logged states, but those cannot be rebuilt, or the data's next observations
-                are shuffled.
+            MadocError: Rows are to start at logged states, but those cannot be rebuilt.
         """
-        problem.require_pairs()
         count, groups, collection = (
             len(problem.simulator.parameters),
             self._group_count(problem),

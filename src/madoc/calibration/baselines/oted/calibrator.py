@@ -31,16 +31,7 @@ from madoc.learning import replay
 from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
 from madoc.learning.features import HIDDEN_WINDOW, last_rows, unbroken, windows_ending
 from madoc.learning.networks import Network, adam, moving_average
-from madoc.simulation.rollout import (
-    Starts,
-    Walkers,
-    begin,
-    chosen_states,
-    out_of_step,
-    reset_states,
-    roll,
-    unbiased_starts,
-)
+from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll, unbiased_starts
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
@@ -121,13 +112,12 @@ class Oted:
         pair = rows_compared(problem) * (observation + action)
         discriminator = Network(pair, 1, self.hidden, key=of_discriminator)
         distribution = Distribution(np.zeros(count), np.full(count, np.log(self.first_std)))
-        walkers = begin(self._starts(problem)[0], of_start, systems=self._systems, rows=self.rows)
         return OtedState(
             clone=clone,
             discriminator=discriminator,
             discriminator_optimiser=adam(self.learning_rate).init(eqx.filter(discriminator, eqx.is_array)),
             rows=replay.empty(self.replay_capacity, pair=(pair,)),
-            walkers=walkers if self._anew(problem) else out_of_step(walkers, task.max_episode_steps),
+            walkers=begin(self._starts(problem)[0], of_start, systems=self._systems, rows=self.rows),
             distribution=distribution,
             average=distribution,
             key=key,
