@@ -32,7 +32,7 @@ FEWEST_RUNS = 3
 def drifts_of(
     tests: TermTests, simulator: Simulator, readings: Readings, fit: Fit, point: Float[np.ndarray, " d"]
 ) -> tuple[list[MissingTerm], list[Alternative], int]:
-    """The most significant change of each parameter over the log, and the estimates of parts that disagree.
+    """The most significant change of each parameter over the log or between runs, and estimates of parts that disagree.
 
     Thirds of the log are fitted by themselves only where a score test says that a parameter changes.
 

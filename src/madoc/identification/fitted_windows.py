@@ -110,7 +110,9 @@ def fit_windows(
     states: Float[np.ndarray, "windows state"],
     point: Float[np.ndarray, " d"],
 ) -> Fit:
-    """A local minimum of the squared residuals over parameters and initial states, from near a given point.
+    """Parameters and initial states that explain the windows best, from near a given point.
+
+    Steps are those of a robust loss, and are taken while they lower the median window's squared residual.
 
     Initial states are fitted alone before, as logged ones are noisy and their slopes are the cheaper ones, and once
     more at the parameters found, so that outlying readings count little.
