@@ -61,7 +61,7 @@ def main() -> None:
     )
     problem = madoc.CalibrationProblem(dataset, simulator)
     method = madoc.Madoc(starts="replay", epoch_steps=500, group_count=3)
-    print(madoc.calibrate(method, problem, key=jax.random.key(1), budget=30_000, truth=TRUTH))
+    print(madoc.calibrate(method, problem, key=jax.random.key(1), budget=15_000, truth=TRUTH))
 
 
 if __name__ == "__main__":

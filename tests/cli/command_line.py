@@ -25,7 +25,7 @@ FAST_LEARNER = ["warmup_steps=500", "steps_per_update=100", "epoch_steps=500", "
 LEARNING = ["--budget", "1000", "--quiet", "--set", *LEARNER]
 
 WHOLE = [
-    *("run", "hopper-medium", "--transitions", "1000", "--policy-budget", "1000", "--episodes", "2"),
+    *("run", "hopper-medium", "--transitions", "500", "--policy-budget", "1000", "--episodes", "2"),
     *("--draws", "4"),
     *CALIBRATION,
     *("--policy-set", *FAST_LEARNER),

@@ -14,5 +14,5 @@ def whole(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def recorded(whole):
-    """A thousand recorded transitions of Hopper."""
+    """Five hundred recorded transitions of Hopper."""
     return whole / "data.npz"

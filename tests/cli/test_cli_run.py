@@ -37,7 +37,7 @@ def test_a_run_leaves_everything(whole):
     assert summary["evaluation"]["over_draws"]["midrange"]["draws"] == 4
     assert list(summary["evaluation"]["error_costs"]) == ["calibrated"]
     assert set(summary["evaluation"]["error_costs"]["calibrated"]) == set(summary["calibration"]["parameters"])
-    assert summary["data"]["transitions"] == 1000
+    assert summary["data"]["transitions"] == 500
 
 
 def test_the_log_of_a_calibration_has_the_estimates_on_their_way(whole):

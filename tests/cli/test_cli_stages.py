@@ -31,7 +31,7 @@ def test_calibrate_prints_what_it_leaves(recorded, whole, tmp_path, capsys):
     assert CalibrationResult.from_json(answer).to_json() == answer
     spec = read(out / "spec.json")
     assert spec["hyperparameters"]["agents"]["batch"] == 32
-    assert spec["data"]["rows"] == 1000
+    assert spec["data"]["rows"] == 500
     # Alone it does the same as within `madoc run`.
     assert without_seconds(answer) == without_seconds(read(whole / "calibration" / "result.json"))
     again, same = asked_for_json(capsys, [*words, "--resume"])

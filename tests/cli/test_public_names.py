@@ -45,7 +45,7 @@ def test_public_names_are_there():
 
 
 SMALL = {
-    "transitions=20_000": "transitions=1_000",
+    "transitions=20_000": "transitions=500",
     "budget=100_000": "budget=1_000",
     "budget=50_000": "budget=1_000",
     "madoc.Madoc()": 'madoc.Madoc(groups="one", starts="replay", updates=2, epoch_steps=500)',

@@ -54,9 +54,17 @@ def clear(replay: Replay) -> Replay:
 
 def sample(replay: Replay, key: PRNGKeyArray, *shape: int) -> dict[str, Array]:
     """Rows drawn uniformly with replacement, with leading axes of this shape."""
-    size = jnp.minimum(replay.written, replay.capacity)
-    index = jax.random.randint(key, shape, 0, size)
-    return jax.tree.map(lambda ring: ring[index], replay.rows)
+    return take(replay.rows, draw(replay, key, *shape))
+
+
+def draw(replay: Replay, key: PRNGKeyArray, *shape: int) -> Int[Array, "..."]:
+    """Indices of rows, uniform with replacement: drawing those of many updates together is faster."""
+    return jax.random.randint(key, shape, 0, jnp.minimum(replay.written, replay.capacity))
+
+
+def take(rows: Mapping[str, Array], index: Int[Array, "..."]) -> dict[str, Array]:
+    """The rows of every column at these indices."""
+    return {name: column[index] for name, column in rows.items()}
 
 
 def flatten_rows(column: np.ndarray, leading: int) -> np.ndarray:

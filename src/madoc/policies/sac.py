@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
-from madoc.learning.networks import scalars, scan_updates
+from madoc.learning.networks import scalars, scan_inputs
 from madoc.learning.sac_losses import cloned_actor_loss, cloning_error
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
@@ -132,12 +132,17 @@ class SAC:
     def _update(
         self, learner: ActorCritic, seen: replay.Replay, logged: Batch | None, key: PRNGKeyArray, count: int
     ) -> tuple[ActorCritic, dict[str, Array]]:
-        """`count` updates of critics, policy and temperature."""
+        """`count` updates of critics, policy and temperature, their rows and noise drawn beforehand: it is faster."""
+        of_rows, of_clones, of_noise = jax.random.split(key, 3)
+        rows = replay.draw(seen, of_rows, count, self.batch)
+        clones = None if logged is None else draw_rows(logged, of_clones, count, self.batch)
+        noise = jax.random.normal(of_noise, (count, 2, self.batch, seen.rows["action"].shape[-1]))
 
-        def update(learner: ActorCritic, key: PRNGKeyArray) -> tuple[ActorCritic, dict[str, Array]]:
-            of_batch, of_clone, of_critic, of_actor = jax.random.split(key, 4)
-            batch = replay.sample(seen, of_batch, self.batch)
-            cloned = None if logged is None else draw_rows(logged, of_clone, self.batch)
+        def update(
+            learner: ActorCritic, drawn: tuple[Int[Array, " rows"], Batch | None, Float[Array, "2 rows action"]]
+        ) -> tuple[ActorCritic, dict[str, Array]]:
+            rows, cloned, (of_critic, of_actor) = drawn
+            batch = replay.take(seen.rows, rows)
 
             def combine(policy: TanhGaussianPolicy, loss: Array, value: Array) -> Array:
                 if cloned is None or self.cloning is None:
@@ -149,7 +154,7 @@ class SAC:
             learner, of_policy = actor_step(learner, batch["observation"], of_actor, self._descent, combine)
             return learner, of_critics | of_policy
 
-        return scan_updates(update, learner, key, count)
+        return scan_inputs(update, learner, (rows, clones, noise))
 
     @property
     def _descent(self) -> Descent:
