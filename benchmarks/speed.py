@@ -39,12 +39,12 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--out", type=Path, default=RESULTS / "speed.json")
     arguments = parser.parse_args()
-    rows = {"cores": len(os.sched_getaffinity(0)), "gflops": round(gflops(), 1)}
+    rows = {"cores": len(os.sched_getaffinity(0))}
     rows["calibration_update"] = {
-        name: against_floor(calibration_update(method), calibration_flops(method.agents, 17, 6, 14), rows["gflops"])
+        name: against_floor(*calibration_update(method), calibration_flops(method.agents, 17, 6, 14))
         for name, method in {"paper": Madoc.paper(), "default": Madoc()}.items()
     }
-    rows["learner_updates"] = {name: learner_updates(name, rows["gflops"]) for name in FLOPS}
+    rows["learner_updates"] = {name: learner_updates(name) for name in FLOPS}
     rows["least_squares_hopper_1000_rows"] = least_squares(1000)
     rows["control_steps"] = {robot: stepping(robot) for robot in tasks.TASKS}
     text = json.dumps(rows, indent=1)
@@ -64,23 +64,29 @@ def best_of(*runs: Callable[[], object], times: int = 3) -> list[float]:
     return [min(spent for turn, other, spent in seconds if turn and other is run) for run in runs]
 
 
-def gflops() -> float:
-    """Matrix products of an update's size, in 1e9 floating point operations a second."""
+def products() -> Callable[[], object]:
+    """A run of `PRODUCTS` floating point operations in matrix products of an update's size."""
     square = jnp.ones((256, 256)) * 1e-3
 
     @jax.jit
     def chain(rows: jax.Array) -> jax.Array:
-        return jax.lax.scan(lambda rows, _: (jnp.tanh(rows @ square), None), rows, None, length=1000)[0]
+        return jax.lax.scan(lambda rows, _: (jnp.tanh(rows @ square), None), rows, None, length=300)[0]
 
-    return 1000 * 2 * 256**3 / best_of(lambda: chain(square).block_until_ready())[0] / 1e9
+    return lambda: chain(square).block_until_ready()
 
 
-def against_floor(seconds: float, flops: float, gflops: float) -> dict[str, float]:
-    """Milliseconds of an update, updates a second, and how many times the time of its products."""
+PRODUCTS = 300 * 2 * 256**3
+
+
+def against_floor(run: Callable[[], object], count: int, flops: float) -> dict[str, float]:
+    """Milliseconds of an update, updates a second, and how many times the time of its products, measured in turns."""
+    together, floor = best_of(run, products(), times=7)
+    seconds, speed = together / count, PRODUCTS / floor
     return {
         "ms": round(seconds * 1e3, 3),
         "per_second": round(1.0 / seconds, 1),
-        "times_floor": round(seconds * gflops * 1e9 / flops, 2),
+        "gflops": round(speed / 1e9, 1),
+        "times_floor": round(seconds * speed / flops, 2),
     }
 
 
@@ -142,19 +148,19 @@ FLOPS = {
 """Of one update of a learner. Those of SAC+BC's cloning and of MOREC's imagined steps are left out."""
 
 
-def learner_updates(name: str, gflops: float) -> dict[str, dict[str, float]]:
+def learner_updates(name: str) -> dict[str, dict[str, float]]:
     """Updates a second on HalfCheetah's data at batch 256, by width, and how many times the time of its products."""
     simulator = CpuSimulator(tasks.half_cheetah())
     dataset = record_quality(simulator, "medium", transitions=5000, key=jax.random.key(0))
     problem = PolicyProblem(simulator, simulator.parameters.middle, dataset)
     found = {}
     for width in (256, 128):
-        found[f"{width}"] = against_floor(learner_update(name, problem, width), FLOPS[name](width, 17, 6), gflops)
+        found[f"{width}"] = against_floor(*learner_update(name, problem, width), FLOPS[name](width, 17, 6))
     return found
 
 
-def learner_update(name: str, problem: PolicyProblem, width: int) -> float:
-    """Seconds of one update inside an epoch of them, without acting."""
+def learner_update(name: str, problem: PolicyProblem, width: int) -> tuple[Callable[[], object], int]:
+    """An epoch's updates without acting, and their number."""
     count = 10 if name == "cql" else 50
     hidden = {"hidden": (width, width)}
     if name == "cql":
@@ -188,14 +194,11 @@ def learner_update(name: str, problem: PolicyProblem, width: int) -> float:
         else:
             logged = problem.logged if method.cloning is not None else None
             run = lambda: method._update(state.learner, seen, logged, key, count)  # noqa: E731
-    return (
-        best_of(lambda: jax.block_until_ready([leaf for leaf in jax.tree.leaves(run()) if eqx.is_array(leaf)]))[0]
-        / count
-    )
+    return lambda: jax.block_until_ready([leaf for leaf in jax.tree.leaves(run()) if eqx.is_array(leaf)]), count
 
 
-def calibration_update(method: Madoc) -> float:
-    """Seconds a calibration update of HalfCheetah takes."""
+def calibration_update(method: Madoc) -> tuple[Callable[[], object], int]:
+    """Some calibration updates on HalfCheetah's data, and their number."""
     simulator = CpuSimulator(tasks.half_cheetah())
     dataset = record_quality(simulator, "medium", transitions=5000, key=jax.random.key(0))
     problem = CalibrationProblem(dataset, simulator)
@@ -217,7 +220,7 @@ def calibration_update(method: Madoc) -> float:
             )[1]
         )
 
-    return best_of(run)[0] / count
+    return run, count
 
 
 def least_squares(transitions: int) -> dict[str, float]:
