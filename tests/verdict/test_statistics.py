@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from madoc.verdict.statistics import better_than_chance, interval_of, resampled
+from madoc.verdict.statistics import better_than_chance, independent_groups, interval_of, resampled
 
 
 def test_the_interval_of_a_mean_is_as_wide_as_its_standard_error_says():
@@ -18,9 +18,23 @@ def test_rows_of_one_episode_are_resampled_together():
     assert together == pytest.approx(np.sqrt(40) * apart, rel=0.3)
 
 
-def test_few_episodes_are_resampled_by_window():
-    values = np.random.default_rng(2).standard_normal((30, 2))
-    assert (resampled(values, np.repeat([0, 1, 2], 10)) == resampled(values, np.arange(30))).all()
+def test_overlapping_windows_of_few_episodes_are_resampled_together():
+    # Means of 20 consecutive noises, at every row: 400 windows tell as much as 20 that do not overlap.
+    groups, widths = independent_groups(np.zeros(400, int), np.arange(400), 20), []
+    assert len(np.unique(groups)) == 10
+    for seed in range(20):
+        noise = np.random.default_rng(seed).standard_normal(419)
+        widths += np.diff(interval_of(resampled(np.convolve(noise, np.full(20, 0.05), "valid"), groups))).tolist()
+    assert np.mean(widths) == pytest.approx(2 * 1.96 / 20, rel=0.2)
+
+
+def test_windows_that_share_all_rows_are_five_groups():
+    assert independent_groups(np.zeros(10, int), np.arange(10), 50).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+
+
+def test_five_episodes_are_groups():
+    episodes = np.repeat(np.arange(5), 40)
+    assert (independent_groups(episodes, np.arange(200), 20) == episodes).all()
 
 
 def test_right_predictions_are_better_than_chance_and_shuffled_ones_are_not():

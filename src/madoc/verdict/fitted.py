@@ -16,7 +16,7 @@ from madoc.identification.replay import slopes_at
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.fitted_starts import FittedReplays
 from madoc.verdict.prediction import magnitudes
-from madoc.verdict.statistics import best_of, better_than_chance, prediction_errors
+from madoc.verdict.statistics import best_of, better_than_chance, independent_groups, prediction_errors
 from madoc.verdict.systematic import explained_at_end
 
 NEARBY_STEPS = 6
@@ -48,7 +48,7 @@ def fitted(
             sizes,
             magnitudes(replays.at_horizons(alone))[:, 0],
             best,
-            episodes=replays.episodes,
+            groups=independent_groups(replays.episodes, replays.rows, replays.readings.steps),
             horizons=replays.ahead,
             signals=signal_names(bench.simulator.task)[: len(noise)],
             failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),

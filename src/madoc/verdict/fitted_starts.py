@@ -33,11 +33,12 @@ _DAMPING = 1e-8
 
 @dataclass(frozen=True)
 class FittedReplays:
-    """Windows of the hold-out whose initial states are unknown: `near` are first guesses of them."""
+    """Windows of the hold-out whose initial states are unknown: `near` are first guesses of them, at their `rows`."""
 
     simulator: Simulator
     readings: Readings
     near: Float[np.ndarray, "windows state"]
+    rows: Int[np.ndarray, " windows"]
     episodes: Int[np.ndarray, " windows"]
     stride: int
 
@@ -104,4 +105,4 @@ def fitted_replays_of(
         return None
     chosen = evenly(possible, MOST)
     readings = Readings.at(held, logged, rows[chosen], steps, scale)
-    return FittedReplays(simulator, readings, near[chosen], held.episode_of(rows[chosen]), stride)
+    return FittedReplays(simulator, readings, near[chosen], rows[chosen], held.episode_of(rows[chosen]), stride)

@@ -12,7 +12,7 @@ from madoc.identification import noise as sensors
 from madoc.identification.states import logged_states
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.prediction import nearby_best
-from madoc.verdict.statistics import best_of, prediction_errors, relative_to_first
+from madoc.verdict.statistics import best_of, independent_groups, prediction_errors, relative_to_first
 from madoc.verdict.systematic import autocorrelation, explained, explained_at_end, persistence
 from madoc.verdict.two_sample import classify, replayed
 
@@ -44,7 +44,7 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
             sizes,
             replays.magnitudes(noisy)[:, 0],
             best,
-            episodes=replays.episodes,
+            groups=independent_groups(replays.episodes, replays.rows, replays.windows.steps),
             horizons=replays.horizons,
             signals=signal_names(bench.simulator.task),
             failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),

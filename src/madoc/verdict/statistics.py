@@ -1,4 +1,4 @@
-"""Means with confidence intervals from resampled episodes, and predictions compared with chance."""
+"""Means with confidence intervals from a bootstrap, and predictions compared with chance."""
 
 from collections.abc import Sequence
 
@@ -13,23 +13,34 @@ NEGLIGIBLE = 1e-3
 RESAMPLES = 500
 """Number of bootstrap samples. The ends of a 95 % interval then vary by about a tenth of its width (Efron and
 Tibshirani 1993, section 13.3)."""
-FEWEST_EPISODES = 5
-"""Smallest number of episodes that are resampled whole; with fewer, single windows are resampled."""
+FEWEST_GROUPS = 5
+"""Smallest number of episodes that are resampled whole; of fewer, shorter stretches are resampled."""
 SHUFFLES = 499
 """Number of random pairings. The smallest p-value is then 1 / 500."""
 _CAPPING = 20
 """Number of random pairings whose 95th percentile of errors caps the error of a row."""
 
 
+def independent_groups(
+    episodes: Int[np.ndarray, " windows"], rows: Int[np.ndarray, " windows"], steps: int
+) -> Int[np.ndarray, " windows"]:
+    """The group of each window, for a bootstrap that resamples groups: windows of one group are not independent.
+
+    Episodes are groups where there are `FEWEST_GROUPS` or more. Else windows overlap that begin within `steps` rows, the
+    length of a window, and stretches of twice as many rows are groups; where these are too few, fifths of the windows.
+    """
+    stretch = rows // (2 * steps)
+    stretches = np.unique(np.stack([episodes, stretch], axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+    for groups in (episodes, stretches):
+        if len(np.unique(groups)) >= FEWEST_GROUPS:
+            return groups
+    return np.arange(len(rows)) * FEWEST_GROUPS // len(rows)
+
+
 def resampled(
     values: Float[np.ndarray, "windows *kinds"], groups: Int[np.ndarray, " windows"]
 ) -> Float[np.ndarray, "resamples *kinds"]:
-    """Bootstrap samples of means over windows: whole episodes are resampled, every kind of value by the same draws.
-
-    With fewer than `FEWEST_EPISODES` different `groups`, the episode of each window, single windows are resampled.
-    """
-    if len(np.unique(groups)) < FEWEST_EPISODES:
-        groups = np.arange(len(values))
+    """Bootstrap samples of means over windows: whole groups are resampled, every kind of value by the same draws."""
     _, member = np.unique(groups, return_inverse=True)
     count = int(member.max()) + 1
     flat = values.reshape(len(values), -1)
@@ -51,7 +62,7 @@ def prediction_errors(
     floor: Float[np.ndarray, "windows horizons signals"],
     best: int,
     *,
-    episodes: Int[np.ndarray, " windows"],
+    groups: Int[np.ndarray, " windows"],
     horizons: Sequence[int],
     signals: Sequence[str],
     failed: int,
@@ -59,14 +70,15 @@ def prediction_errors(
     """Prediction errors of several points at each horizon, with confidence intervals.
 
     `sizes` are absolute residuals at mid-range, at the estimate, then at points near it, and `floor` those that noise
-    alone would cause. `best` is the point of `best_of`, and `failed` the number of windows that failed at the estimate.
+    alone would cause. `best` is the point of `best_of`, `groups` are those of `independent_groups`, and `failed` is the
+    number of windows that failed at the estimate.
     """
-    means, draws = sizes.mean((0, -1)), resampled(sizes.mean(-1), episodes)
+    means, draws = sizes.mean((0, -1)), resampled(sizes.mean(-1), groups)
     relative = relative_to_first(means)
     noise_alone = relative_to_first(np.stack([means[0], floor.mean((0, -1))]))[1]
     low, high = interval_of(relative_to_first(draws)[:, 1])
     mid_range, estimate, nearby_best, noise = (
-        _by_horizon(kind, episodes, horizons, signals) for kind in (sizes[:, 0], sizes[:, 1], sizes[:, best], floor)
+        _by_horizon(kind, groups, horizons, signals) for kind in (sizes[:, 0], sizes[:, 1], sizes[:, best], floor)
     )
     return PredictionErrors(
         mid_range=mid_range,
@@ -88,11 +100,11 @@ def best_of(sizes: Float[np.ndarray, "windows points horizons signals"]) -> int:
 
 def _by_horizon(
     sizes: Float[np.ndarray, "windows horizons signals"],
-    episodes: Int[np.ndarray, " windows"],
+    groups: Int[np.ndarray, " windows"],
     horizons: Sequence[int],
     signals: Sequence[str],
 ) -> tuple[PredictionError, ...]:
-    low, high = interval_of(resampled(sizes.mean(-1), episodes)).tolist()
+    low, high = interval_of(resampled(sizes.mean(-1), groups)).tolist()
     by_signal = [dict(zip(signals, row, strict=True)) for row in sizes.mean(0).tolist()]
     means = [float(sizes[:, index].mean()) for index in range(len(horizons))]
     columns = zip(horizons, means, zip(low, high, strict=True), by_signal, strict=True)
