@@ -26,8 +26,8 @@ def independent_groups(
 ) -> Int[np.ndarray, " windows"]:
     """The group of each window, for a bootstrap that resamples groups: windows of one group are not independent.
 
-    Episodes are groups where there are `FEWEST_GROUPS` or more. Else windows overlap that begin within `steps` rows, the
-    length of a window, and stretches of twice as many rows are groups; where these are too few, fifths of the windows.
+    Episodes are groups where there are `FEWEST_GROUPS` or more. Else windows overlap that begin within `steps` rows,
+    the length of a window, and stretches of twice as many rows are groups; if these are too few, fifths of the windows.
     """
     stretch = rows // (2 * steps)
     stretches = np.unique(np.stack([episodes, stretch], axis=1), axis=0, return_inverse=True)[1].reshape(-1)
