@@ -53,7 +53,11 @@ class Network(eqx.Module):
         """Outputs for a batch; dropout acts only where a key is given."""
         for index, layer in enumerate(self.layers):
             assert layer.bias is not None
-            rows = rows @ layer.weight.T
+            weight = layer.weight.T
+            if len(layer.weight) > rows.shape[-1]:
+                # Else XLA transposes the larger factor of the weight's gradient, on a CPU, and not the smaller one.
+                weight = jax.lax.optimization_barrier(weight)
+            rows = rows @ weight
             rows = rows + jnp.broadcast_to(layer.bias, rows.shape)
             if index + 1 < len(self.layers):
                 rows = self.activation(rows)
