@@ -28,21 +28,6 @@ LEAST_WEIGHT = 1e-3
 _SMALLEST = 1e-100
 
 
-def contacts_at(
-    problem: CalibrationProblem,
-    states: Float[np.ndarray, "known state"],
-    known: Int[np.ndarray, " known"],
-    rows: Int[np.ndarray, " windows"],
-    horizon: int,
-) -> Bool[np.ndarray, "windows readings"]:
-    """Whether bodies are in contact at each row of the windows, by the states of the `known` rows; False at others."""
-    ends = problem.dataset.episode_ends[problem.dataset.episode_of(rows)]
-    there = np.minimum(rows[:, None] + np.arange(horizon + 1), ends[:, None] - 1)
-    place = np.minimum(np.searchsorted(known, there), len(known) - 1)
-    touching = problem.simulator.touching(states[place].reshape(-1, states.shape[1])).reshape(there.shape)
-    return touching & (known[place] == there)
-
-
 @dataclass(frozen=True)
 class KnownStarts:
     """Windows that begin at logged states, which are assumed to be exact; class variables as of `UnknownStarts`."""
@@ -74,7 +59,14 @@ class KnownStarts:
         problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
     ) -> Bool[np.ndarray, " windows"]:
         """Whether bodies were in contact at any logged state of a window, from its first to its last."""
-        return contacts_at(problem, *problem.states.exact(), rows, horizon).any(1)
+        states, known = problem.states.exact()
+        ends = problem.dataset.episode_ends[problem.dataset.episode_of(rows)]
+        touched = np.zeros(len(rows), dtype=bool)
+        for later in range(horizon + 1):
+            there = np.minimum(rows + later, ends - 1)
+            place = np.minimum(np.searchsorted(known, there), len(known) - 1)
+            touched |= problem.simulator.touching(states[place]) & (known[place] == there)
+        return touched
 
     @staticmethod
     def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
