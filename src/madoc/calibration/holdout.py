@@ -33,7 +33,7 @@ class PredictionError:
     Attributes:
         steps: Horizon of the predictions in control steps.
         mean: Mean over windows and signals.
-        interval: 95 % confidence interval of the mean, from resampled episodes.
+        interval: 95 % confidence interval of the mean, by resampling episodes, or stretches where these are few.
         by_signal: Mean over windows, by signal.
     """
 
