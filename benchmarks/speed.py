@@ -33,6 +33,8 @@ from madoc.simulation.cpu import CpuSimulator
 
 RESULTS = Path(__file__).parent / "results"
 SYSTEMS, ROWS, STEPS = 10, 100, 50
+PRODUCTS = 300 * 2 * 256**3
+"""Floating point operations of a run of `products`."""
 
 
 def main() -> None:
@@ -73,9 +75,6 @@ def products() -> Callable[[], object]:
         return jax.lax.scan(lambda rows, _: (jnp.tanh(rows @ square), None), rows, None, length=300)[0]
 
     return lambda: chain(square).block_until_ready()
-
-
-PRODUCTS = 300 * 2 * 256**3
 
 
 def against_floor(run: Callable[[], object], count: int, flops: float) -> dict[str, float]:

@@ -26,6 +26,7 @@ def learnt(simulator, **changes):
     """The state after every epoch, and the epoch."""
     method = SAC(**{name: getattr(SMALL, name) for name in SMALL.__dataclass_fields__} | changes)
     problem = PolicyProblem(simulator, simulator.parameters.middle)
+    # With this seed the return falls again before the end.
     state, seen = method.init(problem, jax.random.key(2)), []
     for _ in range(EPOCHS):
         state, epoch = method.step(problem, state)

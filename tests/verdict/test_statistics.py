@@ -32,6 +32,14 @@ def test_windows_that_share_all_rows_are_five_groups():
     assert independent_groups(np.zeros(10, int), np.arange(10), 50).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
 
 
+def test_stretches_of_few_episodes_do_not_join_them():
+    # Two episodes of 100 rows that begin anywhere: five stretches of 20 rows each.
+    episodes, rows = np.repeat([0, 1], 100), np.concatenate([np.arange(7, 107), np.arange(130, 230)])
+    groups = independent_groups(episodes, rows, 10)
+    assert (np.bincount(groups) == 20).all()
+    assert (groups == np.repeat(np.arange(10), 20)).all()
+
+
 def test_five_episodes_are_groups():
     episodes = np.repeat(np.arange(5), 40)
     assert (independent_groups(episodes, np.arange(200), 20) == episodes).all()

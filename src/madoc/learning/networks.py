@@ -55,7 +55,8 @@ class Network(eqx.Module):
             assert layer.bias is not None
             weight = layer.weight.T
             if len(layer.weight) > rows.shape[-1]:
-                # Else XLA transposes the larger factor of the weight's gradient, on a CPU, and not the smaller one.
+                # The weight's gradient is a product of inputs and slopes, of which XLA would transpose the larger one,
+                # the slopes, on a CPU.
                 weight = jax.lax.optimization_barrier(weight)
             rows = rows @ weight
             rows = rows + jnp.broadcast_to(layer.bias, rows.shape)

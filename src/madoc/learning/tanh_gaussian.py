@@ -38,7 +38,7 @@ def _log_density(raw: Values, mean: Values, log_std: Values) -> Array:
     normal = -0.5 * standard**2 - log_std - 0.5 * np.log(2 * np.pi)
     log_slope = 2.0 * (np.log(2.0) - raw - jax.nn.softplus(-2.0 * raw))
     # The sum as a product: XLA does not vectorise exponentials and logarithms that it fuses into a sum, on a CPU.
-    return (normal - log_slope) @ jnp.ones(raw.shape[-1], raw.dtype)
+    return jnp.matmul(normal - log_slope, jnp.ones(raw.shape[-1], raw.dtype), precision="highest")
 
 
 class TanhGaussianPolicy(eqx.Module):

@@ -132,17 +132,17 @@ class SAC:
     def _update(
         self, learner: ActorCritic, seen: replay.Replay, logged: Batch | None, key: PRNGKeyArray, count: int
     ) -> tuple[ActorCritic, dict[str, Array]]:
-        """`count` updates of critics, policy and temperature, their rows and noise drawn beforehand: it is faster."""
+        """`count` updates of critics, policy and temperature. What is random is drawn beforehand, which is faster."""
         of_rows, of_clones, of_noise = jax.random.split(key, 3)
-        rows = replay.draw(seen, of_rows, count, self.batch)
+        indices = replay.draw(seen, of_rows, count, self.batch)
         clones = None if logged is None else draw_rows(logged, of_clones, count, self.batch)
         noise = jax.random.normal(of_noise, (count, 2, self.batch, seen.rows["action"].shape[-1]))
 
         def update(
             learner: ActorCritic, drawn: tuple[Int[Array, " rows"], Batch | None, Float[Array, "2 rows action"]]
         ) -> tuple[ActorCritic, dict[str, Array]]:
-            rows, cloned, (of_critic, of_actor) = drawn
-            batch = replay.take(seen.rows, rows)
+            index, cloned, (of_critic, of_actor) = drawn
+            batch = replay.take(seen.rows, index)
 
             def combine(policy: TanhGaussianPolicy, loss: Array, value: Array) -> Array:
                 if cloned is None or self.cloning is None:
@@ -154,7 +154,7 @@ class SAC:
             learner, of_policy = actor_step(learner, batch["observation"], of_actor, self._descent, combine)
             return learner, of_critics | of_policy
 
-        return scan_inputs(update, learner, (rows, clones, noise))
+        return scan_inputs(update, learner, (indices, clones, noise))
 
     @property
     def _descent(self) -> Descent:

@@ -14,7 +14,7 @@ RESAMPLES = 500
 """Number of bootstrap samples. The ends of a 95 % interval then vary by about a tenth of its width (Efron and
 Tibshirani 1993, section 13.3)."""
 FEWEST_GROUPS = 5
-"""Smallest number of episodes that are resampled whole; of fewer, shorter stretches are resampled."""
+"""Smallest number of groups that are resampled. Few make the percentile interval somewhat too narrow."""
 SHUFFLES = 499
 """Number of random pairings. The smallest p-value is then 1 / 500."""
 _CAPPING = 20
@@ -24,12 +24,14 @@ _CAPPING = 20
 def independent_groups(
     episodes: Int[np.ndarray, " windows"], rows: Int[np.ndarray, " windows"], steps: int
 ) -> Int[np.ndarray, " windows"]:
-    """The group of each window, for a bootstrap that resamples groups: windows of one group are not independent.
+    """The group of each window, for a bootstrap that resamples groups, as windows of one episode are not independent.
 
-    Episodes are groups where there are `FEWEST_GROUPS` or more. Else windows overlap that begin within `steps` rows,
-    the length of a window, and stretches of twice as many rows are groups; if these are too few, fifths of the windows.
+    Episodes are groups where there are `FEWEST_GROUPS` or more. Else stretches of an episode are, of twice the `steps`
+    of a window, so that windows of different groups overlap only where stretches meet. If these are too few as well,
+    consecutive fifths of all windows are groups.
     """
-    stretch = rows // (2 * steps)
+    first = np.array([rows[episodes == episode].min() for episode in episodes])
+    stretch = (rows - first) // (2 * steps)
     stretches = np.unique(np.stack([episodes, stretch], axis=1), axis=0, return_inverse=True)[1].reshape(-1)
     for groups in (episodes, stretches):
         if len(np.unique(groups)) >= FEWEST_GROUPS:
