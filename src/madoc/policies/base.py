@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.data import Dataset
 from madoc.errors import MadocError
+from madoc.learning import replay
 from madoc.learning.features import Features
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import ParameterDistribution
@@ -107,8 +108,7 @@ def require_data(problem: PolicyProblem, *, rows: int, outcomes: bool = True) ->
 
 def draw_rows(logged: dict[str, Array], key: PRNGKeyArray, *shape: int) -> dict[str, Array]:
     """Logged rows, drawn uniformly with replacement, with leading axes of this shape."""
-    rows = jax.random.randint(key, shape, 0, len(logged["reward"]))
-    return {name: column[rows] for name, column in logged.items()}
+    return replay.take(logged, jax.random.randint(key, shape, 0, len(logged["reward"])))
 
 
 def require_reward(task: Task) -> None:
