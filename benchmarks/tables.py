@@ -159,8 +159,9 @@ def policies() -> str:
     lines = [
         "## Policies\n\n`python benchmarks/policies.py` (see its options). Deterministic, in the target; medium data "
         "where a learner takes data. Budgets are a fraction of the paper's, 1e6 control steps or updates on D4RL's own "
-        "data: none has converged. SAC, SAC+BC and DR+BC hand back the policy that did best in their own simulator, "
-        "which costs up to as many control steps again; the others hand back their last.\n",
+        "data: none has converged. What is handed back is the policy that did best in the learner's own simulator, "
+        "or in MOREC's models, which costs up to as many control steps again; of CQL and BC, and of H2O and MOREC in "
+        "rows whose budget is no time, it is the last.\n",
         "| robot | learner | learnt at | budget | settings | seeds | return | normalized (mean ± std) | paper | s |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]

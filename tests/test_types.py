@@ -62,6 +62,11 @@ def test_a_method_of_ones_own_is_named_after_its_class():
         (lambda: SAC(discount=float("nan")), "expected discount of SAC to be greater than or equal to 0, got nan"),
         (lambda: SAC(batch=1.5), "expected batch of SAC to be a valid integer, got 1.5"),
         (lambda: SAC(epoch_steps=5), "expected epoch_steps of at least the 20 environments, got 5"),
+        (
+            lambda: SAC(epoch_steps=39, updates_per_step=0.02),
+            "expected at least one update in an epoch of 20 control steps, got updates_per_step of 0.02; raise it, "
+            "or epoch_steps",
+        ),
     ],
 )
 def test_impossible_hyperparameters_are_refused_in_one_sentence(wrong, sentence):

@@ -1,5 +1,6 @@
 """The types that all packages share: transitions, policies, metrics, and the protocol of methods."""
 
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass
 from functools import cache
@@ -58,6 +59,14 @@ class Transitions:
 def generator(key: PRNGKeyArray) -> np.random.Generator:
     """NumPy's generator with a JAX key as its seed, for draws whose shapes vary: JAX compiles anew for each shape."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)))
+
+
+def named_key(key: PRNGKeyArray, name: str) -> PRNGKeyArray:
+    """A key for one purpose, made from a key that serves others too.
+
+    The name's checksum is far from the small numbers by which keys are split, or that steps fold into them.
+    """
+    return jax.random.fold_in(key, zlib.crc32(name.encode()))
 
 
 @runtime_checkable

@@ -15,8 +15,10 @@ def result(**changes):
         "gravity": ParameterEstimate(-9.81, 0.02, -30.0, 0.0, "m/s²", [-9.85, -9.77]),
         "body_mass.foot": ParameterEstimate(5.0, 0.1, 4.0, 6.0, "kg"),
     }
-    told = {"covariance": np.diag([4e-4, 1e-2]).tolist(), "groups": [["gravity", "body_mass.foot"]]} | changes
-    return CalibrationResult("m", "hopper", "finished", "done", 1, 0.0, 0, parameters=parameters, **told)
+    told = {"covariance": np.diag([4e-4, 1e-2]).tolist(), "groups": [["gravity", "body_mass.foot"]]}
+    return CalibrationResult(
+        "m", "hopper", "finished", "done", 1, 0.0, 0, **{"parameters": parameters} | told | changes
+    )
 
 
 def test_what_is_known_of_the_spread_is_kept():
@@ -32,6 +34,14 @@ def test_what_is_not_known_is_left_out():
     assert "error" not in told
     assert "interval" not in told["parameters"]["body_mass.foot"]
     assert CalibrationResult.from_json(told).covariance is None
+
+
+def test_half_a_width_reaches_to_the_end_that_is_not_cut_off():
+    cut_off = ParameterEstimate(0.1, 0.3, 0.0, 2.0, "kg", [0.0, 0.7])
+    assert cut_off.half_width == pytest.approx(0.6)
+    assert ParameterEstimate(1.0, 0.1, 0.0, 2.0, "kg").half_width == pytest.approx(0.196, rel=1e-3)
+    widened = result(parameters={"mass": cut_off}).with_intervals({"mass": (0.5, 0.5)}, "widened")
+    assert widened.parameters["mass"].interval == pytest.approx([0.0, 1.0])
 
 
 def test_intervals_have_a_column_of_their_own():

@@ -8,7 +8,7 @@ from madoc import simulation
 from madoc.calibration import CalibrationProblem, CmaEs, LeastSquares, Madoc, Oted
 from madoc.calibration.least_squares.calibrator import horizon_of
 from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
-from madoc.data import Disturbance, disturb, observed_task
+from madoc.data import Disturbance, disturb, observed_task, stride
 from madoc.errors import MadocError
 from madoc.simulation.rollout import Rollout
 from madoc.types import Transitions
@@ -65,6 +65,27 @@ def test_simulated_readings_carry_the_noise_that_the_data_says_it_has(log):
     (warning,) = Madoc().collection(noisy).warnings
     assert warning == "simulated observations were given sensor noise of 9.9 % of a step's change"
     assert Madoc().collection(clean).warnings == ()
+
+
+def test_noise_is_a_share_of_the_change_from_row_to_row_at_any_rate():
+    log = recorded(replace(WHOLE, max_episode_steps=300), ARM_TRUTH, 300, KEY)
+    time = 0.02 * np.arange(301)[:, None] * np.ones(4)
+    smooth = replace(log.transitions, observation=np.sin(time[:-1]), next_observation=np.sin(time[1:]))
+    slow = replace(log, transitions=smooth)
+    assert stride(slow) > 1
+    noisy = disturb(slow, Disturbance(noise=0.1), WHOLE, KEY)
+    put_on = np.asarray(noisy.transitions.observation - smooth.observation).std(0)
+    problem = CalibrationProblem(noisy, simulation.make(WHOLE, threads=1))
+    np.testing.assert_allclose(noise_deviation(problem, None), put_on, rtol=0.1)
+
+
+def test_sensor_noise_is_not_that_of_the_actions():
+    places = np.zeros((4, 2, 3, 1))
+    never = np.zeros((4, 2, 3), dtype=bool)
+    rollout = Rollout(Transitions(places, places, places[..., 0], places, never, never), ~never)
+    seen = with_sensor_noise(rollout, np.ones(1), KEY).transitions.observation
+    actions = [jax.random.normal(jax.random.fold_in(KEY, step), (2, 3, 1)) for step in range(10)]
+    assert not any(np.isclose(seen[0], np.asarray(action)).any() for action in actions)
 
 
 def test_a_reading_that_ends_a_row_begins_the_next():

@@ -27,6 +27,9 @@ def test_a_run_is_exported_beside_itself(whole, tmp_path, capsys):
     assert patch["provenance"]["data"]["fingerprint"] == spec["data"]["fingerprint"]
     assert patch["stepping"]["physics_steps_per_control_step"] == 4
     assert [row["new"] for row in patch["parameters"]] == calibrated.result.mean.tolist()
+    ranges = read_yaml((tmp_path / "out" / "randomization.yaml").read_text())
+    spread = np.array([row["std"] for row in ranges["parameters"].values()])
+    np.testing.assert_allclose(1.96 * spread, calibrated.half_widths, rtol=1e-3)
 
 
 def test_policies_go_along_as_onnx_when_asked(whole, tmp_path):

@@ -10,10 +10,10 @@ from command_line import asked_for_json, without_seconds
 
 import comparing
 from madoc import data
-from madoc.calibration import CalibrationResult
+from madoc.calibration import CalibrationResult, LeastSquares
 from madoc.commands.main import main
 from madoc.data import Disturbance, disturb
-from madoc.pipeline import read_calibration
+from madoc.pipeline import calibration_stage, read_calibration
 from madoc.tasks import TASKS, make
 from robots import SPRING_TRUTH, recorded
 
@@ -62,6 +62,25 @@ def test_auto_keeps_least_squares_where_that_explains_all(log, tmp_path, capsys)
     assert read_calibration(out).result.method == "least-squares"
     again, code = asked_for_json(capsys, [*ask, "--resume"])
     assert (again, code) == (answer, 0)
+
+
+def test_auto_goes_on_to_the_next_method_when_the_first_diverges(log, tmp_path, capsys, monkeypatch):
+    by = calibration_stage._calibrate_by
+
+    def diverging(method, out, prepared, **options):
+        """Both candidates are least squares here; the first one's result is given back as diverged."""
+        result, assessment = by(LeastSquares(), out, prepared, **options)
+        return (
+            (replace(result, status="diverged"), None) if prepared.method == "least-squares" else (result, assessment)
+        )
+
+    monkeypatch.setattr(calibration_stage, "_calibrate_by", diverging)
+    ask = words("calibrate", log, "--method", "auto", "--budget", 60_000, "--out", tmp_path / "run")
+    answer, _ = asked_for_json(capsys, ask)
+    candidates = [row["method"] for row in answer["holdout"]["candidates"]]
+    assert (candidates, answer["holdout"]["chosen"]) == (["least-squares", "madoc-local"], "madoc-local")
+    parts = [read(tmp_path / "run" / name / "result.json") for name in candidates]
+    assert answer["control_steps"] == sum(part["control_steps"] for part in parts)
 
 
 def test_the_verdict_is_read_before_the_table(log, tmp_path, capsys):

@@ -95,7 +95,15 @@ def load_yaml(block, _):
 
 
 def load_spec(block):
-    """A part of a spec takes that part's place in the arm's, whose motors make way for actuators of its own."""
+    """A part of a spec takes that part's place in the pendulum's or the arm's.
+
+    The arm's motors make way for actuators of the block's own.
+    """
+    if "hinge" in block:
+        whole = read_yaml(Path("examples/pendulum/swing_up.yaml").read_text()) | read_yaml(block)
+        Path("part.yaml").write_text(yaml_text(whole | {"model": "examples/pendulum/pendulum.xml"}))
+        robots.load("part.yaml")
+        return
     whole = read_yaml(Path("examples/arm/arm.yaml").read_text()) | read_yaml(block)
     for channel, default in zip(whole["signals"], ("shoulder", "elbow"), strict=False):
         whole.setdefault("log", {}).setdefault("columns", {}).setdefault(channel["name"], default)

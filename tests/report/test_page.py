@@ -99,7 +99,7 @@ def test_a_hold_out_is_told_by_its_own_measure(whole):
     assert len(held["facts"]) == 2 and "control steps ahead of a fitted start" in held["chart"]
     write_json(file, stored | {"holdout": common | areas | {"measure": "told apart"}})
     assert content(whole, "holdout")["chart"] is None
-    assert run_context(read_run(whole))["facts"][0][0] == "told from the log"
+    assert run_context(read_run(whole))["facts"][0][0] == "classifier, simulated or logged"
 
 
 def test_time_is_told_by_stage(whole):

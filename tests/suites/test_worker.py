@@ -9,7 +9,7 @@ from suite_files import CELL
 
 from madoc.errors import MadocError, NotAllowed
 from madoc.suites import process, stages
-from madoc.suites.cells import write_plan
+from madoc.suites.cells import Cell, write_plan
 from madoc.suites.claims import MOST_ATTEMPTS, attempts_of, claimed, outcome_of, try_again
 from madoc.suites.planning import plan_of
 from madoc.suites.standing import Standing
@@ -35,6 +35,19 @@ def test_a_worker_does_every_cell_once(planned):
     for cell, fresh in zip(cells, (True, False), strict=True):
         assert outcome_of(cell, out).fresh is fresh
         assert json.loads((cell.folder(out) / "result.json").read_text())["seed"] == cell.read().search.seed
+
+
+def test_a_policy_is_evaluated_with_its_calibration(place, monkeypatch):
+    out, asked = place / "out", []
+    policy = Cell("policy", "learn", {"method": "sac"}, "calibration")
+    evaluation = Cell("evaluation", "evaluate", {"episodes": 3}, "policy")
+    write_plan(out, "suite", [Cell("calibration", "calibrate", {}), policy, evaluation])
+    monkeypatch.setattr(stages, "_require_unchanged", lambda *asked, **options: None)
+    monkeypatch.setattr(stages, "evaluate_folder", lambda *places, **told: asked.append((places[0], told)) or places[1])
+    with claimed(evaluation, out) as claim:
+        assert stages.carry_out(claim, out).status == "finished"
+    ((folder, told),) = asked
+    assert (folder, told["calibration"]) == (policy.folder(out), out / "cells" / "calibration")
 
 
 def test_a_refusal_is_kept_with_its_sentence_and_others_go_on(planned):

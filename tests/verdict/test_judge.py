@@ -73,7 +73,12 @@ def test_a_good_estimate_is_calibrated_and_the_sentence_has_its_numbers(good):
     [
         ("DATA_REJECTED", {}, {"against_chance": (AgainstChance("s", 0.05, 0.002),)}, "5 % nearer than rows paired"),
         ("DATA_REJECTED", {}, {"against_chance": (AgainstChance("s", 0.9, 0.2),)}, "p = 0.2"),
-        ("MODEL_MISMATCH", LEFT_OVER, {"explained": 0.6}, "the best parameters nearby leave 0.8 of a step's change"),
+        (
+            "MODEL_MISMATCH",
+            LEFT_OVER,
+            {"explained": 0.6},
+            "the best parameters nearby leave 0.8 of the typical change in 1 step",
+        ),
         ("MODEL_MISMATCH", LEFT_OVER, {"explained": 0.6}, "actions? explain 60 % of it"),
         ("MODEL_MISMATCH", LEFT_OVER, {"estimate": {"mass": 1.0}}, "mass at the end of the range"),
         ("NOT_IDENTIFIABLE", {}, {"interval_shares": {"mass": 0.1, "damping": 0.7}}, "leaves damping open"),

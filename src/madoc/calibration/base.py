@@ -48,7 +48,7 @@ class CalibrationProblem:
 
     @cached_property
     def typical_change(self) -> Float[np.ndarray, " observation"]:
-        """Standard deviation of each channel's change in one control step."""
+        """Standard deviation of each channel's change in a stride of rows, as `data.timescale.typical_change`."""
         return typical_change(self.dataset)
 
     @cached_property

@@ -28,7 +28,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class PredictionError:
-    """Mean absolute error of predictions, each signal in units of its typical change in one control step.
+    """Mean absolute error of predictions, each signal in units of its typical change in a stride (`data.timescale`).
 
     Attributes:
         steps: Horizon of the predictions in control steps.
@@ -57,6 +57,7 @@ class PredictionErrors:
         nearby_relative: The same ratio for `nearby_best`, or for `noise` where that is larger.
         windows: Number of windows of the hold-out that were replayed.
         failed_windows: How many of them failed in simulation at the estimate.
+        stride: Number of control steps in which a signal typically changes by the errors' unit.
     """
 
     mid_range: tuple[PredictionError, ...]
@@ -68,6 +69,7 @@ class PredictionErrors:
     nearby_relative: float
     windows: int
     failed_windows: int
+    stride: int = 1
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.holdout import HoldOut, Verdict
 from madoc.errors import MadocError
 from madoc.identification.combinations import Combination
+from madoc.identification.information import NORMAL_95
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,16 @@ class ParameterEstimate:
     high: float
     unit: str
     interval: list[float] | None = None
+
+    @property
+    def half_width(self) -> float:
+        """Half the width of the 95 % interval in the parameter's unit; of a normal distribution's where there is none.
+
+        It is the distance from the estimate to the farther end, as an interval may be cut off at an end of the range.
+        """
+        if self.interval is None:
+            return NORMAL_95 * self.std
+        return max(self.estimate - self.interval[0], self.interval[1] - self.estimate)
 
 
 @dataclass(frozen=True)
@@ -87,8 +98,8 @@ class CalibrationResult:
         for name, (below, above) in widened.items():
             row = parameters[name]
             if row.interval is not None:
-                half = (row.interval[1] - row.interval[0]) / 2.0
-                low, high = max(row.low, row.interval[0] - below * half), min(row.high, row.interval[1] + above * half)
+                out_below, out_above = below * row.half_width, above * row.half_width
+                low, high = max(row.low, row.interval[0] - out_below), min(row.high, row.interval[1] + out_above)
                 parameters[name] = replace(row, interval=[low, high])
         return replace(self, parameters=parameters, warnings=[*self.warnings, warning])
 

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.data.disturbing import row_change
 from madoc.learning.features import HIDDEN_WINDOW, last_rows
 from madoc.simulation.rollout import Rollout
-from madoc.types import NotNegative
+from madoc.types import NotNegative, named_key
 
 SensorNoise = NotNegative | Literal["estimated"] | None
 """Noise relative to a step's typical change, or estimated from the log alone, or, with None, as the log declares."""
@@ -28,18 +29,19 @@ def noise_deviation(problem: CalibrationProblem, share: SensorNoise) -> Float[np
         return problem.estimated_noise
     share = problem.dataset.disturbance.noise if share is None else float(share)
     # The logged change holds the noise of two readings; the share is that of the change without noise.
-    return share / np.sqrt(1.0 + 2.0 * share**2) * problem.typical_change
+    return share / np.sqrt(1.0 + 2.0 * share**2) * row_change(problem.dataset)
 
 
 def with_sensor_noise(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:
     """The rollout with noise on its observations; the end of a step and the start of the next have the same noise.
 
-    The policy acted on observations without noise.
+    The policy acted on observations without noise. The key may be that of the rollout's actions.
     """
     if not deviation.any():
         return rollout
     seen = rollout.transitions
     steps, *others = np.shape(seen.observation)
-    noise = deviation * np.asarray(jax.random.normal(key, (steps + 1, *others)), np.float64)
+    standard = jax.random.normal(named_key(key, "sensor noise"), (steps + 1, *others))
+    noise = deviation * np.asarray(standard, np.float64)
     noisy = replace(seen, observation=seen.observation + noise[:-1], next_observation=seen.next_observation + noise[1:])
     return replace(rollout, transitions=noisy)

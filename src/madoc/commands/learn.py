@@ -23,7 +23,8 @@ class Learn:
     physics: Physics | None = None
     """Only for a result.json outside its run folder, which does not say."""
     out: Path | None = None
-    """Run folder. Default: policy-AT within the run."""
+    """Run folder. Default, within the run: policy-AT; policy-AT-METHOD of another learner than the default one, and
+    policy-METHOD of one that learns at no parameters."""
     resume: bool = False
     """Go on with the run in the folder."""
     permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)

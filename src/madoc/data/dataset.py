@@ -124,7 +124,8 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
     """At most `max_transitions` transitions: whole episodes in a random order, the last one cut short.
 
     The draw depends on the lengths of the episodes alone, so it is the same for every file format, and a smaller draw
-    with the same key is the beginning of a larger one. A dataset that is small enough is returned as it is.
+    with the same key is the beginning of a larger one. A dataset that is small enough is returned as it is; else its
+    findings say how many rows were kept.
 
     Raises:
         MadocError: `max_transitions` is not positive.
@@ -138,7 +139,9 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
     filled = np.cumsum((ends - starts)[order])
     episodes = int(np.searchsorted(filled, max_transitions)) + 1
     rows = np.concatenate([np.arange(starts[episode], ends[episode]) for episode in order[:episodes]])
-    return dataset.take(rows[:max_transitions], np.append(0, filled[: episodes - 1]))
+    kept = dataset.take(rows[:max_transitions], np.append(0, filled[: episodes - 1]))
+    what = f"{max_transitions:,} of {len(dataset):,} rows are used, of whole episodes drawn at random"
+    return replace(kept, findings=(*kept.findings, Finding("note", what, do="a larger --max-transitions uses more")))
 
 
 def spread_of(rows: Float[np.ndarray, "*rows values"]) -> Float[np.ndarray, " values"]:

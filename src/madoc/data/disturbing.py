@@ -77,15 +77,20 @@ def hide_velocities(task: Task) -> Task:
     )
 
 
+def row_change(dataset: Dataset) -> Float[np.ndarray, " observation"]:
+    """Standard deviation of each channel's change from a row to the next, in its unit: what noise is a share of."""
+    logged = dataset.transitions
+    return (np.asarray(logged.next_observation) - np.asarray(logged.observation)).std(0)
+
+
 def noise_of(dataset: Dataset, share: float, key: PRNGKeyArray) -> tuple[Observations, Observations]:
     """Normal noise for observations and next observations, its standard deviation a share of a step's typical change.
 
     A sensor is read once a step: where a row's next observation is the next row's observation, both carry the same
     noise.
     """
-    logged = dataset.transitions
+    logged, deviation = dataset.transitions, share * row_change(dataset)
     observation, following = np.asarray(logged.observation), np.asarray(logged.next_observation)
-    deviation = share * (following - observation).std(0)
     before, after = (np.array(jax.random.normal(part, observation.shape), float) for part in jax.random.split(key))
     same = (following[:-1] == observation[1:]).all(-1)
     same[dataset.episode_starts[1:] - 1] = False

@@ -65,9 +65,8 @@ class Calibrated:
 
     @property
     def half_widths(self) -> Float[np.ndarray, " parameters"]:
-        """Half the width of each parameter's 95 % interval, in its unit; that of a normal one where it has none."""
-        spans = [row.interval or (-NORMAL_95 * row.std, NORMAL_95 * row.std) for row in self.result.parameters.values()]
-        return np.array([(high - low) / 2.0 for low, high in spans])
+        """Half the width of each parameter's 95 % interval, as `ParameterEstimate.half_width`."""
+        return np.array([row.half_width for row in self.result.parameters.values()])
 
 
 def read_calibration(path: str | Path, *, physics: str | None = None, allow_code: bool = False) -> Calibrated:

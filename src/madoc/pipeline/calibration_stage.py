@@ -1,5 +1,6 @@
 """Calibration as a stage: by one method, or by `auto`, which compares several on the hold-out and keeps the best."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -105,30 +106,36 @@ def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool)
             return CalibrationResult.from_json(read_json(folder.result))
         folder.result.unlink(missing_ok=True)
         rows: list[Tried | NotRun] = []
-        tried: list[tuple[CalibrationResult, Assessment]] = []
+        tried: dict[str, tuple[CalibrationResult, Assessment]] = {}
+        spent: list[CalibrationResult] = []
         for name, share in CANDIDATES.items():
-            allowed = _allowed(prepared.budget, share, [result for result, _ in tried])
+            allowed = _allowed(prepared.budget, share, spent)
             reason = _reason_to_stop(tried) or ("the budget is spent" if allowed == 0 else "")
             reason = reason or _refusal(methods[name], prepared)
             if reason:
                 rows.append(NotRun(name, reason))
+                folder.write_json(COMPARISON, {"candidates": [asdict(row) for row in rows]})
                 continue
             part = replace(prepared, method=name, budget=allowed)
             place = out / name
             result, assessment = _calibrate_by(methods[name], place, part, resume=holds_run(place), quiet=quiet)
-            if assessment is None:  # interrupted or diverged
-                if result.status == "diverged" and tried:
-                    rows.append(NotRun(name, result.sentence))
-                    continue
+            if result.status == "interrupted":
                 return result
-            tried.append((result, assessment))
-            rows.append(_row(result, assessment))
+            spent.append(result)
+            if assessment is None:
+                rows.append(NotRun(name, result.sentence))
+            else:
+                tried[name] = result, assessment
+                rows.append(_row(name, result, assessment))
             folder.write_json(COMPARISON, {"candidates": [asdict(row) for row in rows]})
+        if not tried and spent:
+            return spent[-1]
         if not tried:
             raise MadocError("; ".join(f"{row.method}: {row.not_run}" for row in rows if isinstance(row, NotRun)))
-        best = _best(tried, rows)
+        chosen = min(tried, key=lambda name: tried[name][1].holdout.score)
+        best = _with_cost_of_all(*tried[chosen], spent, rows, chosen)
         _leave_evidence(out, prepared, best)
-        compared = {"candidates": [asdict(row) for row in rows], "chosen": best.method, "budget": spec["budget"]}
+        compared = {"candidates": [asdict(row) for row in rows], "chosen": chosen, "budget": spec["budget"]}
         folder.write_json(COMPARISON, compared)
         folder.write_json("result.json", best.to_json())
         return best
@@ -140,7 +147,7 @@ def _leave_evidence(out: Path, prepared: Prepared, result: CalibrationResult) ->
     save_evidence(out / "evidence.npz", arrays)
 
 
-def _allowed(budget: Budget | None, share: float, earlier: list[CalibrationResult]) -> Budget | None:
+def _allowed(budget: Budget | None, share: float, earlier: Sequence[CalibrationResult]) -> Budget | None:
     """The budget of a candidate, at most a share of that of `auto` and what earlier ones left of it; 0 if nothing.
 
     None where `auto` has none, so that each candidate has its own.
@@ -154,14 +161,14 @@ def _allowed(budget: Budget | None, share: float, earlier: list[CalibrationResul
     return max(1, min(round(share * budget), left)) if left > 0 else 0
 
 
-def _reason_to_stop(tried: list[tuple[CalibrationResult, Assessment]]) -> str:
+def _reason_to_stop(tried: Mapping[str, tuple[CalibrationResult, Assessment]]) -> str:
     """Why no other candidate is needed; empty to go on."""
-    for result, assessment in tried:
+    for name, (_, assessment) in tried.items():
         word = assessment.verdict.word
         if word == "DATA_REJECTED":
             return "the data was rejected, and no method changes that"
         if word == "CALIBRATED" and explains_all(assessment.holdout):
-            return f"{result.method} explains the hold-out down to its noise"
+            return f"{name} explains the hold-out down to its noise"
     return ""
 
 
@@ -174,18 +181,23 @@ def _refusal(method: Calibrator, prepared: Prepared) -> str:
     return ""
 
 
-def _row(result: CalibrationResult, assessment: Assessment) -> Tried:
-    """A row of the comparison."""
+def _row(name: str, result: CalibrationResult, assessment: Assessment) -> Tried:
+    """A candidate's row of the comparison."""
     holdout, word = assessment.holdout, assessment.verdict.word
-    return Tried(result.method, holdout.score, holdout.score_interval, word, result.control_steps, result.seconds)
+    return Tried(name, holdout.score, holdout.score_interval, word, result.control_steps, result.seconds)
 
 
-def _best(tried: list[tuple[CalibrationResult, Assessment]], rows: list[Tried | NotRun]) -> CalibrationResult:
-    """The best result, with the cost of all."""
-    best, assessment = min(tried, key=lambda pair: pair[1].holdout.score)
+def _with_cost_of_all(
+    result: CalibrationResult,
+    assessment: Assessment,
+    spent: Sequence[CalibrationResult],
+    rows: Sequence[Tried | NotRun],
+    chosen: str,
+) -> CalibrationResult:
+    """The chosen candidate's result, with the comparison and the cost of all candidates."""
     return replace(
-        best,
-        control_steps=sum(result.control_steps for result, _ in tried),
-        seconds=round(sum(result.seconds for result, _ in tried), 3),
-        holdout=replace(assessment.holdout, candidates=tuple(rows), chosen=best.method),
+        result,
+        control_steps=sum(each.control_steps for each in spent),
+        seconds=round(sum(each.seconds for each in spent), 3),
+        holdout=replace(assessment.holdout, candidates=tuple(rows), chosen=chosen),
     )

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
@@ -20,10 +19,10 @@ from madoc.report.records import EvaluationRecord, SpecRecord, read_spec
 from madoc.runs.files import write_json
 from madoc.runs.progress import bar
 from madoc.simulation import Simulator
-from madoc.types import Policy
+from madoc.types import Policy, named_key
 
 YARDSTICKS = ("midrange", "truth")
-"""Policies that nobody would deploy: what errors cost them is of no interest."""
+"""Where policies are learnt that nobody would deploy: what errors cost them is of no interest."""
 
 
 def evaluate_folder(
@@ -31,6 +30,7 @@ def evaluate_folder(
     order: EvaluationOrder | None = None,
     *,
     names: Sequence[str] = (),
+    calibration: Path | None = None,
     out: Path | None = None,
     quiet: bool = False,
     allow_code: bool = False,
@@ -38,8 +38,8 @@ def evaluate_folder(
     """Evaluate policies of a run on the same starts, and leave `evaluation.json` and `film.npz` there, or in `out`.
 
     The folder is that of a run or of one policy. Without `names` all its policies are evaluated. They act in the target
-    where its parameters are known, from the order or from the run; and where the folder holds a calibration, at its
-    estimate, in systems drawn from its distribution, and under an error of each parameter.
+    where its parameters are known, from the order or from the run; and where the folder holds a calibration, or its
+    folder is given, at its estimate, in systems drawn from its distribution, and under an error of each parameter.
 
     Raises:
         MadocError: There is no policy, neither truth nor calibration is known, or a number is out of range.
@@ -53,7 +53,7 @@ def evaluate_folder(
     policies = {name: load_policy(found[name]) for name in names or found}
     spec = _spec_with_truth(folder, found)
     truth = read_truth(order.truth) or spec.truth
-    calibrated = _calibration_of(folder, allow_code=allow_code)
+    calibrated = _calibration_of(calibration or folder, allow_code=allow_code)
     if truth is None and calibrated is None:
         raise MadocError(
             f"the true parameters of {folder} are not known, and it holds no calibration to evaluate at; "
@@ -114,13 +114,13 @@ def _where_not_sure(
 ) -> tuple[dict[str, OverDraws], dict[str, dict[str, ErrorCost]]]:
     """Returns over draws of the estimate, and of all but yardsticks what an error of each parameter costs."""
     simulator = simulation.make(calibrated.task.for_policies)
-    of_draws, of_errors = jax.random.split(key)
+    of_draws, of_errors = named_key(key, "draws"), named_key(key, "errors")
     drawn, costs = {}, {}
     with bar("evaluating where the estimate is not sure", total=len(policies), unit="policies", quiet=quiet) as advance:
         for name, policy in policies.items():
             distribution = calibrated.distribution()
             drawn[name] = over_draws(policy, simulator, distribution, key=of_draws, draws=order.draws)
-            if name not in YARDSTICKS:
+            if name.partition("-")[0] not in YARDSTICKS:
                 estimate, half_widths = calibrated.result.mean, calibrated.half_widths
                 costs[name] = costs_of_errors(
                     policy, simulator, estimate, half_widths, key=of_errors, episodes=order.episodes

@@ -1,7 +1,9 @@
 """Export as a stage: a finished calibration as files for other tools."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+
+import numpy as np
 
 from madoc import simulation
 from madoc.errors import MadocError
@@ -35,9 +37,10 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False, allow_
     simulator, result = simulation.make(calibrated.task), calibrated.result
     provenance = provenance_of(calibrated)
     model = calibrated.task.compile()
+    covariance = calibrated.distribution().covariance
     exported = [
-        Exported(parameter, result.parameters[parameter.name], nominal_values(model, parameter))
-        for parameter in simulator.parameters.parameters
+        Exported(parameter, replace(result.parameters[parameter.name], std=std), nominal_values(model, parameter))
+        for parameter, std in zip(simulator.parameters.parameters, np.sqrt(np.diag(covariance)).tolist(), strict=True)
     ]
     files = {
         "model": folder / "model.xml",
@@ -47,7 +50,9 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False, allow_
     }
     changes = save_mjcf(simulator, result.mean, files["model"])
     save_patch(files["patch"], exported, provenance, changes=changes, stepping=_stepping(simulator))
-    save_randomization(files["randomization ranges"], exported, provenance, result.covariance)
+    save_randomization(
+        files["randomization ranges"], exported, provenance, None if result.covariance is None else covariance.tolist()
+    )
     save_sysid_parameters(files["mujoco.sysid parameters"], exported)
     for name, file in policies.items():
         target = folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx")

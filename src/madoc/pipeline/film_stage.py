@@ -21,7 +21,7 @@ FRAMES = 9
 WIDTH = 168
 """Width of a picture in pixels."""
 MOST = 1.6
-"""Largest ratio of a picture's width to its height; the smallest is one by this."""
+"""Largest ratio of a picture's width to its height; the smallest is 1 / MOST."""
 
 
 def leave_film(

@@ -7,6 +7,7 @@ import jax
 
 from madoc.calibration import CalibrationProblem, LeastSquares, Madoc
 from madoc.errors import MadocError
+from madoc.report.words import duration
 
 REFINING_EPOCHS = 6
 """Number of steps on all windows that least squares usually takes."""
@@ -16,7 +17,10 @@ PREPARATION = 1.15
 
 @dataclass(frozen=True)
 class Forecast:
-    """Expected duration of a method and its control steps at most; `seconds` is None where it refuses the data."""
+    """Expected duration of a method and the control steps that it learns from.
+
+    `seconds` is None where it refuses the data.
+    """
 
     method: str
     seconds: float | None
@@ -28,10 +32,7 @@ class Forecast:
         """The forecast in words."""
         if self.seconds is None:
             return f"{self.method} would refuse: {self.refusal}"
-        duration = f"{max(1.0, self.seconds):.0f} s"
-        if self.seconds >= 90:
-            duration = f"{self.seconds / 60:.0f} min" if self.seconds < 5400 else f"{self.seconds / 3600:.1f} h"
-        return f"{self.method}: about {duration} for {self.control_steps:,} control steps"
+        return f"{self.method}: about {duration(self.seconds)} for {self.control_steps:,} control steps"
 
 
 def forecast(problem: CalibrationProblem, *, budget: int) -> tuple[Forecast, ...]:

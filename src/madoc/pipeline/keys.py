@@ -1,11 +1,10 @@
 """Random keys of the stages: one seed, and a stream of its own for each stage."""
 
-import zlib
-
 import jax
 from jaxtyping import PRNGKeyArray
 
 from madoc.errors import MadocError
+from madoc.types import named_key
 
 LARGEST_SEED = 2**32 - 1
 """Largest seed: `jax.random.key` takes 32 bits."""
@@ -28,8 +27,5 @@ def check_seed(seed: int) -> None:
 
 
 def stage_key(seed: int, stage: str) -> PRNGKeyArray:
-    """The random key of a stage by its name, the same within `madoc run` as alone.
-
-    The name's checksum is far from the small numbers that stages fold into their keys.
-    """
-    return jax.random.fold_in(seed_key(seed), zlib.crc32(stage.encode()))
+    """The random key of a stage by its name, the same within `madoc run` as alone."""
+    return named_key(seed_key(seed), stage)

@@ -80,13 +80,13 @@ class Search:
     starts: Literal["policy", "logged", "replay"] | None = None
     """Where rollouts start: free running from resets, short ones from logged states, or one step of the log."""
     set: Settings = ()
-    """Hyperparameters of the method as name=value; of a method that auto tries as madoc.name=value."""
+    """Hyperparameters of the method as name=value; of a method that auto tries as least-squares.name=value."""
     budget: int | str | None = None
     """Simulated control steps, or a time, as 300s or 15min. Default: 300s for least-squares, which settles by itself
     and mostly much sooner, 300000 control steps for the others. Of a budget for auto least squares may have two thirds
     and Madoc half."""
     seed: int = 0
-    """Of all randomness."""
+    """Seed of all random numbers."""
 
     @property
     def changes(self) -> dict[str, str]:
@@ -137,7 +137,7 @@ class CheckOrder:
     forecast: bool = True
     """Forecast how long methods would take: the longest part of a check."""
     seed: int = 0
-    """Of the stretches of the log that are looked at."""
+    """Seed that chooses which stretches of the log are examined."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class RecordOrder:
     transitions: int = 200_000
     """Rows to record."""
     seed: int = 0
-    """Of all randomness."""
+    """Seed of all random numbers."""
     physics: Physics = "legacy"
     """legacy is that of D4RL, NeoRL and the paper."""
     friction: float = 1.0
@@ -189,7 +189,7 @@ class PolicyOrder:
     """Simulated control steps, or updates of a learner that does not simulate, as `madoc methods` says; or a time, as
     300s or 15min. Default: 2400000 for fast-sac and rlpd, else 300000."""
     seed: int = 0
-    """Of all randomness."""
+    """Seed of all random numbers."""
     truth: Path | None = None
     """JSON file {parameter: value}, for --at truth. Default: what the run remembers."""
 
@@ -203,7 +203,7 @@ class EvaluationOrder:
     draws: int = 50
     """Systems drawn from the calibrated distribution, to see how policies do where the estimate is not sure."""
     seed: int = 0
-    """Of the starts and of the draws."""
+    """Seed of the starts of episodes and of the draws."""
     truth: Path | None = None
     """JSON file {parameter: value} that makes the target. Default: what the run remembers."""
 

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray, PyTree
 from pydantic import Field
 
-from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, bellman_target, critic_step, fresh
 from madoc.learning.dynamics_ratio import Discriminators, discriminator_loss, log_dynamics_ratio
@@ -19,7 +18,7 @@ from madoc.learning.networks import adam, descend, scalars, scan_updates
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, explore_or_act, start_acting
+from madoc.policies.interaction import Interaction, check_epoch, explore_or_act, start_acting
 from madoc.policies.judging import Judged, judge
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
@@ -62,12 +61,12 @@ class H2O:
         warmup_steps: Control steps with uniform random actions before the first update.
         batch: Rows per update, logged and simulated in equal numbers.
         weight: β of the regulariser.
-        noise: Of the discriminators' inputs while they learn.
+        noise: Standard deviation of the noise on the discriminators' inputs while they learn.
         gap_samples: Next states drawn for the dynamics gap of a row.
-        gap_spread: How wide, in units of a step's change.
-        bound: Of the logits that s' adds to those of (s, a).
-        pair_bound: Of the logits of (s, a). The authors' is 2, like the other: too narrow where the policy is far
-            from the data. The logits of s' then make up for it, and the ratio rejects every simulated row.
+        gap_spread: Standard deviation of those next states, in units of a step's change.
+        bound: Largest absolute value of the logits that s' adds to those of (s, a).
+        pair_bound: The same of the logits of (s, a). The authors' is 2, like the other: too narrow where the policy is
+            far from the data. The logits of s' then make up for it, and the ratio rejects every simulated row.
         discount: γ.
         target_rate: τ of the target critics.
         learning_rate: Adam's, for everything.
@@ -98,10 +97,7 @@ class H2O:
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
-        if self.epoch_steps < self.environments:
-            raise MadocError(
-                f"expected epoch_steps of at least the {self.environments} environments, got {self.epoch_steps}"
-            )
+        check_epoch(self.epoch_steps, environments=self.environments, updates_per_step=self.updates_per_step)
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> H2OState:
         """Fresh networks, an empty replay, rows at reset states.

@@ -116,6 +116,22 @@ def explore_or_act(
     return following, Epoch(metrics, control_steps=taken, updates=due, stage=stage), due
 
 
+def check_epoch(epoch_steps: int, *, environments: int, updates_per_step: float) -> None:
+    """Refuse an epoch in which some environment takes no control step, or no update is due.
+
+    Raises:
+        MadocError: `epoch_steps` or `updates_per_step` is too small.
+    """
+    if epoch_steps < environments:
+        raise MadocError(f"expected epoch_steps of at least the {environments} environments, got {epoch_steps}")
+    taken = epoch_steps // environments * environments
+    if round(updates_per_step * taken) < 1:
+        raise MadocError(
+            f"expected at least one update in an epoch of {taken} control steps, got updates_per_step of "
+            f"{updates_per_step:g}; raise it, or epoch_steps"
+        )
+
+
 class UniformPolicy(eqx.Module):
     """The policy of the exploration before the first update: uniform random actions in [-1, 1]; 0 without a key."""
 

@@ -6,14 +6,13 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
 from madoc.learning.networks import scalars, scan_inputs
 from madoc.learning.sac_losses import cloned_actor_loss, cloning_error
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, explore_or_act, start_acting
+from madoc.policies.interaction import Interaction, check_epoch, explore_or_act, start_acting
 from madoc.policies.judging import Judged, judge
 from madoc.policies.systems import UniformParameters
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
@@ -80,10 +79,7 @@ class SAC:
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
-        if self.epoch_steps < self.environments:
-            raise MadocError(
-                f"expected epoch_steps of at least the {self.environments} environments, got {self.epoch_steps}"
-            )
+        check_epoch(self.epoch_steps, environments=self.environments, updates_per_step=self.updates_per_step)
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> SACState:
         """Fresh networks, an empty replay, rows at reset states.

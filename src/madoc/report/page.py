@@ -68,7 +68,7 @@ class Headline:
 
 _UNJUDGED = {
     "interrupted": ("doubtful", "The run was interrupted: the estimate is that of the moment."),
-    "diverged": ("bad", "The run stopped on a number that is none: do not use the estimate."),
+    "diverged": ("bad", "The run stopped as a value became NaN or infinite: do not use the estimate."),
 }
 """Colour class and sentence of a run without a verdict, by how it ended."""
 
@@ -105,7 +105,7 @@ def _on_holdout(held: HoldOut) -> tuple[str, str, str]:
     if isinstance(held, ToldApart):
         low, high = (number(end, 2) for end in held.area_at_estimate.interval)
         note = f"area of a classifier, {low} to {high}; 0.5 is chance"
-        return "told from the log", number(held.area_at_estimate.area, 2), note
+        return "classifier, simulated or logged", number(held.area_at_estimate.area, 2), note
     value, low, high = map(percent, (held.score, *held.score_interval))
     return "error on the hold-out", value, f"of mid-range's; {low} to {high}"
 

@@ -48,7 +48,7 @@ class Evidence:
 
     Attributes:
         signals: Names of the signals.
-        scale: Typical change of each signal in a control step, in its unit.
+        scale: Typical change of each signal in a stride of rows (`data.timescale`), in its unit.
         time: Time since the beginning of a window, s.
         measured: What was logged.
         before: Simulated at mid-range.
@@ -91,7 +91,7 @@ class Run:
         log: Its metrics.
         evidence: Held-out windows beside their simulation.
         embeddings: What it learnt about which parameters act alike.
-        evaluation: Returns of policies in the target.
+        evaluation: Returns of policies, in the target where it is known and at the estimate.
     """
 
     name: str

@@ -47,7 +47,7 @@ class SpecRecord:
         method: Name of the calibrator or learner, or `auto`.
         physics: `legacy` or `modern`.
         parameters: Range of each calibrated parameter, or its value where a policy was learnt.
-        seed: Seed of all randomness.
+        seed: Seed of all random numbers.
         truth: True values by name, where they are known.
         holdout: Share of the rows that was held out; None where the result was not judged.
         data: The logged data.
@@ -111,11 +111,12 @@ class Summary:
         sentence: The status in words.
         task: Name of the robot.
         physics: `legacy` or `modern`.
-        seed: Seed of all randomness.
+        seed: Seed of all random numbers.
         data: `transitions` and `fingerprint`.
         calibration: The result, as `CalibrationResult.to_json` writes it.
         policies: How the learning of each policy ended, by name.
-        evaluation: The policies in the target; None where the target is not known.
+        evaluation: Returns of the policies, in the target where it is known and at the estimate; None where the run
+            stopped before.
     """
 
     name: str

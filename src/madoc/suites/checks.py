@@ -47,7 +47,9 @@ def under(key: str) -> Iterator[None]:
 
 
 def check_calibration(order: CalibrationOrder, *, recorded: bool, allow_code: bool = False) -> None:
-    """Refuse a calibration whose robot, method or numbers are; its data is only looked for.
+    """Refuse a calibration of an unknown robot, by an unknown method, or with impossible numbers.
+
+    Of its data, only the existence is checked.
 
     Raises:
         Misfit: Names the key.

@@ -30,8 +30,8 @@ class Outcome:
     """How a cell ended.
 
     Attributes:
-        status: `finished` or `converged`; `diverged` (a number was none), `refused` (with a reason), or `failed` (an
-            error that is no refusal, which the next `madoc suite` tries again).
+        status: `finished` or `converged`; `diverged` (a value became NaN or infinite), `refused` (with a reason), or
+            `failed` (an error that is no refusal, which the next `madoc suite` tries again).
         sentence: The status in words.
         seconds: Wall-clock time of the attempt that ended it, s.
         attempts: How often it had been begun.

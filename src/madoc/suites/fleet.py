@@ -113,11 +113,8 @@ def _shared(name: str, robots: Mapping[str, Result]) -> SharedParameter:
 
 def _standard_error(row: ParameterEstimate) -> float:
     """The standard error that a 95 % interval stands for; an interval of no width counts as one of rounding's."""
-    assert row.interval is not None
-    low, high = row.interval
-    half = (high - low) / 2.0
-    smallest = np.finfo(np.float64).eps * max(abs(low), abs(high), 1e-12)
-    return float(max(half, smallest) / NORMAL_95)
+    smallest = np.finfo(np.float64).eps * max(abs(row.estimate), 1e-12)
+    return float(max(row.half_width, smallest) / NORMAL_95)
 
 
 def ranges(fleet: Fleet) -> dict[str, tuple[float, float]]:

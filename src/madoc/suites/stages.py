@@ -10,7 +10,7 @@ from madoc.errors import MadocError, NotAllowed
 from madoc.pipeline import calibrate_in, evaluate_folder, learn_in, read_calibration, record_named
 from madoc.pipeline.folders import ENDED, holds_run
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
-from madoc.suites.cells import RECORDED, Cell
+from madoc.suites.cells import RECORDED, Cell, read_plans
 from madoc.suites.checks import forget_contents, name_of
 from madoc.suites.claims import MOST_ATTEMPTS, Claim, Outcome
 from madoc.suites.options import Order
@@ -70,7 +70,11 @@ def _done(claim: Claim, suite: Path, *, allow_code: bool) -> tuple[str, str]:
             learnt = learn_in(folder, calibrated, order, resume=resume, quiet=True)
             return learnt.status, learnt.sentence
         case EvaluationOrder():
-            evaluation = evaluate_folder(needed, order, out=folder, quiet=True, allow_code=allow_code)
+            policy = next(cell for cell in read_plans(suite) if cell.name == claim.cell.needs)
+            calibration = suite / "cells" / (policy.needs or "")
+            evaluation = evaluate_folder(
+                needed, order, calibration=calibration, out=folder, quiet=True, allow_code=allow_code
+            )
             return "finished", f"{evaluation.episodes} episodes are evaluated"
 
 

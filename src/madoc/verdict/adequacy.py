@@ -149,7 +149,7 @@ def _covering(
             row = result.parameters[name]
             if name in each.shifts and row.interval is not None:
                 slope = factor if combination.kind == "sum" else factor * combination.estimate / row.estimate
-                half = slope * (row.interval[1] - row.interval[0]) / 2.0
+                half = slope * row.half_width
                 shift, reach = shift + half * each.shifts[name], reach + abs(half) * each.errors[name]
         low = min(low, combination.estimate + shift - float(np.hypot(below, reach)))
         high = max(high, combination.estimate + shift + float(np.hypot(above, reach)))

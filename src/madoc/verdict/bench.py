@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from sklearn.neighbors import NearestNeighbors
@@ -26,6 +25,7 @@ from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
+from madoc.types import named_key
 from madoc.verdict.adequacy import is_certain, widening
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
@@ -86,7 +86,7 @@ class Bench:
 
     @property
     def change(self) -> Float[np.ndarray, " observation"]:
-        """Typical change of each signal in one step of the training rows: residuals are multiples of it."""
+        """Typical change of each signal in a stride of the training rows: residuals are multiples of it."""
         return self.problem.typical_change
 
     @property
@@ -167,7 +167,7 @@ class Bench:
             self.simulator,
             self.simulator.parameters.to_physical(point),
             length=length,
-            key=jax.random.fold_in(self.key, 1),
+            key=named_key(self.key, "rollouts"),
             noise=difference_noise(self.problem.dataset),
         )
         return classify(self.view.sample(held), self.view.sample(simulated), overlap=True)
@@ -188,7 +188,7 @@ def judged(
     """Complete a measure's record by the fields that all measures have.
 
     The best possible intervals are computed for parameters `at`, as if `residual` were the standard deviation of noise.
-    That and the sensors' `noise` are in typical changes of a step.
+    That and the sensors' `noise` are in typical changes of a stride.
     """
     space, problem = bench.simulator.parameters, bench.problem
     residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
@@ -200,7 +200,9 @@ def judged(
             problem.states, problem.dataset, problem.simulator, at, sensors, exact=False
         )
         half, spent = np.minimum(half, fitted), spent + more
-    own = half if interval is None else np.maximum((interval[:, 1] - interval[:, 0]) / (space.high - space.low), 1e-9)
+    own = half
+    if interval is not None:  # to the farther end, as the other may be cut off at an end of the range
+        own = np.maximum(np.abs(space.to_unit(interval.T) - point).max(0), 1e-9)
     doubts = Suspicions()
     ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
     if bench.states.kind != "unknown" and problem.dataset.disturbance.shuffled == "none" and ordered:

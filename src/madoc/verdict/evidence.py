@@ -21,11 +21,12 @@ TRACE_STRIDES = 100
 def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float) -> dict[str, np.ndarray]:
     """Arrays of the hold-out by name.
 
-    There are always `signals` (names), `scale` (typical change in a step, in each signal's unit), `time` (s), `episode`
-    and `row` (where each stretch begins in the hold-out) and `measured` (stretches, times, signals). Where states can
-    be rebuilt there are also `before` and `after`, the same stretches simulated at mid-range and at the estimate from
-    the first measured state under the logged actions (NaN once a simulation has failed), and `residual_before` and
-    `residual_after` (windows, signals), simulated minus measured observations after one step.
+    There are always `signals` (names), `scale` (typical change in a stride, in each signal's unit), `time` (s),
+    `episode` and `row` (where each stretch begins in the hold-out) and `measured` (stretches, times, signals). Where
+    states can be rebuilt there are also `before` and `after`, the same stretches simulated at mid-range and at the
+    estimate from the first measured state under the logged actions (NaN once a simulation has failed), and
+    `residual_before` and `residual_after` (windows, signals), simulated minus measured observations after the shortest
+    horizon.
     `mean` is the estimate in physical units, `control_step` the time between two rows in s.
     """
     held, replays = bench.held_out, bench.replays if bench.states_known else None

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.holdout import AgainstChance, Fitted
+from madoc.data import stride
 from madoc.diagnosis.channels import signal_names
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.losses import loss_slope, scale_of
@@ -52,6 +53,7 @@ def fitted(
             horizons=replays.ahead,
             signals=signal_names(bench.simulator.task)[: len(noise)],
             failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
+            stride=stride(bench.problem.dataset),
         ),
         explained=explained_at_end(start_and_actions, residuals[best]),
         fitted_steps=replays.fitted,

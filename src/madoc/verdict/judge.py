@@ -177,6 +177,7 @@ def _remedy(term: MissingTerm) -> str:
         return REMEDIES[term.cause]
     high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
     low = 0.0 if term.value >= 0.0 else max(-high, FIELDS[field].minimum)
+    high = 0.0 if field == "gravity" and term.value < 0.0 else high  # it points downwards
     joints = element.split("+")
     named = f", element: {element}" if element else ""
     named = named if len(joints) == 1 else f", elements: [{', '.join(joints)}]"
@@ -240,8 +241,9 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
         return ""
     left, noise = max(beyond, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
     return (
-        f"the best parameters nearby leave {left.mean:.2g} of a step's change after {_steps(left.steps)}"
-        f"{'' if direct else ' behind a fitted start'} on the hold-out, where noise leaves {noise.mean:.2g}, and "
+        f"the best parameters nearby leave {left.mean:.2g} of the typical change in {_steps(errors.stride)} after "
+        f"{_steps(left.steps)}{'' if direct else ' behind a fitted start'} on the hold-out, where noise leaves "
+        f"{noise.mean:.2g}, and "
         f"{', '.join(reasons)}: the model cannot explain the data ({_change(errors)} at the estimate)"
     )
 
@@ -343,7 +345,7 @@ def _how_small(errors: PredictionErrors) -> str:
     low, high = map(_percent, errors.relative_interval)
     return (
         f"the prediction error on the hold-out is {_percent(errors.relative)} of mid-range's (95 % interval {low} to "
-        f"{high}; {_change(errors)} of a step's change)"
+        f"{high}; {_change(errors)}, in typical changes of {_steps(errors.stride)})"
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.holdout import Predicted
+from madoc.data import stride
 from madoc.diagnosis.channels import signal_names
 from madoc.identification import noise as sensors
 from madoc.identification.states import logged_states
@@ -48,6 +49,7 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
             horizons=replays.horizons,
             signals=signal_names(bench.simulator.task),
             failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
+            stride=stride(bench.problem.dataset),
         ),
         explained=max(single.explained, explained_at_end(start_and_actions, residuals[best])),
         autocorrelation=single.autocorrelation,

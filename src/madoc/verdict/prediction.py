@@ -17,7 +17,7 @@ MOST_WINDOWS = 400
 FEWEST_WINDOWS = 20
 """Smallest number of windows of a horizon; with fewer, the horizon is left out unless single steps are as few."""
 WORST = 1.0
-"""Smallest error, in typical changes of a step, of a window whose simulation failed."""
+"""Smallest error, in typical changes of a stride, of a window whose simulation failed."""
 NEARBY_STEPS = 8
 """Largest number of Gauss-Newton steps from an estimate: enough to reach the nearest local minimum."""
 _STILL = 1e-7
@@ -33,7 +33,7 @@ class Replays:
     """Windows of the hold-out, as long as the longest of the `horizons`, after which errors are taken.
 
     `observation` and `rows` are those at the beginning of each window, `scale` is the typical change of each channel in
-    a step of the training rows.
+    a stride of the training rows.
     """
 
     simulator: Simulator
@@ -63,7 +63,7 @@ class Replays:
     ) -> Float[np.ndarray, "1 windows steps observation"]:
         """Residuals that sensor noise alone would cause, through the initial state and in what is compared with.
 
-        `deviation` is the noise's standard deviation in typical changes of a step, at parameters in [-1, 1].
+        `deviation` is the noise's standard deviation in typical changes of a stride, at parameters in [-1, 1].
         """
         shape = (len(self.windows), self.windows.steps, len(deviation))
         if not deviation.any():

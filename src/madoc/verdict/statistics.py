@@ -9,7 +9,7 @@ from madoc.calibration.holdout import PredictionError, PredictionErrors
 from madoc.identification.information import CONFIDENCE
 
 NEGLIGIBLE = 1e-3
-"""Residual in typical changes of a signal in one step; no sensor is more precise, so smaller ones count as none."""
+"""Residual in typical changes of a signal in a stride; no sensor is more precise, so smaller ones count as none."""
 RESAMPLES = 500
 """Number of bootstrap samples. The ends of a 95 % interval then vary by about a tenth of its width (Efron and
 Tibshirani 1993, section 13.3)."""
@@ -68,12 +68,13 @@ def prediction_errors(
     horizons: Sequence[int],
     signals: Sequence[str],
     failed: int,
+    stride: int,
 ) -> PredictionErrors:
     """Prediction errors of several points at each horizon, with confidence intervals.
 
     `sizes` are absolute residuals at mid-range, at the estimate, then at points near it, and `floor` those that noise
-    alone would cause. `best` is the point of `best_of`, `groups` are those of `independent_groups`, and `failed` is the
-    number of windows that failed at the estimate.
+    alone would cause. `best` is the point of `best_of`, `groups` are those of `independent_groups`, `failed` is the
+    number of windows that failed at the estimate, and `stride` the control steps of the residuals' unit.
     """
     means, draws = sizes.mean((0, -1)), resampled(sizes.mean(-1), groups)
     relative = relative_to_first(means)
@@ -92,6 +93,7 @@ def prediction_errors(
         nearby_relative=float(max(relative[best], min(relative[1], noise_alone))),
         windows=len(sizes),
         failed_windows=failed,
+        stride=stride,
     )
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from sklearn.ensemble import ExtraTreesRegressor
 from sklearn.linear_model import RidgeCV
-from sklearn.model_selection import KFold
+from sklearn.model_selection import KFold, cross_val_predict
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
@@ -18,7 +18,8 @@ _ROUNDING = 1e-6
 """Residual in typical changes of a step; a smaller one is within the tolerance of MuJoCo's solver at contacts."""
 
 LAGS = range(4, 9)
-"""Distances in rows at which residuals are compared: behind noise, its filters, and differences of readings."""
+"""Distances in rows at which residuals are compared: long enough that sensor noise, filters and differences of readings
+no longer correlate."""
 CERTAIN = 6.0
 """Standard errors of a correlation, from which it counts; many channels are looked at."""
 
@@ -43,10 +44,7 @@ def explained(
     if len(inputs) < _FEWEST or np.sqrt((residuals**2).mean(0)).max() <= _ROUNDING:
         return best, explanation
     for make in EXPLAINERS.values():
-        guess = np.empty_like(residuals)
-        for seen, unseen in KFold(FOLDS).split(inputs):
-            model = make().fit(inputs[seen], wanted[seen])
-            guess[unseen] = np.reshape(model.predict(inputs[unseen]), (len(unseen), -1))
+        guess = cross_val_predict(make(), inputs, wanted, cv=KFold(FOLDS)).reshape(residuals.shape)
         share = 1.0 - float(((residuals - guess) ** 2).sum()) / total
         if share > best:
             best, explanation = share, guess

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.linear_model import RidgeCV
 from sklearn.metrics import roc_auc_score
-from sklearn.model_selection import StratifiedKFold
+from sklearn.model_selection import StratifiedKFold, cross_val_predict
 from threadpoolctl import threadpool_limits
 
 from madoc.calibration.holdout import Area
@@ -209,15 +209,14 @@ def _unseen(
     weight: Float[np.ndarray, " rows"] | None,
 ) -> Float[np.ndarray, " rows"]:
     """Probability that each row is a logged one, by a classifier that was not trained on it."""
-    scores = np.empty(len(label))
+    trees = HistGradientBoostingClassifier(
+        max_iter=TREES, max_leaf_nodes=LEAVES, max_bins=BINS, early_stopping=False, random_state=0
+    )
+    folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
+    weights = None if weight is None else {"sample_weight": weight}
     with threadpool_limits(1):  # the same bits on any number of cores, and no threads that wait for each other
-        for seen, unseen in StratifiedKFold(FOLDS, shuffle=True, random_state=0).split(features, label):
-            trees = HistGradientBoostingClassifier(
-                max_iter=TREES, max_leaf_nodes=LEAVES, max_bins=BINS, early_stopping=False, random_state=0
-            )
-            trees.fit(features[seen], label[seen], None if weight is None else weight[seen])
-            scores[unseen] = trees.predict_proba(features[unseen])[:, 1]
-    return scores
+        chances = cross_val_predict(trees, features, label, cv=folds, params=weights, method="predict_proba")
+    return np.asarray(chances)[:, 1]
 
 
 def _interval(scores: np.ndarray, label: np.ndarray, weight: np.ndarray | None) -> tuple[float, float]:

@@ -3,12 +3,12 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.sensing import with_sensor_noise
+from madoc.data.disturbing import row_change
 from madoc.learning import replay
 from madoc.learning.features import WindowScaling, unbroken, windows_ending
 from madoc.simulation.rollout import (
@@ -105,7 +105,7 @@ class Collection:
                 key=keys[0],
                 restart_key=keys[1],
             )
-        return with_sensor_noise(rollout, self.noise, jax.random.fold_in(keys[0], 1)), walkers
+        return with_sensor_noise(rollout, self.noise, keys[0]), walkers
 
     def empty_rows(self, capacity: int) -> replay.Replay:
         """A buffer of features, of the draw each row was simulated under, and of the parameter that was varied."""
@@ -145,6 +145,7 @@ class Collection:
                     "rollouts start at states whose velocities were taken from positions, which is not exact"
                 )
         if self.noise.any():
-            share = 100.0 * np.median(self.noise / self.problem.typical_change)
+            change = row_change(self.problem.dataset)
+            share = 100.0 * np.median(self.noise[change > 0.0] / change[change > 0.0])
             sentences.append(f"simulated observations were given sensor noise of {share:.2g} % of a step's change")
         return tuple(sentences)

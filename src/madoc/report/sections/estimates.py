@@ -42,7 +42,7 @@ def correlations(run: Run) -> dict[str, object] | str:
     if len(names) == 1:
         return "With one parameter there is nothing to correlate."
     if run.result is None or run.result.covariance is None:
-        return "This method does not say how its estimates hang together."
+        return "This method gives no covariance of its estimates."
     covariance = np.asarray(run.result.covariance, dtype=float)
     kept = np.flatnonzero(np.diag(covariance) > 0)
     if len(kept) < 2:

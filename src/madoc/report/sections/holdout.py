@@ -42,7 +42,8 @@ def holdout(run: Run) -> dict[str, object] | str:
         x_words=number,
         log=True,
     )
-    return data | {"chart": chart, "legend": [(line.colour, line.name) for line in lines]}
+    unit = "a step" if errors.stride == 1 else f"{errors.stride} steps"
+    return data | {"chart": chart, "legend": [(line.colour, line.name) for line in lines], "unit": unit}
 
 
 def _error_line(name: str, errors: Sequence[PredictionError], colour: str, *, dashed: bool = False) -> Line:

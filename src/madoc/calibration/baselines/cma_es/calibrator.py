@@ -273,8 +273,7 @@ class CmaEs:
             key=of_actions,
             restart_key=of_restarts,
         )
-        noise = noise_deviation(problem, None)
-        seen = with_sensor_noise(rollout, noise, jax.random.fold_in(of_actions, 1)).transitions
+        seen = with_sensor_noise(rollout, noise_deviation(problem, None), of_actions).transitions
         length = self._window(problem)
         scaling, _ = problem.features.windows("standardised", length)
         # All candidates share the first observation.

@@ -185,7 +185,7 @@ class Oted:
             restart_key=of_restart,
         )
         if not anew:
-            rollout = with_sensor_noise(rollout, noise_deviation(problem, None), jax.random.fold_in(of_action, 1))
+            rollout = with_sensor_noise(rollout, noise_deviation(problem, None), of_action)
         length, seen = rows_compared(problem), rollout.transitions
         scaling, (logged, _) = problem.features.windows("standardised", length)
         # The first pair of a row is its start, which does not depend on the draw.
