@@ -10,6 +10,8 @@ import paper
 
 README = Path(__file__).parents[1] / "README.md"
 NAMES = {"hopper": "Hopper", "halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "ant": "Ant"}
+PLACES = ("calibrated", "truth", "midrange")
+"""Parameters at which policies are learnt, in the order of the columns."""
 _MARKED = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -54,29 +56,37 @@ def errors(rows: Sequence[dict]) -> str:
 
 
 def minutes(rows: Sequence[dict]) -> str:
-    """Median return of the default learner at calibrated parameters, after the longest wall time it was given."""
-    cells = defaultdict[str, defaultdict[str, list[float]]](lambda: defaultdict(list))
+    """Median return of the default learner after the longest wall time it was given, by where it learnt."""
+    cells = defaultdict[tuple[str, str], defaultdict[float, list[float]]](lambda: defaultdict(list))
     for row in rows:
-        if (row["method"], row["at"], row["set"]) == ("fast-sac", "calibrated", []):
-            cells[row["robot"]][row["budget"]].append(row["return"])
-    lines = ["| robot | wall time | return | seeds |", "|---|---|---|---|"]
+        if (row["method"], row["set"]) == ("fast-sac", []):
+            cells[row["robot"], row["at"]][float(row["budget"].removesuffix("s"))].append(row["return"])
+    lines = [
+        "| robot | wall time | learnt at the calibrated parameters | at the truth | at mid-range |",
+        "|---|---|---|---|---|",
+    ]
     for robot, name in NAMES.items():
-        budget, found = max(cells[robot].items(), key=lambda cell: float(cell[0].removesuffix("s")))
-        earned = f"{np.median(found):.0f} ({min(found):.0f} to {max(found):.0f})"
-        lines.append(f"| {name} | {budget.removesuffix('s')} s | {earned} | {len(found)} |")
+        longest = max(cells[robot, "calibrated"])
+        ours = " | ".join(_earned(cells[robot, place][longest]) for place in PLACES)
+        lines.append(f"| {name} | {longest:.0f} s | {ours} |")
     return "\n".join(lines) + "\n"
 
 
 def returns(rows: Sequence[dict]) -> str:
     """Median return of SAC with 300 000 control steps, by the parameters it learnt at."""
-    places = ("calibrated", "truth", "midrange")
     cells = defaultdict[tuple[str, str], list[float]](list)
     for row in rows:
         if (row["method"], row["budget"]) == ("sac", 300_000):
             cells[row["robot"], row["at"]].append(row["return"])
     lines = ["| robot | learnt at the calibrated parameters | at the truth | at mid-range |", "|---|---|---|---|"]
     for robot in ("hopper", "halfcheetah"):
-        found = [cells[robot, place] for place in places]
-        ours = " | ".join(f"{np.median(each):.0f} ({min(each):.0f} to {max(each):.0f})" for each in found)
+        ours = " | ".join(_earned(cells[robot, place]) for place in PLACES)
         lines.append(f"| {NAMES[robot]} | {ours} |")
     return "\n".join(lines) + "\n"
+
+
+def _earned(returns: Sequence[float]) -> str:
+    """Median and range; of a single seed, its return."""
+    if len(returns) == 1:
+        return f"{returns[0]:.0f} (one seed)"
+    return f"{np.median(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
