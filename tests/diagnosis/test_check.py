@@ -114,7 +114,7 @@ def test_an_angle_that_wraps(robot, columns, checked):
     wrapped = np.where(columns["shoulder"] > 0.1, columns["shoulder"] - 2 * np.pi, columns["shoulder"])
     _, findings = checked(robot, columns | {"shoulder": wrapped})
     jumps = int((np.abs(np.diff(wrapped)) > np.pi).sum())
-    assert ("warning", "shoulder", f"it jumps by a whole turn in {jumps} rows") in findings
+    assert ("note", "log.csv", f"column 'shoulder' jumps by a whole turn in {jumps} rows: it was unwrapped") in findings
 
 
 def test_a_reversed_action(robot, columns, checked):

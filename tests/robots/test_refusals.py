@@ -57,6 +57,8 @@ CHANGES = [
     (SIGNAL, '  - {name: e, reads: "position(elbow)[1]"}', r"position\(elbow\)\[1\] does not exist: it has 1 value,"),
     (SIGNAL, "  - {name: e, reads: position(elbow) * (1 / 0)}", "expected an expression with a value"),
     (SIGNAL, "  - {name: e, reads: position(elbow), unit: deg}", r"is in rad, not in deg; write reads: .* \* 180 / pi"),
+    (SIGNAL, "  - {name: e, reads: -position(elbow), unit: Degrees}", r"is in rad, not in Degrees; .*unit: rad$"),
+    (SIGNAL, "  - {name: e, reads: velocity(elbow), unit: rpm}", r"is in rad/s, not in rpm; write unit: rad/s$"),
     # Actions.
     (
         ACTION,
@@ -169,6 +171,11 @@ CHANGES = [
         "groups: 2",
         "log: {columns: {elbow: q2}}",
         "the name of a signal or an action, got 'elbow'; nearest: elbow_angle",
+    ),
+    (
+        "groups: 2",
+        "log: {columns: {elbow_angle: q1, shoulder_angle: q1}}",
+        "shoulder_angle and elbow_angle are both read from the column 'q1'",
     ),
     ("groups: 2", "log: {resample: nearest}", "expected 'hold' or 'linear' in log.resample, got 'nearest'"),
     ("groups: 2", "log: {tolerance: 2}", "expected less than 1 in log.tolerance, got 2"),

@@ -19,7 +19,7 @@ from madoc.identification.states import logged_states
 from madoc.simulation.cpu import CpuSimulator
 from madoc.simulation.sensitivity import insensitive
 from madoc.types import Transitions
-from own_robots import ARM_SPEC, CART_SPEC, SPRING_SPEC, write_robot
+from own_robots import ARM_SPEC, BOUNCER, BOUNCER_SPEC, CART_SPEC, SPRING_SPEC, write_robot
 from robots import spring, two_link_arm
 
 URDF = """
@@ -431,3 +431,10 @@ def test_a_compiled_model_is_the_callers_own():
     task.compile().opt.gravity[2] = 0.0
     assert task.model is task.with_parameters(["gravity"]).model
     assert task.model.opt.gravity[2] == task.compile().opt.gravity[2] == -9.81
+
+
+def test_limits_that_the_model_gives_are_in_the_unit_of_the_action(tmp_path):
+    model = BOUNCER.replace('joint="knee" gear="60"', 'joint="knee" ctrlrange="-0.02 0.03"')
+    spec = BOUNCER_SPEC.replace("low: -1, high: 1}", "unit: mm}")
+    (action,) = robots.load(write_robot(tmp_path, spec, bouncer=model)).task.actions
+    assert (action.low, action.high, action.scale) == (pytest.approx(-20.0), pytest.approx(30.0), 1e-3)

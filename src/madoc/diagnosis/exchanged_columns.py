@@ -73,7 +73,7 @@ def exchanged_columns(
     count = min(WINDOWS, max(FEWEST_WINDOWS, affordable // max(1, len(corrections))))
     replayed = _replayed(dataset, simulator, steps, count)
     as_logged, spent = _error(replayed, simulator, points, steps, scale, count)
-    if as_logged <= _NEGLIGIBLE:
+    if as_logged <= _NEGLIGIBLE or not np.isfinite(as_logged):  # of a simulation that fails nothing can be told
         return (), spent
     better: dict[str, float] = {}
     for correction in corrections:

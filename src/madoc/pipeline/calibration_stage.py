@@ -15,6 +15,7 @@ from madoc.pipeline.preparation import Prepared, prepare
 from madoc.pipeline.refusals import check_order, method_of
 from madoc.runs.budget import Budget, Seconds
 from madoc.runs.files import read_json
+from madoc.runs.progress import bar
 from madoc.verdict import Assessment, assess
 from madoc.verdict.evidence import evidence, save_evidence
 from madoc.verdict.judge import explains_all
@@ -80,7 +81,9 @@ def _calibrate_by(
         )
         if prepared.holdout is None or result.status not in ENDED:
             return result, None
-        assessment = assess(result, prepared.bench)
+        with bar("judging the estimate on the rows held out", total=1, unit="verdicts", quiet=quiet) as advance:
+            assessment = assess(result, prepared.bench)
+            advance(1)
         result = assessment.result
         _leave_evidence(out, prepared, result)
         folder.write_json("result.json", result.to_json())

@@ -53,17 +53,17 @@ def action_channel(draft: Draft, model: mujoco.MjModel, index: int) -> ActionCha
     if name not in actuators:  # MuJoCo leaves out an actuator whose target is missing
         raise draft.document.unknown(("actions", index, "actuator"), "the name of an actuator", name, actuators)
     actuator = actuators.index(name)
+    unit = action.unit or _action_unit(action, model, actuator)
+    if unit and unit not in KNOWN_UNITS:
+        raise draft.document.unknown(("actions", index, "unit"), "a unit that is known", unit, KNOWN_UNITS)
+    scale = SCALES.get(unit, 1.0)
     low, high = action.low, action.high
     if low is None or high is None:
         if not model.actuator_ctrllimited[actuator]:
             raise draft.document.error(
                 ("actions", index), f"expected low: and high:, as the actuator {name!r} has no ctrlrange in the model"
             )
-        low, high = (float(end) for end in model.actuator_ctrlrange[actuator])
-    unit = action.unit or _action_unit(action, model, actuator)
-    if unit and unit not in KNOWN_UNITS:
-        raise draft.document.unknown(("actions", index, "unit"), "a unit that is known", unit, KNOWN_UNITS)
-    scale = SCALES.get(unit, 1.0)
+        low, high = (float(end) / scale for end in model.actuator_ctrlrange[actuator])
     gain, stiffness = model.actuator_gainprm[actuator, 0], -model.actuator_biasprm[actuator, 1]
     length = model.actuator_length0[actuator] if gain else 0.0
     held = length * stiffness / gain / scale if gain and stiffness else 0.0

@@ -1,12 +1,18 @@
 """Signals of a spec: their expressions, checked against the model, and their units."""
 
+import math
+import re
+
 import mujoco
 
-from madoc.robots.expressions import Expression
+from madoc.robots.expressions import Expression, Read
 from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_single, is_slide
 from madoc.robots.sensing import Layout, Signals
 from madoc.robots.spec import SCALES
+
+_NOT_SI = re.compile(r"deg|°|grad|rev|rpm|turn|mm|cm|km|milli|centi|inch|foot|feet|ft", re.IGNORECASE)
+"""Parts of names of units of length, angle and speed that are not m, rad, m/s or rad/s."""
 
 
 def read_signals(draft: Draft, model: mujoco.MjModel) -> Signals:
@@ -23,18 +29,33 @@ def read_signals(draft: Draft, model: mujoco.MjModel) -> Signals:
     return Signals(tuple(expressions), layout)
 
 
-def _plain_unit(model: mujoco.MjModel, expression: Expression) -> str:
-    """The SI unit of an expression that is one joint's position or velocity, unscaled; else empty."""
+def _single_joint(model: mujoco.MjModel, expression: Expression) -> tuple[Read, float] | None:
+    """What an expression reads of one hinge or slide, and its weight, where it reads nothing else and is linear."""
     affine = expression.affine()
     if affine is None or len(affine[0]) != 1:
-        return ""
+        return None
     ((read, weight),) = affine[0].items()
-    if read.kind == "sensor" or weight != 1.0:
+    if read.kind == "sensor" or not is_single(model, int(model.joint(read.name).id)):
+        return None
+    return read, weight
+
+
+def _plain_unit(model: mujoco.MjModel, expression: Expression) -> str:
+    """The SI unit of an expression that is one joint's position or velocity, in either direction; else empty."""
+    single = _single_joint(model, expression)
+    if single is None or abs(single[1]) != 1.0:
         return ""
-    joint = int(model.joint(read.name).id)
-    if not is_single(model, joint):
-        return ""
-    return ("m" if is_slide(model, joint) else "rad") + ("/s" if read.kind == "velocity" else "")
+    read, _ = single
+    slides = is_slide(model, int(model.joint(read.name).id))
+    return ("m" if slides else "rad") + ("/s" if read.kind == "velocity" else "")
+
+
+def turn_of(model: mujoco.MjModel, expression: Expression) -> float:
+    """By how much an expression changes when the hinge whose position it is turns once; 0 where it is none."""
+    single = _single_joint(model, expression)
+    if single is None or single[0].kind != "position" or is_slide(model, int(model.joint(single[0].name).id)):
+        return 0.0
+    return 2.0 * math.pi * abs(single[1])
 
 
 def signal_unit(draft: Draft, model: mujoco.MjModel, expression: Expression, index: int) -> str:
@@ -44,11 +65,13 @@ def signal_unit(draft: Draft, model: mujoco.MjModel, expression: Expression, ind
 
 def _check_unit(draft: Draft, model: mujoco.MjModel, index: int, expression: Expression) -> None:
     """Refuse `position(JOINT)` in deg: the unit converts nothing, the expression has to."""
-    plain, given = _plain_unit(model, expression), draft.spec.signals[index].unit
-    if plain and given in SCALES:
-        factor = "180 / pi" if plain.startswith("rad") else f"{1.0 / SCALES[given]:g}"
-        raise draft.document.error(
-            ("signals", index, "unit"),
-            f"{expression.text} is in {plain}, not in {given}; "
-            f"write reads: {expression.text} * {factor}, or unit: {plain}",
-        )
+    plain, given = _plain_unit(model, expression), draft.spec.signals[index].unit or ""
+    if not plain or not _NOT_SI.search(given):
+        return
+    scale = SCALES.get(given, SCALES["deg"] if "deg" in given.lower() else None)
+    factor = "180 / pi" if plain.startswith("rad") else f"{1.0 / (scale or 1.0):g}"
+    converted = f"reads: {expression.text} * {factor}, or " if scale is not None else ""
+    raise draft.document.error(
+        ("signals", index, "unit"),
+        f"{expression.text} is in {plain}, not in {given}; write {converted}unit: {plain}",
+    )

@@ -16,7 +16,7 @@ from madoc.robots.actions import action_channel, added_actuator, idle_actuators
 from madoc.robots.episodes import Episode, no_reward, read_episode
 from madoc.robots.functions import PythonFile
 from madoc.robots.model import Draft, ModelFiles, compiled, make_model
-from madoc.robots.signals import read_signals, signal_unit
+from madoc.robots.signals import read_signals, signal_unit, turn_of
 from madoc.robots.space import parameter_space
 from madoc.robots.spec import RobotSpec, read_spec
 from madoc.tasks.base import ActionChannel, Batch, Task, never_terminated
@@ -24,11 +24,15 @@ from madoc.tasks.base import ActionChannel, Batch, Task, never_terminated
 
 @dataclass(frozen=True)
 class Signal:
-    """One value of an observation: its name, its unit, and the expression it is."""
+    """One value of an observation: its name, its unit, and the expression it is.
+
+    `turn` is the change of its value in a turn of the hinge whose position it is; 0 where it is none.
+    """
 
     name: str
     unit: str
     reads: str
+    turn: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
         with document.at("python"):
             _try_out(task.for_policies)
     shown = tuple(
-        Signal(given.name, signal_unit(draft, model, expression, index), expression.text)
+        Signal(given.name, signal_unit(draft, model, expression, index), expression.text, turn_of(model, expression))
         for index, (given, expression) in enumerate(zip(spec.signals, signals.expressions, strict=True))
     )
     return Robot(Path(file), spec, task, shown, signals.undetermined(), idle_actuators(model, actions))
@@ -132,7 +136,7 @@ def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco
 
 
 def _check_names(draft: Draft) -> None:
-    """Refuse a name given to two signals or actions, and a log column for a name that neither has."""
+    """Refuse a name given to two signals or actions, a log column for a name that neither has, or one for two names."""
     names: dict[str, tuple[str, int]] = {}
     for kind in ("signals", "actions"):
         for index, part in enumerate(getattr(draft.spec, kind)):
@@ -144,6 +148,16 @@ def _check_names(draft: Draft) -> None:
     for name in draft.spec.log.columns:
         if name not in names:
             raise draft.document.unknown(("log", "columns", name), "the name of a signal or an action", name, names)
+    for kind in ("signals", "actions"):
+        of_column: dict[str, str] = {}
+        for part in getattr(draft.spec, kind):
+            column = draft.spec.log.columns.get(part.name, part.name)
+            other = of_column.setdefault(column, part.name)
+            if other != part.name:
+                named = part.name if part.name in draft.spec.log.columns else other
+                raise draft.document.error(
+                    ("log", "columns", named), f"{other} and {part.name} are both read from the column {column!r}"
+                )
 
 
 def _frame_skip(draft: Draft, model: mujoco.MjModel) -> int:

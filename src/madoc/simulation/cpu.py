@@ -226,7 +226,7 @@ class CpuSystem:
         pool = simulator._pool if many else simulator._alone
         trajectory = np.zeros((total, steps, 1 + self._physical))
         sensors = np.zeros((total, steps, self.models[0].nsensordata))
-        with _quiet():
+        with without_warnings():
             pool.rollout(
                 [model for model in self.models for _ in range(rows)],
                 simulator._data if many else simulator._data[:1],
@@ -265,7 +265,7 @@ def _check_elements(model: mujoco.MjModel, task: Task, parameter: Parameter) -> 
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def without_warnings() -> Iterator[None]:
     """Suppress MuJoCo's warning about a row that diverges (on stderr and in MUJOCO_LOG.TXT): it comes back as NaN."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
+from madoc.simulation.cpu import without_warnings
 
 _PUSH = 1e-3
 """Half the difference of an action, in [-1, 1], by which the response of a joint is computed."""
@@ -162,10 +163,11 @@ def _stepped(
     task, data = simulator.task, mujoco.MjData(model)
     driven = [model.actuator(channel.actuator).id for channel in task.actions] or slice(None)
     seen = []
-    for state, control in zip(states, controls, strict=True):
-        mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:] = np.split(state, [model.nq])
-        data.ctrl[driven] = control
-        mujoco.mj_step(model, data, nstep=task.frame_skip)
-        seen.append(np.concatenate([data.qpos, data.qvel, data.sensordata if task.sense else []]))
+    with without_warnings():
+        for state, control in zip(states, controls, strict=True):
+            mujoco.mj_resetData(model, data)
+            data.qpos[:], data.qvel[:] = np.split(state, [model.nq])
+            data.ctrl[driven] = control
+            mujoco.mj_step(model, data, nstep=task.frame_skip)
+            seen.append(np.concatenate([data.qpos, data.qvel, data.sensordata if task.sense else []]))
     return np.stack(seen)

@@ -13,6 +13,7 @@ from madoc.data.dataset import Dataset
 from madoc.data.findings import Finding
 from madoc.data.logs import csv_reader, hdf5_reader, lerobot_reader, mcap_reader, minari_runs, parquet_reader
 from madoc.data.logs.assembly import assemble, wanted_columns
+from madoc.data.logs.jumps import without_copies
 from madoc.data.logs.tables import Run, Table, tables_of
 from madoc.data.minari_reader import recognises as is_minari
 from madoc.data.npz import read_arrays
@@ -89,14 +90,13 @@ def read(
         raise MadocError("expected at least one file or folder of logs, got none")
     wanted = set(wanted_columns(robot).values())
     contents = [_runs(source, wanted) for source in sources]
-    runs = _distinct([run for of_source, _ in contents for run in of_source])
+    runs, copies = without_copies(_distinct([run for of_source, _ in contents for run in of_source]), sorted(wanted))
     ignored = [file for _, others in contents for file in others]
     origin = str(sources[0]) + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
     dataset = validate(assemble(runs, robot, origin=origin, clip_actions=clip_actions), robot.task)
     if ignored:
-        finding = Finding("note", f"{listed(ignored, 3)} were not read: no reader knows them", dataset.origin)
-        dataset = replace(dataset, findings=(finding, *dataset.findings))
-    return dataset
+        copies.append(Finding("note", f"{listed(ignored, 3)} were not read: no reader knows them", dataset.origin))
+    return replace(dataset, findings=(*copies, *dataset.findings))
 
 
 def files_of(folder: Path) -> list[Path]:

@@ -1,15 +1,25 @@
 """From runs to a dataset of a robot: columns are looked up, checked, cut where rows are missing, and scaled."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from madoc.data.dataset import Dataset, close_episodes, join
 from madoc.data.findings import Finding
+from madoc.data.logs.jumps import episodes_of, unwrapped
 from madoc.data.logs.tables import Run, Table, as_numbers
-from madoc.data.logs.timing import Resample, Series, check_ascending, common_grid, on_grid, rate_findings, steady_links
+from madoc.data.logs.timing import (
+    Resample,
+    Series,
+    check_ascending,
+    common_grid,
+    held_finding,
+    on_grid,
+    rate_findings,
+    steady_links,
+)
 from madoc.data.validation import ACTION_TOLERANCE
 from madoc.errors import MadocError, nearest_hint
 from madoc.robots import Robot
@@ -66,9 +76,10 @@ def _episodes(run: Run, robot: Robot, origin: str, *, clip_actions: bool) -> Dat
             f"expected two rows in a row in {run.name}, a control step apart and all numbers, got none; leave the "
             "file out"
         )
+    scaled, clipped = _scaled(steps, used, robot, run.name, clip_actions=clip_actions)
     transitions = Transitions(
         observation=steps.observation[used],
-        action=_scaled(steps, used, robot, run.name, clip_actions=clip_actions),
+        action=scaled,
         reward=np.zeros(len(used)),
         next_observation=steps.observation[used + 1],
         terminated=np.zeros(len(used), dtype=bool),
@@ -82,7 +93,7 @@ def _episodes(run: Run, robot: Robot, origin: str, *, clip_actions: bool) -> Dat
         robot.task.physics,
         origin,
         run_names=(run.name,) * len(starts),
-        findings=tuple(steps.findings),
+        findings=(*steps.findings, *clipped),
     )
 
 
@@ -101,7 +112,7 @@ def _steps(run: Run, robot: Robot) -> Steps:
                 f"({len(tables[first]):,} and {len(table):,} rows); if each has times of its own, ask for "
                 "log: resample: hold or linear"
             )
-    series, findings = _series(run, tables[first], list(wanted.values()), layout)
+    series, findings = _series(run, tables[first], list(wanted.values()), robot)
     if run.timed:
         linked, unsteady = steady_links(series, control_step, layout.tolerance)
         findings += [*unsteady, *rate_findings(series, control_step)]
@@ -109,6 +120,9 @@ def _steps(run: Run, robot: Robot) -> Steps:
         linked = np.ones(len(series.time) - 1, dtype=bool)
         what = f"its format keeps no times: rows are taken to be {control_step:g} s apart"
         findings.append(Finding("note", what, run.name))
+    follows = np.diff(episodes_of(series.table, wanted.values(), series.rows)) == 0
+    findings += _joined(run, int((~follows).sum()))
+    linked &= follows
     observation, action = np.split(series.values, [len(robot.signals)], axis=1)
     seen, acted = np.isfinite(observation).all(-1), np.isfinite(action).all(-1)
     broken = ~(seen & acted)
@@ -149,17 +163,25 @@ def _time(run: Run, table: Table, layout: LogSpec) -> tuple[Float[np.ndarray, " 
     return as_numbers(table, name, run.name), name
 
 
-def _series(run: Run, table: Table, columns: Sequence[str], layout: LogSpec) -> tuple[Series, list[Finding]]:
-    """Columns of one table with their times, which ascend."""
+def _joined(run: Run, breaks: int) -> list[Finding]:
+    """A note on episodes that one table holds, if there are any."""
+    return [Finding("note", f"it holds {breaks + 1:,} episodes: it is cut between them", run.name)] if breaks else []
+
+
+def _series(run: Run, table: Table, columns: Sequence[str], robot: Robot) -> tuple[Series, list[Finding]]:
+    """Columns of one table with their times, which ascend, and angles that do not wrap around."""
     if len(table) < 2:
         raise MadocError(f"expected at least two rows in {run.name}, got {len(table)}; leave the file out")
-    time, clock = _time(run, table, layout)
+    time, clock = _time(run, table, robot.spec.log)
     values = np.stack([as_numbers(table, column, run.name) for column in columns], axis=-1)
     series, timed = Series(time, values, table, np.arange(len(time)), run.name), np.isfinite(time)
     findings = _lost(series, ~timed, f"no finite time in column {clock!r}", "left out")
     series = series.take(timed)
     check_ascending(series)
-    return series, findings
+    names = wanted_columns(robot)
+    turns = {names[signal.name]: signal.turn for signal in robot.signals}
+    values, wraps = unwrapped(series, columns, turns)
+    return replace(series, values=values), findings + wraps
 
 
 def _lost(series: Series, lost: Bool[np.ndarray, " rows"], what: str, consequence: str) -> list[Finding]:
@@ -189,17 +211,27 @@ def _resampled(run: Run, robot: Robot, wanted: Mapping[str, str], tables: Mappin
             names = [channel.name for channel in channels if tables[channel.name] is table]
             if not names:
                 continue
-            series, untimed = _series(run, table, [wanted[name] for name in names], robot.spec.log)
+            series, untimed = _series(run, table, [wanted[name] for name in names], robot)
             whole = np.isfinite(series.values).all(-1)
             findings += [*untimed, *_lost(series, ~whole, _BROKEN, "left out before resampling")]
             pieces.append((series.take(whole), names, channels is robot.actions))
-    grid = common_grid([series for series, _, _ in pieces], control_step)
+    sensed, acted = ([series for series, _, acting in pieces if acting is kind] for kind in (False, True))
+    grid = common_grid(sensed, acted, control_step)
+    findings += [finding for series in acted for finding in held_finding(series, grid[-1])]
     kept = np.ones(len(grid), dtype=bool)
     columns: dict[str, np.ndarray] = {}
+    linked = np.ones(len(grid) - 1, dtype=bool)
     for series, names, acting in pieces:
         values, outside_gaps = on_grid(series, grid, "hold" if acting else how)
         columns.update(zip(names, values.T, strict=True))
         kept &= outside_gaps | acting  # commands may be logged only where they change
+        if not acting:
+            episodes = episodes_of(series.table, wanted.values(), series.rows)
+            findings += _joined(run, int(episodes[-1]))
+            last, following = (np.searchsorted(series.time, grid, side=side) for side in ("right", "left"))
+            episode, then = (episodes[np.clip(rows, 0, len(episodes) - 1)] for rows in (last - 1, following))
+            kept &= episode == then
+            linked &= episode[1:] == episode[:-1]
     if not kept.all():
         what = f"{(~kept).sum()} of {len(grid):,} control steps fall into gaps: the run is cut there"
         findings.append(Finding("warning", what, run.name))
@@ -217,13 +249,17 @@ def _resampled(run: Run, robot: Robot, wanted: Mapping[str, str], tables: Mappin
         np.stack([columns[channel.name] for channel in channels], axis=-1)
         for channels in (robot.signals, robot.actions)
     )
-    return Steps(observation, action, kept[:-1] & kept[1:], "control step {}".format, tuple(dict.fromkeys(findings)))
+    linked &= kept[:-1] & kept[1:]
+    return Steps(observation, action, linked, "control step {}".format, tuple(dict.fromkeys(findings)))
 
 
 def _scaled(
     steps: Steps, used: np.ndarray, robot: Robot, run: str, *, clip_actions: bool
-) -> Float[np.ndarray, "rows actions"]:
-    """Actions of the used rows, scaled to [-1, 1] by the ranges of their channels, and clipped if asked for."""
+) -> tuple[Float[np.ndarray, "rows actions"], list[Finding]]:
+    """Actions of the used rows, scaled to [-1, 1] by the ranges of their channels, and clipped if asked for.
+
+    Where any are clipped, warnings say how many.
+    """
     low = np.array([channel.low for channel in robot.actions])
     high = np.array([channel.high for channel in robot.actions])
     action = steps.action[used]
@@ -239,4 +275,9 @@ def _scaled(
             f"such rows; the log has {smallest:.4g} to {largest:.4g}); is the unit right? Else widen low and high in "
             "the spec, or pass --clip-actions where the motor driver clips as well"
         )
-    return np.clip(scaled, -1.0, 1.0)
+    clipped = [
+        Finding("warning", f"{count:,} of {len(action):,} values of {channel.name} were clipped to its range", run)
+        for channel, count in zip(robot.actions, outside.sum(0), strict=True)
+        if count
+    ]
+    return np.clip(scaled, -1.0, 1.0), clipped

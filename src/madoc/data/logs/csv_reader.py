@@ -84,9 +84,14 @@ def _all_numbers(lines: Sequence[str], names: list[str], separator: str, first: 
 def _cells(lines: Sequence[str], names: list[str], separator: str, first: int, path: Path) -> Table:
     """Cells as text."""
     rows: dict[int, list[str]] = {}
-    reader = csv.reader(lines, delimiter=separator)
+    reader, line = csv.reader(lines, delimiter=separator), 0
     for cells in reader:
-        line = reader.line_num
+        before, line = line, reader.line_num
+        if line > before + 1:
+            raise MadocError(
+                f"expected every row of {path.name} on a line of its own, got a quotation mark that opens in line "
+                f"{before + 1} and is not closed there; close it, or leave that column out"
+            )
         empty = not any(cell.strip() for cell in cells)
         if line <= first or empty or cells[0].lstrip().startswith("#"):
             continue

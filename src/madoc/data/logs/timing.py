@@ -1,5 +1,6 @@
 """Time in a log: whether rows are a control step apart, where it has gaps, and resampling where it is asked for."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -24,6 +25,8 @@ DRIFT = 0.01
 """Change of the time step from the first to the last row, as a share of the control step; a larger one is warned of."""
 _CERTAIN = 5.0
 """Standard errors by which a mean or a slope has to differ before it is told."""
+MOST_FILLED = 100
+"""Largest number of control steps that are made of a row by resampling."""
 _SKIPPED = 1.5
 """Time between two rows in median time steps; a longer one has lost rows in it, and says nothing of the rate."""
 _FACTORS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}
@@ -146,15 +149,21 @@ def _off_rate(series: Series, control_step: float, ratio: float, drift: str) -> 
     return Finding("warning", what, series.run, remedy)
 
 
-def _wrong_rate(series: Series, control_step: float, tolerance: float) -> MadocError:
-    steps = np.diff(series.time)
-    usual, mean = float(np.median(steps)), float(np.mean(steps))
+def _require_seconds(series: Series, control_step: float) -> None:
+    """Refuse time in another unit, where rows are as many of its units apart as a control step has."""
+    usual = float(np.median(np.diff(series.time)))
     for factor, unit in _FACTORS.items():
         if abs(usual / control_step / factor - 1.0) < 0.3:
-            return MadocError(
+            raise MadocError(
                 f"expected time in s in {series.run}, got steps of {usual:g} where the control step is "
                 f"{control_step:g} s; is it in {unit}? divide it by {factor:g}"
             )
+
+
+def _wrong_rate(series: Series, control_step: float, tolerance: float) -> MadocError:
+    _require_seconds(series, control_step)
+    steps = np.diff(series.time)
+    usual, mean = float(np.median(steps)), float(np.mean(steps))
     if min(abs(usual / control_step - 1.0), abs(mean / control_step - 1.0)) <= tolerance:
         return MadocError(
             f"most time steps of {series.run} are more than {100 * tolerance:g} % off the control step of "
@@ -167,16 +176,45 @@ def _wrong_rate(series: Series, control_step: float, tolerance: float) -> MadocE
     )
 
 
-def common_grid(parts: list[Series], control_step: float) -> Float[np.ndarray, " grid"]:
-    """Times a control step apart, over the period in which all parts have rows; one too short is refused."""
-    start, end = max(part.time[0] for part in parts), min(part.time[-1] for part in parts)
+def common_grid(
+    signals: Sequence[Series], actions: Sequence[Series], control_step: float
+) -> Float[np.ndarray, " grid"]:
+    """Times a control step apart, while all signals have rows, from when all actions have begun.
+
+    An action holds after its last row, as commands may be logged only where they change.
+
+    Raises:
+        MadocError: That is shorter than a control step, or rows are so far apart that time must be in another unit.
+    """
+    for part in signals:
+        if len(part.time) > 1:
+            _require_seconds(part, control_step)
+    start, end = max(part.time[0] for part in (*signals, *actions)), min(part.time[-1] for part in signals)
     count = int(np.floor((end - start) / control_step + _ROUNDING)) + 1
     if count < 2:
         raise MadocError(
-            f"expected all columns of {parts[0].run} to be logged at the same time for at least {control_step:g} s, "
+            f"expected all columns of {signals[0].run} to be logged at the same time for at least {control_step:g} s, "
             f"got {max(0.0, end - start):.4g} s; record them together"
         )
+    rows = max(len(part.time) for part in signals)
+    if count > MOST_FILLED * rows:
+        raise MadocError(
+            f"expected rows about {control_step:g} s apart in {signals[0].run}, got {rows:,} rows in "
+            f"{end - start:g} s, which resampling would make {count:,}; is time in s? Else set control_step to what "
+            "was logged"
+        )
     return start + control_step * np.arange(count)
+
+
+def held_finding(actions: Series, end: float) -> list[Finding]:
+    """A warning where actions were last logged long before the last time of the signals."""
+    if len(actions.time) < 2:
+        return []
+    usual, left = float(np.median(np.diff(actions.time))), float(end - actions.time[-1])
+    if left <= GAP * usual:
+        return []
+    what = f"its last action is {left:.3g} s before its last signal, and is held until then"
+    return [Finding("warning", what, actions.run, "nothing if actions are logged only where they change")]
 
 
 def on_grid(
