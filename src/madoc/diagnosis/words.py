@@ -108,9 +108,9 @@ def _parameter_table(excitation: Excitation, space: ParameterSpace) -> Table:
 
 def _finding_lines(findings: tuple[Finding, ...]) -> tuple[str, ...]:
     counts = Counter(finding.level for finding in findings)
-    names = dict(zip(LEVELS, ("fatal", "warnings", "notes"), strict=True))
     warned = any(finding.level != "note" for finding in findings)
-    lines = [", ".join(f"{counts[level]} {name}" for level, name in names.items() if counts[level])]
+    parts = [f"{counts[level]} {level}{'s' if counts[level] > 1 and level != 'fatal' else ''}" for level in LEVELS]
+    lines = [", ".join(part for level, part in zip(LEVELS, parts, strict=True) if counts[level])]
     lines = lines if warned else ["nothing to warn of"]
     alike = Counter[tuple[str, str]]()
     for finding in findings:
