@@ -65,21 +65,30 @@ def test_auto_keeps_least_squares_where_that_explains_all(log, tmp_path, capsys)
 
 
 def test_auto_goes_on_to_the_next_method_when_the_first_diverges(log, tmp_path, capsys, monkeypatch):
-    by = calibration_stage._calibrate_by
+    step, by, taken = LeastSquares.step, calibration_stage._calibrate_by, []
 
-    def diverging(method, out, prepared, **options):
-        """Both candidates are least squares here; the first one's result is given back as diverged."""
-        result, assessment = by(LeastSquares(), out, prepared, **options)
-        return (
-            (replace(result, status="diverged"), None) if prepared.method == "least-squares" else (result, assessment)
-        )
+    def failing(method, problem, state):
+        """The third step leaves a curvature that is not finite."""
+        following, epoch = step(method, problem, state)
+        taken.append(epoch)
+        if len(taken) == 3:
+            broken = replace(following.known, bread=np.full_like(following.known.bread, np.nan))
+            following = replace(following, known=broken)
+        return following, epoch
 
-    monkeypatch.setattr(calibration_stage, "_calibrate_by", diverging)
+    monkeypatch.setattr(LeastSquares, "step", failing)
+    monkeypatch.setattr(calibration_stage, "_calibrate_by", lambda _, *where, **how: by(LeastSquares(), *where, **how))
     ask = words("calibrate", log, "--method", "auto", "--budget", 60_000, "--out", tmp_path / "run")
     answer, _ = asked_for_json(capsys, ask)
-    candidates = [row["method"] for row in answer["holdout"]["candidates"]]
-    assert (candidates, answer["holdout"]["chosen"]) == (["least-squares", "madoc-local"], "madoc-local")
-    parts = [read(tmp_path / "run" / name / "result.json") for name in candidates]
+    diverged, kept = answer["holdout"]["candidates"]
+    assert (diverged["method"], kept["method"], answer["holdout"]["chosen"]) == (
+        "least-squares",
+        "madoc-local",
+        "madoc-local",
+    )
+    assert diverged["not_run"].startswith("it diverged: stopped at")
+    parts = [read(tmp_path / "run" / name / "result.json") for name in ("least-squares", "madoc-local")]
+    assert parts[0]["status"] == "diverged"
     assert answer["control_steps"] == sum(part["control_steps"] for part in parts)
 
 
@@ -101,6 +110,14 @@ def test_a_bare_method_holds_out_where_asked_and_leaves_with_its_verdict(log, tm
     assert code == 0
     assert not {"verdict", "holdout"} & plain.keys()
     assert "holdout" not in read(tmp_path / "plain" / "spec.json")
+
+
+def test_auto_leaves_nothing_where_every_candidate_refuses(log, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(calibration_stage, "_refusal", lambda method, prepared: "refused: it cannot")
+    ask = words("calibrate", log, "--method", "auto", "--out", tmp_path / "run")
+    assert main([str(word) for word in ask]) == 2
+    assert "least-squares: refused: it cannot; madoc-local: refused: it cannot" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 def test_rejected_data_ends_auto_with_a_code_of_its_own(log, tmp_path, capsys):

@@ -5,7 +5,8 @@ import pytest
 from logged_arm import SPEC, arm_of, columns_of, write_csv
 
 from madoc.data import logs
-from madoc.data.logs.tables import Table
+from madoc.data.logs.jumps import split_episodes
+from madoc.data.logs.tables import Run, Table
 from madoc.data.logs.timing import Series, held_finding
 from madoc.errors import MadocError
 
@@ -65,10 +66,17 @@ def test_a_turn_is_in_the_unit_of_the_signal(columns, tmp_path):
     np.testing.assert_allclose(dataset.transitions.observation[:, 0], angle[:-1], atol=1e-9)
 
 
-def test_an_angle_as_fast_as_a_turn_a_row_is_left_alone(robot, columns, tmp_path):
-    fast = columns["shoulder"] + 2.0 * np.pi * (np.arange(50) % 2)
-    dataset = logs.read(write_csv(tmp_path / "log.csv", columns | {"shoulder": fast}), robot)
-    np.testing.assert_allclose(dataset.transitions.observation[:, 0], fast[:-1])
+def test_a_fast_angle_is_unwrapped_the_shorter_way(robot, columns, tmp_path):
+    wheel = 2.0 * np.pi * 0.12 * np.arange(50)
+    dataset = logs.read(write_csv(tmp_path / "log.csv", columns | {"shoulder": wrapped(wheel)}), robot)
+    np.testing.assert_allclose(np.diff(dataset.transitions.observation[:, 0]), 2.0 * np.pi * 0.12, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [2.0 * np.pi * 0.3 * np.arange(50), 4.0 * np.pi * (np.arange(50) % 2)])
+def test_an_angle_that_may_have_gone_either_way_or_does_not_wrap_is_left_alone(robot, columns, tmp_path, angle):
+    angle = wrapped(angle) if angle.max() > 20.0 else angle
+    dataset = logs.read(write_csv(tmp_path / "log.csv", columns | {"shoulder": angle}), robot)
+    np.testing.assert_allclose(dataset.transitions.observation[:, 0], angle[:-1])
     assert not dataset.findings
 
 
@@ -77,24 +85,53 @@ def test_an_angle_as_fast_as_a_turn_a_row_is_left_alone(robot, columns, tmp_path
     [
         {"Episode": np.repeat([3.0, 4.0, 9.0], [20, 10, 20])},
         {"terminals": np.isin(np.arange(50), [19]) * 1.0, "timeouts": np.isin(np.arange(50), [29, 49]) * 1.0},
+        {"done": np.isin(np.arange(50), [19]) * 1.0, "is_last": (np.arange(50) >= 29) * 1.0},
     ],
-    ids=["numbered", "flagged"],
+    ids=["numbered", "flagged", "latched"],
 )
-def test_episodes_in_one_table_are_cut(robot, resampled, columns, tmp_path, column):
-    path = write_csv(tmp_path / "log.csv", columns | column)
-    dataset = logs.read(path, robot)
-    assert (dataset.episode_ends - dataset.episode_starts).tolist() == [19, 9, 19]
-    assert sentences(dataset) == ["log.csv: it holds 3 episodes: it is cut between them"]
-    assert (logs.read(path, resampled).episode_starts == dataset.episode_starts).all()
+@pytest.mark.parametrize("restarting", [False, True])
+def test_episodes_of_one_table_are_runs_of_their_own(robot, resampled, columns, tmp_path, column, restarting):
+    time = np.concatenate([0.02 * np.arange(count) for count in (20, 10, 20)])
+    changed = columns | column | ({"time": time} if restarting else {"time": np.cumsum(np.full(50, 0.02))})
+    path = write_csv(tmp_path / "log.csv", changed)
+    for reader in (robot, resampled):
+        dataset = logs.read(path, reader)
+        assert (dataset.episode_ends - dataset.episode_starts).tolist() == [19, 9, 19]
+        assert dataset.run_names == tuple(f"log.csv, episode {number}" for number in (1, 2, 3))
+        assert sentences(dataset)[0] == "log.csv: it holds 3 episodes"
+        assert not any(finding.level == "warning" for finding in dataset.findings)
+
+
+@pytest.mark.parametrize("unset", ["0.000000", "False", "", "no", b"False", None])
+def test_flags_that_are_not_set_cut_nothing(unset):
+    flags = np.array([unset] * 5 + ["True"], dtype=object)
+    table = Table({"q": np.arange(6.0), "done": flags, "trial": np.array([None] * 6, dtype=object)})
+    run = Run("log.csv", (table,))
+    assert split_episodes(run, {"q"}) == ([run], [])
+
+
+def test_a_reset_between_two_episodes_is_no_turn(robot, columns, tmp_path):
+    angle = np.concatenate([np.linspace(0.0, 3.0, 25), np.linspace(-3.0, 0.0, 25)])
+    path = write_csv(tmp_path / "log.csv", columns | {"elbow": angle, "trial": np.repeat([0.0, 1.0], 25)})
+    seen = logs.read(path, robot).transitions
+    assert (seen.observation[:, 1].min(), seen.next_observation[:, 1].max()) == (-3.0, 3.0)
 
 
 def test_nothing_is_interpolated_from_one_episode_to_the_next(resampled, columns, tmp_path):
-    later = columns | {"time": columns["time"] + 0.01, "trial": np.repeat([0.0, 1.0], 25)}
-    later["time"][0] = 0.0
-    angle = np.repeat([0.0, 3.0], 25)
-    dataset = logs.read(write_csv(tmp_path / "log.csv", later | {"shoulder": angle}), resampled)
+    done, elbow = np.zeros(50), columns["elbow"].copy()
+    done[19], elbow[19] = 1.0, np.nan  # the row that ends the episode is lost
+    angle = np.repeat([0.0, 3.0], [20, 30])
+    path = write_csv(tmp_path / "log.csv", columns | {"shoulder": angle, "elbow": elbow, "done": done})
+    dataset = logs.read(path, resampled)
     assert set(dataset.transitions.observation[:, 0]) | set(dataset.transitions.next_observation[:, 0]) == {0.0, 3.0}
     assert len(dataset.episode_starts) == 2
+
+
+def test_an_episode_of_one_row_is_left_out_and_told(robot, columns, tmp_path):
+    path = write_csv(tmp_path / "log.csv", columns | {"episode": np.repeat([0.0, 1.0, 2.0], [20, 1, 29])})
+    dataset = logs.read(path, robot)
+    assert sentences(dataset) == ["log.csv: it holds 3 episodes, of which 1 have one row and are left out"]
+    assert dataset.run_names == ("log.csv, episode 1", "log.csv, episode 3")
 
 
 def test_a_copy_of_a_run_is_left_out_and_told(robot, columns, tmp_path):
@@ -133,6 +170,7 @@ def test_a_quotation_mark_that_is_never_closed_is_refused(robot, columns, tmp_pa
         (1e3, "got steps of 20 where the control step is 0.02 s; is it in ms"),
         (1e9, "is it in ns"),
         (4e2, r"got 50 rows in 392 s, which resampling would make 19,601; is time in s\?"),
+        (50.0, r"got 50 rows in 49 s, which resampling would make 2,451; is time in s\?"),
     ],
 )
 def test_time_in_another_unit_is_not_resampled(resampled, columns, tmp_path, factor, sentence):

@@ -59,6 +59,9 @@ CHANGES = [
     (SIGNAL, "  - {name: e, reads: position(elbow), unit: deg}", r"is in rad, not in deg; write reads: .* \* 180 / pi"),
     (SIGNAL, "  - {name: e, reads: -position(elbow), unit: Degrees}", r"is in rad, not in Degrees; .*unit: rad$"),
     (SIGNAL, "  - {name: e, reads: velocity(elbow), unit: rpm}", r"is in rad/s, not in rpm; write unit: rad/s$"),
+    (SIGNAL, "  - {name: e, reads: position(elbow) - 1, unit: deg}", r"reads: \(position\(elbow\) - 1\) \* 180 / pi"),
+    (SIGNAL, "  - {name: e, reads: position(elbow), unit: mm}", r"is in rad, not in mm; write unit: rad$"),
+    (SIGNAL, "  - {name: e, reads: position(elbow), unit: rad (left shaft)}", None),
     # Actions.
     (
         ACTION,
@@ -175,7 +178,7 @@ CHANGES = [
     (
         "groups: 2",
         "log: {columns: {elbow_angle: q1, shoulder_angle: q1}}",
-        "shoulder_angle and elbow_angle are both read from the column 'q1'",
+        "shoulder_angle and elbow_angle are both read from the column 'q1'; name a column of its own for each",
     ),
     ("groups: 2", "log: {resample: nearest}", "expected 'hold' or 'linear' in log.resample, got 'nearest'"),
     ("groups: 2", "log: {tolerance: 2}", "expected less than 1 in log.tolerance, got 2"),

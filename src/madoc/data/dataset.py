@@ -140,7 +140,7 @@ def subsample(dataset: Dataset, max_transitions: int, key: PRNGKeyArray) -> Data
     episodes = int(np.searchsorted(filled, max_transitions)) + 1
     rows = np.concatenate([np.arange(starts[episode], ends[episode]) for episode in order[:episodes]])
     kept = dataset.take(rows[:max_transitions], np.append(0, filled[: episodes - 1]))
-    what = f"{max_transitions:,} of {len(dataset):,} rows are used, of whole episodes drawn at random"
+    what = f"{max_transitions:,} of {len(dataset):,} rows are used, of episodes drawn at random, the last one cut short"
     return replace(kept, findings=(*kept.findings, Finding("note", what, do="a larger --max-transitions uses more")))
 
 

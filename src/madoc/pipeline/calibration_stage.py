@@ -117,7 +117,8 @@ def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool)
             reason = reason or _refusal(methods[name], prepared)
             if reason:
                 rows.append(NotRun(name, reason))
-                folder.write_json(COMPARISON, {"candidates": [asdict(row) for row in rows]})
+                if spent:  # else nothing is to be kept if the others refuse too
+                    folder.write_json(COMPARISON, {"candidates": [asdict(row) for row in rows]})
                 continue
             part = replace(prepared, method=name, budget=allowed)
             place = out / name
@@ -126,7 +127,7 @@ def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool)
                 return result
             spent.append(result)
             if assessment is None:
-                rows.append(NotRun(name, result.sentence))
+                rows.append(NotRun(name, f"it diverged: {result.sentence}"))
             else:
                 tried[name] = result, assessment
                 rows.append(_row(name, result, assessment))

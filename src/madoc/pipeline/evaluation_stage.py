@@ -1,6 +1,6 @@
 """Evaluation as a stage: learnt policies in the target, at the estimate, and over the estimate's distribution."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +74,7 @@ def evaluate_folder(
     assert system is not None  # one of them is known
     leave_film(out or folder, policies, *system, key)
     task = Machine.restored(spec, allow_code=allow_code).task
+    yardsticks = [name for name in policies if read_spec(found[name].parent).at in YARDSTICKS]
     evaluation = EvaluationRecord(
         task.name,
         task.physics,
@@ -81,7 +82,7 @@ def evaluate_folder(
         order.seed,
         in_target,
         at_estimate,
-        *({}, {}) if calibrated is None else _where_not_sure(policies, calibrated, key, order, quiet=quiet),
+        *({}, {}) if calibrated is None else _where_not_sure(policies, yardsticks, calibrated, key, order, quiet=quiet),
         _percent_of_truth(in_target),
     )
     write_json((out or folder) / "evaluation.json", evaluation.to_json())
@@ -110,7 +111,13 @@ def _returns(
 
 
 def _where_not_sure(
-    policies: Mapping[str, Policy], calibrated: Calibrated, key: PRNGKeyArray, order: EvaluationOrder, *, quiet: bool
+    policies: Mapping[str, Policy],
+    yardsticks: Collection[str],
+    calibrated: Calibrated,
+    key: PRNGKeyArray,
+    order: EvaluationOrder,
+    *,
+    quiet: bool,
 ) -> tuple[dict[str, OverDraws], dict[str, dict[str, ErrorCost]]]:
     """Returns over draws of the estimate, and of all but yardsticks what an error of each parameter costs."""
     simulator = simulation.make(calibrated.task.for_policies)
@@ -120,7 +127,7 @@ def _where_not_sure(
         for name, policy in policies.items():
             distribution = calibrated.distribution()
             drawn[name] = over_draws(policy, simulator, distribution, key=of_draws, draws=order.draws)
-            if name.partition("-")[0] not in YARDSTICKS:
+            if name not in yardsticks:
                 estimate, half_widths = calibrated.result.mean, calibrated.half_widths
                 costs[name] = costs_of_errors(
                     policy, simulator, estimate, half_widths, key=of_errors, episodes=order.episodes

@@ -48,6 +48,7 @@ class SpecRecord:
         physics: `legacy` or `modern`.
         parameters: Range of each calibrated parameter, or its value where a policy was learnt.
         seed: Seed of all random numbers.
+        at: Where a policy was learnt: `calibrated`, `truth`, `midrange`, ...; None of a calibration.
         truth: True values by name, where they are known.
         holdout: Share of the rows that was held out; None where the result was not judged.
         data: The logged data.
@@ -61,6 +62,7 @@ class SpecRecord:
     physics: str | None = None
     parameters: dict[str, tuple[float, float] | float] = field(default_factory=dict)
     seed: int | None = None
+    at: str | None = None
     truth: dict[str, float] | None = None
     holdout: float | None = None
     data: DataRecord | None = None

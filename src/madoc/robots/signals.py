@@ -11,8 +11,10 @@ from madoc.robots.model import Draft, is_single, is_slide
 from madoc.robots.sensing import Layout, Signals
 from madoc.robots.spec import SCALES
 
-_NOT_SI = re.compile(r"deg|°|grad|rev|rpm|turn|mm|cm|km|milli|centi|inch|foot|feet|ft", re.IGNORECASE)
-"""Parts of names of units of length, angle and speed that are not m, rad, m/s or rad/s."""
+_NOT_SI = re.compile(
+    r"\b(deg\w*|grad|mrad|rev|revolutions?|rpm|turns?|mm|cm|km|inch(es)?|ft|feet|foot)\b|°|/min\b", re.IGNORECASE
+)
+"""Units of length, angle and speed that are not m, rad, m/s or rad/s."""
 
 
 def read_signals(draft: Draft, model: mujoco.MjModel) -> Signals:
@@ -68,9 +70,9 @@ def _check_unit(draft: Draft, model: mujoco.MjModel, index: int, expression: Exp
     plain, given = _plain_unit(model, expression), draft.spec.signals[index].unit or ""
     if not plain or not _NOT_SI.search(given):
         return
-    scale = SCALES.get(given, SCALES["deg"] if "deg" in given.lower() else None)
-    factor = "180 / pi" if plain.startswith("rad") else f"{1.0 / (scale or 1.0):g}"
-    converted = f"reads: {expression.text} * {factor}, or " if scale is not None else ""
+    factor = "180 / pi" if "deg" in given.lower() or "°" in given else f"{1.0 / SCALES.get(given, 1.0):g}"
+    convertible = (given in SCALES or "deg" in given.lower()) and (factor == "180 / pi") == plain.startswith("rad")
+    converted = f"reads: ({expression.text}) * {factor}, or " if convertible else ""
     raise draft.document.error(
         ("signals", index, "unit"),
         f"{expression.text} is in {plain}, not in {given}; write {converted}unit: {plain}",

@@ -136,7 +136,7 @@ def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco
 
 
 def _check_names(draft: Draft) -> None:
-    """Refuse a name given to two signals or actions, a log column for a name that neither has, or one for two names."""
+    """Refuse a name given to two signals or actions, a log column for a name that neither has, or for two signals."""
     names: dict[str, tuple[str, int]] = {}
     for kind in ("signals", "actions"):
         for index, part in enumerate(getattr(draft.spec, kind)):
@@ -148,16 +148,17 @@ def _check_names(draft: Draft) -> None:
     for name in draft.spec.log.columns:
         if name not in names:
             raise draft.document.unknown(("log", "columns", name), "the name of a signal or an action", name, names)
-    for kind in ("signals", "actions"):
-        of_column: dict[str, str] = {}
-        for part in getattr(draft.spec, kind):
-            column = draft.spec.log.columns.get(part.name, part.name)
-            other = of_column.setdefault(column, part.name)
-            if other != part.name:
-                named = part.name if part.name in draft.spec.log.columns else other
-                raise draft.document.error(
-                    ("log", "columns", named), f"{other} and {part.name} are both read from the column {column!r}"
-                )
+    of_column: dict[str, str] = {}
+    for part in draft.spec.signals:  # one command may drive two actuators
+        column = draft.spec.log.columns.get(part.name, part.name)
+        other = of_column.setdefault(column, part.name)
+        if other != part.name:
+            named = part.name if part.name in draft.spec.log.columns else other
+            raise draft.document.error(
+                ("log", "columns", named),
+                f"{other} and {part.name} are both read from the column {column!r}; name a column of its own for each, "
+                "or leave one of them out",
+            )
 
 
 def _frame_skip(draft: Draft, model: mujoco.MjModel) -> int:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Generic, Literal
 
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.errors import MadocError
@@ -227,13 +228,18 @@ class _Session(Generic[State]):
         """Accept the result of a step, log it, and check that its metrics are finite."""
         self.state, self._tally = state, self._tally.plus(epoch)
         metrics = {name: float(value) for name, value in epoch.metrics.items()}
+        bad = next((name for name, value in metrics.items() if not math.isfinite(value)), None)
+        problem = "" if bad is None else f"metric {bad} became {metrics[bad]} while {epoch.stage}"
+        traced = metrics
+        if self._log and self._trace and not problem:
+            try:
+                traced = metrics | self._trace(state)
+            except np.linalg.LinAlgError as error:
+                problem = f"the state has no estimate while {epoch.stage} ({error})"
         if self._log:
-            traced = metrics | (self._trace(state) if self._trace else {})
             self._log.append(traced, stage=epoch.stage, spent=self.spent, seconds=self._seconds())
-        for name, value in metrics.items():
-            if not math.isfinite(value):
-                self._diverge(f"metric {name} became {value} while {epoch.stage}")
-                break
+        if problem:
+            self._diverge(problem)
         return metrics
 
     def save(self) -> None:

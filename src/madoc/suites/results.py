@@ -24,10 +24,11 @@ COLUMNS: dict[str, type] = {
     **{"verdict_sentence": str, "holdout_score": float, "holdout_low": float, "holdout_high": float},
     **{"control_steps": int, "seconds": float, "error_mean_absolute": float, "error_percent_of_range": float},
     **{"parameter": str, "unit": str, "estimate": float, "interval_low": float, "interval_high": float, "std": float},
-    **{"low": float, "high": float, "error": float, "policy": str, "return": float, "return_std": float},
+    **{"low": float, "high": float, "error": float, "policy": str, "where": str, "return": float, "return_std": float},
     **{"normalized": float, "episodes": int},
 }
-"""Columns of the table and the types of their values; a calibration has a row a parameter, an evaluation a policy."""
+"""Columns of the table and the types of their values; a calibration has a row a parameter, an evaluation one for each
+policy and place: `target` where its parameters are known, and `estimate`."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +84,11 @@ def rows(results: Sequence[Result]) -> Iterator[dict[str, Any]]:
             off = result.error.get("per_parameter", {}).get(name)
             yield whole | of_row | {"parameter": name, "interval_low": low, "interval_high": high, "error": off}
         if result.evaluation is not None:
-            for name, returns in result.evaluation.policies.items():
-                known = {key: returns[key] for key in ("return", "return_std", "normalized")}
-                yield whole | known | {"policy": name, "episodes": result.evaluation.episodes}
+            places = {"target": result.evaluation.policies, "estimate": result.evaluation.at_estimate}
+            for where, policies in places.items():
+                for name, returns in policies.items():
+                    known = {key: returns[key] for key in ("return", "return_std", "normalized")}
+                    yield whole | known | {"policy": name, "where": where, "episodes": result.evaluation.episodes}
         elif not result.parameters:
             yield whole
 

@@ -216,8 +216,10 @@ def judged(
         found, spent = (*exchanged, *found), spent + steps
     # Another estimate of other windows says that the search is not at its end, not that a parameter is open.
     open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
-    covered = own * (1.0 + widening(open_by, space.names).mean(1))
-    shares = np.minimum(np.maximum(half, covered), 1.0)
+    best, own_ends = (point[:, None] + np.outer(each, (-1.0, 1.0)) for each in (half, own))
+    ends = own_ends if interval is None else space.to_unit(interval.T).T
+    ends = ends + own[:, None] * widening(open_by, space.names) * (-1.0, 1.0)
+    shares = np.maximum(*(np.ptp(np.clip(each, -1.0, 1.0), axis=1) / 2.0 for each in (best, ends)))
     signals = signal_names(bench.simulator.task)[: len(noise)]
     return record(
         split=bench.split,

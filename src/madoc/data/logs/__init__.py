@@ -13,7 +13,7 @@ from madoc.data.dataset import Dataset
 from madoc.data.findings import Finding
 from madoc.data.logs import csv_reader, hdf5_reader, lerobot_reader, mcap_reader, minari_runs, parquet_reader
 from madoc.data.logs.assembly import assemble, wanted_columns
-from madoc.data.logs.jumps import without_copies
+from madoc.data.logs.jumps import split_episodes, without_copies
 from madoc.data.logs.tables import Run, Table, tables_of
 from madoc.data.minari_reader import recognises as is_minari
 from madoc.data.npz import read_arrays
@@ -90,13 +90,16 @@ def read(
         raise MadocError("expected at least one file or folder of logs, got none")
     wanted = set(wanted_columns(robot).values())
     contents = [_runs(source, wanted) for source in sources]
-    runs, copies = without_copies(_distinct([run for of_source, _ in contents for run in of_source]), sorted(wanted))
+    runs, findings = without_copies(_distinct([run for of_source, _ in contents for run in of_source]), sorted(wanted))
+    episodes = [split_episodes(run, wanted) for run in runs]
+    runs = [run for parts, _ in episodes for run in parts]
+    findings += [finding for _, told in episodes for finding in told]
     ignored = [file for _, others in contents for file in others]
     origin = str(sources[0]) + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
     dataset = validate(assemble(runs, robot, origin=origin, clip_actions=clip_actions), robot.task)
     if ignored:
-        copies.append(Finding("note", f"{listed(ignored, 3)} were not read: no reader knows them", dataset.origin))
-    return replace(dataset, findings=(*copies, *dataset.findings))
+        findings.append(Finding("note", f"{listed(ignored, 3)} were not read: no reader knows them", dataset.origin))
+    return replace(dataset, findings=(*findings, *dataset.findings))
 
 
 def files_of(folder: Path) -> list[Path]:

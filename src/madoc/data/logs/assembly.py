@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from madoc.data.dataset import Dataset, close_episodes, join
 from madoc.data.findings import Finding
-from madoc.data.logs.jumps import episodes_of, unwrapped
+from madoc.data.logs.jumps import unwrapped
 from madoc.data.logs.tables import Run, Table, as_numbers
 from madoc.data.logs.timing import (
     Resample,
@@ -120,9 +120,6 @@ def _steps(run: Run, robot: Robot) -> Steps:
         linked = np.ones(len(series.time) - 1, dtype=bool)
         what = f"its format keeps no times: rows are taken to be {control_step:g} s apart"
         findings.append(Finding("note", what, run.name))
-    follows = np.diff(episodes_of(series.table, wanted.values(), series.rows)) == 0
-    findings += _joined(run, int((~follows).sum()))
-    linked &= follows
     observation, action = np.split(series.values, [len(robot.signals)], axis=1)
     seen, acted = np.isfinite(observation).all(-1), np.isfinite(action).all(-1)
     broken = ~(seen & acted)
@@ -161,11 +158,6 @@ def _time(run: Run, table: Table, layout: LogSpec) -> tuple[Float[np.ndarray, " 
             raise MadocError(f"column {name!r} of {run.name} has another number of rows than the columns it times")
         raise MadocError(str(_no_column(run, "time", name)).replace("log: columns:", "log: time:"))
     return as_numbers(table, name, run.name), name
-
-
-def _joined(run: Run, breaks: int) -> list[Finding]:
-    """A note on episodes that one table holds, if there are any."""
-    return [Finding("note", f"it holds {breaks + 1:,} episodes: it is cut between them", run.name)] if breaks else []
 
 
 def _series(run: Run, table: Table, columns: Sequence[str], robot: Robot) -> tuple[Series, list[Finding]]:
@@ -220,18 +212,10 @@ def _resampled(run: Run, robot: Robot, wanted: Mapping[str, str], tables: Mappin
     findings += [finding for series in acted for finding in held_finding(series, grid[-1])]
     kept = np.ones(len(grid), dtype=bool)
     columns: dict[str, np.ndarray] = {}
-    linked = np.ones(len(grid) - 1, dtype=bool)
     for series, names, acting in pieces:
         values, outside_gaps = on_grid(series, grid, "hold" if acting else how)
         columns.update(zip(names, values.T, strict=True))
         kept &= outside_gaps | acting  # commands may be logged only where they change
-        if not acting:
-            episodes = episodes_of(series.table, wanted.values(), series.rows)
-            findings += _joined(run, int(episodes[-1]))
-            last, following = (np.searchsorted(series.time, grid, side=side) for side in ("right", "left"))
-            episode, then = (episodes[np.clip(rows, 0, len(episodes) - 1)] for rows in (last - 1, following))
-            kept &= episode == then
-            linked &= episode[1:] == episode[:-1]
     if not kept.all():
         what = f"{(~kept).sum()} of {len(grid):,} control steps fall into gaps: the run is cut there"
         findings.append(Finding("warning", what, run.name))
@@ -249,8 +233,7 @@ def _resampled(run: Run, robot: Robot, wanted: Mapping[str, str], tables: Mappin
         np.stack([columns[channel.name] for channel in channels], axis=-1)
         for channels in (robot.signals, robot.actions)
     )
-    linked &= kept[:-1] & kept[1:]
-    return Steps(observation, action, linked, "control step {}".format, tuple(dict.fromkeys(findings)))
+    return Steps(observation, action, kept[:-1] & kept[1:], "control step {}".format, tuple(dict.fromkeys(findings)))
 
 
 def _scaled(

@@ -2,9 +2,10 @@
 
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from madoc.data.findings import Finding
 from madoc.data.logs.tables import Run, Table
@@ -13,52 +14,102 @@ from madoc.data.logs.timing import Series
 EPISODES = ("episode", "episode_id", "episode_index", "trial")
 """Names of columns, in lower case, whose value changes from one episode to the next."""
 ENDS = ("terminals", "timeouts", "terminated", "truncated", "done", "is_last")
-"""Names of columns, in lower case, that are 1 in the last row of an episode."""
-_NEAR_A_TURN = 0.1
-"""Largest difference of a jump from a whole turn, in turns."""
-_SLOW = 0.1
-"""Median change of an angle from row to row in turns; above it a jump may be motion."""
-_FALSE = frozenset((b"0", b"false", b"", b"0.0", b"no"))
+"""Names of columns, in lower case, that become 1 in the last row of an episode."""
+_WITHIN = 1.05
+"""Span of an angle that wraps around, in turns; noise may bring it slightly above 1."""
+_SLOW = 0.25
+"""Median change of an angle from row to row, the shorter way round, in turns; above it either way may be meant."""
+_TRUE = frozenset(("true", "t", "yes", "y", "on"))
+_FALSE = frozenset(("", "false", "f", "no", "n", "off", "nan", "na", "n/a", "none", "null", "-"))
 
 
 def unwrapped(
     series: Series, columns: Sequence[str], turns: Mapping[str, float]
 ) -> tuple[Float[np.ndarray, "rows columns"], list[Finding]]:
-    """The values of a series, its angles made continuous where they jump by a whole turn, and a note on each.
+    """The values of a series, its angles made continuous where they wrap around, and a note on each.
 
-    `turns` are the changes of angles in a turn, by column.
+    `turns` are the changes of angles in a turn, by column. An angle that covers more than a turn does not wrap around,
+    and one that moves by a quarter of a turn from row to row may have gone either way round: both are left alone.
     """
     values, findings = series.values.copy(), []
     for index, column in enumerate(columns):
         turn, known = turns.get(column, 0.0), np.isfinite(values[:, index])
-        change = np.abs(np.diff(values[known, index]))
-        if not turn or not len(change) or np.median(change) > _SLOW * turn:
+        angle = values[known, index]
+        if not turn or len(angle) < 2 or np.ptp(angle) > _WITHIN * turn:
             continue
-        count = int((np.abs(change - turn) < _NEAR_A_TURN * turn).sum())
-        if count:
-            values[known, index] = np.unwrap(values[known, index], period=turn)
+        change = np.diff(angle)
+        count = int((np.abs(change) > turn / 2.0).sum())
+        if count and np.median(np.abs(np.mod(change + turn / 2.0, turn) - turn / 2.0)) <= _SLOW * turn:
+            values[known, index] = np.unwrap(angle, period=turn)
             what = f"column {column!r} jumps by a whole turn in {count:,} rows: it was unwrapped"
             findings.append(Finding("note", what, series.run, "a policy needs the unwrapped angle too"))
     return values, findings
 
 
-def episodes_of(table: Table, used: Collection[str], rows: Int[np.ndarray, " rows"]) -> Int[np.ndarray, " rows"]:
-    """The episode of each of the rows, counted from 0, by columns that are not `used` for a signal or an action."""
-    begins = np.zeros(len(rows), dtype=bool)
+def split_episodes(run: Run, used: Collection[str]) -> tuple[list[Run], list[Finding]]:
+    """The episodes that a run's table says it holds, each as a run, and a note where there are several.
+
+    What `EPISODES` and `ENDS` name counts unless it is `used` for a signal or an action. Episodes of one row are left
+    out. A run whose signals and actions are in several tables, with a clock each, is not split.
+    """
+    tables = [table for table in run.tables if table.columns.keys() & set(used)]
+    if len(tables) != 1:
+        return [run], []
+    (table,) = tables
+    first = _first_rows(table, used)
+    if len(first) < 2:
+        return [run], []
+    ends = np.append(first[1:], len(table))
+    parts = [
+        Run(f"{run.name}, episode {number}", (_rows_of(table, slice(start, end)),), run.timed)
+        for number, (start, end) in enumerate(zip(first, ends, strict=True), 1)
+        if end - start > 1
+    ]
+    if not parts:
+        return [run], []
+    short = len(first) - len(parts)
+    what = f"it holds {len(first):,} episodes{f', of which {short:,} have one row and are left out' if short else ''}"
+    return parts, [Finding("warning" if short else "note", what, run.name)]
+
+
+def _first_rows(table: Table, used: Collection[str]) -> Int[np.ndarray, " episodes"]:
+    """The first row of each episode."""
+    begins = np.zeros(len(table), dtype=bool)
+    begins[:1] = True
     for name in table.columns.keys() - set(used):
-        values = table.columns[name][rows]
+        values = table.columns[name]
         if name.lower() in EPISODES:
-            begins[1:] |= values[1:] != values[:-1]
+            number = _numbers(values)
+            begins[1:] |= number[1:] != number[:-1]
         elif name.lower() in ENDS:
-            begins[1:] |= _flags(values)[:-1]
-    return np.cumsum(begins)
+            ended = _numbers(values) > 0.0
+            begins[2:] |= ended[1:-1] & ~ended[:-2]
+            begins[1:2] |= ended[:1]
+    return np.flatnonzero(begins)
 
 
-def _flags(values: np.ndarray) -> Bool[np.ndarray, " rows"]:
-    """Whether flags are set, which may be numbers or text."""
+def _numbers(values: np.ndarray) -> Float[np.ndarray, " rows"]:
+    """Values as numbers: flags as 0 and 1, what is missing as 0, other text as numbers that differ where it does."""
     if values.dtype.kind in "fiub":
-        return values.astype(np.float64) > 0.0
-    return np.array([str(value).strip().lower().encode() not in _FALSE for value in values])
+        return np.nan_to_num(values.astype(np.float64))
+    texts, places = np.unique(values.astype(str), return_inverse=True)
+    return np.array([_number(text, place) for place, text in enumerate(texts.tolist())])[places]
+
+
+def _number(text: str, otherwise: int) -> float:
+    word = text.strip().removeprefix("b'").removesuffix("'").lower()
+    if word in _FALSE or word in _TRUE:
+        return float(word in _TRUE)
+    try:
+        return float(np.nan_to_num(float(word)))
+    except ValueError:
+        return float(otherwise + 1)
+
+
+def _rows_of(table: Table, rows: slice) -> Table:
+    """Some rows of a table."""
+    columns = {name: values[rows] for name, values in table.columns.items()}
+    return replace(table, columns=columns, lines=None if table.lines is None else table.lines[rows])
 
 
 def without_copies(runs: Sequence[Run], wanted: Sequence[str]) -> tuple[list[Run], list[Finding]]:

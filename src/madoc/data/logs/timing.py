@@ -25,7 +25,7 @@ DRIFT = 0.01
 """Change of the time step from the first to the last row, as a share of the control step; a larger one is warned of."""
 _CERTAIN = 5.0
 """Standard errors by which a mean or a slope has to differ before it is told."""
-MOST_FILLED = 100
+MOST_FILLED = 10
 """Largest number of control steps that are made of a row by resampling."""
 _SKIPPED = 1.5
 """Time between two rows in median time steps; a longer one has lost rows in it, and says nothing of the rate."""
