@@ -28,6 +28,8 @@ Layers = tuple[Count, ...]
 """Number of units in each hidden layer of a network."""
 NotNegative = Annotated[float, Field(ge=0.0)]
 """A hyperparameter that is a number of at least 0, such as a rate or a weight."""
+Positive = Annotated[float, Field(gt=0.0)]
+"""A hyperparameter that is a number above 0, such as a time or a standard deviation."""
 
 Metrics = dict[str, float]
 """Scalars for the log, by name; no step depends on them."""

@@ -198,6 +198,14 @@ def test_windows_that_scatter_too_little_by_chance():
     np.testing.assert_allclose(at_least_noise(meat_of_windows, bread, 1.0), np.diag([0.5 * 4.0, 1.0 * 16.0]))
 
 
+def test_a_parameter_that_no_or_one_window_tells_narrows_no_other():
+    # The second changes nothing; the third is told by one window, without scatter: noise gives it 1/4.
+    bread, meat_of_windows = np.diag([2.0, 0.0, 4.0]), np.diag([16.0, 0.0, 0.0])
+    found = at_least_noise(meat_of_windows, bread, 1.0)
+    np.testing.assert_allclose(found, np.diag([16.0, 0.0, 0.25 * 16.0]))
+    np.testing.assert_allclose(at_least_noise(np.zeros((3, 3)), bread, 0.5), 0.5 * bread)
+
+
 def test_values_of_one_window_count_as_one_piece_of_evidence():
     alone = at(np.ones((4, 1, 1)), [[0.1], [-0.2], [0.05], [0.05]])
     repeated = at(np.ones((4, 3, 1)), np.repeat(alone.residuals, 3, axis=1))

@@ -32,6 +32,8 @@ def test_a_geared_joint_tells_the_sum_of_its_inertias():
     assert found.estimate * by_joint == pytest.approx(0.36 + 36 * 0.01)
     # One direction of [-1, 1] is (1, 1) / √2: the sum of both has √2 times its error, in halves of 0.36.
     assert (found.interval[1] - found.estimate) * by_joint == pytest.approx(NORMAL_95 * 0.01 * np.sqrt(2) * 0.36)
+    (few,) = combinations(joint, np.array([0.36, 0.01]), covariance_of(joint, [1.0, 1.0], 0.01), 2.23)
+    assert np.ptp(few.interval) == pytest.approx(np.ptp(found.interval) * 2.23 / NORMAL_95)
 
 
 def test_a_mass_on_a_rod_tells_their_product():

@@ -8,7 +8,7 @@ import pytest
 from madoc import robots, simulation
 from madoc.data import logs, typical_change
 from madoc.identification import missing_terms as terms
-from madoc.identification.candidate_terms import Candidate
+from madoc.identification.candidate_terms import EARLY, Candidate, _cut_off
 from madoc.identification.drifts import DRIFT, _between_runs
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
@@ -60,7 +60,7 @@ def plant(folder: Path, *, friction: float = 0.0, drag: float = 0.0, late: int =
     for row in range(len(torque)):
         system = systems[2 * row // len(torque)]
         angles.append(np.asarray(system.observe(state))[0, 0])
-        state = system.step(state, torque[None, None, max(0, row - late)][..., None])
+        state = system.step(state, torque[None, None, min(max(0, row - late), len(torque) - 1)][..., None])
     seen = np.array(angles) + NOISE * random.standard_normal((len(torque), 2))
     columns = np.column_stack([0.02 * np.arange(len(torque)), seen, torque])
     np.savetxt(folder / "log.csv", columns, "%.9g", ",", header="time,angle,speed,torque", comments="")
@@ -88,6 +88,22 @@ def test_the_missing_term_is_named_with_its_value(tmp_path, lacks, parameter, va
     assert best.parameter == parameter
     assert abs(best.t) > 10
     assert best.value == pytest.approx(value, rel=0.3)
+
+
+def test_actions_that_come_early_are_told_though_the_delay_is_calibrated(tmp_path):
+    with_delay = SPEC + "  - {field: action_delay, low: 0, high: 0.04}\n"
+    found = {}
+    for late in (0, -1):
+        dataset, _ = plant(tmp_path / str(late), late=late)
+        (tmp_path / str(late) / "pendulum.yaml").write_text(with_delay)
+        simulator = simulation.make(robots.load(tmp_path / str(late) / "pendulum.yaml").task)
+        point, states = simulator.parameters.to_unit(np.array([0.1, 0.0])), states_of(dataset, simulator)
+        told = terms.suspicions(dataset, states, simulator, point, np.full(2, 0.05), typical_change(dataset)).terms
+        found[late] = [term for term in told if term.cause == EARLY]
+    (early,) = found[-1]
+    assert (early.t < -10, early.value) == (True, pytest.approx(-0.02, rel=0.5))
+    assert early.shifts["action_delay"] < -1.0
+    assert found[0] == []
 
 
 def test_a_right_model_lacks_nothing(tmp_path):
@@ -169,3 +185,12 @@ def test_a_term_that_explains_the_same_is_a_rival():
     (chosen,) = terms._chosen(tests)
     ((rival,),) = terms._rivals(tests, [chosen])
     assert {chosen, rival} == {0, 2}
+
+
+def test_a_drive_saturates_at_both_ends_of_what_it_is_asked_for(tmp_path):
+    plant(tmp_path)
+    (tmp_path / "pendulum.yaml").write_text(SPEC.replace("low: -1, high: 1", "low: 0, high: 10"))
+    simulator = simulation.make(robots.load(tmp_path / "pendulum.yaml").task)
+    # 0, 5 and 10 N·m are -1, 0 and 1; what is above 7 N·m is cut off, nothing below 0.
+    asked = np.array([-1.0, 0.0, 1.0])[None, :, None]
+    np.testing.assert_allclose(_cut_off(asked, simulator)[0, :, 0], [-1.0, 0.0, 0.4])

@@ -165,6 +165,11 @@ CHANGES = [
     ),
     (
         DAMPING,
+        "  - {field: body_mass_and_inertia, element: elbow, low: 1, high: 2}",
+        "and body_mass of line 16 are one thing",
+    ),
+    (
+        DAMPING,
         "  - {field: signal_bias, element: elbow, low: -1, high: 1}",
         "a signal, got 'elbow'; nearest: elbow_angle",
     ),

@@ -12,6 +12,7 @@ from madoc.parameters import Parameter
 from madoc.robots import load
 from madoc.simulation.cpu import CpuSimulator
 from own_robots import CART_SPEC, write_robot
+from robots import spring
 
 
 @pytest.mark.parametrize("name", madoc.tasks.TASKS)
@@ -244,3 +245,19 @@ def test_replaced_systems_are_as_if_bound_together(tmp_path):
         state = exchanged.step(state, action)
         np.testing.assert_array_equal(exchanged.observe(state), together.observe(state))
         np.testing.assert_array_equal(exchanged.step(state, -action), together.step(state, -action))
+
+
+def test_no_rows_step_to_no_rows(hopper):
+    system = hopper.bind(hopper.parameters.middle)
+    state = np.zeros((1, 0, len(hopper.initial_state)))
+    assert system.step(state, np.zeros((1, 0, 3))).shape == state.shape
+
+
+def test_a_model_that_keeps_a_history_is_refused():
+    def delayed():
+        spec = spring().spec()
+        spec.actuators[0].delay, spec.actuators[0].nsample = 0.01, 4
+        return spec
+
+    with pytest.raises(MadocError, match=r"actuators or sensors keep a history \(delay, nsample\)"):
+        CpuSimulator(replace(spring(), spec=delayed))

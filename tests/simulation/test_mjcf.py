@@ -193,6 +193,19 @@ def test_nothing_changes_at_the_robots_own_values(tmp_path):
     assert save_mjcf(simulation.make(task, threads=1), np.array([4.0]), tmp_path / "model.xml") == []
 
 
+def test_drag_is_taken_out_where_none_was_found(tmp_path):
+    def dragging():
+        spec = spring().spec()
+        spec.joints[0].damping = [0.5, 0.2, 0.0]
+        return spec
+
+    task = replace(spring(Parameter("dof_drag", "slide", 0.0, 1.0)), spec=dragging)
+    (change,) = save_mjcf(simulation.make(task, threads=1), np.array([0.0]), tmp_path / "model.xml")
+    assert (change.old[:2], change.new[:1]) == ([0.5, 0.2], [0.5])
+    written = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert (written.dof_damping[0], written.dof_dampingpoly[0, 0]) == (0.5, 0.0)
+
+
 @pytest.mark.parametrize(
     ("written", "short"),
     [

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from madoc.data import Dataset, typical_change
 from madoc.errors import MadocError
+from madoc.identification.information import NORMAL_95
 from madoc.identification.noise import regression_noise
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.learning.features import LoggedFeatures
@@ -99,6 +100,7 @@ class Estimate:
         warnings: Reasons to doubt the estimate, one sentence each.
         covariance: Covariance of the estimates, with `std` squared on its diagonal; None where it is unknown.
         interval: 95 % confidence intervals, columns low and high; None where they are unknown.
+        quantile: Standard errors in half of such an interval, before an end of the range cuts it off.
         settled: False where the method can tell that its search is not at its end, so that a larger budget would change
             the estimate: least squares until its steps are small, Madoc until its discriminators can have settled.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
@@ -112,6 +114,7 @@ class Estimate:
     warnings: tuple[str, ...] = field(default=())
     covariance: Float[np.ndarray, "d d"] | None = None
     interval: Float[np.ndarray, "d 2"] | None = None
+    quantile: float = NORMAL_95
     settled: bool = True
     group_stability: float | None = None
 

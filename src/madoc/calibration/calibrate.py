@@ -81,7 +81,7 @@ def calibrate(
         warnings=without_repeats(warnings, problem.doubts),
         error=None if true_values is None else calibration_error(estimate.mean, true_values, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
-        combinations=[] if told is None else list(combinations(space, estimate.mean, told)),
+        combinations=[] if told is None else list(combinations(space, estimate.mean, told, estimate.quantile)),
         settled=estimate.settled,
         group_stability=estimate.group_stability,
         problem=problem,

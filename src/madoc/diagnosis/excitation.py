@@ -35,8 +35,9 @@ INSIDE = 0.98
 _DAMPING = 1e-8
 """Marquardt's damping of a step, relative to the squared lengths of the columns: enough for unidentified directions."""
 HIDDEN = 1e-2
-"""Change of the residuals along a direction over the root of the sum of squares of what each parameter changes there; a
-smaller one is none. Masses that the model keeps fixed and that are 1 % of the others leave as much."""
+"""If scaling all calibrated masses and forces by one factor changes the residuals by less than this share of what the
+single parameters change them by (root of the sum of squares), the common scale counts as invisible. Masses that stay
+fixed and weigh 1 % of the calibrated ones leave about this much."""
 ALIGNED = 0.9
 """Cosine from which on two directions count as one."""
 WIDE = 0.25

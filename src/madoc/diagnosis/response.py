@@ -23,7 +23,7 @@ CONTRADICTING = 0.5
 CERTAIN = 5.0
 """Standard errors by which a lag or a response has to differ from 0 before it is told."""
 FAR = 3.0
-"""Ratio of the logged response to the nearest that the model has; a larger one is told."""
+"""Ratio of the logged response to the nearest that the model has; a ratio above this, or below its inverse, is told."""
 _TAPS = 2
 """Number of rows on either side of the correlation's peak over which the response is resolved."""
 _BLOCKS = 12

@@ -33,6 +33,7 @@ CAUSES = {
 """What a candidate of each field stands for, in words."""
 DELAY = "actions that take effect later, by a delay or a lag of the actuator"
 EARLY = "actions that take effect before they are logged"
+BELOW_MINIMUM = "a value below the physical minimum of a parameter"
 SATURATION = "a drive that saturates below the limit of its actions"
 SPACING = "rows that are farther apart in time than the spec says, by another rate or a clock that drifts"
 TILTS = ("a base or a floor that is tilted towards x", "a base or a floor that is tilted towards y")
@@ -181,8 +182,7 @@ def effects(
     point, step = at[: len(at) - count], simulator.control_step
     earlier = np.concatenate([before[:, None], readings.actions[:, :-1]], axis=1)
     late = replace(readings, actions=readings.actions + _LATER * (earlier - readings.actions))
-    most = (1.0 - _SATURATED) * np.abs(readings.actions).max((0, 1))
-    saturated = replace(readings, actions=np.clip(readings.actions, -most, most))
+    saturated = replace(readings, actions=_cut_off(readings.actions, simulator))
     stretched = simulation.make(simulator.task.with_time_step(1.0 + _CHANGE))
     finer = simulation.make(simulator.task.with_time_step(0.25, substeps=4))
     fields = {each.field for each in simulator.parameters.parameters}
@@ -207,6 +207,18 @@ def effects(
             tried.append(candidate)
             found.append((moved - base) / change)
     return tried, np.stack(found, axis=-1)
+
+
+def _cut_off(
+    actions: Float[np.ndarray, "windows steps action"], simulator: Simulator
+) -> Float[np.ndarray, "windows steps action"]:
+    """Actions of a drive that saturates: in the spec's units none is farther from 0 than a share of the largest."""
+    channels = simulator.task.actions
+    middle = np.array([(row.high + row.low) / 2.0 for row in channels] or 0.0)
+    half = np.array([(row.high - row.low) / 2.0 for row in channels] or 1.0)
+    asked = actions * half + middle
+    most = (1.0 - _SATURATED) * np.abs(asked).max((0, 1))
+    return (np.clip(asked, -most, most) - middle) / half
 
 
 def _of_groups(

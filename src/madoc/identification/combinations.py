@@ -47,17 +47,21 @@ class Combination:
 
 
 def combinations(
-    space: ParameterSpace, mean: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"]
+    space: ParameterSpace,
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    quantile: float = NORMAL_95,
 ) -> tuple[Combination, ...]:
     """The combinations of open parameters that an estimate tells, each of as few parameters as possible.
 
     `mean` and `covariance` are in physical units. A direction that the log does not tell has the variance of the box.
+    Half of a 95 % interval is `quantile` standard errors.
     """
     half = (space.high - space.low) / 2.0
     scaled = covariance / half[:, None] / half
-    is_open = np.flatnonzero(NORMAL_95 * np.sqrt(np.diag(scaled)) >= OPEN)
+    is_open = np.flatnonzero(quantile * np.sqrt(np.diag(scaled)) >= OPEN)
     values, vectors = np.linalg.eigh(scaled[np.ix_(is_open, is_open)])
-    told = vectors[:, NORMAL_95 * np.sqrt(np.maximum(values, 0.0)) < TOLD].T
+    told = vectors[:, quantile * np.sqrt(np.maximum(values, 0.0)) < TOLD].T
     if not len(told):
         return ()
     _, factor, order = qr(told, mode="economic", pivoting=True)
@@ -67,7 +71,8 @@ def combinations(
         weights = np.zeros(len(space))
         weights[is_open[order]] = row
         weights = _sparse(weights, scaled)
-        found.append(_product(space, mean, scaled, weights) or _sum(space, mean, scaled, weights))
+        asked = (space, mean, scaled, weights, quantile)
+        found.append(_product(*asked) or _sum(*asked))
     return tuple(found)
 
 
@@ -92,6 +97,7 @@ def _sum(
     mean: Float[np.ndarray, " d"],
     scaled: Float[np.ndarray, "d d"],
     weights: Float[np.ndarray, " d"],
+    quantile: float,
 ) -> Combination:
     """The sum with these weights of parameters in [-1, 1], in the unit of the first, whose factor is 1."""
     involved = np.flatnonzero(weights)
@@ -108,7 +114,7 @@ def _sum(
         parameters={space.names[index]: float(factors[index]) for index in (first, *others)},
         kind="sum",
         estimate=value,
-        interval=(value - NORMAL_95 * error, value + NORMAL_95 * error),
+        interval=(value - quantile * error, value + quantile * error),
         unit=space.parameters[first].unit,
     )
 
@@ -118,6 +124,7 @@ def _product(
     mean: Float[np.ndarray, " d"],
     scaled: Float[np.ndarray, "d d"],
     weights: Float[np.ndarray, " d"],
+    quantile: float,
 ) -> Combination | None:
     """The product of whole powers that has these weights at the estimate; None if there is none.
 
@@ -141,7 +148,7 @@ def _product(
     exact = max(_error(weights, scaled), EXACT) / np.abs(weights).max() * np.abs(gradient).max()
     if error > SPARSE * exact:
         return None
-    low, high = value * np.exp(-NORMAL_95 * error), value * np.exp(NORMAL_95 * error)
+    low, high = value * np.exp(-quantile * error), value * np.exp(quantile * error)
     return Combination(
         name=_powers([space.names[index] for index in involved], whole),
         parameters={space.names[index]: float(power) for index, power in zip(involved, whole, strict=True)},

@@ -51,8 +51,7 @@ def drifts_of(
     between, of_runs = _between_runs(tests)
     others += of_runs
     if any(abs(term.t) >= DISAGREEING for term in drifts):
-        thirds = _fitted_thirds(simulator, readings, fit)
-        spent = sum(third.control_steps for third in thirds)
+        thirds, spent = _fitted_thirds(simulator, readings, fit)
         drifts += list(_changes(tests, thirds, drifts))
         others += _of_thirds(tests, thirds, drifts, point)
     return list(_most_certain([*drifts, *between])), others, spent
@@ -108,27 +107,28 @@ class _Third:
     point: Float[np.ndarray, " d"]
     variance: Float[np.ndarray, " d"]
     freedom: int
-    control_steps: int
 
 
-def _fitted_thirds(simulator: Simulator, readings: Readings, fit: Fit) -> list[_Third]:
-    """Estimates of the first and of the last third of the log; none where a third has too few windows.
+def _fitted_thirds(simulator: Simulator, readings: Readings, fit: Fit) -> tuple[list[_Third], int]:
+    """Estimates of the first and of the last third of the log, and the control steps simulated.
+
+    There are none where a third has too few windows.
 
     A score test underestimates a change that leaves residuals far from noise, which count little.
     """
-    time, found = np.linspace(-1.0, 1.0, len(readings)), list[_Third]()
+    time, found, spent = np.linspace(-1.0, 1.0, len(readings)), list[_Third](), 0
     for third in (time < -1.0 / 3.0, time > 1.0 / 3.0):
         if third.sum() < FEWEST + len(fit.point):
-            return []
+            return [], spent
         part = replace(readings, actions=readings.actions[third], observed=readings.observed[third])
         own = fit_windows(simulator, part, fit.states[third], fit.point)
-        products = products_of(own.slopes, part, len(own.point))
+        products, spent = products_of(own.slopes, part, len(own.point)), spent + own.control_steps
         if products is None or len(products) < FEWEST + len(own.point):
-            return []
+            return [], spent
         step, covariance = parameter_shift(products)
         point, variance = np.clip(own.point + step, -1.0, 1.0), np.maximum(np.diag(covariance), 0.0)
-        found.append(_Third(point, variance, len(products) - 1, own.control_steps))
-    return found
+        found.append(_Third(point, variance, len(products) - 1))
+    return found, spent
 
 
 def _changes(tests: TermTests, thirds: list[_Third], drifts: Iterable[MissingTerm]) -> Iterator[MissingTerm]:

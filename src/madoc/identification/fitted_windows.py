@@ -22,7 +22,7 @@ WINDOWS = 120
 """Largest number of windows that are simulated, unless more are needed for as many parameters; standard errors vary by
 about 10 % with so many."""
 STRIDES = 20
-"""Length of a window in strides: in longer ones small errors of the model grow beyond their slopes."""
+"""A window's length in strides; over longer ones derivatives no longer predict what a small error of the model does."""
 NEGLIGIBLE = 1e-5
 """Residual in typical changes of a step; below it there is nothing to explain."""
 LINEARISATIONS = 4

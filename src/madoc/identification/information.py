@@ -101,10 +101,13 @@ def at_least_noise(
     inverse = np.linalg.pinv(bread, rcond=_BLIND, hermitian=True)
     covariance = inverse @ meat @ inverse
     by_windows, by_noise = np.diag(covariance), ratio * np.diag(inverse)
-    if (by_windows <= _BLIND * by_noise).any():  # as for a single window, which has no scatter
+    told = by_noise > 0.0
+    alone = told & (by_windows <= _BLIND * by_noise)  # as for what a single window tells, which has no scatter
+    if (alone == told).all():
         return ratio * bread
-    wider = np.sqrt(np.maximum(1.0, by_noise / np.maximum(by_windows, np.finfo(float).tiny)))
-    return bread @ (wider[:, None] * covariance * wider) @ bread
+    wider = np.where(alone, 0.0, np.sqrt(np.maximum(1.0, by_noise / np.where(by_windows > 0.0, by_windows, 1.0))))
+    covariance = wider[:, None] * covariance * wider + np.diag(np.where(alone, by_noise, 0.0))
+    return bread @ covariance @ bread
 
 
 def sandwich(bread: Float[np.ndarray, "d d"], meat: Float[np.ndarray, "d d"]) -> Uncertainty:
@@ -127,11 +130,15 @@ def sandwich(bread: Float[np.ndarray, "d d"], meat: Float[np.ndarray, "d d"]) ->
 
 
 def half_width(covariance: Float[np.ndarray, "d d"], windows: int) -> Float[np.ndarray, " d"]:
-    """Half of the 95 % interval: Student's t with windows - d degrees of freedom times the standard error."""
-    freedom = max(1, windows - len(covariance))
+    """Half of the 95 % interval: the quantile of Student's t times the standard error."""
+    return quantile(windows, len(covariance)) * np.sqrt(np.diag(covariance))
+
+
+def quantile(windows: int, parameters: int) -> float:
+    """Standard errors in half of a 95 % interval: of Student's t with windows - parameters degrees of freedom."""
     from scipy.stats import t  # slow to import, and only results need it
 
-    return t.ppf(0.5 + CONFIDENCE / 2.0, freedom) * np.sqrt(np.diag(covariance))
+    return float(t.ppf(0.5 + CONFIDENCE / 2.0, max(1, windows - parameters)))
 
 
 def identifiability(uncertainty: Uncertainty, names: tuple[str, ...]) -> tuple[str, ...]:

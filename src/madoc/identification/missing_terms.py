@@ -13,12 +13,12 @@ from jaxtyping import Float
 
 from madoc import simulation
 from madoc.data.dataset import Dataset
-from madoc.identification.candidate_terms import INTEGRATION, Candidate, candidates, effects
+from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, INTEGRATION, Candidate, candidates, effects
 from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import Fit, fit_windows, negligible, products_of, windows_of
 from madoc.identification.information import NORMAL_95
 from madoc.identification.replay import Readings
-from madoc.identification.score_tests import deviate, joint_shift, parameter_shift
+from madoc.identification.score_tests import deviate, joint_shift, parameter_shift, score
 from madoc.identification.states import LoggedStates
 from madoc.identification.term_tests import (
     DISAGREEING,
@@ -29,7 +29,7 @@ from madoc.identification.term_tests import (
     TermTests,
     term_of,
 )
-from madoc.parameters import ParameterSpace
+from madoc.parameters import FIELDS, ParameterSpace
 from madoc.simulation.base import Simulator
 
 TOGETHER = 4
@@ -40,6 +40,8 @@ MOST_FITTED = 2
 """Largest number of terms that are fitted together with the parameters."""
 DIVERGING = 0.1
 """Share in [0, 1] of windows; a candidate with which more of them diverge is not tested."""
+_AT_MINIMUM = 1e-3
+"""Distance in [-1, 1] from the end of a range, up to which a parameter is at its minimum."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
 
 
@@ -100,7 +102,10 @@ def suspicions(
     tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
     drifts, others, of_thirds = drifts_of(tests, simulator, readings, fit, point)
     spent += of_thirds
-    terms, others = [*_terms(tests), *drifts], [*others, *_of_other_windows(tests, led - point)]
+    terms, others = (
+        [*_terms(tests), *_below_minimum(tests, led), *drifts],
+        [*others, *_of_other_windows(tests, led - point)],
+    )
     chosen = _chosen(tests)
     if chosen:
         together = _with_terms(tests, chosen)
@@ -140,6 +145,37 @@ def _terms(tests: TermTests) -> Iterator[MissingTerm]:
         if candidate.cause == INTEGRATION and abs(found.t) >= SUSPICIOUS:
             beside = [index]
         yield term_of(candidate, found, tests.by_name(found.shifts))
+
+
+def _below_minimum(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[MissingTerm]:
+    """Parameters at their physical minimum that the residuals pull below it, where no search may follow.
+
+    Something else must be missing, and in other tests these parameters would explain it, with the wrong sign.
+    """
+    rows = tests.space.parameters
+    pinned = [
+        index
+        for index, row in enumerate(rows)
+        if led[index] <= -1.0 + _AT_MINIMUM and row.low <= FIELDS[row.field].minimum
+    ]
+    free = [index for index in range(len(rows)) if index not in pinned]
+    products = tests.products.with_parameters(free)
+    for place, index in enumerate(pinned):
+        row, found = rows[index], score(products, 1 + len(free) + place)
+        if found is None or found.change >= 0.0 or abs(found.t) < SUSPICIOUS:
+            continue
+        half, shifts, early = (row.high - row.low) / 2.0, np.zeros(len(rows)), row.field == "action_delay"
+        shifts[free], shifts[index] = found.shifts, found.change
+        yield MissingTerm(
+            cause=EARLY if early else BELOW_MINIMUM,
+            parameter="" if early else row.name,
+            value=row.low + half * found.change,
+            standard_error=half * found.error,
+            unit=row.unit,
+            explained=found.explained,
+            t=found.t,
+            shifts=tests.by_name(shifts),
+        )
 
 
 def _chosen(tests: TermTests) -> list[int]:

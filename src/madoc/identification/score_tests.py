@@ -50,6 +50,13 @@ class Products:
         """Indices of the calibrated parameters' columns."""
         return list(range(1, 1 + self.count))
 
+    def with_parameters(self, kept: Sequence[int]) -> "Products":
+        """The same with only these of the parameters counted as such, the others behind them before all other terms."""
+        others = [index for index in range(self.count) if index not in kept]
+        first = [0, *(1 + index for index in (*kept, *others))]
+        order = [*first, *range(len(first), self.each.shape[1])]
+        return Products(self.each[:, order][:, :, order], len(kept))
+
     def bounded(self, columns: Sequence[int]) -> Float[np.ndarray, "windows columns columns"]:
         """The products, of which no window has more than `REACH` times the usual length of any of these columns."""
         lengths = np.sqrt(np.maximum(self.each[:, columns, columns], 0.0))

@@ -17,7 +17,8 @@ from madoc.simulation.velocities import unseen_positions
 from madoc.tasks import Task
 
 _PROBED = 64
-"""Number of logged actions taken from a reset where states are unknown: within seconds every parameter matters."""
+"""Number of logged actions simulated from a reset where states are unknown; after so many the robot moves, so that
+damping, friction and the like have an effect."""
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,8 @@ class MissingTerm:
         standard_error: Of the value.
         unit: Unit of the value.
         explained: Share of the squared residuals that it explains, those of initial states and parameters taken away.
-        t: Its change from the model over the standard error, as the normal deviate of the same probability.
+        t: The change divided by its standard error, converted from Student's t to the normal deviate of the same tail
+            probability.
         shifts: By how much each calibrated parameter would move if the term were included, in half-widths of its
             95 % interval.
     """

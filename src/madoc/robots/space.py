@@ -7,7 +7,7 @@ from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_slide
 from madoc.robots.signals import signal_unit
 from madoc.robots.spec import ParameterSpec
-from madoc.simulation.write import element_names
+from madoc.simulation.write import element_names, find_elements
 
 SLIDE_UNITS = {
     "dof_damping": "N·s/m",
@@ -27,15 +27,21 @@ def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
         _check_elements(draft, model, index)
         parameter = given.parameter(_unit_of(draft, model, index))
         for other, earlier in enumerate(parameters):
-            _check_distinct(draft, index, parameter, other, earlier)
+            _check_distinct(draft, model, index, parameter, other, earlier)
         parameters.append(parameter)
     return ParameterSpace(tuple(parameters))
 
 
-def _check_distinct(draft: Draft, index: int, parameter: Parameter, other: int, earlier: Parameter) -> None:
+def _check_distinct(
+    draft: Draft, model: mujoco.MjModel, index: int, parameter: Parameter, other: int, earlier: Parameter
+) -> None:
     """Refuse two parameters of one name or of one quantity, of which the one written last would win."""
     line = draft.document.line(("parameters", other))
     shared = set(earlier.elements) & set(parameter.elements)
+    if FIELDS[parameter.field].element == FIELDS[earlier.field].element == "body":  # which a joint's name may mean too
+        held = set(find_elements(model, earlier))
+        elements = zip(parameter.elements, find_elements(model, parameter), strict=True)
+        shared = {name for name, body in elements if body in held}
     whole_robot = FIELDS[earlier.field].element is None
     exclusive = ({"body_mass", "body_mass_and_inertia"}, {"body_inertia", "body_mass_and_inertia"})
     if parameter.name == earlier.name:

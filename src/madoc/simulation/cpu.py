@@ -41,6 +41,12 @@ class CpuSimulator:
         self.control_step = float(self._model.opt.timestep) * task.frame_skip
         if self._model.na or self._model.nmocap:
             raise MadocError(f"{task.name}: models with actuator activations or mocap bodies are not supported")
+        whole = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        if whole != 1 + self._model.nq + self._model.nv:  # time, positions, velocities
+            raise MadocError(
+                f"{task.name}: models whose actuators or sensors keep a history (delay, nsample), or plugins have "
+                "a state, are not supported; take it out, and calibrate action_delay instead"
+            )
         for parameter in task.parameters.parameters:
             _check_elements(self._model, task, parameter)
         self._actuators = [self._model.actuator(channel.actuator).id for channel in task.actions]
@@ -217,6 +223,8 @@ class CpuSystem:
         """States after the physics steps, NaN where they diverge, and what the sensors read in the first of them."""
         simulator, (_, rows, steps, _) = self._simulator, control.shape
         total = self.count * rows
+        if not total:
+            return state, np.zeros((*state.shape[:2], self.models[0].nsensordata))
         start = np.full((total, 1 + self._physical), _CLOCK)
         start[:, 1:] = state.reshape(total, -1)
         bad = ~np.isfinite(start).all(1)

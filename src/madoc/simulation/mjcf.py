@@ -211,7 +211,7 @@ def _write_rows(
         if attribute in _ANGLES and spec.compiler.degree and int(element.type) == int(mujoco.mjtJoint.mjJNT_HINGE):
             old, new = np.rad2deg(old).tolist(), np.rad2deg(new).tolist()
         if np.ndim(getattr(element, attribute)):
-            getattr(element, attribute)[: len(new)] = new
+            getattr(element, attribute)[: max(len(old), len(new))] = [*new, *[0.0] * (len(old) - len(new))]
         else:
             setattr(element, attribute, new[0])
         changes.append(Change(f"{kind} {element.name or element.id}", attribute, old, new))

@@ -21,7 +21,10 @@ RANGES = {
 
 
 def hopper(physics: str = "legacy") -> Task:
-    """The Hopper of D4RL and Gymnasium v5: 11 observations, 3 motors, 8 parameters."""
+    """The Hopper of D4RL and Gymnasium v5: 11 observations, 3 motors, 8 parameters.
+
+    Rewards are those of v5: D4RL's count one more in the step in which it falls.
+    """
     return walking_task(
         "hopper",
         "hopper.xml",

@@ -26,7 +26,10 @@ RANGES = {
 
 
 def walker2d(physics: str = "legacy") -> Task:
-    """The Walker2d of D4RL and Gymnasium v2 to v4: 17 observations, 6 motors, 14 parameters."""
+    """The Walker2d of D4RL and Gymnasium v2 to v4: 17 observations, 6 motors, 14 parameters.
+
+    Rewards are those of v5: the earlier ones count one more in the step in which it falls.
+    """
     return walking_task(
         "walker2d",
         "walker2d.xml",

@@ -15,7 +15,7 @@ from madoc.calibration.holdout import (
     Verdict,
     Word,
 )
-from madoc.identification.candidate_terms import EARLY, SATURATION, SPACING, TILTS
+from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, SATURATION, SPACING, TILTS
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
 from madoc.identification.information import OPEN
@@ -28,11 +28,12 @@ from madoc.verdict.statistics import NEGLIGIBLE
 
 REMEDIES = {
     EARLY: "log each action with what was seen just before it",
+    BELOW_MINIMUM: "look for what acts against it: a force, a gain or a sign that the model has wrong",
     SPACING: "check control_step of the spec against the log's time column",
     SATURATION: "narrow low and high of the spec's actions to what the drive follows, or log smaller actions",
     **dict.fromkeys(TILTS, "level it, or tilt the gravity of the model (its option gravity) as the base is"),
 }
-"""What to do about terms that no parameter of a spec adds."""
+"""What to do about terms that no further parameter of a spec adds."""
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
 
 WORDS: dict[Word, str] = {
@@ -173,7 +174,7 @@ def _value(term: MissingTerm) -> str:
 def _remedy(term: MissingTerm) -> str:
     """What to do about a missing term: the line of the spec that adds it, where there is one."""
     field, _, element = term.parameter.partition(".")
-    if not field:
+    if term.cause in REMEDIES:
         return REMEDIES[term.cause]
     high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
     low = 0.0 if term.value >= 0.0 else max(-high, FIELDS[field].minimum)

@@ -67,7 +67,7 @@ def replay_residuals(
 
 
 def mean_with_failures(costs: Float[np.ndarray, "candidates windows"]) -> Float[np.ndarray, " candidates"]:
-    """Mean cost of each candidate, where a failed simulation (NaN) costs 2 worst - best of all that did not fail.
+    """Mean cost of each candidate, where a failed simulation (NaN) costs twice the largest less the smallest cost.
 
     So no candidate can lower its cost by failing.
     """

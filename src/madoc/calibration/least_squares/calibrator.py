@@ -27,7 +27,7 @@ from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.statistics import alternation, consecutive_residuals
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import stride
-from madoc.identification.information import half_width, identifiability, sandwich
+from madoc.identification.information import identifiability, quantile, sandwich
 from madoc.identification.losses import Loss
 from madoc.identification.noise import difference_noise
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
@@ -165,7 +165,8 @@ class LeastSquares:
         half = (space.high - space.low) / 2.0
         mean = space.to_physical(point)
         covariance = half[:, None] * uncertainty.covariance * half
-        width = half * half_width(uncertainty.covariance, windows)
+        errors = quantile(windows, len(space))
+        width = half * errors * np.sqrt(np.diag(uncertainty.covariance))
         interval = np.clip(np.stack([mean - width, mean + width], axis=-1), space.low[:, None], space.high[:, None])
         searches = (*(() if state.known is None else (state.known,)), *state.unknown)
         return Estimate(
@@ -181,6 +182,7 @@ class LeastSquares:
             ),
             covariance=covariance,
             interval=interval,
+            quantile=errors,
             settled=settled,
         )
 

@@ -72,6 +72,9 @@ class KnownStarts:
     def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
         """Rows at which windows can begin that do not overlap: intervals assume that windows are independent.
 
+        Single steps may be neighbours, which share a reading. Where that is noisy, their residuals alternate, and the
+        search goes on to unknown initial states.
+
         Raises:
             MadocError: No state can be rebuilt, no episode is long enough, or there are fewer values than parameters.
         """

@@ -13,7 +13,7 @@ from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, va
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
 from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend, moving_average, scan_updates
-from madoc.types import Count, Layers, NotNegative, check_hyperparameters
+from madoc.types import Count, Layers, NotNegative, Positive, check_hyperparameters
 
 AT_BOUND = 0.95
 """Share of the reward's bound above which a reward counts as saturated."""
@@ -92,7 +92,7 @@ class AgentSettings:
     actor_rate: NotNegative = 3e-3
     judge_rate: NotNegative = 0.01
     entropy_weight: NotNegative = 0.05
-    prior_time: NotNegative = 2e5
+    prior_time: Positive = 2e5
     prior_largest: NotNegative = 10.0
     prior_rate: NotNegative = 0.1
     prior_every: Count = 10

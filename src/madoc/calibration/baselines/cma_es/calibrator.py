@@ -83,7 +83,7 @@ class CmaEs:
 
     Attributes:
         objective: `one-step`: the mean squared error of next observations, each channel in units of its typical
-            change. `distribution`: the maximum mean discrepancy of clouds of observations; see `starts`.
+            change. `distribution`: the distance of clouds of observations in `mean_embedding`; see `starts`.
         starts: Rollouts of `distribution`; None takes `logged` where states are exact, else `policy`.
             `logged`: one control step from logged states under their actions; the cloud of next observations is to
             differ from that of observations as it does in the log, whichever belong together. `policy`: a clone acts

@@ -1,7 +1,7 @@
 """Distances between clouds of rows whose order and pairing are unknown: means of random cosine features.
 
-The distance between two means is the maximum mean discrepancy (Gretton et al. 2012) under Gaussian kernels, by random
-Fourier features (Rahimi and Recht 2007).
+The distance between two means is a kernel Hotelling statistic (Harchaoui, Bach and Moulines 2008): that of Mahalanobis,
+with a ridge, of the means of random Fourier features of Gaussian kernels (Rahimi and Recht 2007).
 """
 
 from dataclasses import dataclass

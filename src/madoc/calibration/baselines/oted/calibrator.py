@@ -32,7 +32,7 @@ from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
 from madoc.learning.features import HIDDEN_WINDOW, last_rows, unbroken, windows_ending
 from madoc.learning.networks import Network, adam, moving_average
 from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll, unbiased_starts
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Positive, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -86,13 +86,13 @@ class Oted:
     batch: Count = 256
     mean_rate: NotNegative = 0.3
     std_rate: NotNegative = 0.1
-    first_std: NotNegative = 0.6
-    smallest_std: float = 0.02
+    first_std: Positive = 0.6
+    smallest_std: Positive = 0.02
     average_rate: NotNegative = 0.03
     hidden: Layers = (128, 128)
     cloning_epochs: CountOrZero = 40
     cloning_updates: Count = 200
-    learning_rate: float = 1e-3
+    learning_rate: NotNegative = 1e-3
     replay_capacity: Count = 20_000
 
     def __post_init__(self) -> None:
