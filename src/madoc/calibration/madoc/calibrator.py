@@ -62,6 +62,7 @@ PAPER: dict[str, object] = {
         critic_rate=3e-4,
         actor_rate=3e-4,
         prior_rate=1e-3,
+        average_rate=1.0,
         reward_size=0.0,
     ),
 }
