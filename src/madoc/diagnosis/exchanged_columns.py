@@ -165,9 +165,7 @@ def _corrected_actions(
     action: Float[np.ndarray, "rows action"], simulator: Simulator, correction: _Correction
 ) -> Float[np.ndarray, "rows action"]:
     """Actions with their columns corrected in the units of the spec, not in [-1, 1] of each column's range."""
-    channels = simulator.task.actions
-    middle = np.array([(row.high + row.low) / 2.0 for row in channels] or 0.0)
-    half = np.array([(row.high - row.low) / 2.0 for row in channels] or 1.0)
+    middle, half = simulator.task.action_ranges
     return ((action * half + middle)[:, correction.order] * correction.sign - middle) / half
 
 

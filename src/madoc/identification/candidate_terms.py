@@ -213,9 +213,7 @@ def _cut_off(
     actions: Float[np.ndarray, "windows steps action"], simulator: Simulator
 ) -> Float[np.ndarray, "windows steps action"]:
     """Actions of a drive that saturates: in the spec's units none is farther from 0 than a share of the largest."""
-    channels = simulator.task.actions
-    middle = np.array([(row.high + row.low) / 2.0 for row in channels] or 0.0)
-    half = np.array([(row.high - row.low) / 2.0 for row in channels] or 1.0)
+    middle, half = simulator.task.action_ranges
     asked = actions * half + middle
     most = (1.0 - _SATURATED) * np.abs(asked).max((0, 1))
     return (np.clip(asked, -most, most) - middle) / half

@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 import jax
 import mujoco
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.parameters import ParameterSpace
@@ -150,6 +150,14 @@ class Task:
     def action_size(self) -> int:
         """Values per action."""
         return len(self.actions) or int(self.model.nu)
+
+    @property
+    def action_ranges(self) -> tuple[Float[np.ndarray, " action"], Float[np.ndarray, " action"]]:
+        """Middle and half of each action's range in the unit of its channel; 0 and 1 without channels."""
+        low, high = (np.array([getattr(channel, end) for channel in self.actions]) for end in ("low", "high"))
+        if not self.actions:
+            return np.zeros(self.action_size), np.ones(self.action_size)
+        return (high + low) / 2.0, (high - low) / 2.0
 
     @property
     def model(self) -> mujoco.MjModel:

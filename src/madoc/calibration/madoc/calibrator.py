@@ -189,11 +189,8 @@ class Madoc:
         Raises:
             MadocError: Rows are to start at logged states, but those cannot be rebuilt.
         """
-        count, groups, collection = (
-            len(problem.simulator.parameters),
-            self._group_count(problem),
-            self.collection(problem),
-        )
+        count, groups = len(problem.simulator.parameters), self._group_count(problem)
+        collection = self.collection(problem)
         window, following = collection.scaling.sizes
         of_policy, of_vae, of_agents, of_start, key = jax.random.split(key, 5)
         vae = GroupingVAE(count, window, following, self.hidden, key=of_vae)
@@ -271,10 +268,8 @@ class Madoc:
         count = len(problem.simulator.parameters)
         if self.groups in ("one", "each"):
             return 1 if self.groups == "one" else count
-        of_physics = self.groups == "physics"
-        return min(
-            count, self.group_count or (effects.most_groups(count) if of_physics else problem.simulator.task.groups)
-        )
+        most = effects.most_groups(count) if self.groups == "physics" else problem.simulator.task.groups
+        return min(count, self.group_count or most)
 
     @property
     def _voting(self) -> int:
@@ -358,14 +353,8 @@ class Madoc:
             grouped=grouped,
             failures=state.failures + rollout.failures,
         )
-        steps = rollout.valid.size
-        return following, Epoch(
-            {"grouping_loss": float(np.mean(losses))},
-            control_steps=steps,
-            unbudgeted=steps,
-            stage="grouping",
-            fraction=1.0,
-        )
+        steps, metrics = rollout.valid.size, {"grouping_loss": float(np.mean(losses))}
+        return following, Epoch(metrics, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=1.0)
 
     def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
