@@ -82,6 +82,7 @@ def _calibrate_by(
         if prepared.holdout is None or result.status not in ENDED:
             return result, None
         with bar("judging the estimate on the rows held out", total=1, unit="verdicts", quiet=quiet) as advance:
+            advance(0)  # shown while it is under way, as it may take a minute
             assessment = assess(result, prepared.bench)
             advance(1)
         result = assessment.result
