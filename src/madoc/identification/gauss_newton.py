@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import lsq_linear
 
 from madoc.identification.linearisation import Linearisation, WindowSlopes, difference_points, linearise
 from madoc.identification.losses import Loss, loss_slope, scale_of
@@ -53,6 +52,8 @@ def damped_step(
 
     D is the length of each column of R, Marquardt's scaling, with a floor for columns that are nearly 0.
     """
+    from scipy.optimize import lsq_linear  # 35 MB, and a listing of a suite does not need it
+
     lengths = np.linalg.norm(factor, axis=0)
     lengths = np.maximum(lengths, 1e-6 * max(float(lengths.max()), 1e-12))
     rows = np.concatenate([factor, np.diag(np.sqrt(damping) * lengths)])

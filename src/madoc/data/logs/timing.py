@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import linregress
 
 from madoc.data.findings import Finding
 from madoc.data.logs.tables import Table
@@ -112,6 +111,8 @@ def rate_findings(series: Series, control_step: float) -> list[Finding]:
     Raises:
         MadocError: Rows are on average so far from a control step apart that every estimate would be wrong.
     """
+    from scipy.stats import linregress  # slow to import, and a suite's plan only looks for logs
+
     steps = np.diff(series.time)
     kept = np.flatnonzero(steps < _SKIPPED * np.median(steps))
     if len(kept) < 10:
