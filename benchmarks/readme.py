@@ -36,20 +36,21 @@ def rewritten(text: str, calibrations: Sequence[dict], policies: Sequence[dict])
 
 
 def errors(rows: Sequence[dict]) -> str:
-    """Median error of Madoc on clean medium data with 300 000 control steps, by its groups and where rollouts start."""
+    """Median error of Madoc on clean medium data with 300 000 control steps, by its agents, starts and features."""
     cells = defaultdict[tuple[str, str, str], list[float]](list)
     for row in rows:
         if (row["quality"], row["data"], row["budget"]) == ("medium", "clean", 300_000) and "error" in row:
             cells[row["robot"], row["method"], row["starts"]].append(row["error"]["mean_absolute"])
     columns = {
-        "`madoc`": ("madoc-physics", "policy"),
-        "`madoc`, groups by a VAE": ("madoc", "policy"),
+        "`madoc`": ("madoc", "policy"),
         "`madoc-s`, one group": ("madoc-s", "policy"),
-        "`madoc-local`, groups by a VAE": ("madoc", "logged"),
+        "`madoc-local`": ("madoc-local", "logged"),
+        "`madoc` on changes, groups by a VAE": ("madoc-vae-changes", "policy"),
     }
     lines = [f"| robot | {' | '.join(columns)} | paper |", "|---" * (len(columns) + 2) + "|"]
     for robot, name in NAMES.items():
-        ours = " | ".join(f"{np.median(cells[robot, *column]):.3f}" for column in columns.values())
+        medians = ([float(np.median(found))] if (found := cells[robot, *column]) else [] for column in columns.values())
+        ours = " | ".join(f"{median[0]:.3f}" if median else "not run" for median in medians)
         printed = paper.printed("table-10", f"{robot}-medium", "madoc")
         assert printed is not None
         lines.append(f"| {name} | {ours} | {printed[0]:.2f} |")

@@ -158,3 +158,13 @@ def test_a_critic_learns_what_its_parameters_earn():
     assert loss_of(made) < 0.005
     credit = np.asarray(made.values(drawn, MEMBERS))[:, 2]
     assert np.corrcoef(credit, drawn[:, 3])[0, 1] < -0.99
+
+
+def test_a_baseline_takes_what_it_says_of_each_row_and_the_papers_takes_nothing():
+    pair = jax.random.normal(jax.random.key(2), (2, 5))
+    assert critics().baseline is None
+    np.testing.assert_array_equal(critics().less_baseline(REWARD, pair), REWARD)
+    made = GroupCritics(3, 4, (16, 16), window=5, key=jax.random.key(0))
+    constant = eqx.tree_at(lambda made: made.baseline.layers[-1].weight, made, jnp.zeros((1, 16)))
+    constant = eqx.tree_at(lambda made: made.baseline.layers[-1].bias, constant, jnp.array([0.5]))
+    np.testing.assert_allclose(constant.less_baseline(REWARD, pair), [1.5, -0.5])

@@ -9,7 +9,8 @@ from madoc.calibration.baselines.dropo.calibrator import ENTROPY_WEIGHT, Dropo
 from madoc.calibration.baselines.oted.calibrator import Oted
 from madoc.calibration.baselines.uncalibrated import Uncalibrated
 from madoc.calibration.least_squares.calibrator import LeastSquares
-from madoc.calibration.madoc.calibrator import PAPER, Madoc
+from madoc.calibration.madoc.calibrator import Madoc
+from madoc.calibration.madoc.paper import PAPER
 from madoc.types import MethodEntry
 
 _SHOWN: dict[type, tuple[str, ...]] = {

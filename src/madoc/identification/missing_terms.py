@@ -193,12 +193,13 @@ def _chosen(tests: TermTests) -> list[int]:
 def _rivals(tests: TermTests, chosen: list[int]) -> Iterator[list[int]]:
     """The chosen candidates with one of them replaced by another that cannot be excluded in its place.
 
-    Twice the difference of two terms' logarithms of the likelihood is about that of their t².
+    Twice the difference of two terms' logarithms of the likelihood is about that of their t². A rival need not be
+    significant by itself, as something is missing; but the t² of a term that is not missing is 1 on average.
     """
     for place in range(len(chosen)):
         rest = [*chosen[:place], *chosen[place + 1 :]]
         significance = _significance(tests, rest)
-        least = max(SUSPICIOUS**2, significance.get(chosen[place], 0.0) ** 2 - SUSPICIOUS**2)
+        least = max(1.0, significance.get(chosen[place], 0.0) ** 2 - SUSPICIOUS**2)
         for index, t in significance.items():
             if index not in chosen and t**2 >= least:
                 yield [index, *rest]

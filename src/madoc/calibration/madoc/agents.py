@@ -17,9 +17,30 @@ from madoc.types import Count, Layers, NotNegative, Positive, check_hyperparamet
 
 AT_BOUND = 0.95
 """Share of the reward's bound above which a reward counts as saturated."""
-BLUR_RANGE = (0.01, 0.3)
-"""Range of the blur, in standard deviations of a step's change. It begins at the upper end. Below the lower end the
-networks cannot resolve differences in s'."""
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Constants that follow from how discriminators see s'.
+
+    Attributes:
+        blur: The first blur, in units of the features of s'.
+        smallest: Lower limit of the blur, below which networks cannot resolve differences in s'.
+        largest: Upper limit of the blur.
+        entropy_weight: α of Eq. (13). The entropy holds a parameter of small effect at the middle of its range where
+            the reward is too blunt to move it; where the reward is sharp, less of it will do.
+    """
+
+    blur: float
+    smallest: float
+    largest: float
+    entropy_weight: float
+
+
+OF_CHANGES = Resolution(blur=0.3, smallest=0.01, largest=0.3, entropy_weight=0.05)
+"""Where s' is described by its change or as it is; the entropy's weight is the paper's."""
+OF_INNOVATIONS = Resolution(blur=0.5, smallest=0.01, largest=3.0, entropy_weight=0.01)
+"""Where s' is described by its innovation, whose scale is the spread that the actors leave."""
 
 
 @jax.tree_util.register_dataclass
@@ -69,12 +90,13 @@ class AgentSettings:
         actor_rate: Adam's learning rate of the actors.
         judge_rate: Rate of the judges' moving average; with 1 the discriminators themselves give the reward, as in the
             paper.
-        entropy_weight: α of Eq. (13).
+        entropy_weight: α of Eq. (13); None takes that of the `Resolution`.
         prior_time: Number of updates in which λ of Eq. (13) grows by the factor e.
         prior_largest: Largest λ of Eq. (13).
         prior_rate: Rate of the prior's moving average.
         prior_every: Updates between two moves of the prior.
         average_rate: Rate of the moving average from which the estimate is read.
+        baseline: Whether b of Eq. (11) depends on (s, a); in the paper it does not.
         reward_size: Mean |reward| to which the blur is steered; 0 for no blur, as in the paper.
         blur_rate: Change of the logarithm of the blur in an update, for an error of the mean |reward| of 1.
     """
@@ -91,24 +113,35 @@ class AgentSettings:
     critic_rate: NotNegative = 1e-3
     actor_rate: NotNegative = 3e-3
     judge_rate: NotNegative = 0.01
-    entropy_weight: NotNegative = 0.05
+    entropy_weight: NotNegative | None = None
     prior_time: Positive = 2e5
     prior_largest: NotNegative = 10.0
     prior_rate: NotNegative = 0.1
     prior_every: Count = 10
     average_rate: NotNegative = 1e-3
+    baseline: bool = True
     reward_size: NotNegative = 1.0
     blur_rate: NotNegative = 3e-3
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
 
-    def init(self, *, window: int, observation: int, parameters: int, groups: int, key: PRNGKeyArray) -> Agents:
+    def init(
+        self,
+        *,
+        window: int,
+        observation: int,
+        parameters: int,
+        groups: int,
+        resolution: Resolution = OF_CHANGES,
+        key: PRNGKeyArray,
+    ) -> Agents:
         """Fresh networks; actors and prior at N(0, 1). `window` is the number of features in the place of (s, a)."""
         of_discriminators, of_critics = jax.random.split(key)
         bounds = {"bound": self.bound, "pair_bound": self.pair_bound, "dropout": self.dropout}
         discriminators = Discriminators(observation, window - observation, self.hidden, key=of_discriminators, **bounds)
-        critics = GroupCritics(groups, parameters, self.critic_hidden, key=of_critics)
+        size = window if self.baseline else 0
+        critics = GroupCritics(groups, parameters, self.critic_hidden, window=size, key=of_critics)
         actors = initial_actors(parameters)
         return Agents(
             discriminators=discriminators,
@@ -117,7 +150,7 @@ class AgentSettings:
             actors=actors,
             prior=initial_actors(parameters),
             average=initial_actors(parameters),
-            log_blur=jnp.full((), np.log(BLUR_RANGE[1]), jnp.float32),
+            log_blur=jnp.full((), np.log(resolution.blur), jnp.float32),
             updates=jnp.zeros((), jnp.int32),
             discriminator_optimiser=adam(self.discriminator_rate).init(eqx.filter(discriminators, eqx.is_array)),
             critic_optimiser=adam(self.critic_rate).init(eqx.filter(critics, eqx.is_array)),
@@ -134,6 +167,7 @@ class AgentSettings:
         key: PRNGKeyArray,
         *,
         mixing: Mixing,
+        resolution: Resolution,
         count: int,
     ) -> tuple[Agents, dict[str, Array]]:
         """`count` updates, Algorithm 1, lines 13 to 19, and the mean of each metric.
@@ -154,9 +188,9 @@ class AgentSettings:
             reward = log_dynamics_ratio(agents.judges, drawn["pair"], drawn["following"])
             common = overlap(agents.judges, drawn["pair"])
             share = common / common.mean() if self.weigh_overlap else jnp.ones_like(reward)
-            agents, reward_metrics = self._steer_blur(agents, reward, share)
-            agents, value_metrics = self._update_critics(agents, drawn["parameters"], reward, share, members, mixing)
-            agents, actor_metrics = self._update_actors(agents, members, of_actors)
+            agents, reward_metrics = self._steer_blur(agents, reward, share, resolution)
+            agents, value_metrics = self._update_critics(agents, drawn, reward, share, members, mixing)
+            agents, actor_metrics = self._update_actors(agents, members, resolution, of_actors)
             return agents, metrics | reward_metrics | value_metrics | actor_metrics | {"overlap": common.mean()}
 
         return scan_updates(update, agents, key, count)
@@ -173,11 +207,14 @@ class AgentSettings:
         judges = moving_average(agents.judges, discriminators, self.judge_rate)
         return replace(agents, discriminators=discriminators, judges=judges, discriminator_optimiser=optimiser), metrics
 
-    def _steer_blur(self, agents: Agents, reward: PerRow, share: PerRow) -> tuple[Agents, dict[str, Array]]:
+    def _steer_blur(
+        self, agents: Agents, reward: PerRow, share: PerRow, resolution: Resolution
+    ) -> tuple[Agents, dict[str, Array]]:
         """Widen the blur where the mean |reward| is above `reward_size`, and narrow it where it is below."""
         size = (share * jnp.abs(reward)).mean()
         surplus = jnp.clip(size - self.reward_size, -1.0, 1.0)
-        log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *np.log(BLUR_RANGE))
+        limits = np.log([resolution.smallest, resolution.largest])
+        log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *limits)
         metrics = {
             "reward": (share * reward).mean(),
             "reward_size": size,
@@ -187,17 +224,27 @@ class AgentSettings:
         return replace(agents, log_blur=log_blur), metrics
 
     def _update_critics(
-        self, agents: Agents, parameters: Array, reward: Array, share: Array, members: Array, mixing: Mixing
+        self,
+        agents: Agents,
+        rows: dict[str, Array],
+        reward: PerRow,
+        share: PerRow,
+        members: Bool[Array, "groups d"],
+        mixing: Mixing,
     ) -> tuple[Agents, dict[str, Array]]:
         def loss_of(critics: GroupCritics) -> Array:
-            values = critics.values(parameters, members)
-            return value_loss(values, critics.weight, critics.bias, reward, share, mixing)
+            values = critics.values(rows["parameters"], members)
+            left = critics.less_baseline(reward, rows["pair"])
+            return value_loss(values, critics.weight, critics.bias, left, share, mixing)
 
         loss, gradients = eqx.filter_value_and_grad(loss_of)(agents.critics)
         critics, optimiser = descend(adam(self.critic_rate), gradients, agents.critic_optimiser, agents.critics)
         return replace(agents, critics=critics, critic_optimiser=optimiser), {"value_loss": loss}
 
-    def _update_actors(self, agents: Agents, members: Array, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
+    def _update_actors(
+        self, agents: Agents, members: Array, resolution: Resolution, key: PRNGKeyArray
+    ) -> tuple[Agents, dict[str, Array]]:
+        entropy_weight = resolution.entropy_weight if self.entropy_weight is None else self.entropy_weight
         weight = prior_weight(agents.updates, time_constant=self.prior_time, largest=self.prior_largest)
 
         def loss_of(actors: Actors) -> Array:
@@ -206,7 +253,7 @@ class AgentSettings:
                 agents.critics.values(draws, members).sum(-1),
                 density,
                 divergence(actors, agents.prior).sum(),
-                entropy_weight=self.entropy_weight,
+                entropy_weight=entropy_weight,
                 prior_weight=weight,
             )
 

@@ -10,24 +10,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.madoc import effects, grouping, watch
-from madoc.calibration.madoc.actors import draw_parameters
-from madoc.calibration.madoc.agents import BLUR_RANGE, Agents, AgentSettings
+from madoc.calibration.madoc import effects, grouping, innovations, watch
+from madoc.calibration.madoc.actors import Actors, draw_parameters
+from madoc.calibration.madoc.agents import OF_CHANGES, OF_INNOVATIONS, AgentSettings, Resolution
 from madoc.calibration.madoc.collection import GEOMETRY, Collection, Features, StartMode
 from madoc.calibration.madoc.grouping import GroupingVAE
+from madoc.calibration.madoc.innovations import Reference
+from madoc.calibration.madoc.paper import PAPER
+from madoc.calibration.madoc.state import MadocState
 from madoc.calibration.madoc.value_decomposition import Mixing
-from madoc.calibration.madoc.watch import Watch
 from madoc.calibration.sensing import SensorNoise, noise_deviation
 from madoc.errors import MadocError
 from madoc.identification.states import probing_windows
 from madoc.learning import replay
-from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
+from madoc.learning.cloning import continue_cloning, fresh_clone
 from madoc.learning.features import HIDDEN_WINDOW
 from madoc.learning.networks import adam, scalars
-from madoc.simulation.rollout import Walkers, out_of_step
+from madoc.simulation.rollout import out_of_step
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 Grouping = Literal["physics", "learned", "one", "each"]
@@ -37,75 +39,6 @@ VOTES = 10
 """Number of votes in each of these epochs: the authors take about 9, at random, in 1000 updates."""
 STATES = 100
 """Logged states in an epoch of grouping by physics."""
-PAPER: dict[str, object] = {
-    "groups": "learned",
-    "features": "raw",
-    "hidden": (256, 256),
-    "cloning_epochs": 100,
-    "cloning_updates": 1000,
-    "keep_cloning": True,
-    "grouping_epochs": 200,
-    "grouping_updates": 1000,
-    "updates": 1000,
-    "draws": 10,
-    "horizon": 100,
-    "learning_rate": 3e-4,
-    "replay_capacity": 1_000_000,
-    "patience": 0,
-    "agents": AgentSettings(
-        hidden=(256, 256),
-        pair_bound=2.0,
-        weigh_overlap=False,
-        judge_rate=1.0,
-        dropout=0.2,
-        actor_batch=256,
-        critic_rate=3e-4,
-        actor_rate=3e-4,
-        prior_rate=1e-3,
-        average_rate=1.0,
-        reward_size=0.0,
-    ),
-}
-"""Hyperparameters of the paper (appendix C, and the authors' code) that differ from the defaults."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class MadocState:
-    """Everything Madoc carries.
-
-    Attributes:
-        clone: The running policy.
-        vae: The network that embeds parameters by their effect.
-        vae_optimiser: State of its optimiser.
-        schemes: Groups proposed in the last epochs of grouping by the VAE.
-        moments: What the parameters' effects have in common, in each epoch of grouping by physics.
-        labels: Group of each parameter.
-        stability: Mean adjusted Rand index of the groups with those of resampled states, or with those proposed in
-            other epochs; 0 before there are groups.
-        agents: Discriminators, critics and actors.
-        rows: Buffer of simulated rows.
-        walkers: Simulated rows that go on in the next epoch.
-        watch: Running averages, and the best estimate so far.
-        key: The random key.
-        grouped: Number of epochs of grouping so far.
-        failures: Number of simulated rows that exploded.
-    """
-
-    clone: Clone
-    vae: GroupingVAE
-    vae_optimiser: PyTree
-    schemes: Int[np.ndarray, "votes d"]
-    moments: Float[np.ndarray, "blocks d d"]
-    labels: Int[np.ndarray, " d"]
-    stability: float
-    agents: Agents
-    rows: replay.Replay
-    walkers: Walkers
-    watch: Watch
-    key: PRNGKeyArray
-    grouped: int
-    failures: int
 
 
 @dataclass(frozen=True)
@@ -124,7 +57,9 @@ class Madoc:
             state, as in the paper, else 3.
         sensor_noise: Noise put on simulated observations, as a share of a step's typical change. None takes the share
             that the data declares, `estimated` estimates the noise from the data.
-        features: `standardised` (s, a) and s' - s, or `raw` (s, a) and s' as in the paper.
+        features: How discriminators see s': `innovations` (what it differs by from the simulator's prediction at the
+            current estimate), `standardised` (s' - s) or `raw` (s' and (s, a) as they are, as in the paper). None takes
+            innovations where an observation determines the state, else `standardised`.
         hidden: Units per layer of clone and VAE.
         cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
         cloning_updates: Updates in each epoch of cloning.
@@ -149,7 +84,7 @@ class Madoc:
     starts: StartMode | None = "policy"
     window: Count | None = None
     sensor_noise: SensorNoise = None
-    features: Features = "standardised"
+    features: Features | Literal["innovations"] | None = None
     hidden: Layers = (128, 128)
     cloning_epochs: CountOrZero = 40
     cloning_updates: Count = 200
@@ -187,14 +122,24 @@ class Madoc:
         """Fresh networks, empty buffers, rows at their starts.
 
         Raises:
-            MadocError: Rows are to start at logged states, but those cannot be rebuilt.
+            MadocError: Rows are to start at logged states, or discriminators to see innovations, but the log's states
+                cannot be rebuilt.
         """
         count, groups = len(problem.simulator.parameters), self._group_count(problem)
         collection = self.collection(problem)
         window, following = collection.scaling.sizes
         of_policy, of_vae, of_agents, of_start, key = jax.random.split(key, 5)
         vae = GroupingVAE(count, window, following, self.hidden, key=of_vae)
-        agents = self.agents.init(window=window, observation=following, parameters=count, groups=groups, key=of_agents)
+        seen = self._sees_innovations(problem, collection)
+        reference = innovations.no_reference(problem, collection.scaling.scaling) if seen else None
+        agents = self.agents.init(
+            window=window,
+            observation=following,
+            parameters=count,
+            groups=groups,
+            resolution=_resolution(reference),
+            key=of_agents,
+        )
         logged, time_limit = problem.dataset.transitions, problem.simulator.task.max_episode_steps
         return MadocState(
             clone=fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy),
@@ -207,6 +152,7 @@ class Madoc:
             agents=agents,
             rows=collection.empty_rows(self.replay_capacity),
             walkers=out_of_step(collection.begin(collection.systems, of_start), time_limit),
+            reference=reference,
             watch=watch.begin_watch(agents.average),
             key=key,
             grouped=0,
@@ -251,7 +197,8 @@ class Madoc:
         one_row = problem.states.kind == "exact" or mode == "replay"
         window = self.window or (1 if one_row else HIDDEN_WINDOW)
         systems, horizon = GEOMETRY[mode]
-        scaling, logged = problem.features.windows(self.features, window)
+        kind: Features = "raw" if self.features == "raw" else "standardised"
+        scaling, logged = problem.features.windows(kind, window)
         return Collection(
             problem,
             mode,
@@ -262,6 +209,14 @@ class Madoc:
             logged=logged,
             noise=noise_deviation(problem, self.sensor_noise),
         )
+
+    def _sees_innovations(self, problem: CalibrationProblem, collection: Collection) -> bool:
+        if self.features not in (None, "innovations"):
+            return False
+        reason = innovations.obstacle(problem, collection.scaling.length)
+        if reason and self.features:
+            raise MadocError(f"features=innovations cannot be had here: {reason}; leave features= out")
+        return not reason
 
     def _group_count(self, problem: CalibrationProblem) -> int:
         """Number of groups, or the most that can be chosen by physics."""
@@ -357,36 +312,55 @@ class Madoc:
         return following, Epoch(metrics, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=1.0)
 
     def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
-        of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
+        of_draws, of_start, of_action, of_restart, of_reference, of_updates, key = jax.random.split(state.key, 7)
         collection = self.collection(problem)
         systems, fresh = collection.systems, collection.mode == "logged"
         draws = np.asarray(draw_parameters(state.agents.actors, of_draws, systems)[0], dtype=np.float64)
         walkers = collection.begin(systems, of_start) if fresh else state.walkers
         rollout, walkers = collection.roll(state.clone.policy, draws, walkers, (of_action, of_restart))
-        rows = collection.remember(state.rows, rollout, draws, np.zeros(systems, np.int64))
+        reference, rows, logged, described = state.reference, state.rows, collection.logged, None
+        steps = rollout.valid.size
+        if reference is not None:
+            due = state.watch.epochs % innovations.RENEWAL == 0
+            parameters = _middle(problem, state.agents.actors) if due else reference.parameters
+            seen = innovations.innovations(problem.simulator, parameters, rollout.transitions)
+            steps += rollout.valid.size
+            if due:
+                reference = innovations.renewed(problem, collection.scaling.scaling, parameters, seen, of_reference)
+                rows, steps = replay.clear(rows), steps + len(reference.pair)
+            described, logged = reference.features(seen), (reference.pair, reference.following)
+        rows = collection.remember(rows, rollout, draws, np.zeros(systems, np.int64), described)
         if not int(rows.written):
             raise MadocError(
-                f"madoc: every row simulated so far diverged or ended within {collection.scaling.length} steps, so "
+                f"madoc: every simulated row diverged or ended within {collection.scaling.length} steps, so "
                 "there is nothing to compare with the log; narrow the ranges of the parameters"
             )
+        resolution = _resolution(reference)
         agents, device_metrics = self.agents.update(
             state.agents,
             rows,
-            collection.logged,
+            logged,
             jnp.asarray(grouping.members(state.labels, self._group_count(problem))),
             of_updates,
             mixing=self.mixing,
+            resolution=resolution,
             count=self.updates,
         )
         metrics = scalars(device_metrics)
         watched = watch.observe(
-            state.watch, metrics, agents.average, steered_to=self.agents.reward_size, blur_range=BLUR_RANGE
+            state.watch,
+            metrics,
+            agents.average,
+            steered_to=self.agents.reward_size,
+            blur_range=(resolution.smallest, resolution.largest),
+            unit=1.0 if reference is None else reference.size(problem.typical_change),
         )
         following = replace(
             state,
             agents=agents,
             rows=rows,
             walkers=state.walkers if fresh else walkers,
+            reference=reference,
             watch=watched,
             key=key,
             failures=state.failures + rollout.failures,
@@ -396,4 +370,14 @@ class Madoc:
             following, cloning = self._clone(problem, following)
             metrics |= cloning.metrics
         stalled = watch.stalled(watched, self.patience) if self.patience else None
-        return following, Epoch(metrics, control_steps=rollout.valid.size, converged=stalled)
+        return following, Epoch(metrics, control_steps=steps, converged=stalled)
+
+
+def _middle(problem: CalibrationProblem, actors: Actors) -> Float[np.ndarray, " d"]:
+    """The actors' deterministic output in physical units."""
+    return problem.simulator.parameters.to_physical(np.tanh(np.asarray(actors.mean, np.float64)))
+
+
+def _resolution(reference: Reference | None) -> Resolution:
+    """The agents' constants, by whether discriminators see innovations."""
+    return OF_CHANGES if reference is None else OF_INNOVATIONS

@@ -26,6 +26,7 @@ from madoc.types import Policy
 
 StartMode = Literal["policy", "logged", "replay"]
 Features = Literal["standardised", "raw"]
+"""How discriminators see a row: (s, a) standardised and s' - s, or (s, a) and s' as they are."""
 GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
 """Number of parameter draws in an epoch, and of control steps that each row is simulated under one draw, by mode."""
 
@@ -119,11 +120,17 @@ class Collection:
         rollout: Rollout,
         draws: Float[np.ndarray, "systems d"],
         identity: Int[np.ndarray, " systems"],
+        following: Float[np.ndarray, "windows systems rows observation"] | None = None,
     ) -> replay.Replay:
-        """Add the windows of a rollout to the buffer, with the draw and the varied parameter of their system."""
+        """Add the windows of a rollout to the buffer, with the draw and the varied parameter of their system.
+
+        Features of s' may be given; windows for which they are NaN are left out.
+        """
         seen, length = rollout.transitions, self.scaling.length
-        window, following = self.scaling.features(windows_ending(seen, np.arange(length - 1, len(seen)), length))
+        window, described = self.scaling.features(windows_ending(seen, np.arange(length - 1, len(seen)), length))
+        following = described if following is None else following
         whole = unbroken(rollout.valid, np.asarray(seen.terminated) | np.asarray(seen.truncated), length)
+        whole &= np.isfinite(following).all(-1)
         columns = {
             "pair": window,
             "following": following,

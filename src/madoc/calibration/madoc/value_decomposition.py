@@ -3,6 +3,7 @@
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
@@ -18,16 +19,24 @@ class GroupCritics(eqx.Module):
         networks: A stack of networks over groups.
         weight: k of Eq. (11), which starts at 1.
         bias: b of Eq. (11), which starts at 0.
+        baseline: b(s, a) in its place, a network of the features of (s, a); None for the paper's b. How well
+            discriminators judge a row differs from state to state far more than from draw to draw, and what b takes of
+            it is no noise on the values of draws (DOP: Wang et al. 2021, where b depends on the state too).
     """
 
     networks: Network
     weight: Float[Array, " groups"]
     bias: Scalar
+    baseline: Network | None
 
-    def __init__(self, groups: int, parameters: int, hidden: tuple[int, ...], *, key: PRNGKeyArray) -> None:
+    def __init__(
+        self, groups: int, parameters: int, hidden: tuple[int, ...], *, window: int = 0, key: PRNGKeyArray
+    ) -> None:
+        """Fresh critics; with a `window`, the number of features of (s, a), b depends on those."""
         self.networks = stack(groups, lambda key: Network(parameters, 1, hidden, key=key), key)
         self.weight = jnp.ones(groups)
         self.bias = jnp.zeros(())
+        self.baseline = Network(window, 1, hidden, key=jax.random.fold_in(key, groups)) if window else None
 
     def values(
         self, parameters: Float[Array, "rows d"], members: Bool[Array, "groups d"]
@@ -36,6 +45,10 @@ class GroupCritics(eqx.Module):
         own = jnp.where(members[:, None], parameters[None], 0.0)
         values = eqx.filter_vmap(lambda network, rows: network(rows)[:, 0])(self.networks, own).T
         return jnp.where(members.any(-1), values, 0.0)
+
+    def less_baseline(self, reward: PerRow, pair: Float[Array, "rows window"]) -> PerRow:
+        """R - b(s, a), which the values are to explain; R without a baseline."""
+        return reward if self.baseline is None else reward - self.baseline(pair)[:, 0]
 
 
 def total_value(values: Float[Array, "rows groups"], weight: Float[Array, " groups"], bias: Scalar) -> PerRow:

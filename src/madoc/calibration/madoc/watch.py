@@ -32,8 +32,8 @@ class Watch:
 
     Attributes:
         epochs: Number of calibration epochs so far.
-        mismatch: Distance of simulated from logged rows, in the unit of the blur: the blur times the mean |reward| over
-            its set value. Without a blur it is the mean |reward|.
+        mismatch: Distance of simulated from logged rows in typical changes of a row: the blur times the mean |reward|
+            over its set value. Without a blur it is the mean |reward|.
         at_bound: Share of rows whose reward is at its bound.
         best_mismatch: The lowest mismatch since they are compared.
         milestone: The mismatch at the last progress.
@@ -56,16 +56,24 @@ def begin_watch(actors: Actors) -> Watch:
 
 
 def observe(
-    watch: Watch, metrics: Metrics, average: Actors, *, steered_to: float, blur_range: tuple[float, float]
+    watch: Watch,
+    metrics: Metrics,
+    average: Actors,
+    *,
+    steered_to: float,
+    blur_range: tuple[float, float],
+    unit: float = 1.0,
 ) -> Watch:
     """The watch after one more epoch, whose estimate is kept unless an earlier mismatch was clearly lower.
+
+    `unit` is the unit of the blur in typical changes of a row.
 
     Mismatches are compared once the discriminators have settled, provided that the mean |reward| is near `steered_to`,
     its set value, or the blur is at its lower limit. Before that, without a blur (`steered_to` is then 0), and while
     rewards are at their bound under the largest blur, the latest estimate is kept.
     """
     blur, size, at_bound = metrics["blur"], metrics["reward_size"], metrics["reward_at_bound"]
-    mismatch = blur * size / steered_to if steered_to else size
+    mismatch = unit * blur * size / steered_to if steered_to else size
     if watch.epochs:
         mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
