@@ -7,18 +7,40 @@ import pytest
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, Madoc
 from madoc.calibration.madoc import innovations
+from madoc.calibration.madoc.watch import SETTLING
 from madoc.data import Disturbance
 from madoc.errors import MadocError
 from madoc.parameters import Parameter
+from madoc.simulation.rollout import Rollout
+from madoc.types import Transitions
 from robots import CountingSimulator, recorded, spring
 
 TRUTH = {"jnt_stiffness.slide": 4.0, "dof_damping.slide": 0.5, "body_mass.cart": 2.0}
+KEY = jax.random.key(0)
 
 
 def problem_of(task=None, rows=400):
     task = task or spring()
     truth = {row.name: TRUTH[row.name] for row in task.parameters.parameters}
-    return CalibrationProblem(recorded(task, truth, rows, jax.random.key(0)), simulation.make(task, threads=1))
+    return CalibrationProblem(recorded(task, truth, rows, KEY), simulation.make(task, threads=1))
+
+
+def rollout_of(problem, valid=None):
+    """The log's own first 120 rows as a rollout of 10 steps, 4 systems and 3 rows."""
+    rows = jax.tree.map(lambda column: column[:120].reshape(10, 4, 3, *column.shape[1:]), problem.dataset.transitions)
+    return Rollout(Transitions(*jax.tree.leaves(rows)), np.ones((10, 4, 3), bool) if valid is None else valid)
+
+
+def seen(problem, reference=None, estimate=None, rollout=None):
+    scaling = problem.features.standardised
+    return innovations.seen(
+        problem,
+        scaling,
+        innovations.no_reference(problem, scaling) if reference is None else reference,
+        problem.simulator.parameters.middle if estimate is None else estimate,
+        rollout_of(problem) if rollout is None else rollout,
+        KEY,
+    )
 
 
 def test_innovations_by_hand():
@@ -33,52 +55,65 @@ def test_innovations_by_hand():
     np.testing.assert_allclose(stiffer[far, 1], position[far] * step / 2.0, rtol=0.1)
 
 
-def test_rows_that_cannot_be_rebuilt_have_none():
-    task = replace(spring(), rebuildable=lambda observation: observation[..., 0] > 0.0)
-    problem = problem_of(task)
-    seen = innovations.innovations(problem.simulator, problem.simulator.parameters.middle, problem.dataset.transitions)
-    known = problem.dataset.transitions.observation[:, 0] > 0.0
+def test_rows_that_cannot_be_rebuilt_or_failed_have_none():
+    problem = problem_of(replace(spring(), rebuildable=lambda observation: observation[..., 0] > 0.0))
+    valid = np.ones((10, 4, 3), bool)
+    valid[0, 0] = False
+    found = seen(problem, rollout=rollout_of(problem, valid))
+    known = (problem.dataset.transitions.observation[:120, 0] > 0.0).reshape(10, 4, 3) & valid
     assert known.any() and not known.all()
-    np.testing.assert_array_equal(np.isfinite(seen).all(-1), known)
+    np.testing.assert_array_equal(np.isfinite(found.following).all(-1), known)
+    assert found.failures == (~known).sum()  # rows of the log are drawn from those that can be rebuilt
 
 
-def test_innovations_have_the_shape_of_a_rollout():
-    problem = problem_of(rows=120)
-    rows, middle = problem.dataset.transitions, problem.simulator.parameters.middle
-    rollout = jax.tree.map(lambda column: column.reshape(10, 4, 3, *column.shape[1:]), rows)
-    flat = innovations.innovations(problem.simulator, middle, rows)
-    np.testing.assert_array_equal(
-        innovations.innovations(problem.simulator, middle, rollout), flat.reshape(10, 4, 3, 2)
-    )
-
-
-def test_a_reference_counts_its_rows_and_scales_them_together_with_simulated_ones():
+def test_the_scale_is_that_of_logged_and_simulated_innovations_together():
     problem = problem_of()
-    counting = CountingSimulator(problem.simulator)
-    counted = replace(problem, simulator=counting)
-    scaling, simulated = problem.features.standardised, np.full((50, 2), np.nan)
-    simulated[:30] = [3.0, 0.0]
     middle = problem.simulator.parameters.middle
-    found = innovations.renewed(counted, scaling, middle, simulated, jax.random.key(0))
-    assert counting.rows == 400 == len(found.pair)
+    found = seen(problem)
+    assert (found.reference.age, found.control_steps) == (0, 120 + 400)
     logged = innovations.innovations(problem.simulator, middle, problem.dataset.transitions)
-    squares = np.concatenate([logged, simulated[:30]]) ** 2
-    most = np.quantile(squares, 0.99, axis=0)
-    np.testing.assert_allclose(found.scale, np.sqrt(np.minimum(squares, most).mean(0)))
-    # asinh(3 · 1) / 3 = 0.606, asinh(0.03) / 3 = 0.01: linear below a third of the scale
-    np.testing.assert_allclose(found.features(np.array([1.0, 0.01]) * found.scale), [0.6061, 0.01], rtol=1e-3)
-    assert sorted(found.following[:, 1].tolist()) == sorted(found.features(logged)[:, 1].tolist())
-    assert found.size(2.0 * found.scale) == pytest.approx(0.5)
+    squares = np.concatenate([logged, logged[:120]]) ** 2
+    scale = np.sqrt(np.minimum(squares, np.quantile(squares, 0.99, axis=0)).mean(0))
+    np.testing.assert_allclose(found.reference.scale, np.maximum(scale, 1e-3 * problem.typical_change))
+    # asinh(3 e / scale) / 3
+    features = np.arcsinh(3.0 * logged / found.reference.scale) / 3.0
+    np.testing.assert_allclose(found.following.reshape(120, 2), features[:120], rtol=1e-5, atol=1e-7)
+    assert sorted(found.reference.following[:, 1].tolist()) == sorted(features[:, 1].astype(np.float32).tolist())
+    assert found.reference.size(2.0 * found.reference.scale) == pytest.approx(0.5)
 
 
-def test_a_signal_that_no_parameter_moves_is_no_feature():
+def test_rounding_of_a_log_is_no_difference():
     problem = problem_of(spring(Parameter("dof_damping", "slide", 0.0, 1.0)))
+    rows = problem.dataset.transitions
+    rounded = replace(rows, observation=rows.observation.round(9), next_observation=rows.next_observation.round(9))
+    log = replace(problem.dataset, transitions=rounded)
     truth = problem.simulator.parameters.vector({"dof_damping.slide": 0.5})
-    nothing = np.zeros((1, 2))
-    found = innovations.renewed(problem, problem.features.standardised, truth, nothing, jax.random.key(0))
-    assert found.scale.tolist() == [0.0, 0.0]
-    assert not np.asarray(found.following).any()
-    assert found.size(problem.typical_change) == 1.0
+    found = seen(replace(problem, dataset=log), estimate=truth)
+    assert np.abs(found.reference.following).max() < 0.01  # of the smallest blur
+
+
+def test_a_reference_is_renewed_at_the_estimate_once_it_is_due():
+    problem = problem_of()
+    truth = problem.simulator.parameters.vector(TRUTH)
+    first = seen(problem).reference
+    kept = seen(problem, first, truth)
+    assert (kept.reference.age, kept.control_steps) == (1, 120)
+    np.testing.assert_array_equal(kept.reference.parameters, first.parameters)
+    renewed = seen(problem, replace(first, age=innovations.RENEWAL - 1), truth).reference
+    assert renewed.age == 0
+    np.testing.assert_array_equal(renewed.parameters, truth)
+
+
+def test_a_reference_at_which_nothing_can_be_predicted_is_not_taken():
+    problem = problem_of()
+    nothing = rollout_of(problem, np.zeros((10, 4, 3), bool))
+    before = seen(problem, rollout=nothing)
+    assert before.following is None
+    assert before.reference.age == -1
+    old = replace(seen(problem).reference, age=innovations.RENEWAL - 1)
+    after = seen(problem, old, rollout=nothing)
+    assert after.reference is old  # still due
+    assert after.control_steps == 120 + 400 + 120
 
 
 def test_where_innovations_cannot_be_had():
@@ -86,41 +121,40 @@ def test_where_innovations_cannot_be_had():
     problem = problem_of(task)
     assert innovations.obstacle(problem, 1) == ""
     assert "3 rows" in innovations.obstacle(problem, 3)
-    hidden = replace(task, state_from_observation=None)
-    shuffled = replace(problem.dataset, disturbance=Disturbance(shuffled="next_observations"))
+    hidden = simulation.make(replace(task, state_from_observation=None), threads=1)
     for other, word in (
-        (replace(problem, simulator=simulation.make(hidden, threads=1)), "does not determine its state"),
-        (replace(problem, dataset=shuffled), "shuffled"),
+        (replace(problem, simulator=hidden), "does not determine the state"),
+        (
+            replace(problem, dataset=replace(problem.dataset, disturbance=Disturbance(shuffled="next_observations"))),
+            "shuffled",
+        ),
+        (
+            replace(problem, dataset=replace(problem.dataset, disturbance=Disturbance(velocities="differences"))),
+            "differences",
+        ),
     ):
         assert word in innovations.obstacle(other, 1)
         with pytest.raises(MadocError, match="features=innovations cannot be had here"):
-            Madoc(features="innovations").init(other, jax.random.key(0))
-        assert Madoc().init(other, jax.random.key(0)).reference is None
+            Madoc(features="innovations").init(other, KEY)
+        assert Madoc().init(other, KEY).reference is None
 
 
-def test_an_epoch_counts_every_predicted_row_and_the_reference_moves_with_the_estimate():
+def test_innovations_begin_where_rows_overlap_and_every_predicted_row_is_counted(monkeypatch):
     problem = problem_of()
     counting = CountingSimulator(problem.simulator)
-    method = Madoc(groups="one", cloning_epochs=0, epoch_steps=200, draws=4, horizon=10, updates=2)
     counted = replace(problem, simulator=counting)
-    state = method.init(counted, jax.random.key(0))
-    spent, references = [], []
-    for _ in range(innovations.RENEWAL + 1):
+    method = Madoc(groups="one", cloning_epochs=0, epoch_steps=200, draws=4, horizon=10, updates=2)
+    state = method.init(counted, KEY)
+    spent, ages = [], []
+    for epoch in range(SETTLING + 3):
         before = counting.rows
-        state, epoch = method.step(counted, state)
-        assert epoch.control_steps == counting.rows - before
-        spent.append(epoch.control_steps)
-        references.append(state.reference.parameters)
-    assert spent == [800, *[400] * (innovations.RENEWAL - 1), 800]  # simulated, predicted, and 400 logged rows
-    np.testing.assert_array_equal(references[0], problem.simulator.parameters.middle)
-    np.testing.assert_array_equal(references[0], references[-2])
-    assert (references[-1] != references[0]).all()
-
-
-def test_a_log_of_which_no_row_can_be_predicted_is_refused(monkeypatch):
-    problem = problem_of()
-    nowhere = np.full(problem.dataset.transitions.observation.shape, np.nan)
-    monkeypatch.setattr(innovations, "innovations", lambda *_: nowhere)
+        monkeypatch.setattr(innovations, "OVERLAP", 0.0 if epoch > SETTLING else 2.0)
+        state, told = method.step(counted, state)
+        assert told.control_steps == counting.rows - before
+        spent.append(told.control_steps)
+        ages.append(state.reference.age)
+    assert ages == [-1] * (SETTLING + 1) + [0, 1]
+    assert spent == [200] * (SETTLING + 1) + [800, 400]  # simulated, predicted, and 400 logged rows
+    assert state.watch.began == SETTLING + 1
     middle = problem.simulator.parameters.middle
-    with pytest.raises(MadocError, match="all of 400 logged rows diverged"):
-        innovations.renewed(problem, problem.features.standardised, middle, np.zeros((1, 2)), jax.random.key(0))
+    assert (state.reference.parameters != middle).all()

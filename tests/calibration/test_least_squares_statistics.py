@@ -1,8 +1,15 @@
+from dataclasses import replace
+
+import jax
 import numpy as np
 import pytest
 
+from madoc import simulation
+from madoc.calibration import CalibrationProblem, LeastSquares
+from madoc.calibration.least_squares.sentences import about_residuals, have_long_tails
 from madoc.calibration.least_squares.statistics import alternation, autocorrelation, clipped_change, outlier_limits
 from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE
+from robots import SPRING_TRUTH, recorded, spring
 
 LIMITS = {"least": LIKE_NOISE, "failed": FAILED_WINDOW}
 
@@ -65,3 +72,21 @@ def test_what_is_left_of_consecutive_readings_is_correlated_where_it_is_not_nois
     assert autocorrelation(residuals[..., 1:]) == pytest.approx(-2.0 / 3.0)
     assert autocorrelation(0.1 * residuals) == pytest.approx(0.02 / 3.0)  # less than the noise says nothing
     assert autocorrelation(100.0 * residuals) == pytest.approx(2.0 / 3.0)  # 3 deviations at most
+
+
+def test_tails_are_long_where_the_cost_is_above_that_of_noise():
+    task = spring()
+    problem = CalibrationProblem(recorded(task, SPRING_TRUTH, 100, jax.random.key(0)), simulation.make(task, threads=1))
+    begun = LeastSquares(initial_states="estimated", windows=10).init(problem, jax.random.key(0)).unknown[0]
+    search = replace(begun, refining=1, epochs=3, deviation=np.full(2, 0.1), explained=len(begun.rows))
+
+    def costing(cost, **changes):
+        return replace(search, cost=np.full(len(search.cost), cost), **changes)
+
+    assert not have_long_tails(costing(1.0))
+    assert have_long_tails(costing(1.2))
+    assert about_residuals(costing(1.2)) == (
+        "residuals have longer tails than noise has: the intervals are too narrow",
+    )
+    assert not have_long_tails(costing(1.2, epochs=0))  # not all windows are known yet
+    assert not have_long_tails(costing(1.2, deviation=np.full(2, 1e-9)))  # rounding errors

@@ -23,7 +23,7 @@ def actors(value):
 
 
 def watched(watch, epochs, *, blur, size=1.0, at_bound=0.0, estimate=0.0, steered_to=1.0):
-    metrics = {"blur": blur, "reward_size": size, "reward_at_bound": at_bound}
+    metrics = {"blur": blur, "reward_size": size, "reward_at_bound": at_bound, "overlap": 0.5}
     for _ in range(epochs):
         watch = observe(watch, metrics, actors(estimate), steered_to=steered_to, blur_range=(SMALLEST, LARGEST))
     return watch

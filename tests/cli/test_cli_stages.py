@@ -13,7 +13,7 @@ from madoc.numpy_policy import NumpyPolicy
 
 RESULT = {
     *("method", "task", "status", "sentence", "control_steps", "seconds", "seed", "groups", "parameters", "settled"),
-    *("warnings", "error"),
+    *("warnings", "error", "long_tails"),
 }
 
 

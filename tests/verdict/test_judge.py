@@ -173,6 +173,13 @@ def test_what_could_not_be_tested_or_stands_at_an_end_is_not_calibrated(good):
 
 
 @EITHER
+def test_residuals_with_long_tails_are_a_mismatch(good):
+    verdict = judge(good, long_tails=True)
+    assert verdict.word == "MODEL_MISMATCH"
+    assert verdict.sentence.startswith("residuals have longer tails than noise has")
+
+
+@EITHER
 def test_a_right_guess_is_confirmed_where_intervals_hold_it(good):
     no_gain = {
         "mid_range": errors(0.1, 0.4),

@@ -83,6 +83,7 @@ def calibrate(
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
         combinations=[] if told is None else list(combinations(space, estimate.mean, told, estimate.quantile)),
         settled=estimate.settled,
+        long_tails=estimate.long_tails,
         group_stability=estimate.group_stability,
         problem=problem,
     )

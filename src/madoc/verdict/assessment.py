@@ -71,7 +71,7 @@ def assess(
         )
     holdout = measured(bench, result.mean, result.interval)
     widened = with_widened_intervals(result, holdout)
-    verdict = judge(holdout, settled=result.settled, combinations=widened.combinations)
+    verdict = judge(holdout, settled=result.settled, long_tails=result.long_tails, combinations=widened.combinations)
     widened = replace(widened, verdict=verdict, holdout=holdout)
     return Assessment(verdict, holdout, widened)
 

@@ -69,7 +69,9 @@ SEPARABLE = 0.65
 true simulator have about 0.55."""
 
 
-def judge(holdout: HoldOut, *, settled: bool = True, combinations: Sequence[Combination] = ()) -> Verdict:
+def judge(
+    holdout: HoldOut, *, settled: bool = True, long_tails: bool = False, combinations: Sequence[Combination] = ()
+) -> Verdict:
     """The first verdict that applies: rejected data, a mismatch, open parameters, no improvement; else calibrated.
 
     A log that is too short to tell whether the model lacks a term leaves its parameters open.
@@ -77,6 +79,7 @@ def judge(holdout: HoldOut, *, settled: bool = True, combinations: Sequence[Comb
     Args:
         holdout: What the hold-out says of the estimate.
         settled: Whether the search that led to it came to its end.
+        long_tails: Whether its residuals have longer tails than noise has.
         combinations: What the log tells of parameters that it leaves open.
     """
     return (
@@ -85,6 +88,7 @@ def judge(holdout: HoldOut, *, settled: bool = True, combinations: Sequence[Comb
         or _missing(holdout)
         or _mismatch(holdout)
         or _outside(holdout)
+        or (_unlike_noise(holdout) if long_tails else None)
         or _open(holdout, combinations)
         or _untested(holdout)
         or _no_improvement(holdout)
@@ -201,6 +205,18 @@ def _outside(holdout: HoldOut) -> Verdict | None:
         f"{', '.join(holdout.at_end)} at the end of the range: the true value may lie beyond it, and then the other "
         "parameters make up for it; widen the range",
         holdout.at_end,
+    )
+
+
+def _unlike_noise(holdout: HoldOut) -> Verdict | None:
+    """Residuals with long tails, where the error of the integration step does not explain them."""
+    if numerical(holdout) is not None:
+        return None
+    return Verdict(
+        "MODEL_MISMATCH",
+        "residuals have longer tails than noise has: the model does not explain some stretches of the log, and "
+        "intervals do not count that; look there for a force that acts at times only, at contacts or in fast motion, "
+        "and for wrong readings",
     )
 
 

@@ -33,9 +33,14 @@ def about_estimated_states(problem: CalibrationProblem, search: SearchState, hor
     return f"{sentence}; the noise it finds is {noise:.2g} % of a step's change"
 
 
+def have_long_tails(search: SearchState) -> bool:
+    """Whether residuals have longer tails than noise has; not known before the first step on all windows."""
+    return _noisy(search) and bool(search.cost[0] > LONG_TAILS)
+
+
 def about_residuals(search: SearchState) -> tuple[str, ...]:
     """Sentences on windows left out and on residuals with long tails; none before the first step on all windows."""
-    if not (search.refining and search.epochs) or float(search.deviation.max()) < EXACT:
+    if not _noisy(search):
         return ()
     left_out, windows = len(search.rows) - search.explained, len(search.rows)
     sentence = (
@@ -43,7 +48,7 @@ def about_residuals(search: SearchState) -> tuple[str, ...]:
         "well as others, as where contacts begin, or their simulation failed"
     )
     tails = "residuals have longer tails than noise has: the intervals are too narrow"
-    return (*([sentence] if left_out else []), *([tails] if search.cost[0] > LONG_TAILS else []))
+    return (*([sentence] if left_out else []), *([tails] if have_long_tails(search) else []))
 
 
 def about_model_errors(horizon: int) -> str:
@@ -52,3 +57,8 @@ def about_model_errors(horizon: int) -> str:
         f"over {horizon} control steps the simulator leaves more than noise: something the model lacks, "
         "which intervals do not count"
     )
+
+
+def _noisy(search: SearchState) -> bool:
+    """Whether residuals of all windows are known, and are not rounding errors."""
+    return bool(search.refining and search.epochs) and float(search.deviation.max()) >= EXACT

@@ -10,15 +10,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.madoc import effects, grouping, innovations, watch
-from madoc.calibration.madoc.actors import Actors, draw_parameters
-from madoc.calibration.madoc.agents import OF_CHANGES, OF_INNOVATIONS, AgentSettings, Resolution
+from madoc.calibration.madoc.actors import draw_parameters
+from madoc.calibration.madoc.agents import OF_CHANGES, OF_INNOVATIONS, Agents, AgentSettings, Resolution
 from madoc.calibration.madoc.collection import GEOMETRY, Collection, Features, StartMode
 from madoc.calibration.madoc.grouping import GroupingVAE
-from madoc.calibration.madoc.innovations import Reference
 from madoc.calibration.madoc.paper import PAPER
 from madoc.calibration.madoc.state import MadocState
 from madoc.calibration.madoc.value_decomposition import Mixing
@@ -132,14 +131,7 @@ class Madoc:
         vae = GroupingVAE(count, window, following, self.hidden, key=of_vae)
         seen = self._sees_innovations(problem, collection)
         reference = innovations.no_reference(problem, collection.scaling.scaling) if seen else None
-        agents = self.agents.init(
-            window=window,
-            observation=following,
-            parameters=count,
-            groups=groups,
-            resolution=_resolution(reference),
-            key=of_agents,
-        )
+        agents = self._fresh_agents(problem, OF_CHANGES, of_agents)
         logged, time_limit = problem.dataset.transitions, problem.simulator.task.max_episode_steps
         return MadocState(
             clone=fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy),
@@ -217,6 +209,17 @@ class Madoc:
         if reason and self.features:
             raise MadocError(f"features=innovations cannot be had here: {reason}; leave features= out")
         return not reason
+
+    def _fresh_agents(self, problem: CalibrationProblem, resolution: Resolution, key: PRNGKeyArray) -> Agents:
+        window, observation = self.collection(problem).scaling.sizes
+        sizes = {"parameters": len(problem.simulator.parameters), "groups": self._group_count(problem)}
+        return self.agents.init(window=window, observation=observation, **sizes, resolution=resolution, key=key)
+
+    def _begun_again(self, problem: CalibrationProblem, state: MadocState, key: PRNGKeyArray) -> Agents:
+        """The agents where innovations begin: the same actors, fresh networks, as theirs have learnt of s' - s."""
+        kept = ("actors", "prior", "average", "updates", "actor_optimiser")
+        fresh = self._fresh_agents(problem, OF_INNOVATIONS, key)
+        return replace(fresh, **{name: getattr(state.agents, name) for name in kept})
 
     def _group_count(self, problem: CalibrationProblem) -> int:
         """Number of groups, or the most that can be chosen by physics."""
@@ -312,34 +315,42 @@ class Madoc:
         return following, Epoch(metrics, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=1.0)
 
     def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
-        of_draws, of_start, of_action, of_restart, of_reference, of_updates, key = jax.random.split(state.key, 7)
+        of_draws, of_start, of_action, of_restart, of_reference, of_networks, of_updates, key = jax.random.split(
+            state.key, 8
+        )
         collection = self.collection(problem)
         systems, fresh = collection.systems, collection.mode == "logged"
         draws = np.asarray(draw_parameters(state.agents.actors, of_draws, systems)[0], dtype=np.float64)
         walkers = collection.begin(systems, of_start) if fresh else state.walkers
         rollout, walkers = collection.roll(state.clone.policy, draws, walkers, (of_action, of_restart))
-        reference, rows, logged, described = state.reference, state.rows, collection.logged, None
-        steps = rollout.valid.size
-        if reference is not None:
-            due = state.watch.epochs % innovations.RENEWAL == 0
-            parameters = _middle(problem, state.agents.actors) if due else reference.parameters
-            seen = innovations.innovations(problem.simulator, parameters, rollout.transitions)
-            steps += rollout.valid.size
-            if due:
-                reference = innovations.renewed(problem, collection.scaling.scaling, parameters, seen, of_reference)
-                rows, steps = replay.clear(rows), steps + len(reference.pair)
-            described, logged = reference.features(seen), (reference.pair, reference.following)
+        agents, watched, reference, rows = state.agents, state.watch, state.reference, state.rows
+        logged, pairs, described, resolution = collection.logged, None, None, OF_CHANGES
+        steps, failures, unit = rollout.valid.size, rollout.failures, 1.0
+        if reference is not None and (reference.age >= 0 or watch.overlaps(watched, innovations.OVERLAP)):
+            estimate = problem.simulator.parameters.to_physical(np.tanh(np.asarray(agents.actors.mean, np.float64)))
+            seen = innovations.seen(problem, collection.scaling.scaling, reference, estimate, rollout, of_reference)
+            steps, failures = steps + seen.control_steps, failures + seen.failures
+            if seen.following is not None:
+                if reference.age < 0:
+                    agents, watched = self._begun_again(problem, state, of_networks), watch.begin_again(watched)
+                elif seen.reference.age == 0:
+                    was, now = (each.size(problem.typical_change) for each in (reference, seen.reference))
+                    agents = replace(agents, log_blur=agents.log_blur + np.float32(np.log(was / now)))
+                rows = replay.clear(rows) if seen.reference.age == 0 else rows
+                reference, described, resolution = seen.reference, seen.following, OF_INNOVATIONS
+                logged, pairs = (reference.pair, reference.following), collection.logged[0]
+                unit = reference.size(problem.typical_change)
         rows = collection.remember(rows, rollout, draws, np.zeros(systems, np.int64), described)
         if not int(rows.written):
             raise MadocError(
-                f"madoc: every simulated row diverged or ended within {collection.scaling.length} steps, so "
+                f"madoc: every row simulated so far diverged or ended within {collection.scaling.length} steps, so "
                 "there is nothing to compare with the log; narrow the ranges of the parameters"
             )
-        resolution = _resolution(reference)
         agents, device_metrics = self.agents.update(
-            state.agents,
+            agents,
             rows,
             logged,
+            pairs,
             jnp.asarray(grouping.members(state.labels, self._group_count(problem))),
             of_updates,
             mixing=self.mixing,
@@ -348,12 +359,12 @@ class Madoc:
         )
         metrics = scalars(device_metrics)
         watched = watch.observe(
-            state.watch,
+            watched,
             metrics,
             agents.average,
             steered_to=self.agents.reward_size,
             blur_range=(resolution.smallest, resolution.largest),
-            unit=1.0 if reference is None else reference.size(problem.typical_change),
+            unit=unit,
         )
         following = replace(
             state,
@@ -363,7 +374,7 @@ class Madoc:
             reference=reference,
             watch=watched,
             key=key,
-            failures=state.failures + rollout.failures,
+            failures=state.failures + failures,
         )
         metrics |= {"mismatch": watched.mismatch, "failures": float(following.failures)}
         if self.keep_cloning and self.starts != "replay":
@@ -371,13 +382,3 @@ class Madoc:
             metrics |= cloning.metrics
         stalled = watch.stalled(watched, self.patience) if self.patience else None
         return following, Epoch(metrics, control_steps=steps, converged=stalled)
-
-
-def _middle(problem: CalibrationProblem, actors: Actors) -> Float[np.ndarray, " d"]:
-    """The actors' deterministic output in physical units."""
-    return problem.simulator.parameters.to_physical(np.tanh(np.asarray(actors.mean, np.float64)))
-
-
-def _resolution(reference: Reference | None) -> Resolution:
-    """The agents' constants, by whether discriminators see innovations."""
-    return OF_CHANGES if reference is None else OF_INNOVATIONS

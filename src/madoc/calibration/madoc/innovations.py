@@ -5,10 +5,11 @@ change it by a hundredth of its usual size. The innovation e = s' - f(s, a; ξ̂
 less its prediction (Kailath 1968), is without that motion: where ξ̂ is the truth it is 0 in logged rows, and about
 J (ξ - ξ̂) in rows simulated under ξ. The reference ξ̂ is renewed from time to time, and the scale of e with it, so that
 parameters of small effect are seen once those of large effect are known. Not in the paper; an observation has to
-determine the state.
+determine the state. Discriminators begin with s' - s: while simulated rows are seldom where logged ones are, the few
+logged rows that are predicted say too little.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -16,22 +17,24 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.errors import MadocError
 from madoc.learning.features import Scaling
 from madoc.simulation.base import Simulator
+from madoc.simulation.rollout import Rollout
 from madoc.types import Transitions
 
 RENEWAL = 20
 """Epochs of calibration from one reference to the next."""
 ROWS = 5000
-"""Logged rows that are predicted at each reference; they are all that discriminators see of the log until the next."""
+"""Logged rows that are predicted at each reference; of them alone is s' seen until the next."""
+OVERLAP = 0.4
+"""Mean overlap of logged and simulated (s, a), in [0, 1], from which discriminators go on to innovations."""
 IMPACTS = 0.99
 """Quantile of the squared innovations of a channel beyond which they do not raise its scale."""
+FINEST = 1e-3
+"""Smallest scale of a channel, in typical changes of a row: finer differences are rounding, of the log or the model."""
 LINEAR = 3.0
 """Features are asinh(3 e / scale) / 3: linear up to a third of the scale, logarithmic beyond, as innovations at impacts
 are a hundred times those in flight."""
-UNMOVED = 1e-9
-"""Scale, in typical changes of a channel, below which its innovations are rounding."""
 
 
 @jax.tree_util.register_dataclass
@@ -41,30 +44,46 @@ class Reference:
 
     Attributes:
         parameters: In physical units.
-        scale: Scale of each channel's innovations; 0 where they are rounding, and its features 0.
+        scale: Scale of each channel's innovations.
         pair: Features of (s, a) of the logged rows.
         following: Features of their innovations.
+        age: Epochs since it was chosen; negative before the first is.
     """
 
     parameters: Float[np.ndarray, " d"]
     scale: Float[np.ndarray, " observation"]
     pair: Float[Array, "rows pair"]
     following: Float[Array, "rows observation"]
-
-    def features(self, innovations: Float[np.ndarray, "*rows observation"]) -> Float[np.ndarray, "*rows observation"]:
-        """Innovations as discriminators see them, float32."""
-        return _features(innovations, self.scale)
+    age: int
 
     def size(self, typical_change: Float[np.ndarray, " observation"]) -> float:
         """Root mean square, over channels, of the scale in typical changes of a row: the unit of the features."""
-        share = (self.scale / typical_change)[self.scale > 0.0]
-        return float(np.sqrt(np.mean(share**2))) if len(share) else 1.0
+        return float(np.sqrt(np.mean((self.scale / typical_change) ** 2)))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Simulated rows as discriminators see them.
+
+    Attributes:
+        reference: What they are measured from.
+        following: Features of their innovations, NaN where there are none; None before the first reference.
+        control_steps: Control steps that predictions took, those of logged rows included.
+        failures: Rows among them whose simulation failed, or whose state could not be rebuilt.
+    """
+
+    reference: Reference
+    following: Float[np.ndarray, "steps systems rows observation"] | None
+    control_steps: int
+    failures: int
 
 
 def obstacle(problem: CalibrationProblem, window: int) -> str:
-    """Why innovations cannot be had from this log, as a sentence; empty if they can."""
+    """Why innovations cannot be had from this log, as a clause; empty if they can."""
     if problem.states.kind != "exact":
-        return problem.states.reason
+        return "an observation does not determine the state"
+    if problem.dataset.disturbance.velocities == "differences":
+        return "velocities are differences of positions, so an observation does not determine the state"
     if problem.simulator.task.pending:
         return "actions take effect with a delay, so an observation and an action do not determine the next"
     if problem.dataset.disturbance.shuffled == "next_observations":
@@ -73,10 +92,40 @@ def obstacle(problem: CalibrationProblem, window: int) -> str:
 
 
 def no_reference(problem: CalibrationProblem, scaling: Scaling) -> Reference:
-    """The reference before there is one: no row of the log is seen."""
-    rows, channels = _count(problem), len(scaling.next_scale)
+    """The reference before the first: no row of the log is seen."""
+    rows, channels = min(ROWS, len(problem.states.rows)), len(scaling.next_scale)
     pair, following = jnp.zeros((rows, len(scaling.pair_offset))), jnp.zeros((rows, channels))
-    return Reference(problem.simulator.parameters.middle, np.zeros(channels), pair, following)
+    return Reference(problem.simulator.parameters.middle, np.ones(channels), pair, following, -1)
+
+
+def seen(
+    problem: CalibrationProblem,
+    scaling: Scaling,
+    reference: Reference,
+    estimate: Float[np.ndarray, " d"],
+    rollout: Rollout,
+    key: PRNGKeyArray,
+) -> Seen:
+    """An epoch's simulated rows, from the reference or, where it is due, from a new one at the estimate.
+
+    A new reference at which no row of the log, or none of the rollout, can be predicted is not taken: the next epoch is
+    to find another.
+    """
+    following = _of_rollout(problem, estimate if _due(reference) else reference.parameters, rollout)
+    steps, failures = rollout.valid.size, _missing(following)
+    if not _due(reference):
+        aged = replace(reference, age=reference.age + 1)
+        return Seen(aged, _features(following, reference.scale), steps, failures)
+    rows, logged = _of_log(problem, estimate, len(reference.pair), key)
+    steps, failures = steps + len(logged), failures + _missing(logged)
+    new = _measured(problem, scaling, estimate, rows, logged, following)
+    if new is not None:
+        return Seen(new, _features(following, new.scale), steps, failures)
+    if reference.age < 0:
+        return Seen(reference, None, steps, failures)
+    following = _of_rollout(problem, reference.parameters, rollout)
+    failures += _missing(following)
+    return Seen(reference, _features(following, reference.scale), steps + rollout.valid.size, failures)
 
 
 def innovations(
@@ -102,42 +151,49 @@ def innovations(
     return np.asarray(rows.next_observation, dtype=np.float64) - predicted.reshape(shape)
 
 
-def renewed(
+def _due(reference: Reference) -> bool:
+    return not 0 <= reference.age < RENEWAL - 1
+
+
+def _of_rollout(
+    problem: CalibrationProblem, parameters: Float[np.ndarray, " d"], rollout: Rollout
+) -> Float[np.ndarray, "steps systems rows observation"]:
+    found = innovations(problem.simulator, parameters, rollout.transitions)
+    return np.where(rollout.valid[..., None], found, np.nan)
+
+
+def _of_log(
+    problem: CalibrationProblem, parameters: Float[np.ndarray, " d"], count: int, key: PRNGKeyArray
+) -> tuple[Transitions, Float[np.ndarray, "rows observation"]]:
+    """Rows of the log, drawn without repetition, and their innovations."""
+    chosen = np.asarray(jax.random.choice(key, problem.states.exact()[1], (count,), replace=False))
+    rows = problem.dataset.transitions.take(chosen)
+    return rows, innovations(problem.simulator, parameters, rows)
+
+
+def _measured(
     problem: CalibrationProblem,
     scaling: Scaling,
     parameters: Float[np.ndarray, " d"],
+    rows: Transitions,
+    logged: Float[np.ndarray, "rows observation"],
     simulated: Float[np.ndarray, "*rows observation"],
-    key: PRNGKeyArray,
-) -> Reference:
-    """A reference at these parameters, with other rows of the log; it takes a control step for each of them.
-
-    The scale is that of logged innovations and of the `simulated` ones, at the same parameters, together.
-
-    Raises:
-        MadocError: No logged row can be predicted.
-    """
-    chosen = np.asarray(jax.random.choice(key, problem.states.exact()[1], (_count(problem),), replace=False))
-    rows = problem.dataset.transitions.take(chosen)
-    logged = innovations(problem.simulator, parameters, rows)
-    finite = np.flatnonzero(np.isfinite(logged).all(-1))
-    if not len(finite):
-        raise MadocError(
-            f"all of {len(chosen)} logged rows diverged in the simulator at the estimate, so that there are no "
-            "innovations; narrow the ranges of the parameters, or take --set features=standardised"
-        )
-    kept = np.resize(finite, len(chosen))
-    rows, logged = rows.take(kept), logged[kept]
-    simulated = _flat(simulated)
-    squares = np.concatenate([logged, simulated[np.isfinite(simulated).all(-1)]]) ** 2
+) -> Reference | None:
+    """The reference of these rows, in the scale of logged and simulated innovations together; None without any."""
+    finite, of_simulated = np.isfinite(logged).all(-1), _flat(simulated)
+    of_simulated = of_simulated[np.isfinite(of_simulated).all(-1)]
+    if not finite.any() or not len(of_simulated):
+        return None
+    squares = np.concatenate([logged[finite], of_simulated]) ** 2
     scale = np.sqrt(np.minimum(squares, np.quantile(squares, IMPACTS, axis=0)).mean(0))
-    scale = np.where(scale > UNMOVED * problem.typical_change, scale, 0.0)
-    pair = jnp.asarray(scaling.features(rows)[0])
-    return Reference(parameters, scale, pair, jnp.asarray(_features(logged, scale)))
+    scale = np.maximum(scale, FINEST * problem.typical_change)
+    kept = np.resize(np.flatnonzero(finite), len(rows.observation))
+    pair = jnp.asarray(scaling.features(rows.take(kept))[0])
+    return Reference(parameters, scale, pair, jnp.asarray(_features(logged[kept], scale)), 0)
 
 
-def _count(problem: CalibrationProblem) -> int:
-    """Number of logged rows at each reference."""
-    return min(ROWS, len(problem.states.rows))
+def _missing(found: Float[np.ndarray, "*rows observation"]) -> int:
+    return int((~np.isfinite(found).all(-1)).sum())
 
 
 def _flat(column: np.ndarray | Array) -> Float[np.ndarray, "rows channels"]:
@@ -148,5 +204,4 @@ def _flat(column: np.ndarray | Array) -> Float[np.ndarray, "rows channels"]:
 def _features(
     innovations: Float[np.ndarray, "*rows observation"], scale: Float[np.ndarray, " observation"]
 ) -> Float[np.ndarray, "*rows observation"]:
-    units = np.divide(innovations, scale, out=np.zeros_like(innovations), where=scale > 0.0)
-    return (np.arcsinh(LINEAR * units) / LINEAR).astype(np.float32)
+    return (np.arcsinh(LINEAR * innovations / scale) / LINEAR).astype(np.float32)

@@ -19,7 +19,7 @@ class GroupCritics(eqx.Module):
         networks: A stack of networks over groups.
         weight: k of Eq. (11), which starts at 1.
         bias: b of Eq. (11), which starts at 0.
-        baseline: b(s, a) in its place, a network of the features of (s, a); None for the paper's b. How well
+        baseline: b(s, a), added to it: a network of the features of (s, a); None for the paper's b alone. How well
             discriminators judge a row differs from state to state far more than from draw to draw, and what b takes of
             it is no noise on the values of draws (DOP: Wang et al. 2021, where b depends on the state too).
     """

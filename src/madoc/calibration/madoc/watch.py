@@ -34,6 +34,8 @@ class Watch:
         epochs: Number of calibration epochs so far.
         mismatch: Distance of simulated from logged rows in typical changes of a row: the blur times the mean |reward|
             over its set value. Without a blur it is the mean |reward|.
+        began: Epoch from which mismatches are of the same features of s'.
+        overlap: Mean overlap of logged and simulated (s, a).
         at_bound: Share of rows whose reward is at its bound.
         best_mismatch: The lowest mismatch since they are compared.
         milestone: The mismatch at the last progress.
@@ -43,6 +45,8 @@ class Watch:
 
     epochs: int
     mismatch: float
+    began: int
+    overlap: float
     at_bound: float
     best_mismatch: float
     milestone: float
@@ -52,7 +56,17 @@ class Watch:
 
 def begin_watch(actors: Actors) -> Watch:
     """The watch before the first epoch."""
-    return Watch(0, 0.0, 0.0, 0.0, 0.0, 0, actors)
+    return Watch(0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0, actors)
+
+
+def begin_again(watch: Watch) -> Watch:
+    """The watch where discriminators go on to other features of s', with which earlier mismatches do not compare."""
+    return _mark(replace(watch, began=watch.epochs))
+
+
+def overlaps(watch: Watch, least: float) -> bool:
+    """Whether discriminators have settled, and simulated rows are where logged ones are."""
+    return settled(watch) and watch.overlap >= least
 
 
 def observe(
@@ -74,13 +88,15 @@ def observe(
     """
     blur, size, at_bound = metrics["blur"], metrics["reward_size"], metrics["reward_at_bound"]
     mismatch = unit * blur * size / steered_to if steered_to else size
-    if watch.epochs:
+    overlap = metrics["overlap"]
+    if watch.epochs > watch.began:
         mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
-    watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, at_bound=at_bound)
+        overlap = watch.overlap + SMOOTHING * (overlap - watch.overlap)
+    watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, overlap=overlap, at_bound=at_bound)
     smallest, largest = blur_range
     immeasurable = blur > 0.99 * largest and at_bound > SATURATED
-    if not steered_to or watch.epochs <= SETTLING or immeasurable:
+    if not steered_to or watch.epochs - watch.began <= SETTLING or immeasurable:
         return _mark(replace(watch, best=average, best_mismatch=mismatch))
     if size < LEAST_REWARD * steered_to and blur > 1.01 * smallest:
         return watch
