@@ -41,7 +41,9 @@ def main() -> None:
     parser.add_argument(
         "--at", nargs="+", default=["calibrated"], help="calibrated distribution uniform midrange truth"
     )
-    parser.add_argument("--calibrator", default="madoc-local-logged-300000", help="whose estimate, as results are named")
+    parser.add_argument(
+        "--calibrator", default="madoc-local-logged-300000", help="whose estimate, as results are named"
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--budget", type=budget, default=300_000, help="300000, or a time as 300s")
     parser.add_argument("--set", nargs="*", default=[], help="hyperparameters as name=value")

@@ -152,9 +152,11 @@ def test_innovations_begin_where_rows_overlap_and_every_predicted_row_is_counted
         state, told = method.step(counted, state)
         assert told.control_steps == counting.rows - before
         spent.append(told.control_steps)
+        assert state.reference is not None
         ages.append(state.reference.age)
     assert ages == [-1] * (SETTLING + 1) + [0, 1]
     assert spent == [200] * (SETTLING + 1) + [800, 400]  # simulated, predicted, and 400 logged rows
     assert state.watch.began == SETTLING + 1
     middle = problem.simulator.parameters.middle
+    assert state.reference is not None
     assert (state.reference.parameters != middle).all()

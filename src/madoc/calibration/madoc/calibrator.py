@@ -56,9 +56,10 @@ class Madoc:
             state, as in the paper, else 3.
         sensor_noise: Noise put on simulated observations, as a share of a step's typical change. None takes the share
             that the data declares, `estimated` estimates the noise from the data.
-        features: How discriminators see s': `innovations` (what it differs by from the simulator's prediction at the
-            current estimate), `standardised` (s' - s) or `raw` (s' and (s, a) as they are, as in the paper). None takes
-            innovations where an observation determines the state, else `standardised`.
+        features: How discriminators see s': `standardised` (s' - s), `innovations` (s' - s, and once simulated rows are
+            where logged ones are, what s' differs by from the simulator's prediction at a recent estimate) or `raw` (s'
+            and (s, a) as they are, as in the paper). None takes `innovations` where an observation determines the
+            state, else `standardised`.
         hidden: Units per layer of clone and VAE.
         cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
         cloning_updates: Updates in each epoch of cloning.
@@ -66,7 +67,7 @@ class Madoc:
         grouping_epochs: Epochs of grouping, outside the budget. One spends at most 100 · (1 + 2 d) control steps by
             physics, `epoch_steps` if groups are learned.
         grouping_updates: Updates of the VAE in each epoch of grouping, rounded up to tens while groups are voted on.
-        epoch_steps: Control steps in an epoch.
+        epoch_steps: Control steps of rollouts in an epoch; predictions for innovations take as many again.
         updates: Calibration updates in an epoch.
         draws: Parameter draws in an epoch; None takes 20, 100, 100 for `policy`, `logged`, `replay`.
         horizon: Control steps under one draw; None takes 50, 5, 1 for `policy`, `logged`, `replay`.
