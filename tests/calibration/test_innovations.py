@@ -7,10 +7,12 @@ import pytest
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, Madoc
 from madoc.calibration.madoc import innovations
+from madoc.calibration.madoc.agents import OF_INNOVATIONS
 from madoc.calibration.madoc.watch import SETTLING
 from madoc.data import Disturbance
 from madoc.errors import MadocError
 from madoc.parameters import Parameter
+from madoc.runs import checkpoint
 from madoc.simulation.rollout import Rollout
 from madoc.types import Transitions
 from robots import CountingSimulator, recorded, spring
@@ -122,24 +124,19 @@ def test_where_innovations_cannot_be_had():
     assert innovations.obstacle(problem, 1) == ""
     assert "3 rows" in innovations.obstacle(problem, 3)
     hidden = simulation.make(replace(task, state_from_observation=None), threads=1)
-    for other, word in (
-        (replace(problem, simulator=hidden), "does not determine the state"),
-        (
-            replace(problem, dataset=replace(problem.dataset, disturbance=Disturbance(shuffled="next_observations"))),
-            "shuffled",
-        ),
-        (
-            replace(problem, dataset=replace(problem.dataset, disturbance=Disturbance(velocities="differences"))),
-            "differences",
-        ),
-    ):
+    shuffled, derived = (
+        replace(problem, dataset=replace(problem.dataset, disturbance=disturbance))
+        for disturbance in (Disturbance(shuffled="next_observations"), Disturbance(velocities="differences"))
+    )
+    blind = replace(problem, simulator=hidden)
+    for other, word in ((blind, "does not determine the state"), (shuffled, "shuffled"), (derived, "differences")):
         assert word in innovations.obstacle(other, 1)
         with pytest.raises(MadocError, match="features=innovations cannot be had here"):
             Madoc(features="innovations").init(other, KEY)
         assert Madoc().init(other, KEY).reference is None
 
 
-def test_innovations_begin_where_rows_overlap_and_every_predicted_row_is_counted(monkeypatch):
+def test_innovations_begin_where_rows_overlap_and_a_checkpoint_holds_them(monkeypatch, tmp_path):
     problem = problem_of()
     counting = CountingSimulator(problem.simulator)
     counted = replace(problem, simulator=counting)
@@ -160,3 +157,25 @@ def test_innovations_begin_where_rows_overlap_and_every_predicted_row_is_counted
     middle = problem.simulator.parameters.middle
     assert state.reference is not None
     assert (state.reference.parameters != middle).all()
+    checkpoint.save(tmp_path / "checkpoint.npz", state, {})
+    fresh = method.init(counted, KEY)
+    assert checkpoint.difference(checkpoint.layout(state), checkpoint.layout(fresh)) is None
+    resumed, _ = checkpoint.load(tmp_path / "checkpoint.npz", fresh)
+    ours, theirs = (jax.tree.leaves(method.step(counted, each)[0]) for each in (state, resumed))
+    for one, other in zip(ours, theirs, strict=True):
+        if isinstance(one, jax.Array) and jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key):
+            one, other = jax.random.key_data(one), jax.random.key_data(other)
+        np.testing.assert_array_equal(one, other)
+
+
+def test_where_innovations_begin_the_actors_stay_and_networks_are_fresh():
+    problem, method = problem_of(), Madoc(groups="one")
+    state = method.init(problem, KEY)
+    moved = replace(state.agents.actors, mean=state.agents.actors.mean + 0.5)
+    state = replace(state, agents=replace(state.agents, actors=moved, updates=state.agents.updates + 7))
+    again = method._begun_again(problem, state, jax.random.key(1))
+    assert again.actors is moved
+    assert int(again.updates) == 7
+    assert float(np.exp(again.log_blur)) == pytest.approx(OF_INNOVATIONS.blur)
+    before, after = (each.discriminators.triple.layers[0].weight for each in (state.agents, again))
+    assert not np.array_equal(before, after)

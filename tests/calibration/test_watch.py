@@ -9,8 +9,10 @@ from madoc.calibration.madoc.watch import (
     SATURATED,
     SETTLING,
     SMOOTHING,
+    begin_again,
     begin_watch,
     observe,
+    overlaps,
     stalled,
     warnings,
 )
@@ -157,3 +159,24 @@ def test_too_few_epochs_are_warned():
 
 def test_warnings_add_up():
     assert len(warned(watched(begun(), 3, blur=0.1, at_bound=1.0), unit=(1.0, 0.0))) == 3
+
+
+def test_where_features_change_earlier_mismatches_do_not_compare():
+    watch = watched(settled(blur=0.02, estimate=0.1), 5, blur=0.02, estimate=0.2)
+    again = begin_again(watch)
+    assert (again.epochs, again.began, again.milestone_epoch) == (SETTLING + 5, SETTLING + 5, SETTLING + 5)
+    later = watched(again, 1, blur=0.3, estimate=0.7)  # a mismatch fifteen times as large, of other features
+    assert float(later.best.mean[0]) == pytest.approx(0.7)
+    assert later.mismatch == pytest.approx(0.3)
+
+
+def test_rows_overlap_only_once_discriminators_have_settled():
+    assert not overlaps(watched(begun(), SETTLING - 1, blur=0.2), 0.4)
+    assert overlaps(settled(blur=0.2), 0.4)
+    assert not overlaps(settled(blur=0.2), 0.6)
+
+
+def test_the_unit_of_the_blur_scales_the_mismatch():
+    metrics = {"blur": 0.2, "reward_size": 1.0, "reward_at_bound": 0.0, "overlap": 0.5}
+    watch = observe(begun(), metrics, actors(0.0), steered_to=1.0, blur_range=(SMALLEST, LARGEST), unit=0.1)
+    assert watch.mismatch == pytest.approx(0.02)
