@@ -65,7 +65,7 @@ def test_rows_that_cannot_be_rebuilt_or_failed_have_none():
     known = (problem.dataset.transitions.observation[:120, 0] > 0.0).reshape(10, 4, 3) & valid
     assert known.any() and not known.all()
     np.testing.assert_array_equal(np.isfinite(found.following).all(-1), known)
-    assert found.failures == (~known).sum()  # rows of the log are drawn from those that can be rebuilt
+    assert found.failures == 0  # the failed rows of the rollout are counted with it
 
 
 def test_the_scale_is_that_of_logged_and_simulated_innovations_together():
@@ -121,8 +121,11 @@ def test_a_reference_at_which_nothing_can_be_predicted_is_not_taken():
 def test_where_innovations_cannot_be_had():
     task = spring()
     problem = problem_of(task)
-    assert innovations.obstacle(problem, 1) == ""
-    assert "3 rows" in innovations.obstacle(problem, 3)
+    silent = np.zeros(2)
+    assert innovations.obstacle(problem, 1, silent) == ""
+    assert "3 rows" in innovations.obstacle(problem, 3, silent)
+    assert innovations.obstacle(problem, 1, 0.02 * problem.typical_change) == ""
+    assert "noise is more than 3 %" in innovations.obstacle(problem, 1, 0.04 * problem.typical_change)
     hidden = simulation.make(replace(task, state_from_observation=None), threads=1)
     shuffled, derived = (
         replace(problem, dataset=replace(problem.dataset, disturbance=disturbance))
@@ -130,7 +133,7 @@ def test_where_innovations_cannot_be_had():
     )
     blind = replace(problem, simulator=hidden)
     for other, word in ((blind, "does not determine the state"), (shuffled, "shuffled"), (derived, "differences")):
-        assert word in innovations.obstacle(other, 1)
+        assert word in innovations.obstacle(other, 1, silent)
         with pytest.raises(MadocError, match="features=innovations cannot be had here"):
             Madoc(features="innovations").init(other, KEY)
         assert Madoc().init(other, KEY).reference is None

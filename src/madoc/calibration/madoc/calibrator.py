@@ -206,7 +206,7 @@ class Madoc:
     def _sees_innovations(self, problem: CalibrationProblem, collection: Collection) -> bool:
         if self.features not in (None, "innovations"):
             return False
-        reason = innovations.obstacle(problem, collection.scaling.length)
+        reason = innovations.obstacle(problem, collection.scaling.length, collection.noise)
         if reason and self.features:
             raise MadocError(f"features=innovations cannot be had here: {reason}; leave features= out")
         return not reason

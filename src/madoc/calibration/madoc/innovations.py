@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.learning.features import Scaling
@@ -26,8 +26,10 @@ RENEWAL = 20
 """Epochs of calibration from one reference to the next."""
 ROWS = 5000
 """Logged rows that are predicted at each reference; of them alone is s' seen until the next."""
-OVERLAP = 0.4
+OVERLAP = 0.3
 """Mean overlap of logged and simulated (s, a), in [0, 1], from which discriminators go on to innovations."""
+LOUDEST = 0.03
+"""Noise of the sensors, in typical changes of a row, above which a prediction from a reading tells too little."""
 IMPACTS = 0.99
 """Quantile of the squared innovations of a channel beyond which they do not raise its scale."""
 FINEST = 1e-3
@@ -69,7 +71,7 @@ class Seen:
         reference: What they are measured from.
         following: Features of their innovations, NaN where there are none; None before the first reference.
         control_steps: Control steps that predictions took, those of logged rows included.
-        failures: Rows among them whose simulation failed, or whose state could not be rebuilt.
+        failures: Rows among them whose simulation failed.
     """
 
     reference: Reference
@@ -78,8 +80,14 @@ class Seen:
     failures: int
 
 
-def obstacle(problem: CalibrationProblem, window: int) -> str:
-    """Why innovations cannot be had from this log, as a clause; empty if they can."""
+def obstacle(problem: CalibrationProblem, window: int, noise: Float[np.ndarray, " observation"]) -> str:
+    """Why innovations cannot be had from this log, as a clause; empty if they can.
+
+    Args:
+        problem: The log and the simulator.
+        window: Rows that discriminators see before s'.
+        noise: Standard deviation of the noise that simulated observations are given, as the log's have it.
+    """
     if problem.states.kind != "exact":
         return "an observation does not determine the state"
     if problem.dataset.disturbance.velocities == "differences":
@@ -88,6 +96,8 @@ def obstacle(problem: CalibrationProblem, window: int) -> str:
         return "actions take effect with a delay, so an observation and an action do not determine the next"
     if problem.dataset.disturbance.shuffled == "next_observations":
         return "the log's next observations are shuffled"
+    if np.median(noise / problem.typical_change) > LOUDEST:
+        return f"the sensors' noise is more than {100 * LOUDEST:g} % of a step's change, and a prediction amplifies it"
     return "" if window == 1 else f"discriminators see windows of {window} rows"
 
 
@@ -112,19 +122,19 @@ def seen(
     to find another.
     """
     following = _of_rollout(problem, estimate if _due(reference) else reference.parameters, rollout)
-    steps, failures = rollout.valid.size, _missing(following)
+    steps, failures = rollout.valid.size, _failed(problem, rollout.transitions, following, rollout.valid)
     if not _due(reference):
         aged = replace(reference, age=reference.age + 1)
         return Seen(aged, _features(following, reference.scale), steps, failures)
     rows, logged = _of_log(problem, estimate, len(reference.pair), key)
-    steps, failures = steps + len(logged), failures + _missing(logged)
+    steps, failures = steps + len(logged), failures + _failed(problem, rows, logged, np.ones(len(logged), bool))
     new = _measured(problem, scaling, estimate, rows, logged, following)
     if new is not None:
         return Seen(new, _features(following, new.scale), steps, failures)
     if reference.age < 0:
         return Seen(reference, None, steps, failures)
     following = _of_rollout(problem, reference.parameters, rollout)
-    failures += _missing(following)
+    failures += _failed(problem, rollout.transitions, following, rollout.valid)
     return Seen(reference, _features(following, reference.scale), steps + rollout.valid.size, failures)
 
 
@@ -192,8 +202,16 @@ def _measured(
     return Reference(parameters, scale, pair, jnp.asarray(_features(logged[kept], scale)), 0)
 
 
-def _missing(found: Float[np.ndarray, "*rows observation"]) -> int:
-    return int((~np.isfinite(found).all(-1)).sum())
+def _failed(
+    problem: CalibrationProblem,
+    rows: Transitions,
+    found: Float[np.ndarray, "*rows observation"],
+    valid: Bool[np.ndarray, "*rows"],
+) -> int:
+    """Valid rows without innovations though their state can be rebuilt."""
+    rebuildable = problem.simulator.task.rebuildable
+    known = valid if rebuildable is None else valid & np.asarray(rebuildable(np.asarray(rows.observation)))
+    return int((~np.isfinite(found).all(-1) & known).sum())
 
 
 def _flat(column: np.ndarray | Array) -> Float[np.ndarray, "rows channels"]:
