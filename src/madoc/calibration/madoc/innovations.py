@@ -29,11 +29,11 @@ ROWS = 5000
 OVERLAP = 0.3
 """Mean overlap of logged and simulated (s, a), in [0, 1], from which discriminators go on to innovations."""
 LOUDEST = 0.03
-"""Noise of the sensors, in typical changes of a row, above which a prediction from a reading tells too little."""
+"""Noise of the sensors, in typical changes of a signal, above which a prediction from a reading tells too little."""
 IMPACTS = 0.99
 """Quantile of the squared innovations of a channel beyond which they do not raise its scale."""
 FINEST = 1e-3
-"""Smallest scale of a channel, in typical changes of a row: finer differences are rounding, of the log or the model."""
+"""Smallest scale of a channel, in its typical changes: finer differences are rounding, of the log or the model."""
 LINEAR = 3.0
 """Features are asinh(3 e / scale) / 3: linear up to a third of the scale, logarithmic beyond, as innovations at impacts
 are a hundred times those in flight."""
@@ -59,7 +59,7 @@ class Reference:
     age: int
 
     def size(self, typical_change: Float[np.ndarray, " observation"]) -> float:
-        """Root mean square, over channels, of the scale in typical changes of a row: the unit of the features."""
+        """Root mean square, over channels, of the scale in typical changes: the unit of the features."""
         return float(np.sqrt(np.mean((self.scale / typical_change) ** 2)))
 
 
@@ -97,7 +97,7 @@ def obstacle(problem: CalibrationProblem, window: int, noise: Float[np.ndarray, 
     if problem.dataset.disturbance.shuffled == "next_observations":
         return "the log's next observations are shuffled"
     if np.median(noise / problem.typical_change) > LOUDEST:
-        return f"the sensors' noise is more than {100 * LOUDEST:g} % of a step's change, and a prediction amplifies it"
+        return f"the sensors' noise is more than {100 * LOUDEST:g} % of a signal's typical change, and a prediction amplifies it"
     return "" if window == 1 else f"discriminators see windows of {window} rows"
 
 

@@ -32,7 +32,7 @@ class Watch:
 
     Attributes:
         epochs: Number of calibration epochs so far.
-        mismatch: Distance of simulated from logged rows in typical changes of a row: the blur times the mean |reward|
+        mismatch: Distance of simulated from logged rows in typical changes of a signal: the blur times the mean |reward|
             over its set value. Without a blur it is the mean |reward|.
         began: Epoch from which mismatches are of the same features of s'.
         overlap: Mean overlap of logged and simulated (s, a).
@@ -80,7 +80,7 @@ def observe(
 ) -> Watch:
     """The watch after one more epoch, whose estimate is kept unless an earlier mismatch was clearly lower.
 
-    `unit` is the unit of the blur in typical changes of a row.
+    `unit` is the unit of the blur in typical changes of a signal.
 
     Mismatches are compared once the discriminators have settled, provided that the mean |reward| is near `steered_to`,
     its set value, or the blur is at its lower limit. Before that, without a blur (`steered_to` is then 0), and while
