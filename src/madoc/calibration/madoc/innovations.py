@@ -97,7 +97,8 @@ def obstacle(problem: CalibrationProblem, window: int, noise: Float[np.ndarray, 
     if problem.dataset.disturbance.shuffled == "next_observations":
         return "the log's next observations are shuffled"
     if np.median(noise / problem.typical_change) > LOUDEST:
-        return f"the sensors' noise is more than {100 * LOUDEST:g} % of a signal's typical change, and a prediction amplifies it"
+        share = f"{100 * LOUDEST:g} % of a signal's typical change"
+        return f"the sensors' noise is more than {share}, and a prediction amplifies it"
     return "" if window == 1 else f"discriminators see windows of {window} rows"
 
 

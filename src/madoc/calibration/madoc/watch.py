@@ -32,8 +32,8 @@ class Watch:
 
     Attributes:
         epochs: Number of calibration epochs so far.
-        mismatch: Distance of simulated from logged rows in typical changes of a signal: the blur times the mean |reward|
-            over its set value. Without a blur it is the mean |reward|.
+        mismatch: Distance of simulated from logged rows in typical changes of a signal: the blur times the mean
+            |reward| over its set value. Without a blur it is the mean |reward|.
         began: Epoch from which mismatches are of the same features of s'.
         overlap: Mean overlap of logged and simulated (s, a).
         at_bound: Share of rows whose reward is at its bound.
