@@ -84,7 +84,7 @@ class Madoc:
     starts: StartMode | None = "policy"
     window: Count | None = None
     sensor_noise: SensorNoise = None
-    features: Features | Literal["innovations"] | None = None
+    features: Features | None = None
     hidden: Layers = (128, 128)
     cloning_epochs: CountOrZero = 40
     cloning_updates: Count = 200
@@ -190,7 +190,7 @@ class Madoc:
         one_row = problem.states.kind == "exact" or mode == "replay"
         window = self.window or (1 if one_row else HIDDEN_WINDOW)
         systems, horizon = GEOMETRY[mode]
-        kind: Features = "raw" if self.features == "raw" else "standardised"
+        kind: Literal["standardised", "raw"] = "raw" if self.features == "raw" else "standardised"
         scaling, logged = problem.features.windows(kind, window)
         return Collection(
             problem,

@@ -25,8 +25,8 @@ from madoc.simulation.rollout import (
 from madoc.types import Policy
 
 StartMode = Literal["policy", "logged", "replay"]
-Features = Literal["standardised", "raw"]
-"""How discriminators see a row: (s, a) standardised and s' - s, or (s, a) and s' as they are."""
+Features = Literal["innovations", "standardised", "raw"]
+"""How discriminators see s'; `Madoc` describes each."""
 GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
 """Number of parameter draws in an epoch, and of control steps that each row is simulated under one draw, by mode."""
 
