@@ -41,6 +41,8 @@ def test_tasks_that_are_worse_than_printed_are_named(monkeypatch):
     told = readme.tasks()
     assert "On 2 of the paper's 21 tasks, 1 seed each, `madoc` errs by 0.30 on average" in told
     assert "where the paper prints 0.30,\nand by no more than printed in 1, all but b-low." in told
+    monkeypatch.setattr(paper, "beside_printed", lambda column: rows[:1])
+    assert "by no more than printed in each of them." in readme.tasks()
 
 
 def test_a_cell_shows_seeds_refusals_what_was_not_run_and_what_is_printed():
