@@ -48,12 +48,11 @@ class Discriminators(eqx.Module):
         self.pair_bound = pair_bound
 
     def __call__(
-        self, pair: Array, following: Array, key: PRNGKeyArray | None = None, *, known: bool = False
+        self, pair: Array, following: Array, key: PRNGKeyArray | None = None
     ) -> tuple[Float[Array, "rows 2"], Float[Array, "rows 2"]]:
-        """Log probabilities (target, source) given (s, a), and given (s, a, s'); f_sa learns unless it is `known`."""
+        """Log probabilities (target, source) given (s, a), and given (s, a, s')."""
         keys = (None, None) if key is None else jax.random.split(key)
         logits_pair = self.pair_logits(pair, keys[0])
-        logits_pair = jax.lax.stop_gradient(logits_pair) if known else logits_pair
         triple = jnp.concatenate([pair, following], axis=-1)
         logits_triple = self.bound * jnp.tanh(self.triple(triple, keys[1])) + logits_pair
         return jax.nn.log_softmax(logits_pair), jax.nn.log_softmax(logits_triple)
@@ -68,19 +67,14 @@ def discriminator_loss(
     logged: tuple[Array, Array],
     simulated: tuple[Array, Array],
     key: PRNGKeyArray | None = None,
-    pairs: Array | None = None,
 ) -> tuple[Scalar, dict[str, Array]]:
     """Eq. (6), Jiang et al. 2024: the sum of both cross-entropies; also each of them, and each accuracy.
 
-    `logged` and `simulated` are features (pair, following) of as many rows. The key is that of dropout. Where s' is
-    known of few rows only, f_sa learns from `pairs`, as many (s, a) of the whole log, and from nothing else: it
-    would know the few by heart.
+    `logged` and `simulated` are features (pair, following) of as many rows. The key is that of dropout.
     """
     count = len(logged[0])
     joined = [jnp.concatenate(parts) for parts in zip(logged, simulated, strict=True)]
-    pair, triple = discriminators(joined[0], joined[1], key, known=pairs is not None)
-    if pairs is not None:
-        pair = jax.nn.log_softmax(discriminators.pair_logits(jnp.concatenate([pairs, simulated[0]])))
+    pair, triple = discriminators(joined[0], joined[1], key)
 
     def cross_entropy(log_probability: Array) -> Array:
         return -log_probability[:count, TARGET].mean() - log_probability[count:, SOURCE].mean()

@@ -163,7 +163,6 @@ class AgentSettings:
         agents: Agents,
         simulated: replay.Replay,
         logged: tuple[Float[Array, "rows pair"], Observations],
-        pairs: Float[Array, "log pair"] | None,
         members: Bool[Array, "groups d"],
         key: PRNGKeyArray,
         *,
@@ -175,19 +174,16 @@ class AgentSettings:
 
         The discriminators learn from blurred s'; the reward is computed at s' without blur, where it is least noisy.
         Simulated rows are columns `pair`, `following` and `parameters` (in [-1, 1]), logged rows are (pair, following).
-        f_sa learns from the `pairs` of the whole log where logged rows are only some of it.
         """
 
         def update(agents: Agents, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
             of_logged, of_simulated, of_blur, of_dropout, of_actors = jax.random.split(key, 5)
             rows = jax.random.randint(of_logged, (self.batch,), 0, len(logged[0]))
             drawn = replay.sample(simulated, of_simulated, self.batch)
-            of_pairs = jax.random.fold_in(of_logged, 1)
-            drawn_pairs = None if pairs is None else pairs[jax.random.randint(of_pairs, (self.batch,), 0, len(pairs))]
             scale = jnp.exp(agents.log_blur) if self.reward_size else 0.0
             target, source = blur((logged[1][rows], drawn["following"]), scale, of_blur)
             agents, metrics = self._update_discriminators(
-                agents, (logged[0][rows], target), (drawn["pair"], source), drawn_pairs, of_dropout
+                agents, (logged[0][rows], target), (drawn["pair"], source), of_dropout
             )
             reward = log_dynamics_ratio(agents.judges, drawn["pair"], drawn["following"])
             common = overlap(agents.judges, drawn["pair"])
@@ -204,11 +200,10 @@ class AgentSettings:
         agents: Agents,
         target: tuple[Array, Array],
         source: tuple[Array, Array],
-        pairs: Array | None,
         key: PRNGKeyArray,
     ) -> tuple[Agents, dict[str, Array]]:
         (_, metrics), gradients = eqx.filter_value_and_grad(discriminator_loss, has_aux=True)(
-            agents.discriminators, target, source, key, pairs
+            agents.discriminators, target, source, key
         )
         discriminators, optimiser = descend(
             adam(self.discriminator_rate), gradients, agents.discriminator_optimiser, agents.discriminators

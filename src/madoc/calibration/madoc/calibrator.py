@@ -325,7 +325,7 @@ class Madoc:
         walkers = collection.begin(systems, of_start) if fresh else state.walkers
         rollout, walkers = collection.roll(state.clone.policy, draws, walkers, (of_action, of_restart))
         agents, watched, reference, rows = state.agents, state.watch, state.reference, state.rows
-        logged, pairs, described, resolution = collection.logged, None, None, OF_CHANGES
+        logged, described, resolution = collection.logged, None, OF_CHANGES
         steps, failures, unit = rollout.valid.size, rollout.failures, 1.0
         if reference is not None and (reference.age >= 0 or watch.overlaps(watched, innovations.OVERLAP)):
             estimate = problem.simulator.parameters.to_physical(np.tanh(np.asarray(agents.actors.mean, np.float64)))
@@ -339,7 +339,7 @@ class Madoc:
                     agents = replace(agents, log_blur=agents.log_blur + np.float32(np.log(was / now)))
                 rows = replay.clear(rows) if seen.reference.age == 0 else rows
                 reference, described, resolution = seen.reference, seen.following, OF_INNOVATIONS
-                logged, pairs = (reference.pair, reference.following), collection.logged[0]
+                logged = reference.pair, reference.following
                 unit = reference.size(problem.typical_change)
         rows = collection.remember(rows, rollout, draws, np.zeros(systems, np.int64), described)
         if not int(rows.written):
@@ -351,7 +351,6 @@ class Madoc:
             agents,
             rows,
             logged,
-            pairs,
             jnp.asarray(grouping.members(state.labels, self._group_count(problem))),
             of_updates,
             mixing=self.mixing,
