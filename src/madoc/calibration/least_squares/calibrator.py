@@ -184,7 +184,7 @@ class LeastSquares:
             interval=interval,
             quantile=errors,
             settled=settled,
-            long_tails=state.estimates_starts and sentences.have_long_tails(best),
+            long_tails=settled and state.estimates_starts and sentences.have_long_tails(best),
         )
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:

@@ -67,7 +67,8 @@ class Madoc:
         grouping_epochs: Epochs of grouping, outside the budget. One spends at most 100 · (1 + 2 d) control steps by
             physics, `epoch_steps` if groups are learned.
         grouping_updates: Updates of the VAE in each epoch of grouping, rounded up to tens while groups are voted on.
-        epoch_steps: Control steps of rollouts in an epoch; predictions for innovations take as many again.
+        epoch_steps: Control steps of rollouts in an epoch. Predictions for innovations take as many again, and those of
+            logged rows at a new reference come on top.
         updates: Calibration updates in an epoch.
         draws: Parameter draws in an epoch; None takes 20, 100, 100 for `policy`, `logged`, `replay`.
         horizon: Control steps under one draw; None takes 50, 5, 1 for `policy`, `logged`, `replay`.
