@@ -96,7 +96,7 @@ class AgentSettings:
         prior_rate: Rate of the prior's moving average.
         prior_every: Updates between two moves of the prior.
         average_rate: Rate of the moving average from which the estimate is read.
-        baseline: Whether b of Eq. (11) depends on (s, a); in the paper it does not.
+        baseline: Whether b of Eq. (11) depends on (s, a), where credit has one (`dop`); in the paper it does not.
         reward_size: Mean |reward| to which the blur is steered; 0 for no blur, as in the paper.
         blur_rate: Change of the logarithm of the blur in an update, for an error of the mean |reward| of 1.
     """
@@ -196,11 +196,7 @@ class AgentSettings:
         return scan_updates(update, agents, key, count)
 
     def _update_discriminators(
-        self,
-        agents: Agents,
-        target: tuple[Array, Array],
-        source: tuple[Array, Array],
-        key: PRNGKeyArray,
+        self, agents: Agents, target: tuple[Array, Array], source: tuple[Array, Array], key: PRNGKeyArray
     ) -> tuple[Agents, dict[str, Array]]:
         (_, metrics), gradients = eqx.filter_value_and_grad(discriminator_loss, has_aux=True)(
             agents.discriminators, target, source, key
