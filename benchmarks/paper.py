@@ -20,6 +20,7 @@ from jaxtyping import Float
 from scipy import stats
 
 from calibration import commit
+from madoc import tasks
 from madoc.suites.cells import KINDS, Cell
 from madoc.suites.options import flat
 from madoc.suites.planning import Plan, plan_of
@@ -38,10 +39,15 @@ TITLES = {
     "table-2": "Table 2: normalized return, NeoRL's qualities",
     "table-12": "Table 12: normalized return by the kind of credit",
     "table-13": "Table 13: normalized return with cloning",
+    "figure-3b": "Figure 3b: normalized return by the number of calibrated parameters",
+    "figure-3b-errors": "Figure 3b: mean calibration error by the number of parameters, in % of their ranges",
     "figure-4": "Figures 4 and 8: normalized return by rows and ranges",
     "figure-6": "Figure 6: normalized return with groups and without",
     "figure-7": "Figure 7: normalized return by the number of groups and α",
 }
+
+MEASURES = {"figure-3b-errors": "percent_of_range"}
+"""What is shown of a cell's result, where that is not its `value`: a mean over other parameters has other units."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +175,7 @@ def planned(name: str) -> Plan:
 def scores_of(plan: Plan, found: Mapping[str, Mapping]) -> list[Score]:
     """Every cell that a suite asks for, with its place in the table and what it found."""
     by_name = {cell.name: cell for cell in plan.cells}
+    counted = any("parameters" in asked(cell) for cell in plan.cells if cell.kind == "calibrate")
     scores = []
     for cell in plan.cells:
         if not cell.wanted:
@@ -179,7 +186,10 @@ def scores_of(plan: Plan, found: Mapping[str, Mapping]) -> list[Score]:
             chain[cell.kind] = cell
         last = next(chain[kind] for kind in ("evaluate", "learn", "calibrate") if kind in chain)
         known = found.get(last.name, {})
-        scores.append(Score(*place(chain), known.get("value"), "refusal" in known))
+        row, column = place(chain)
+        count = parameters(chain["calibrate"])
+        row += f", {count} parameter{'s' * (count > 1)}" if counted else ""
+        scores.append(Score(row, column, known.get(MEASURES.get(plan.name, "value")), "refusal" in known))
     return scores
 
 
@@ -200,6 +210,12 @@ def place(chain: Mapping[str, Cell]) -> tuple[str, str]:
     if method != "nominal":
         return row, column if learner == "sac" else f"{column} + {learner}"
     return row, (at if at != "calibrated" else method) if learner == "sac" else learner
+
+
+def parameters(calibration: Cell) -> int:
+    """How many parameters a cell calibrates: those that it names, or all of the robot's."""
+    told = asked(calibration)
+    return len(told.get("parameters") or tasks.make(told["task"]).parameters)
 
 
 def asked(cell: Cell) -> dict:
