@@ -35,9 +35,10 @@ check: $(TESTS)  ## format, lint, types, layers
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-figures: $(TESTS)  ## every measured table of the README and of the documentation, from committed results
+figures: $(TESTS)  ## every measured table and picture of the README and of the documentation, from committed results
 	$(BIN)/python benchmarks/tables.py > /dev/null
 	$(BIN)/python benchmarks/paper.py > /dev/null
+	$(BIN)/python benchmarks/embedding.py > /dev/null
 
 docs: $(TESTS)  ## the site, in build/site; opens from there without a server or a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --clean

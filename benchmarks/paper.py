@@ -112,7 +112,7 @@ def tables() -> str:
     head = (
         "# The paper's tables\n\nMade by `python benchmarks/paper.py`; in brackets, as printed. "
         "A calibration here learns from at most 300,000 control steps, the paper's from 1,000,000; Madoc's grouping "
-        "takes up to 60,000 more.\n"
+        "takes up to 60,000 more. [Figure 3a](../../docs/concepts/groups.svg) is by `benchmarks/embedding.py`.\n"
     )
     return "\n".join([head, *(table(name) for name in TITLES)])
 

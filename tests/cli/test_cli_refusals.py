@@ -86,6 +86,8 @@ def places(recorded, whole, tmp_path):
         (CALIBRATE + "--seed -1", "seed"),
         (CALIBRATE + "--method madok", "did you mean madoc?"),
         (CALIBRATE + "--parameters torso", "did you mean body_mass.torso?"),
+        (CALIBRATE + "--parameters --seed 1", "expected the names of parameters to calibrate, got none"),
+        (CALIBRATE + "--parameters gravity gravity", "the parameter gravity is named twice; keep one"),
         (CALIBRATE + "--set updats=2", "did you mean updates?"),
         (CALIBRATE + "--set bound=2", "did you mean agents.bound?"),
         (CALIBRATE + "--set updates=few", "hyperparameter updates of madoc is int, got 'few'"),

@@ -34,6 +34,8 @@ def changed(old, new):
         (changed("budget", "budgt"), 6, "unknown key 'budgt'; nearest: budget"),
         (changed("windows", "windws"), 7, "did you mean windows?"),
         (CELL + "    parameters: [body_mass.cat]\n", 8, "unknown parameter of spring.yaml 'body_mass.cat'"),
+        (CELL + "    parameters: []\n", 8, "expected the names of parameters to calibrate, got none"),
+        (HOPPER + "    parameters: [gravity, gravity]\n", 4, "the parameter gravity is named twice; keep one"),
         (changed("windows: 4", "windows: 2024-05-01"), 7, "windows of least-squares"),
         (changed("400", "2024-05-01"), 6, "expected a budget such as 300000, 300s, 15min or 2h, got '2024-05-01'"),
         (ROBOTS.format("a**b/*"), 4, "a**b/*"),

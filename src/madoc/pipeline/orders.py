@@ -72,8 +72,8 @@ class Search:
     """Physics of the simulator. Default: the data's; legacy where it does not say."""
     level: str = "normal"
     """Ranges to search: easy, normal or hard."""
-    parameters: tuple[str, ...] = ()
-    """Calibrate only these. Default: all of the robot's."""
+    parameters: tuple[str, ...] | None = None
+    """Calibrate only these; the others stay at the model's own values. Default: all of the robot's."""
     method: str | None = None
     """A calibrator, as `madoc methods` lists it, or auto: what the data allows, compared on a hold-out. Default: auto
     for a robot of your own, else madoc."""

@@ -36,7 +36,7 @@ def check_order(order: CalibrationOrder, out: Path | None = None) -> None:
 
 
 def check_search(search: Search, task: Task, name: str) -> None:
-    """Refuse parameters that the robot does not have, and ranges of an unknown level.
+    """Refuse parameters that the robot does not have, one named twice, none at all, and ranges of an unknown level.
 
     Args:
         search: What is calibrated.
@@ -46,7 +46,12 @@ def check_search(search: Search, task: Task, name: str) -> None:
     Raises:
         MadocError: Names the parameter or the level.
     """
-    for parameter in search.parameters:
+    named = task.parameters.names if search.parameters is None else search.parameters
+    if not named:
+        raise MadocError("expected the names of parameters to calibrate, got none; without the option all are")
+    for parameter in named:
         if parameter not in task.parameters.names:
             raise unknown_name(f"parameter of {name}", parameter, task.parameters.names)
+        if named.count(parameter) > 1:
+            raise MadocError(f"the parameter {parameter} is named twice; keep one")
     task.with_level(search.level)

@@ -57,7 +57,7 @@ def check_calibration(order: CalibrationOrder, *, recorded: bool, allow_code: bo
     search = order.search
     with under("task"):
         task = _robot(order.task, search.physics, allow_code)
-    with under("parameters" if search.parameters else "level"):
+    with under("level" if search.parameters is None else "parameters"):
         _ranges(order.task, search.physics, search.parameters, search.level, allow_code)
     method = method_of(order)
     with under("method"):
@@ -253,12 +253,12 @@ def _robot(task: str, physics: str | None, allow_code: bool) -> Task:
 
 
 @cache
-def _ranges(task: str, physics: str | None, parameters: tuple[str, ...], level: str, allow_code: bool) -> None:
+def _ranges(task: str, physics: str | None, parameters: tuple[str, ...] | None, level: str, allow_code: bool) -> None:
     check_search(Search(parameters=parameters, level=level), _robot(task, physics, allow_code), Path(task).name)
 
 
 @cache
-def _truth(file: Path, task: str, physics: str | None, parameters: tuple[str, ...], allow_code: bool) -> None:
+def _truth(file: Path, task: str, physics: str | None, parameters: tuple[str, ...] | None, allow_code: bool) -> None:
     from madoc.pipeline.data_stage import Machine, read_truth
 
     robot = _robot(task, physics, allow_code)

@@ -1,6 +1,7 @@
 """Estimates in their ranges, which parameters act alike, and which estimates are correlated."""
 
 import numpy as np
+from jaxtyping import Float
 
 from madoc.report.charts import matrix_chart, scatter_chart
 from madoc.report.reading import Run
@@ -22,11 +23,9 @@ def grouping(run: Run) -> dict[str, object] | str:
         if run.groups:
             return "The parameters were grouped, but the run kept no embeddings to draw."
         return "This method does not group parameters by what they do, so there is no picture of it."
-    centred = embeddings.vectors - embeddings.vectors.mean(0)
-    left, singular, _ = np.linalg.svd(centred, full_matrices=False)
-    shares = singular**2 / max(float((singular**2).sum()), 1e-300)
+    points, shares = plane_of(embeddings.vectors)
     chart = scatter_chart(
-        left[:, :2] * singular[:2],
+        points,
         [parameter_title(name) for name in embeddings.names],
         [run.colour(name) for name in embeddings.names],
         label="parameters in the plane of their embeddings",
@@ -34,6 +33,19 @@ def grouping(run: Run) -> dict[str, object] | str:
     )
     groups, stability = (run.result.groups, run.result.group_stability) if run.result else ([], None)
     return {"chart": chart, "groups": groups, "stability": None if stability is None else f"{stability:.2f}"}
+
+
+def plane_of(
+    vectors: Float[np.ndarray, "points components"],
+) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, " shares"]]:
+    """Points in the plane of the two directions in which they differ most, and shares of the variance by direction.
+
+    The point that is farthest out in a direction is on its positive side: the same vectors make the same picture.
+    """
+    left, singular, _ = np.linalg.svd(vectors - vectors.mean(0), full_matrices=False)
+    points = left[:, :2] * singular[:2]
+    farthest = np.take_along_axis(points, np.abs(points).argmax(0)[None], axis=0)
+    return np.where(farthest < 0.0, -points, points), singular**2 / max(float((singular**2).sum()), 1e-300)
 
 
 def correlations(run: Run) -> dict[str, object] | str:
