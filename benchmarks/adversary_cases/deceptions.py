@@ -25,6 +25,7 @@ CLOCK = r"clock|drift|spacing|\brates?\b"
 FORCE = r"constant|wind|external|offset|\bbias"
 CONTACT = r"contact|\bwall|collision"
 BASE = r"\bbase\b|accelerat|periodic"
+TIMESTEP = "timestep|integration step"
 
 POSITIONS = Log(velocities="none")
 NOISY = Log(noise=0.02)
@@ -167,6 +168,8 @@ _ARM = (
 )
 
 _BOX = (
+    Case(BOX, "fine", Plant(fine=5), cause=TIMESTEP),
+    Case(BOX, "fine-exact", Plant(fine=5), Log(noise=0.0), cause=TIMESTEP),
     Case(BOX, "slope", Plant({"slope": 0.08}), cause=GRAVITY),
     Case(BOX, "drag", Plant(drag=1.0), cause=DRAG),
     Case(BOX, "damping", Plant({"damping": 2.0}), cause="damping|viscous"),

@@ -22,6 +22,10 @@ def usual(robot: Robot, *, share: float = 0.02) -> tuple[Case, ...]:
     )
 
 
+_NOT = {**dict.fromkeys(("ball", "hull", "leg"), ("few", "100hz")), "box": ("few", "100hz", "fine", "fine-exact")}
+"""Conditions that a robot does not meet. Integrated five times more finely, the box slides otherwise than the user's
+model can say: at the true values one row's prediction is off by 0.7 typical changes of the speed. That is a deception.
+"""
 _LONG = ("length", "damping", "friction", "armature")  # with the gain as well, the log would tell only ratios
 _EIGHT = tuple(ARM.catalogue)
 
@@ -60,6 +64,6 @@ _SPECIAL = (
 
 HONEST = (
     *(case for robot in (PENDULUM, ARM, CART) for case in usual(robot)),
-    *(case for robot in (BOX, BALL, HULL, LEG) for case in usual(robot) if case.name not in ("few", "100hz")),
+    *(case for robot in (BOX, BALL, HULL, LEG) for case in usual(robot) if case.name not in _NOT[robot.name]),
     *_SPECIAL,
 )

@@ -14,6 +14,7 @@ from madoc.diagnosis.explanation import Explanation, action_findings, box_draws,
 from madoc.diagnosis.response import response_findings
 from madoc.diagnosis.scales import scale_findings
 from madoc.diagnosis.speeds import speed_findings
+from madoc.diagnosis.timestep import timestep_findings
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.robots import Robot
 from madoc.simulation import Simulator
@@ -96,6 +97,8 @@ def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None,
         spent += excitation.control_steps
         findings += excitation_findings(excitation, simulator)
         findings += scale_findings(dataset, simulator, logged, start, only_ratios=excitation.only_ratios)
+        about_timestep, steps = timestep_findings(dataset, simulator, logged, start)
+        findings, spent = findings + about_timestep, spent + steps
     return Diagnosis(
         rows=len(dataset),
         episodes=len(dataset.episode_starts),

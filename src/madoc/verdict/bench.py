@@ -16,6 +16,7 @@ from madoc.diagnosis.channels import signal_names
 from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.errors import MadocError
 from madoc.identification.candidate_terms import INTEGRATION
+from madoc.identification.coarseness import coarseness
 from madoc.identification.excitation import expected_half_widths
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
 from madoc.identification.noise import difference_noise
@@ -214,6 +215,9 @@ def judged(
             bench.held_out, bench.simulator, points, horizons(problem.dataset)[1], bench.change, contradicts=True
         )
         found, spent = (*exchanged, *found), spent + steps
+    coarse, steps = np.zeros(1), 0
+    if bench.simulator.task.source is not None:  # else no timestep can be given
+        coarse, steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
     # Another estimate of other windows says that the search is not at its end, not that a parameter is open.
     open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
     best, own_ends = (point[:, None] + np.outer(each, (-1.0, 1.0)) for each in (half, own))
@@ -229,7 +233,7 @@ def judged(
         interval_shares=dict(zip(space.names, shares.tolist(), strict=True)),
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
-        control_steps=control_steps + spent + doubts.control_steps,
+        control_steps=control_steps + spent + steps + doubts.control_steps,
         missing_terms=tuple(
             term
             for place, term in enumerate(doubts.terms)
@@ -238,6 +242,7 @@ def judged(
         alternatives=doubts.alternatives,
         tested=doubts.tested,
         contradictions=tuple(each.sentence for each in found if each.contradicts),
+        coarseness=float(coarse.max()),
         at_end=tuple(
             row.name
             for row, value in zip(space.parameters, point, strict=True)

@@ -16,6 +16,7 @@ from madoc.calibration.holdout import (
     Word,
 )
 from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, SATURATION, SPACING, TILTS
+from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
 from madoc.identification.information import OPEN
@@ -150,13 +151,16 @@ def _others(holdout: HoldOut, term: MissingTerm) -> str:
     return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
 
 
-def _coarse(holdout: HoldOut, named: MissingTerm) -> str:
-    """That the model should be integrated more finely first, where that explains more than the term named."""
-    step = coarse_step(holdout, named)
-    if step is None:
-        return ""
-    explains = f"explains {100 * step.explained:.2g} % (t = {abs(step.t):.0f})"
-    return f"; first take a smaller timestep of the model, whose error {explains}"
+def _coarse(holdout: HoldOut, named: MissingTerm | None = None) -> str:
+    """That the model should be integrated more finely first.
+
+    That is so where it changes predictions by much, or explains more than the term named.
+    """
+    first = "; first take a smaller timestep of the model"
+    if holdout.coarseness > COARSE:
+        return f"{first}: steps of a quarter change predictions by {holdout.coarseness:.2g} typical changes of a signal"
+    step = None if named is None else coarse_step(holdout, named)
+    return "" if step is None else f"{first}, whose error explains {100 * step.explained:.2g} % (t = {abs(step.t):.0f})"
 
 
 def _at_end(holdout: HoldOut) -> str:
@@ -203,7 +207,7 @@ def _outside(holdout: HoldOut) -> Verdict | None:
     return Verdict(
         "MODEL_MISMATCH",
         f"{', '.join(holdout.at_end)} at the end of the range: the true value may lie beyond it, and then the other "
-        "parameters make up for it; widen the range",
+        f"parameters make up for it; widen the range{_coarse(holdout)}",
         holdout.at_end,
     )
 
@@ -216,7 +220,7 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
         "MODEL_MISMATCH",
         "residuals have longer tails than noise has: the model does not explain some stretches of the log, and "
         "intervals do not count that; look there for a force that acts at times only, at contacts or in fast motion, "
-        "and for wrong readings",
+        f"and for wrong readings{_coarse(holdout)}",
     )
 
 
@@ -238,7 +242,7 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
             f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}){_others(holdout, term)}; "
             f"{_remedy(term)}"
         )
-    return Verdict("MODEL_MISMATCH", sentence, pinned)
+    return Verdict("MODEL_MISMATCH", f"{sentence}{_coarse(holdout)}", pinned)
 
 
 def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
