@@ -136,9 +136,10 @@ def compared(whole: Path, killed: Path) -> dict:
 
 
 def bits(folder: Path) -> tuple:
-    """What a calibration found, without seconds: its result, its log, and the windows that show it."""
+    """What a calibration found, without seconds and memory: its result, its log, and the windows that show it."""
     result = json.loads((folder / "result.json").read_text())
     del result["seconds"]
+    result.pop("peak_memory", None)
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     with np.load(folder / "evidence.npz") as arrays:
         evidence = {name: arrays[name].tobytes() for name in arrays}

@@ -10,11 +10,12 @@ from madoc.commands.answer import EXIT_CODES
 from madoc.commands.main import main
 from madoc.data.targets import paper_truth
 from madoc.numpy_policy import NumpyPolicy
+from madoc.runs.memory import forget_peak
 
 RESULT = {
     *("method", "task", "status", "sentence", "control_steps", "seconds", "seed", "groups", "parameters", "settled"),
     *("warnings", "error", "long_tails"),
-}
+} | ({"peak_memory"} if forget_peak() else set())
 
 
 def read(path):

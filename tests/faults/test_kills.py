@@ -50,6 +50,7 @@ def kill_after(process, *, folder, more, seconds):
 def told(folder):
     result = json.loads((folder / "result.json").read_text())
     del result["seconds"]
+    result.pop("peak_memory", None)
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     return result, [(line["stage"], line["control_steps"], line["metrics"]) for line in lines]
 

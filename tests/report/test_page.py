@@ -102,6 +102,13 @@ def test_a_hold_out_is_told_by_its_own_measure(whole):
     assert run_context(read_run(whole))["facts"][0][0] == "classifier, simulated or logged"
 
 
+def test_memory_is_told_where_it_is_known(whole):
+    assert ("most memory held", "not known") in content(whole, "cost")["facts"]
+    file = whole / "calibration" / "result.json"
+    write_json(file, json.loads(file.read_text()) | {"peak_memory": 512_000_000})
+    assert ("most memory held", "512 MB") in content(whole, "cost")["facts"]
+
+
 def test_time_is_told_by_stage(whole):
     stages = content(whole, "cost")["stages"]
     assert [(stage["name"], stage["share"], stage["words"]) for stage in stages] == [

@@ -75,6 +75,7 @@ def calibrate(
         sentence=finished.sentence,
         control_steps=finished.control_steps + probing,
         seconds=round(finished.seconds, 3),
+        peak_memory=finished.peak_memory,
         seed=int(np.asarray(jax.random.key_data(key))[-1]),
         groups=[[space.names[index] for index in group] for group in estimate.groups or [range(len(space))]],
         parameters=_parameters(space, estimate),

@@ -67,6 +67,7 @@ class CalibrationResult:
             groups, 0 for chance; None where the method did not find groups.
         verdict: The judgement on held-out rows; None where none were held out.
         holdout: The numbers behind the verdict.
+        peak_memory: The most resident memory that the process held while epochs ran, bytes; None where it is not known.
         problem: The data and the simulator; None in a result that was read from a file.
     """
 
@@ -90,6 +91,7 @@ class CalibrationResult:
     group_stability: float | None = None
     verdict: Verdict | None = None
     holdout: HoldOut | None = None
+    peak_memory: int | None = None
     problem: Annotated[CalibrationProblem | None, GetPydanticSchema(lambda kind, handler: core_schema.any_schema())] = (
         field(default=None, repr=False, compare=False)
     )

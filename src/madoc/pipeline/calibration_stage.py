@@ -95,7 +95,8 @@ def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool)
     """Try the candidates within the budget, each in a folder of its own, and keep what predicts the hold-out best.
 
     The first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and so does a
-    verdict on the data itself. Killed at any moment and resumed, the result has the same bits but for its seconds.
+    verdict on the data itself. Killed at any moment and resumed, the result has the same bits but for its seconds and
+    its memory.
 
     Returns:
         The best candidate's result, with the cost of all of them; `holdout` has a row for each candidate.
@@ -200,9 +201,11 @@ def _with_cost_of_all(
     chosen: str,
 ) -> CalibrationResult:
     """The chosen candidate's result, with the comparison and the cost of all candidates."""
+    peaks = [each.peak_memory for each in spent]
     return replace(
         result,
         control_steps=sum(each.control_steps for each in spent),
         seconds=round(sum(each.seconds for each in spent), 3),
+        peak_memory=max(peaks) if None not in peaks else None,
         holdout=replace(assessment.holdout, candidates=tuple(rows), chosen=chosen),
     )

@@ -41,7 +41,7 @@ def run_all(
 
     The folder holds `data.npz`, the run folders `calibration`, `policy-calibrated` (or `policy-distribution`),
     `policy-midrange` and `policy-truth`, `evaluation.json`, `export` and `summary.json`. Killed at any moment and
-    resumed, the summary is the same but for its seconds.
+    resumed, the summary is the same but for seconds and memory.
 
     Returns:
         The summary. Its `status` is `finished`, or that of the stage that was interrupted or diverged.

@@ -19,6 +19,15 @@ from madoc.robots.document import yaml_text
 
 
 @dataclass(frozen=True)
+class StageCost:
+    """What all epochs of a stage took: wall-clock time in s, control steps (or updates), and their number."""
+
+    seconds: float
+    spent: float
+    epochs: int
+
+
+@dataclass(frozen=True)
 class MetricLog:
     """The lines of a `metrics.jsonl` as columns; a metric is NaN at lines that do not have it.
 
@@ -38,6 +47,15 @@ class MetricLog:
 
     def __len__(self) -> int:
         return len(self.stage)
+
+    def by_stage(self) -> dict[str, StageCost]:
+        """The cost of each stage; what came before the first line belongs to the first stage."""
+        seconds, spent = np.diff(self.seconds, prepend=0.0), np.diff(self.spent, prepend=0.0)
+        rows = {name: np.array([stage == name for stage in self.stage]) for name in dict.fromkeys(self.stage)}
+        return {
+            name: StageCost(float(seconds[own].sum()), float(spent[own].sum()), int(own.sum()))
+            for name, own in rows.items()
+        }
 
 
 @dataclass(frozen=True)

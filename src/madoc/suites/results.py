@@ -22,7 +22,8 @@ COLUMNS: dict[str, type] = {
     **{"cell": str, "kind": str, "robot": str, "task": str, "data": str, "method": str, "at": str, "seed": int},
     **{"budget": str, "settings": str, "other": str, "needs": str, "status": str, "sentence": str, "verdict": str},
     **{"verdict_sentence": str, "holdout_score": float, "holdout_low": float, "holdout_high": float},
-    **{"control_steps": int, "seconds": float, "error_mean_absolute": float, "error_percent_of_range": float},
+    **{"control_steps": int, "seconds": float, "peak_memory": int, "error_mean_absolute": float},
+    **{"error_percent_of_range": float},
     **{"parameter": str, "unit": str, "estimate": float, "interval_low": float, "interval_high": float, "std": float},
     **{"low": float, "high": float, "error": float, "policy": str, "where": str, "return": float, "return_std": float},
     **{"normalized": float, "episodes": int},
@@ -161,6 +162,7 @@ def _row(result: Result) -> dict[str, Any]:
         "sentence": result.sentence or None,
         "control_steps": cost.get("control_steps"),
         "seconds": cost.get("seconds"),
+        "peak_memory": cost.get("peak_memory"),
         "error_mean_absolute": result.error.get("mean_absolute"),
         "error_percent_of_range": result.error.get("mean_percent_of_range"),
     }
