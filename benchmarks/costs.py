@@ -1,0 +1,107 @@
+"""Tables 3 and 4 of the paper: the memory that methods hold, and their time by stage."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from madoc.report.reading import read_metrics
+from madoc.suites.cells import Cell
+from madoc.suites.planning import Plan
+from madoc.suites.results import Result
+from paper_cells import asked, chain_of, how_far, kept, planned, printed_number, wanted
+
+PRINTED = {"cloning": "", "calibrating": "calibration", "exploring": "", "fitting": "", "opposing": "dynamics reward"}
+"""What the paper calls a stage, and nothing where it tells no time of it; all others have our name there too."""
+
+Costs = Sequence[Mapping]
+"""What is kept of the same cell under several seeds."""
+
+
+def cells(plan: Plan) -> list[Cell]:
+    """The cells whose cost counts: policies, and the calibrations they need; `nominal` does nothing."""
+    chains = [chain_of(cell, plan) for cell in wanted(plan)]
+    every = [chain[kind] for chain in chains for kind in ("calibrate", "learn")]
+    return [cell for cell in every if asked(cell)["method"] != "nominal"]
+
+
+def told(result: Result, folder: Path) -> dict:
+    """What is kept of a result: its peak of memory in bytes, and seconds, epochs and budget spent by stage."""
+    log = read_metrics(result.cell.folder(folder) / "metrics.jsonl")
+    if log is None or (result.calibration is None and not result.learnt):
+        return {"refusal": result.sentence}
+    cost = result.learnt if result.calibration is None else vars(result.calibration)
+    stages = {
+        name: {"seconds": round(stage.seconds, 3), "epochs": stage.epochs, "spent": round(stage.spent)}
+        for name, stage in log.by_stage().items()
+    }
+    return {"peak_memory": cost.get("peak_memory"), "unit": log.unit, "stages": stages}
+
+
+def table(name: str) -> str:
+    """Both tables, as Markdown without their title."""
+    plan, found = planned(name), kept(name)
+    methods = _by_method(plan, found)
+    lines = [
+        f"{how_far(name, cells(plan))}. Means over seeds.\n",
+        "Table 3: the largest resident memory of the process while epochs ran, in MB, with Python, its libraries, the "
+        "log and what earlier cells of the process left; in brackets the GPU memory that the paper prints, which is "
+        "another thing.\n",
+        "| method | calibration | policy |",
+        "|---|---|---|",
+        *(f"| {method} | {_memory(parts, method)} |" for method, parts in methods.items()),
+        "\nTable 4: wall-clock time, ours on one core of a CPU and the paper's with a GPU. An epoch of the paper's "
+        "calibration has 1,000 control steps and as many updates; of ours see the columns.\n",
+        "| method | stage | s | epochs | s an epoch | s per 1,000 steps or updates | printed |",
+        "|---|---|---|---|---|---|---|",
+        *(line for method, parts in methods.items() for line in _times(parts, method)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _by_method(plan: Plan, found: Mapping[str, Mapping]) -> dict[str, dict[str, list[Mapping]]]:
+    """What is kept of each method's cells by their kind, a list over seeds; a cell without cost is left out."""
+    methods: dict[str, dict[str, list[Mapping]]] = {}
+    counted = {cell.name for cell in cells(plan)}
+    for cell in wanted(plan):
+        chain = chain_of(cell, plan)
+        calibrator, learner = asked(chain["calibrate"])["method"], asked(chain["learn"])["method"]
+        parts = methods.setdefault(learner if calibrator == "nominal" else calibrator, {})
+        for kind in ("calibrate", "learn"):
+            row = found.get(chain[kind].name, {})
+            if chain[kind].name in counted:
+                parts.setdefault(kind, []).extend([row] if "stages" in row else [])
+    return methods
+
+
+def _memory(parts: Mapping[str, Costs], method: str) -> str:
+    """The cells of a row of table 3."""
+    shown = []
+    for kind in ("calibrate", "learn"):
+        peaks = [row["peak_memory"] for row in parts.get(kind, ()) if row["peak_memory"] is not None]
+        none = "" if kind not in parts else "not known" if parts[kind] else "not run"
+        shown.append(f"{np.mean(peaks) / 1e6:.0f}" if peaks else none)
+    number = printed_number("table-3", method, "memory")
+    return " | ".join(shown) + ("" if number is None else f" [{number:g}]")
+
+
+def _times(parts: Mapping[str, Costs], method: str) -> Iterator[str]:
+    """The rows of a method in table 4: a stage each, and their total."""
+    total = printed_number("table-4", method, "total")
+    known = f"{total:g} h" if total is not None else ""
+    if not all(parts.values()):
+        yield f"| {method} | all | not run | | | | {known} |"
+        return
+    sums = []
+    for costs in parts.values():
+        sums.append(np.mean([sum(stage["seconds"] for stage in row["stages"].values()) for row in costs]))
+        for name in dict.fromkeys(name for row in costs for name in row["stages"]):
+            seconds, epochs, spent = (
+                float(np.mean([row["stages"].get(name, {}).get(key, 0) for row in costs]))
+                for key in ("seconds", "epochs", "spent")
+            )
+            each = f"{1000 * seconds / spent:.3g}" if spent else ""
+            theirs = printed_number("table-4", method, PRINTED.get(name, name))
+            beside = f"{theirs:g} s an epoch" if theirs is not None else ""
+            yield f"| {method} | {name} | {seconds:.3g} | {epochs:.0f} | {seconds / epochs:.3g} | {each} | {beside} |"
+    yield f"| {method} | all | {sum(sums):.3g} | | | | {known} |"
