@@ -4,12 +4,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from paper_cells import asked, chain_of, how_far, kept, planned, printed_number, wanted
 
 from madoc.report.reading import read_metrics
 from madoc.suites.cells import Cell
 from madoc.suites.planning import Plan
 from madoc.suites.results import Result
-from paper_cells import asked, chain_of, how_far, kept, planned, printed_number, wanted
 
 PRINTED = {"cloning": "", "calibrating": "calibration", "exploring": "", "fitting": "", "opposing": "dynamics reward"}
 """What the paper calls a stage, and nothing where it tells no time of it; all others have our name there too."""

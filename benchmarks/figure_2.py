@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
+from paper_cells import asked, how_far, kept, planned, wanted
 from scipy import stats
 
 from madoc.calibration.madoc import grouping
@@ -21,7 +22,6 @@ from madoc.runs import checkpoint
 from madoc.suites.cells import Cell
 from madoc.suites.planning import Plan
 from madoc.suites.results import Result
-from paper_cells import asked, how_far, kept, planned, wanted
 
 PARAMETER = "gravity"
 COUNT = 2000

@@ -13,19 +13,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float
-from scipy import stats
-
 import costs
 import figure_2
+import numpy as np
 import paper_cells
+from jaxtyping import Float
+from paper_cells import asked, chain_of, how_far, keep, kept, planned, printed, wanted
+from scipy import stats
+
 from calibration import commit
 from madoc.suites.cells import Cell, Kind
 from madoc.suites.planning import Plan
 from madoc.suites.results import Result, results_of
 from madoc.suites.standing import Standing
-from paper_cells import asked, chain_of, how_far, keep, kept, planned, printed, wanted
 
 RESAMPLES = 2000
 """Of the bootstrap."""
