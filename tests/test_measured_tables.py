@@ -98,9 +98,9 @@ def collected(tmp_path, monkeypatch):
     return collect
 
 
-def files_of_a_run(result, count, lines):
+def files_of_a_run(result, count, lines, *, fresh=True):
     """The files of a cell, with a line of its log for each (stage, count, seconds)."""
-    ending = {"status": "finished", "sentence": "", "seconds": 1.0, "attempts": 1, "host": ""}
+    ending = {"status": "finished", "sentence": "", "seconds": 1.0, "attempts": 1, "host": "", "fresh": fresh}
     log = [{count: spent, "seconds": seconds, "stage": stage, "metrics": {}} for stage, spent, seconds in lines]
     return {
         "outcome.json": json.dumps(ending),
@@ -131,14 +131,18 @@ def test_costs_are_those_of_a_method_by_stage(collected):
     calibration = CALIBRATION | {"peak_memory": 512_000_000}
     left = {
         ("calibrate", "madoc"): files_of_a_run(calibration, "control_steps", of_calibration),
-        ("learn", "sac"): files_of_a_run({"peak_memory": 600_000_000}, "control_steps", of_policy),
+        ("learn", "sac"): files_of_a_run({"peak_memory": 600_000_000}, "control_steps", of_policy, fresh=False),
         ("learn", "cql"): files_of_a_run({"seconds": 16.0}, "updates", of_cql),
     }
     count, told = collected("table-3", [(cells[which], files) for which, files in left.items()])
     assert count == 3
     assert "9 of 12 cells are not run" in told
     rows = [line for line in told.splitlines() if line.startswith("| ")]
-    assert rows[1:4] == ["| madoc | 512 | 600 [398] |", "| cql |  | not known [286] |", "| morec |  | not run [1053] |"]
+    assert rows[1:4] == [
+        "| madoc | 512 | at most 600 [398] |",
+        "| cql |  | not known [286] |",
+        "| morec |  | not run [1053] |",
+    ]
     assert rows[5:] == [
         "| madoc | cloning | 1 | 1 | 1 |  |  |",
         "| madoc | grouping | 2 | 1 | 2 |  | 1.8 s an epoch |",
