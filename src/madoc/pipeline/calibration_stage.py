@@ -201,11 +201,11 @@ def _with_cost_of_all(
     chosen: str,
 ) -> CalibrationResult:
     """The chosen candidate's result, with the comparison and the cost of all candidates."""
-    peaks = [each.peak_memory for each in spent]
+    peaks = [each.peak_memory for each in spent if each.peak_memory is not None]
     return replace(
         result,
         control_steps=sum(each.control_steps for each in spent),
         seconds=round(sum(each.seconds for each in spent), 3),
-        peak_memory=max(peaks) if None not in peaks else None,
+        peak_memory=max(peaks) if len(peaks) == len(spent) else None,
         holdout=replace(assessment.holdout, candidates=tuple(rows), chosen=chosen),
     )
