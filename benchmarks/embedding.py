@@ -13,7 +13,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from paper import RESULTS, asked, planned
+from paper_cells import RESULTS, asked, planned
 
 from calibration import commit
 from madoc import tasks

@@ -8,28 +8,26 @@ Suites share their cells: what table 10 has calibrated, table 1 learns policies 
 """
 
 import argparse
-import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
+import costs
+import figure_2
 import numpy as np
+import paper_cells
 from jaxtyping import Float
+from paper_cells import asked, chain_of, how_far, keep, kept, planned, printed, wanted
 from scipy import stats
 
 from calibration import commit
 from madoc import tasks
-from madoc.suites.cells import KINDS, Cell
-from madoc.suites.options import flat
-from madoc.suites.planning import Plan, plan_of
+from madoc.suites.cells import Cell, Kind
+from madoc.suites.planning import Plan
 from madoc.suites.results import Result, results_of
 from madoc.suites.standing import Standing
 
-SUITES = Path(__file__).parent / "suites"
-RESULTS = Path(__file__).parent / "results" / "paper"
-OUT = "runs/paper"
 RESAMPLES = 2000
 """Of the bootstrap."""
 TITLES = {
@@ -39,12 +37,16 @@ TITLES = {
     "table-2": "Table 2: normalized return, NeoRL's qualities",
     "table-12": "Table 12: normalized return by the kind of credit",
     "table-13": "Table 13: normalized return with cloning",
+    "table-3": "Tables 3 and 4: memory, and time by stage",
+    "figure-2": "Figure 2: correlation of the critic's value with the absolute error of gravity",
     "figure-3b": "Figure 3b: normalized return by the number of calibrated parameters",
     "figure-3b-errors": "Figure 3b: mean calibration error by the number of parameters, in % of their ranges",
     "figure-4": "Figures 4 and 8: normalized return by rows and ranges",
     "figure-6": "Figure 6: normalized return with groups and without",
     "figure-7": "Figure 7: normalized return by the number of groups and α",
 }
+OWN = {"table-3": costs, "figure-2": figure_2}
+"""Modules of what is no table of scores; each has `cells`, `told` and `table`."""
 
 MEASURES = {"figure-3b-errors": "percent_of_range"}
 """What is shown of a cell's result, where that is not its `value`: a mean over other parameters has other units."""
@@ -68,24 +70,22 @@ def main() -> None:
         for name in TITLES:
             print(f"{name}: {collect(name, arguments.collect)} cells kept")
     else:
-        (RESULTS.parent / "paper.md").write_text(tables())
+        (paper_cells.RESULTS.parent / "paper.md").write_text(tables())
         print(tables())
 
 
 def collect(name: str, folder: Path) -> int:
     """Keep what the cells of a suite have found, those of earlier calls included: how many."""
-    plan = plan_of(SUITES / f"{name}.yaml")
-    wanted = [cell for cell in plan.cells if cell.wanted]
-    found = kept(name) | {
-        result.cell.name: told(result) | {"commit": commit()}
-        for result in results_of(Standing(folder, wanted, workers=1), folder)
-        if result.cell.name not in kept(name) and result.status not in ("not run", "failed")
+    own, plan, earlier = OWN.get(name), planned(name), kept(name)
+    cells = [cell for cell in (own.cells if own else wanted)(plan) if cell.name not in earlier]
+    found = {
+        result.cell.name: (own.told(result, folder) if own else told(result)) | {"commit": commit()}
+        for result in results_of(Standing(folder, cells, workers=1), folder)
+        if result.status not in ("not run", "failed")
     }
     if found:
-        RESULTS.mkdir(parents=True, exist_ok=True)
-        lines = ",\n".join(f' "{cell}": {json.dumps(row)}' for cell, row in sorted(found.items()))
-        (RESULTS / f"{name}.json").write_text(f"{{\n{lines}\n}}\n")
-    return len(found)
+        keep(name, earlier | found)
+    return len(earlier | found)
 
 
 def told(result: Result) -> dict:
@@ -101,12 +101,6 @@ def told(result: Result) -> dict:
     return {"value": None, "refusal": result.sentence}
 
 
-def kept(name: str) -> dict[str, dict]:
-    """What was collected of a suite, by cell."""
-    file = RESULTS / f"{name}.json"
-    return json.loads(file.read_text()) if file.exists() else {}
-
-
 def tables() -> str:
     """All tables, as Markdown."""
     head = (
@@ -114,18 +108,7 @@ def tables() -> str:
         "A calibration here learns from at most 300,000 control steps, the paper's from 1,000,000; Madoc's grouping "
         "takes up to 60,000 more. [Figure 3a](../../docs/concepts/groups.svg) is by `benchmarks/embedding.py`.\n"
     )
-    return "\n".join([head, *(table(name) for name in TITLES)])
-
-
-def printed(name: str, row: str, column: str) -> tuple[float, float] | None:
-    """Mean and 95 % interval that the paper prints in a cell of a table; None where it prints none."""
-    cell = _printed().get(name, {}).get(row, {}).get(column)
-    return None if cell is None else (cell[0], cell[1])
-
-
-@cache
-def _printed() -> dict[str, dict[str, dict[str, list[float]]]]:
-    return json.loads((SUITES / "printed.json").read_text())
+    return "\n".join([head, *(f"## {TITLES[name]}\n\n{table(name)}" for name in TITLES)])
 
 
 def beside_printed(column: str) -> list[tuple[str, float, float, int]]:
@@ -144,18 +127,17 @@ def beside_printed(column: str) -> list[tuple[str, float, float, int]]:
 
 
 def table(name: str) -> str:
-    """One table: ours beside the printed value, cells that were not run, and their command."""
+    """One table without its title: ours beside the printed value, cells that were not run, and their command."""
+    if name in OWN:
+        return OWN[name].table(name)
     plan = planned(name)
-    scores, wanted = scores_of(plan, kept(name)), [cell for cell in plan.cells if cell.wanted]
+    scores = scores_of(plan, kept(name))
     rows = list(dict.fromkeys(score.row for score in scores))
     columns = list(dict.fromkeys(score.column for score in scores))
     by_cell = defaultdict[tuple[str, str], list[Score]](list)
     for score in scores:
         by_cell[score.row, score.column].append(score)
-    missing = len(wanted) - len(kept(name).keys() & {cell.name for cell in wanted})
-    command = f"`madoc suite benchmarks/suites/{name}.yaml --out {OUT}`"
-    state = f"{missing} of {len(wanted)} cells are not run: {command}" if missing else f"All cells are run by {command}"
-    lines = [f"## {TITLES[name]}\n", f"{state}. Interquartile mean over seeds (the paper's mean, over 6 seeds).\n"]
+    lines = [f"{how_far(name, wanted(plan))}. Interquartile mean over seeds (the paper's mean, over 6 seeds).\n"]
     lines += [f"| task | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
     for row in rows:
         cells = [_shown(by_cell[row, column], printed(name, row, column)) for column in columns]
@@ -166,34 +148,22 @@ def table(name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-@cache
-def planned(name: str) -> Plan:
-    """The plan of a suite."""
-    return plan_of(SUITES / f"{name}.yaml")
-
-
 def scores_of(plan: Plan, found: Mapping[str, Mapping]) -> list[Score]:
     """Every cell that a suite asks for, with its place in the table and what it found."""
-    by_name = {cell.name: cell for cell in plan.cells}
     counted = any("parameters" in asked(cell) for cell in plan.cells if cell.kind == "calibrate")
+    measure = MEASURES.get(plan.name, "value")
     scores = []
-    for cell in plan.cells:
-        if not cell.wanted:
-            continue
-        chain = {cell.kind: cell}
-        while cell.needs:
-            cell = by_name[cell.needs]
-            chain[cell.kind] = cell
-        last = next(chain[kind] for kind in ("evaluate", "learn", "calibrate") if kind in chain)
-        known = found.get(last.name, {})
+    for cell in wanted(plan):
+        chain = chain_of(cell, plan)
+        known = found.get(cell.name, {})
         row, column = place(chain)
         count = parameters(chain["calibrate"])
         row += f", {count} parameter{'s' * (count > 1)}" if counted else ""
-        scores.append(Score(row, column, known.get(MEASURES.get(plan.name, "value")), "refusal" in known))
+        scores.append(Score(row, column, known.get(measure), "refusal" in known))
     return scores
 
 
-def place(chain: Mapping[str, Cell]) -> tuple[str, str]:
+def place(chain: Mapping[Kind, Cell]) -> tuple[str, str]:
     """Row and column of a cell: the data with what differs in it, and the system of calibrator and learner."""
     calibration, record = asked(chain["calibrate"]), asked(chain["record"])
     row = str(record["name"])
@@ -216,11 +186,6 @@ def parameters(calibration: Cell) -> int:
     """How many parameters a cell calibrates: those that it names, or all of the robot's."""
     told = asked(calibration)
     return len(told.get("parameters") or tasks.make(told["task"]).parameters)
-
-
-def asked(cell: Cell) -> dict:
-    """What a cell asks, by the keys of a suite file."""
-    return flat(KINDS[cell.kind], cell.order)
 
 
 def interquartile_mean(*rows: Float[np.ndarray, "*resamples seeds"], axis: int = -1) -> Float[np.ndarray, "*resamples"]:

@@ -1,18 +1,27 @@
 """The measured tables of the README and of the documentation say what the committed results say."""
 
+import json
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
+import jax
 import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import costs
 import embedding
+import figure_2
 import paper
+import paper_cells
 import readme
 import tables
+
+from madoc.calibration.madoc.actors import initial_actors
+from madoc.parameters import Parameter, ParameterSpace
 
 STALE = "stale: run make figures"
 
@@ -109,3 +118,114 @@ def test_resampling_stays_within_tasks():
     """Tasks without spread of their own leave no doubt, however far apart they are."""
     low, high = paper.stratified_interval([[1.0, 1.0], [50.0, 50.0], [100.0, 100.0]])
     assert low == high == pytest.approx(50.25)  # of six values one at each end is left out
+
+
+@pytest.mark.parametrize(("name", "whole"), [("table-3", "table-1"), ("figure-2", "table-10")])
+def test_suites_share_their_cells(name, whole):
+    """What one table has run the other takes, but for the evaluations that it does not ask for."""
+    shared = {cell.name for cell in paper_cells.planned(whole).cells}
+    assert {cell.name for cell in paper_cells.planned(name).cells} <= shared
+
+
+@pytest.fixture
+def collected(tmp_path, monkeypatch):
+    """A function that collects a suite from a folder where some of its cells have left their files: its table."""
+    monkeypatch.setattr(paper_cells, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(paper, "commit", lambda: "0")
+
+    def collect(name, left):
+        for cell, files in left:
+            folder = cell.folder(tmp_path / "suite")
+            folder.mkdir(parents=True)
+            for file, text in files.items():
+                (folder / file).write_text(text)
+        return paper.collect(name, tmp_path / "suite"), paper.table(name)
+
+    return collect
+
+
+def files_of_a_run(result, count, lines, *, peak=None, fresh=True):
+    """The files of a cell, with a line of its log for each (stage, count, seconds)."""
+    ending = {"status": "finished", "sentence": "", "seconds": 1.0, "attempts": 1, "host": "", "fresh": fresh}
+    log = [{count: spent, "seconds": seconds, "stage": stage, "metrics": {}} for stage, spent, seconds in lines]
+    held = {} if peak is None else {"memory.json": json.dumps({"peak_memory": peak})}
+    return held | {
+        "outcome.json": json.dumps(ending),
+        "result.json": json.dumps(result),
+        "metrics.jsonl": "".join(json.dumps(line) + "\n" for line in log),
+    }
+
+
+CALIBRATION = {
+    **{"method": "madoc", "task": "halfcheetah", "status": "finished", "sentence": "", "control_steps": 2000},
+    **{"seconds": 11.0, "seed": 0, "groups": [], "parameters": {}},
+}
+
+
+def test_costs_are_those_of_a_method_by_stage(collected):
+    cells = {
+        (cell.kind, paper_cells.asked(cell)["method"]): cell for cell in costs.cells(paper_cells.planned("table-3"))
+    }
+    assert cells.keys() == {("calibrate", "madoc"), ("learn", "sac"), ("learn", "cql"), ("learn", "morec")}
+    of_calibration = [
+        ("cloning", 0, 1.0),
+        ("grouping", 0, 3.0),
+        ("calibrating", 1000, 6.0),
+        ("calibrating", 2000, 11.0),
+    ]
+    of_policy = [("exploring", 500, 1.0), ("learning", 1000, 9.0)]
+    of_cql = [("learning", 4000, 6.0), ("learning", 8000, 16.0)]
+    left = {
+        ("calibrate", "madoc"): files_of_a_run(CALIBRATION, "control_steps", of_calibration, peak=512_000_000),
+        ("learn", "sac"): files_of_a_run({"seconds": 10.0}, "control_steps", of_policy, peak=600_000_000, fresh=False),
+        ("learn", "cql"): files_of_a_run({"seconds": 16.0}, "updates", of_cql),
+    }
+    count, told = collected("table-3", [(cells[which], files) for which, files in left.items()])
+    assert count == 3
+    assert "9 of 12 cells are not run" in told
+    rows = [line for line in told.splitlines() if line.startswith("| ")]
+    assert rows[1:4] == [
+        "| madoc | 512 | at most 600 [398] |",
+        "| cql |  | not known [286] |",
+        "| morec |  | not run [1053] |",
+    ]
+    assert rows[5:] == [
+        "| madoc | cloning | 1 | 1 | 1 |  |  |",
+        "| madoc | grouping | 2 | 1 | 2 |  | 1.8 s an epoch |",
+        "| madoc | calibrating | 8 | 2 | 4 | 4 | 14 s an epoch |",
+        "| madoc | exploring | 1 | 1 | 1 | 2 |  |",
+        "| madoc | learning | 8 | 1 | 8 | 16 | 4 s an epoch |",
+        "| madoc | all | 20 | | | | 5 h |",
+        "| cql | learning | 16 | 2 | 8 | 2 | 7 s an epoch |",
+        "| cql | all | 16 | | | | 2 h |",
+        "| morec | all | not run | | | | 6 h |",
+    ]
+
+
+def test_what_was_collected_once_is_not_read_again(collected, monkeypatch):
+    (cell, *others) = paper_cells.wanted(paper_cells.planned("figure-2"))
+    found = [{"correlations": {"actors": value, "uniform": -0.5}, "control_steps": 300} for value in (-0.9, -0.7)]
+    answers = iter(found)
+    monkeypatch.setattr(figure_2, "told", lambda result, folder: next(answers))
+    files = files_of_a_run(CALIBRATION, "control_steps", [("calibrating", 1000, 1.0)])
+    assert collected("figure-2", [(cell, files)])[0] == 1
+    count, told = collected("figure-2", [(others[0], files)])
+    assert (count, next(answers, None)) == (2, None)
+    assert "| madoc | drawn from the actors | -0.90 | -0.70 | not run | -0.80 | 300 |" in told
+    assert "| madoc-s | uniform over the ranges | not run | not run | not run |  |  |" in told
+
+
+def test_the_critic_of_gravitys_group_is_correlated_with_gravitys_error():
+    """Two groups: one critic knows the error of gravity, the other gets it the wrong way round."""
+    space = ParameterSpace((Parameter("body_mass", "torso", 5.0, 7.0), Parameter("gravity", "", -30.0, 0.0)))
+    truth = -9.0  # 0.4 of the way from the middle of the range to its end
+
+    def values(draws, members):
+        assert members.tolist() == [[False, True], [True, False]]
+        error = np.abs(np.asarray(draws)[:, 1] - 0.4)
+        return np.stack([-error, error], axis=1)
+
+    agents = SimpleNamespace(actors=initial_actors(2), critics=SimpleNamespace(weight=np.ones(2), values=values))
+    state = SimpleNamespace(agents=agents, labels=np.array([1, 0]))
+    found = figure_2.correlations(state, space, truth, key=jax.random.key(0))
+    assert found == {"actors": -1.0, "uniform": -1.0}

@@ -12,6 +12,7 @@ from madoc.report import write_comparison, write_report
 from madoc.report.page import headline, run_context
 from madoc.report.reading import read_run
 from madoc.report.sections import SECTIONS
+from madoc.runs.memory import write_peak
 
 IDS = list(SECTIONS)
 
@@ -100,6 +101,14 @@ def test_a_hold_out_is_told_by_its_own_measure(whole):
     write_json(file, stored | {"holdout": common | areas | {"measure": "told apart"}})
     assert content(whole, "holdout")["chart"] is None
     assert run_context(read_run(whole))["facts"][0][0] == "classifier, simulated or logged"
+
+
+def test_memory_is_told_where_it_is_known(whole):
+    assert ("most memory held", "not known") in content(whole, "cost")["facts"]
+    for method, peak in (("least-squares", 500_000_000), ("madoc-local", 512_000_000)):
+        (whole / "calibration" / method).mkdir()
+        write_peak(whole / "calibration" / method, peak)
+    assert ("most memory held", "512 MB") in content(whole, "cost")["facts"]
 
 
 def test_time_is_told_by_stage(whole):

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from madoc.report.words import count, duration, number, parameter_title, short_count
+from madoc.report.words import count, duration, memory, number, parameter_title, short_count
 
 
 @pytest.mark.parametrize(
@@ -29,6 +29,10 @@ def test_numbers_have_their_digits_and_a_real_minus(value, written):
 )
 def test_durations_are_read_at_a_glance(seconds, written):
     assert duration(seconds) == written
+
+
+def test_memory_is_told_in_megabytes_up_to_a_thousand():
+    assert [memory(size) for size in (398_400_000, 999_600_000, 1_053_000_000)] == ["398 MB", "1.00 GB", "1.05 GB"]
 
 
 def test_counts_keep_thousands_apart():

@@ -16,6 +16,16 @@ from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.errors import MadocError
 from madoc.report.records import EvaluationRecord, SpecRecord, read_object, read_record, read_spec
 from madoc.robots.document import yaml_text
+from madoc.runs.memory import read_peak
+
+
+@dataclass(frozen=True)
+class StageCost:
+    """What all epochs of a stage took: wall-clock time in s, control steps (or updates), and their number."""
+
+    seconds: float
+    spent: float
+    epochs: int
 
 
 @dataclass(frozen=True)
@@ -38,6 +48,15 @@ class MetricLog:
 
     def __len__(self) -> int:
         return len(self.stage)
+
+    def by_stage(self) -> dict[str, StageCost]:
+        """The cost of each stage; what came before the first line belongs to the first stage."""
+        seconds, spent = np.diff(self.seconds, prepend=0.0), np.diff(self.spent, prepend=0.0)
+        rows = {name: np.array([stage == name for stage in self.stage]) for name in dict.fromkeys(self.stage)}
+        return {
+            name: StageCost(float(seconds[own].sum()), float(spent[own].sum()), int(own.sum()))
+            for name, own in rows.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -106,6 +125,7 @@ class Run:
     evidence: Evidence | None = None
     embeddings: Embeddings | None = None
     evaluation: EvaluationRecord | None = None
+    peak_memory: int | None = None
 
     @property
     def parameters(self) -> dict[str, ParameterEstimate]:
@@ -190,6 +210,7 @@ def read_run(path: Path) -> Run:
         evidence=_read_evidence(folder / "evidence.npz"),
         embeddings=_read_embeddings(method / "embeddings.npz"),
         evaluation=read_record(EvaluationRecord, evaluation) if evaluation.exists() else None,
+        peak_memory=read_peak(folder),
     )
 
 

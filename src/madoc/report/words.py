@@ -99,6 +99,12 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
+def memory(size: int) -> str:
+    """Bytes as `512 MB` (of 10⁶ bytes) or `1.24 GB`."""
+    megabytes = round(size / 1e6)
+    return f"{megabytes} MB" if megabytes < 1000 else f"{size / 1e9:.2f} GB"
+
+
 def interval_words(ends: Sequence[float]) -> str:
     """An interval by its ends, or by its half-width where the ends agree in four digits."""
     low, high = (number(end) for end in ends)

@@ -15,6 +15,7 @@ from madoc.errors import MadocError
 from madoc.runs import checkpoint
 from madoc.runs.budget import Budget, Seconds, read_budget
 from madoc.runs.interruption import interruptible
+from madoc.runs.memory import forget_peak, peak_memory, write_peak
 from madoc.runs.progress import Moment, display
 from madoc.runs.run_folder import RunFolder, RunLog
 from madoc.types import Epoch, Method, Metrics, Problem, State, Unit
@@ -172,11 +173,14 @@ class _Session(Generic[State]):
         self._earlier = 0.0
         self._started: float | None = None
         self._stopped: float | None = None
+        self._measured = False
+        self._peak: int | None = 0
         if folder and self.resumed:
             self.state, extra = checkpoint.load(folder.checkpoint, like=state)
             self._tally = Tally(**extra["tally"])
             self._offset = int(extra["metrics_bytes"])
             self._earlier = float(extra["seconds"])
+            self._peak = extra.get("peak_memory")
 
     @property
     def spent(self) -> int:
@@ -202,6 +206,8 @@ class _Session(Generic[State]):
     def begin(self, stack: ExitStack) -> None:
         """Open the logs, and write the first checkpoint, so that a bad state is refused before any budget is spent."""
         self._started = time.monotonic()
+        self._measured = forget_peak()
+        self._look_at_memory()
         if self._folder:
             self._folder.result.unlink(missing_ok=True)
             self._folder.diverged.unlink(missing_ok=True)
@@ -227,6 +233,7 @@ class _Session(Generic[State]):
     def take(self, state: State, epoch: Epoch) -> Metrics:
         """Accept the result of a step, log it, and check that its metrics are finite."""
         self.state, self._tally = state, self._tally.plus(epoch)
+        self._look_at_memory()
         metrics = {name: float(value) for name, value in epoch.metrics.items()}
         bad = next((name for name, value in metrics.items() if not math.isfinite(value)), None)
         problem = "" if bad is None else f"metric {bad} became {metrics[bad]} while {epoch.stage}"
@@ -266,6 +273,7 @@ class _Session(Generic[State]):
         status, sentence = self.outcome
         tally, seconds = self._tally, self._seconds()
         if self._folder and not self._folder.result.exists():
+            write_peak(self._folder.path, self._peak)
             counts = {"control_steps": tally.control_steps, "updates": tally.updates, "seconds": seconds}
             self._folder.write_json("result.json", {"status": status, "sentence": sentence} | counts)
         return Finished(self.state, status, sentence, tally.control_steps, tally.updates, self.spent, seconds)
@@ -287,8 +295,14 @@ class _Session(Generic[State]):
             self._stopped = time.monotonic()
         return self._earlier + self._stopped - self._started
 
+    def _look_at_memory(self) -> None:
+        """Keep the largest peak; None for good once a part of the run has one that is not known."""
+        now = peak_memory() if self._measured else None
+        self._peak = None if now is None or self._peak is None else max(now, self._peak)
+
     def _write_state(self, path: Path, metrics_bytes: int) -> None:
-        extra = {"tally": asdict(self._tally), "seconds": self._seconds(), "metrics_bytes": metrics_bytes}
+        cost = {"seconds": self._seconds(), "peak_memory": self._peak}
+        extra = {"tally": asdict(self._tally), "metrics_bytes": metrics_bytes} | cost
         checkpoint.save(path, self.state, extra)
 
 

@@ -23,8 +23,9 @@ class RunFolder:
     """A locked run folder; as a context manager it unlocks the folder at the end.
 
     It holds `spec.json` (the settings and versions), `metrics.jsonl` (one line for each epoch), `tensorboard/`,
-    `checkpoint.npz` (the last good state), `result.json` (how the run ended; missing until then), and `diverged.npz`
-    (the last state, if it held a NaN). All files but the logs, which grow, are written whole or not at all.
+    `checkpoint.npz` (the last good state), `result.json` (how the run ended; missing until then), `memory.json` (the
+    most memory held, where the system tells) and `diverged.npz` (the last state, if it held a NaN). All files but the
+    logs, which grow, are written whole or not at all.
 
     Call `create` or `open` to make one.
     """

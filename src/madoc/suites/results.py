@@ -12,6 +12,7 @@ from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.errors import MadocError
 from madoc.report.records import EvaluationRecord, read_object, read_record
 from madoc.runs.files import read_json, replacing
+from madoc.runs.memory import read_peak
 from madoc.suites.cells import Cell
 from madoc.suites.listing import asked
 from madoc.suites.standing import Standing
@@ -22,7 +23,8 @@ COLUMNS: dict[str, type] = {
     **{"cell": str, "kind": str, "robot": str, "task": str, "data": str, "method": str, "at": str, "seed": int},
     **{"budget": str, "settings": str, "other": str, "needs": str, "status": str, "sentence": str, "verdict": str},
     **{"verdict_sentence": str, "holdout_score": float, "holdout_low": float, "holdout_high": float},
-    **{"control_steps": int, "seconds": float, "error_mean_absolute": float, "error_percent_of_range": float},
+    **{"control_steps": int, "seconds": float, "peak_memory": int, "error_mean_absolute": float},
+    **{"error_percent_of_range": float},
     **{"parameter": str, "unit": str, "estimate": float, "interval_low": float, "interval_high": float, "std": float},
     **{"low": float, "high": float, "error": float, "policy": str, "where": str, "return": float, "return_std": float},
     **{"normalized": float, "episodes": int},
@@ -43,6 +45,7 @@ class Result:
         calibration: Of a calibration that has ended: its estimate, verdict and error.
         evaluation: Of an evaluation that has ended: the returns of its policy.
         learnt: Of a policy that has ended: the content of its `result.json`.
+        peak_memory: The most resident memory that its process held, bytes; None where it is not known.
     """
 
     cell: Cell
@@ -52,6 +55,7 @@ class Result:
     calibration: CalibrationResult | None = None
     evaluation: EvaluationRecord | None = None
     learnt: Mapping[str, Any] = field(default_factory=dict)
+    peak_memory: int | None = None
 
     @property
     def parameters(self) -> dict[str, ParameterEstimate]:
@@ -127,7 +131,7 @@ def _result(cell: Cell, standing: Standing, suite: Path) -> Result:
     if cell.name not in standing.ended:
         return Result(cell, NOT_RUN, method=method)
     outcome, folder = standing.ended[cell.name][1], cell.folder(suite)
-    result = Result(cell, outcome.status, outcome.sentence, method)
+    result = Result(cell, outcome.status, outcome.sentence, method, peak_memory=read_peak(folder))
     if not outcome.usable:
         return result
     match cell.kind:
@@ -161,6 +165,7 @@ def _row(result: Result) -> dict[str, Any]:
         "sentence": result.sentence or None,
         "control_steps": cost.get("control_steps"),
         "seconds": cost.get("seconds"),
+        "peak_memory": result.peak_memory,
         "error_mean_absolute": result.error.get("mean_absolute"),
         "error_percent_of_range": result.error.get("mean_percent_of_range"),
     }

@@ -1,9 +1,7 @@
 """What the run led to and what it took: policies, cost, and what was asked."""
 
-import numpy as np
-
 from madoc.report.reading import MetricLog, Run
-from madoc.report.words import count, duration
+from madoc.report.words import count, duration, memory
 
 POLICIES = {
     "calibrated": ("calibrated", "after"),
@@ -37,19 +35,23 @@ def cost(run: Run) -> dict[str, object] | str:
         facts.append(("control steps a second, all in", count(steps / seconds)))
     if run.log is not None:
         facts.append(("epochs", count(len(run.log))))
+    if run.result is not None:
+        facts.append(("most memory held", "not known" if run.peak_memory is None else memory(run.peak_memory)))
     return {"facts": facts, "stages": [] if run.log is None else _stages(run.log)}
 
 
 def _stages(log: MetricLog) -> list[dict[str, object]]:
-    """Seconds and steps of each stage; what came before the first line of the log belongs to the first stage."""
-    seconds, steps = np.diff(log.seconds, prepend=0.0), np.diff(log.spent, prepend=0.0)
-    stages = []
-    for name in dict.fromkeys(log.stage):
-        rows = np.array([stage == name for stage in log.stage])
-        spent = float(seconds[rows].sum())
-        words = f"{duration(spent)}, {count(float(steps[rows].sum()))} {log.unit}"
-        stages.append({"name": name, "share": spent / (float(seconds.sum()) or 1.0), "words": words})
-    return stages
+    """Seconds and steps of each stage."""
+    costs = log.by_stage()
+    total = sum(cost.seconds for cost in costs.values()) or 1.0
+    return [
+        {
+            "name": name,
+            "share": cost.seconds / total,
+            "words": f"{duration(cost.seconds)}, {count(cost.spent)} {log.unit}",
+        }
+        for name, cost in costs.items()
+    ]
 
 
 def asked(run: Run) -> dict[str, object] | str:

@@ -1,0 +1,77 @@
+"""Cells of the paper's suites: what they ask, what was kept of them, and what the paper prints beside them."""
+
+import json
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+
+from madoc.suites.cells import KINDS, Cell, Kind
+from madoc.suites.options import flat
+from madoc.suites.planning import Plan, plan_of
+
+SUITES = Path(__file__).parent / "suites"
+RESULTS = Path(__file__).parent / "results" / "paper"
+OUT = "runs/paper"
+
+
+@cache
+def planned(name: str) -> Plan:
+    """The plan of a suite."""
+    return plan_of(SUITES / f"{name}.yaml")
+
+
+def wanted(plan: Plan) -> list[Cell]:
+    """The cells that a suite asks for itself."""
+    return [cell for cell in plan.cells if cell.wanted]
+
+
+def chain_of(cell: Cell, plan: Plan) -> dict[Kind, Cell]:
+    """A cell and those that it needs, by their kinds."""
+    by_name = {each.name: each for each in plan.cells}
+    chain = {cell.kind: cell}
+    while cell.needs:
+        cell = by_name[cell.needs]
+        chain[cell.kind] = cell
+    return chain
+
+
+def asked(cell: Cell) -> dict:
+    """What a cell asks, by the keys of a suite file."""
+    return flat(KINDS[cell.kind], cell.order)
+
+
+def kept(name: str) -> dict[str, dict]:
+    """What was collected of a suite, by cell."""
+    file = RESULTS / f"{name}.json"
+    return json.loads(file.read_text()) if file.exists() else {}
+
+
+def keep(name: str, found: Mapping[str, Mapping]) -> None:
+    """Keep what was collected of a suite, a cell a line."""
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    lines = ",\n".join(f' "{cell}": {json.dumps(row)}' for cell, row in sorted(found.items()))
+    (RESULTS / f"{name}.json").write_text(f"{{\n{lines}\n}}\n")
+
+
+def how_far(name: str, cells: Sequence[Cell]) -> str:
+    """How many of a suite's cells are not run, and the command that runs them."""
+    missing = len(cells) - len(kept(name).keys() & {cell.name for cell in cells})
+    command = f"`madoc suite benchmarks/suites/{name}.yaml --out {OUT}`"
+    return f"{missing} of {len(cells)} cells are not run: {command}" if missing else f"All cells are run by {command}"
+
+
+def printed(name: str, row: str, column: str) -> tuple[float, float] | None:
+    """Mean and 95 % interval that the paper prints in a cell of a table; None where it prints none."""
+    cell = _printed().get(name, {}).get(row, {}).get(column)
+    return None if cell is None else (cell[0], cell[1])
+
+
+def printed_number(name: str, row: str, column: str) -> float | None:
+    """The number that the paper prints without an interval in a cell of a table; None where it prints none."""
+    cell = _printed().get(name, {}).get(row, {}).get(column)
+    return None if cell is None else cell[0]
+
+
+@cache
+def _printed() -> dict[str, dict[str, dict[str, list[float]]]]:
+    return json.loads((SUITES / "printed.json").read_text())
