@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_parameters, initial_actors, prior_weight
+from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_parameters, prior_weight
 from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
@@ -131,25 +131,27 @@ class AgentSettings:
         *,
         window: int,
         observation: int,
-        parameters: int,
+        actors: Actors,
         groups: int,
         resolution: Resolution = OF_CHANGES,
         key: PRNGKeyArray,
     ) -> Agents:
-        """Fresh networks; actors and prior at N(0, 1). `window` is the number of features in the place of (s, a)."""
+        """Fresh networks, with actors, prior and average at `actors`.
+
+        `window` is the number of features in the place of (s, a).
+        """
         of_discriminators, of_critics = jax.random.split(key)
         bounds = {"bound": self.bound, "pair_bound": self.pair_bound, "dropout": self.dropout}
         discriminators = Discriminators(observation, window - observation, self.hidden, key=of_discriminators, **bounds)
         size = window if self.baseline else 0
-        critics = GroupCritics(groups, parameters, self.critic_hidden, window=size, key=of_critics)
-        actors = initial_actors(parameters)
+        critics = GroupCritics(groups, len(actors.mean), self.critic_hidden, window=size, key=of_critics)
         return Agents(
             discriminators=discriminators,
             judges=jax.tree.map(lambda leaf: leaf.copy() if eqx.is_array(leaf) else leaf, discriminators),
             critics=critics,
             actors=actors,
-            prior=initial_actors(parameters),
-            average=initial_actors(parameters),
+            prior=actors,
+            average=actors,
             log_blur=jnp.full((), np.log(resolution.blur), jnp.float32),
             updates=jnp.zeros((), jnp.int32),
             discriminator_optimiser=adam(self.discriminator_rate).init(eqx.filter(discriminators, eqx.is_array)),
