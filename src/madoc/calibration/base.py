@@ -27,7 +27,7 @@ class Prior:
         origin: Whose estimate it is, as words for sentences.
 
     Raises:
-        MadocError: A number is not finite, a standard deviation is negative, or there are more of one than of the other.
+        MadocError: A number is not finite, a deviation is negative, or there are not as many means as deviations.
     """
 
     mean: Float[np.ndarray, " d"]
@@ -37,12 +37,12 @@ class Prior:
     def __post_init__(self) -> None:
         if len(self.mean) != len(self.std):
             raise MadocError(
-                f"a prior has {len(self.mean)} means and {len(self.std)} standard deviations; give as many"
+                f"the prior has {len(self.mean)} means and {len(self.std)} standard deviations; give one of each"
             )
         if not (np.isfinite(self.mean).all() and np.isfinite(self.std).all() and (self.std >= 0.0).all()):
             raise MadocError(
-                f"the means of a prior must be finite, its standard deviations finite and not negative, got {self.mean} "
-                f"and {self.std}; take a deviation as wide as the range where nothing is known"
+                f"expected a prior of finite means and finite deviations of at least 0, got {self.mean} and "
+                f"{self.std}; where nothing is known, give a deviation as wide as the range"
             )
 
 
