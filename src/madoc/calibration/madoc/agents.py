@@ -171,8 +171,11 @@ class AgentSettings:
         mixing: Mixing,
         resolution: Resolution,
         count: int,
+        told: Bool[Array, " d"] | None = None,
     ) -> tuple[Agents, dict[str, Array]]:
         """`count` updates, Algorithm 1, lines 13 to 19, and the mean of each metric.
+
+        The prior of parameters that are `told`, by the problem's own prior, stays where it began.
 
         The discriminators learn from blurred s'; the reward is computed at s' without blur, where it is least noisy.
         Simulated rows are columns `pair`, `following` and `parameters` (in [-1, 1]), logged rows are (pair, following).
@@ -192,7 +195,7 @@ class AgentSettings:
             share = common / common.mean() if self.weigh_overlap else jnp.ones_like(reward)
             agents, reward_metrics = self._steer_blur(agents, reward, share, resolution)
             agents, value_metrics = self._update_critics(agents, drawn, reward, share, members, mixing)
-            agents, actor_metrics = self._update_actors(agents, members, resolution, of_actors)
+            agents, actor_metrics = self._update_actors(agents, members, resolution, told, of_actors)
             return agents, metrics | reward_metrics | value_metrics | actor_metrics | {"overlap": common.mean()}
 
         return scan_updates(update, agents, key, count)
@@ -244,7 +247,7 @@ class AgentSettings:
         return replace(agents, critics=critics, critic_optimiser=optimiser), {"value_loss": loss}
 
     def _update_actors(
-        self, agents: Agents, members: Array, resolution: Resolution, key: PRNGKeyArray
+        self, agents: Agents, members: Array, resolution: Resolution, told: Array | None, key: PRNGKeyArray
     ) -> tuple[Agents, dict[str, Array]]:
         entropy_weight = resolution.entropy_weight if self.entropy_weight is None else self.entropy_weight
         weight = prior_weight(agents.updates, time_constant=self.prior_time, largest=self.prior_largest)
@@ -262,10 +265,12 @@ class AgentSettings:
         loss, gradients = jax.value_and_grad(loss_of)(agents.actors)
         actors, optimiser = descend(adam(self.actor_rate), gradients, agents.actor_optimiser, agents.actors)
         due = (agents.updates + 1) % self.prior_every == 0
+        prior_rate = jnp.where(due, self.prior_rate, 0.0)
+        prior_rate = prior_rate if told is None else jnp.where(told, 0.0, prior_rate)
         following = replace(
             agents,
             actors=actors,
-            prior=moving_average(agents.prior, actors, jnp.where(due, self.prior_rate, 0.0)),
+            prior=moving_average(agents.prior, actors, prior_rate),
             average=moving_average(agents.average, actors, self.average_rate),
             actor_optimiser=optimiser,
             updates=agents.updates + 1,

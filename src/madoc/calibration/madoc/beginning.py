@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from madoc.calibration.base import CalibrationProblem, Prior
 from madoc.calibration.madoc.actors import Actors, initial_actors
@@ -28,8 +28,8 @@ def first_actors(problem: CalibrationProblem) -> Actors:
     point = np.clip(space.to_unit(prior.mean), -FARTHEST, FARTHEST)
     slope = 1.0 - point**2  # of tanh
     deviation = np.minimum(np.maximum(_scaled(space, prior), NARROWEST) / slope, 1.0)
-    told = _told(space, prior)
-    mean, std = np.where(told, np.arctanh(point), 0.0), np.where(told, deviation, 1.0)
+    known = _known(space, prior)
+    mean, std = np.where(known, np.arctanh(point), 0.0), np.where(known, deviation, 1.0)
     return Actors(jnp.asarray(mean, jnp.float32), jnp.asarray(np.log(std), jnp.float32))
 
 
@@ -38,14 +38,19 @@ def sentence(problem: CalibrationProblem) -> str | None:
     space, prior = problem.simulator.parameters, problem.prior
     if prior is None:
         return None
-    open_ones = [name for name, told in zip(space.names, _told(space, prior), strict=True) if not told]
+    open_ones = [name for name, known in zip(space.names, _known(space, prior), strict=True) if not known]
     if len(open_ones) == len(space):
         return f"Madoc began at the middle of every range, as {prior.origin} leaves all parameters open"
     but = f", which leaves {', '.join(open_ones)} open: there at the middle of the range" if open_ones else ""
     return f"Madoc began at {prior.origin}{but}"
 
 
-def _told(space: ParameterSpace, prior: Prior) -> Bool[np.ndarray, " d"]:
+def told(problem: CalibrationProblem) -> Bool[Array, " d"] | None:
+    """Of which parameters the problem's prior tells anything; None without one."""
+    return None if problem.prior is None else jnp.asarray(_known(problem.simulator.parameters, problem.prior))
+
+
+def _known(space: ParameterSpace, prior: Prior) -> Bool[np.ndarray, " d"]:
     """Of which parameters the prior tells anything."""
     return _scaled(space, prior) < WIDEST
 

@@ -16,7 +16,7 @@ from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.madoc import effects, grouping, innovations, watch
 from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.agents import OF_CHANGES, OF_INNOVATIONS, Agents, AgentSettings, Resolution
-from madoc.calibration.madoc.beginning import first_actors, sentence
+from madoc.calibration.madoc.beginning import first_actors, sentence, told
 from madoc.calibration.madoc.collection import GEOMETRY, Collection, Features, StartMode
 from madoc.calibration.madoc.grouping import GroupingVAE
 from madoc.calibration.madoc.paper import PAPER
@@ -365,6 +365,7 @@ class Madoc:
             mixing=self.mixing,
             resolution=resolution,
             count=self.updates,
+            told=told(problem),
         )
         metrics = scalars(device_metrics)
         watched = watch.observe(
