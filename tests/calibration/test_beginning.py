@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+import calibrating
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, Madoc, Prior
 from madoc.calibration.madoc.actors import draw_parameters
@@ -66,6 +67,19 @@ def test_madoc_and_its_variants_begin_there(problem, method):
     assert estimate.mean == pytest.approx(known.prior.mean)
     assert estimate.std == pytest.approx(known.prior.std)
     assert estimate.began == f"Madoc began at {WHERE}"
+
+
+def test_only_the_prior_of_what_is_left_open_follows_the_actors(problem):
+    partly = at(problem, [0.5, -0.5, 0.2], [0.1, 0.1, 0.9])
+    method = calibrating.madoc(groups="one", cloning_epochs=0, updates=20)
+    state = first = method.init(partly, KEY)
+    for _ in range(2):
+        state, _ = method.step(partly, state)
+    before, after = first.agents.prior, state.agents.prior
+    assert (np.asarray(state.agents.actors.mean) != np.asarray(first.agents.actors.mean)).all()
+    np.testing.assert_array_equal(before.mean[:2], after.mean[:2])
+    np.testing.assert_array_equal(before.log_std[:2], after.log_std[:2])
+    assert before.mean[2] != after.mean[2]
 
 
 def test_without_a_prior_it_is_the_papers(problem):

@@ -53,7 +53,7 @@ class Agents:
         judges: Moving average of the discriminators, which gives the reward: that of the latest networks is noisier.
         critics: One critic for each group.
         actors: The calibration distribution.
-        prior: Moving average of the actors, the p of Eq. (13).
+        prior: The p of Eq. (13): a moving average of the actors, or what was told of the parameters beforehand.
         average: Moving average of the actors from which the estimate is read.
         log_blur: Logarithm of the deviation of the noise on s' features that both discriminators see.
         updates: Number of updates so far.
