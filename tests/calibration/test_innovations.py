@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from madoc import simulation
-from madoc.calibration import CalibrationProblem, Madoc
+from madoc.calibration import CalibrationProblem, Madoc, Prior
 from madoc.calibration.madoc import innovations
 from madoc.calibration.madoc.agents import OF_INNOVATIONS
 from madoc.calibration.madoc.watch import SETTLING
@@ -169,6 +169,17 @@ def test_innovations_begin_where_rows_overlap_and_a_checkpoint_holds_them(monkey
         if isinstance(one, jax.Array) and jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key):
             one, other = jax.random.key_data(one), jax.random.key_data(other)
         np.testing.assert_array_equal(one, other)
+
+
+def test_with_a_prior_innovations_begin_at_once():
+    problem, method = problem_of(), Madoc(groups="one", starts=None, cloning_epochs=0, epoch_steps=200, updates=2)
+    known = replace(problem, prior=Prior(problem.simulator.parameters.vector(TRUTH), np.full(3, 0.1), "a guess"))
+    references = []
+    for each in (problem, known):
+        state, _ = method.step(each, method.init(each, KEY))
+        references.append(state.reference)
+    assert [reference.age for reference in references] == [-1, 0]
+    np.testing.assert_allclose(references[1].parameters, problem.simulator.parameters.vector(TRUTH), rtol=1e-5)
 
 
 def test_where_innovations_begin_the_actors_stay_and_networks_are_fresh():

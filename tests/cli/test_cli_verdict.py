@@ -92,6 +92,25 @@ def test_auto_goes_on_to_the_next_method_when_the_first_diverges(log, tmp_path, 
     assert answer["control_steps"] == sum(part["control_steps"] for part in parts)
 
 
+def test_auto_lets_madoc_begin_at_least_squares_estimate(log, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(calibration_stage, "_reason_to_stop", lambda tried: "")
+    out = tmp_path / "run"
+    ask = words("calibrate", log, "--method", "auto", "--budget", 30_000, "--set", *comparing.TINY, "--out", out)
+    asked_for_json(capsys, ask)
+    first, second = (read(out / name / "result.json") for name in ("least-squares", "madoc-local"))
+    assert second["began"] == "Madoc began at least squares' estimate"
+    assert "began" not in first
+    estimates = [row["estimate"] for row in first["parameters"].values()]
+    prior = read(out / "madoc-local" / "spec.json")["prior"]
+    assert (prior["mean"], prior["origin"]) == (estimates, "least squares' estimate")
+    assert not {"prior"} & (read(out / "spec.json").keys() | read(out / "least-squares" / "spec.json").keys())
+    (out / "result.json").unlink()
+    (out / "comparison.json").unlink()
+    asked_for_json(capsys, [*ask, "--resume"])
+    again = read(out / "madoc-local" / "result.json")
+    assert without_seconds(again) == without_seconds(second)
+
+
 def test_the_verdict_is_read_before_the_table(log, tmp_path, capsys):
     ask = words("calibrate", log, "--method", "auto", "--budget", 30_000, "--out", tmp_path / "run")
     assert main([str(word) for word in ask]) == 0

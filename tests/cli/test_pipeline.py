@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from madoc import tasks
-from madoc.calibration import CALIBRATORS
+from madoc.calibration import CALIBRATORS, CalibrationResult, ParameterEstimate
+from madoc.calibration.holdout import AgainstChance, Area, ToldApart, Verdict
 from madoc.commands.main import _parse
 from madoc.data import Disturbance
 from madoc.errors import MadocError
@@ -16,8 +17,10 @@ from madoc.pipeline.keys import seed_key, stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
 from madoc.pipeline.orders import parse_settings
 from madoc.pipeline.preparation import prepare
+from madoc.pipeline.priors import prior_for, stored
 from madoc.report.records import restored_path, stored_path
 from madoc.simulation import make
+from madoc.verdict import Assessment
 
 
 def test_a_name_is_a_task_and_a_quality():
@@ -120,3 +123,47 @@ def test_few_rows_step_like_many():
     action = np.random.default_rng(0).uniform(-1, 1, (1, 16, 3))
     many = system.step(state, action)
     assert (system.step(state[:, :3], action[:, :3]) == many[:, :3]).all()
+
+
+def first_candidate(area, *, settled=True):
+    """Least squares' result of a mass of 2 kg with an interval of 1.8 to 2.1, and its area on a hold-out."""
+    row = ParameterEstimate(2.0, 0.1, 1.0, 3.0, "kg", [1.8, 2.1])
+    result = CalibrationResult(
+        "least-squares", "cart", "converged", "", 1, 0.0, 0, [["mass"]], {"mass": row}, settled=settled
+    )
+    holdout = ToldApart(
+        split="",
+        rows=400,
+        episodes=1,
+        estimate={"mass": 0.0},
+        interval_shares={"mass": 0.1},
+        against_chance=(AgainstChance("the simulator", 0.9, 0.01),),
+        noise={},
+        control_steps=0,
+        area_at_mid_range=Area(0.9, (0.87, 0.93), 400),
+        area_at_estimate=area,
+    )
+    return {"least-squares": (result, Assessment(Verdict("MODEL_MISMATCH", ""), holdout, result))}
+
+
+def test_what_least_squares_leaves_to_the_next_candidate(tmp_path):
+    good, bad = Area(0.7, (0.67, 0.73), 400), Area(0.88, (0.85, 0.91), 400)
+    prior = prior_for(tmp_path, first_candidate(good))
+    assert (prior.mean.tolist(), prior.origin) == ([2.0], "least squares' estimate")
+    assert prior.std == pytest.approx([0.2 / 1.959964])  # the farther end of the interval counts
+    assert prior_for(tmp_path, {}) is None
+    assert prior_for(tmp_path, first_candidate(good, settled=False)) is None
+    assert prior_for(tmp_path, first_candidate(bad)) is None
+
+
+def test_a_run_goes_on_with_the_prior_that_it_began_at(tmp_path):
+    prior = prior_for(tmp_path, first_candidate(Area(0.7, (0.67, 0.73), 400)))
+    (tmp_path / "spec.json").write_text(json.dumps(stored(prior)))
+    again = prior_for(tmp_path, {})
+    assert (again.mean.tolist(), again.std.tolist(), again.origin) == (
+        prior.mean.tolist(),
+        prior.std.tolist(),
+        prior.origin,
+    )
+    (tmp_path / "spec.json").write_text("{}")
+    assert prior_for(tmp_path, first_candidate(Area(0.7, (0.67, 0.73), 400))) is None

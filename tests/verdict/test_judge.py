@@ -16,7 +16,7 @@ from madoc.calibration.holdout import (
 from madoc.commands.answer import EXIT_CODES
 from madoc.identification.term_tests import MissingTerm
 from madoc.verdict import WORDS, judge
-from madoc.verdict.judge import explains_all
+from madoc.verdict.judge import beats_mid_range, explains_all
 
 
 def errors(one, twenty):
@@ -214,3 +214,9 @@ def test_every_word_has_an_exit_code_of_its_own():
     assert len(set(codes)) == len(codes)
     assert EXIT_CODES["CALIBRATED"] == 0
     assert not {1, 2, 130} & set(codes)
+
+
+def test_an_estimate_beats_mid_range_beyond_chance():
+    assert all(beats_mid_range(good) for good in (PREDICTED, FITTED, TOLD_APART))
+    assert not beats_mid_range(changed(FITTED, {"relative": 0.9, "relative_interval": (0.7, 1.1)}))
+    assert not beats_mid_range(replace(TOLD_APART, area_at_estimate=Area(0.88, (0.85, 0.91), 400)))

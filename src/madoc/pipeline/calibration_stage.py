@@ -1,4 +1,4 @@
-"""Calibration as a stage: by one method, or by `auto`, which compares several on the hold-out and keeps the best."""
+"""Calibration as a stage: by one method, or by `auto`, where the next begins at what the first has found."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -12,6 +12,7 @@ from madoc.pipeline.keys import seed_key
 from madoc.pipeline.methods import CANDIDATES, candidates_for, hyperparameters, make_method
 from madoc.pipeline.orders import AUTO, CalibrationOrder
 from madoc.pipeline.preparation import Prepared, prepare
+from madoc.pipeline.priors import prior_for
 from madoc.pipeline.refusals import check_order, method_of
 from madoc.runs.budget import Budget, Seconds
 from madoc.runs.files import read_json
@@ -94,7 +95,8 @@ def _calibrate_by(
 def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool) -> CalibrationResult:
     """Try the candidates within the budget, each in a folder of its own, and keep what predicts the hold-out best.
 
-    The first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and so does a
+    Madoc begins at least squares' estimate, where that has settled and predicts the hold-out better than mid-range. The
+    first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and so does a
     verdict on the data itself. Killed at any moment and resumed, the result has the same bits but for its seconds.
 
     Returns:
@@ -121,8 +123,8 @@ def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool)
                 if spent:  # else nothing is to be kept if the others refuse too
                     folder.write_json(COMPARISON, {"candidates": [asdict(row) for row in rows]})
                 continue
-            part = replace(prepared, method=name, budget=allowed)
             place = out / name
+            part = replace(prepared, method=name, budget=allowed, prior=prior_for(place, tried))
             result, assessment = _calibrate_by(methods[name], place, part, resume=holds_run(place), quiet=quiet)
             if result.status == "interrupted":
                 return result

@@ -17,7 +17,7 @@ Made = TypeVar("Made")
 CANDIDATES = {"least-squares": 2 / 3, "madoc-local": 1 / 2}
 """The methods that `auto` tries, in this order (seconds before minutes), with the largest share of the budget of each.
 
-What a method does not spend is left to those after it.
+What a method does not spend is left to those after it, which may begin at its estimate (`pipeline/priors.py`).
 """
 
 

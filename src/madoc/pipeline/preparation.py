@@ -6,13 +6,14 @@ from functools import cached_property
 from pathlib import Path
 
 from madoc import simulation
-from madoc.calibration import CALIBRATORS, CalibrationProblem
+from madoc.calibration import CALIBRATORS, CalibrationProblem, Prior
 from madoc.data import Dataset, observed_task
 from madoc.data.split import hold_out
 from madoc.diagnosis import check, refuse_fatal
 from madoc.pipeline.data_stage import Machine, fingerprint, load_source, read_truth
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import AUTO, CalibrationOrder
+from madoc.pipeline.priors import stored
 from madoc.pipeline.refusals import check_search, method_of
 from madoc.report.records import DataRecord, stored_path
 from madoc.runs.budget import Budget, Seconds, read_budget
@@ -37,6 +38,7 @@ class Prepared:
         dataset: All rows.
         simulator: Simulator of the parameters, ranges and physics that the order names.
         truth: True values by name, from the order or else from the data.
+        prior: What a candidate of `auto` begins at, if another has left it an estimate.
     """
 
     order: CalibrationOrder
@@ -47,6 +49,7 @@ class Prepared:
     dataset: Dataset
     simulator: Simulator
     truth: dict[str, float] | None
+    prior: Prior | None = None
 
     @property
     def seed(self) -> int:
@@ -63,7 +66,8 @@ class Prepared:
     @cached_property
     def problem(self) -> CalibrationProblem:
         """What methods are given: all rows but those that are held out."""
-        return CalibrationProblem(self.dataset, self.simulator) if self.holdout is None else self.bench.problem
+        whole = CalibrationProblem(self.dataset, self.simulator) if self.holdout is None else self.bench.problem
+        return whole if self.prior is None else replace(whole, prior=self.prior)
 
     @property
     def calibrated_truth(self) -> dict[str, float] | None:
@@ -75,7 +79,7 @@ class Prepared:
         """What the `spec.json` of the run folder `out` keeps; `SpecRecord` reads it."""
         search, source, task = self.order.search, self.order.source, self.simulator.task
         files = {path: Path(path).expanduser() for path in source.paths}
-        stored = DataRecord(
+        data = DataRecord(
             paths=tuple(stored_path(file, out) if file.exists() else path for path, file in files.items()),
             format=source.reading.format,
             clip_actions=source.reading.clip_actions,
@@ -92,12 +96,12 @@ class Prepared:
             "level": search.level,
             "parameters": {row.name: [row.low, row.high] for row in task.parameters.parameters},
             "method": self.method,
-            "data": asdict(stored),
+            "data": asdict(data),
             "seed": self.seed,
             "budget": str(self.budget) if isinstance(self.budget, Seconds) else self.budget,
             "truth": self.truth,
         }
-        return asked | held | self.machine.stored()
+        return asked | held | stored(self.prior) | self.machine.stored()
 
 
 def prepare(order: CalibrationOrder, *, allow_code: bool = False) -> Prepared:

@@ -105,6 +105,13 @@ def explains_all(holdout: HoldOut) -> bool:
     return numerical(holdout) is not None or not _beyond_noise(holdout.errors.estimate, holdout.errors.noise)
 
 
+def beats_mid_range(holdout: HoldOut) -> bool:
+    """Whether an estimate predicts the hold-out better than mid-range, beyond what chance may do."""
+    if isinstance(holdout, ToldApart):
+        return holdout.area_at_estimate.interval[1] < holdout.area_at_mid_range.area
+    return holdout.errors.relative_interval[1] < 1.0
+
+
 def _rejected(holdout: HoldOut) -> Verdict | None:
     if holdout.chance <= CHANCE and holdout.clearest.skill >= SKILL:
         return None

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_parameters, initial_actors, prior_weight
+from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_parameters, prior_weight
 from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
@@ -53,7 +53,7 @@ class Agents:
         judges: Moving average of the discriminators, which gives the reward: that of the latest networks is noisier.
         critics: One critic for each group.
         actors: The calibration distribution.
-        prior: Moving average of the actors, the p of Eq. (13).
+        prior: The p of Eq. (13): a moving average of the actors, or what was told of the parameters beforehand.
         average: Moving average of the actors from which the estimate is read.
         log_blur: Logarithm of the deviation of the noise on s' features that both discriminators see.
         updates: Number of updates so far.
@@ -131,25 +131,27 @@ class AgentSettings:
         *,
         window: int,
         observation: int,
-        parameters: int,
+        actors: Actors,
         groups: int,
         resolution: Resolution = OF_CHANGES,
         key: PRNGKeyArray,
     ) -> Agents:
-        """Fresh networks; actors and prior at N(0, 1). `window` is the number of features in the place of (s, a)."""
+        """Fresh networks, with actors, prior and average at `actors`.
+
+        `window` is the number of features in the place of (s, a).
+        """
         of_discriminators, of_critics = jax.random.split(key)
         bounds = {"bound": self.bound, "pair_bound": self.pair_bound, "dropout": self.dropout}
         discriminators = Discriminators(observation, window - observation, self.hidden, key=of_discriminators, **bounds)
         size = window if self.baseline else 0
-        critics = GroupCritics(groups, parameters, self.critic_hidden, window=size, key=of_critics)
-        actors = initial_actors(parameters)
+        critics = GroupCritics(groups, len(actors.mean), self.critic_hidden, window=size, key=of_critics)
         return Agents(
             discriminators=discriminators,
             judges=jax.tree.map(lambda leaf: leaf.copy() if eqx.is_array(leaf) else leaf, discriminators),
             critics=critics,
             actors=actors,
-            prior=initial_actors(parameters),
-            average=initial_actors(parameters),
+            prior=actors,
+            average=actors,
             log_blur=jnp.full((), np.log(resolution.blur), jnp.float32),
             updates=jnp.zeros((), jnp.int32),
             discriminator_optimiser=adam(self.discriminator_rate).init(eqx.filter(discriminators, eqx.is_array)),
@@ -169,8 +171,11 @@ class AgentSettings:
         mixing: Mixing,
         resolution: Resolution,
         count: int,
+        told: Bool[Array, " d"] | None = None,
     ) -> tuple[Agents, dict[str, Array]]:
         """`count` updates, Algorithm 1, lines 13 to 19, and the mean of each metric.
+
+        The prior of parameters that are `told`, by the problem's own prior, stays where it began.
 
         The discriminators learn from blurred s'; the reward is computed at s' without blur, where it is least noisy.
         Simulated rows are columns `pair`, `following` and `parameters` (in [-1, 1]), logged rows are (pair, following).
@@ -190,7 +195,7 @@ class AgentSettings:
             share = common / common.mean() if self.weigh_overlap else jnp.ones_like(reward)
             agents, reward_metrics = self._steer_blur(agents, reward, share, resolution)
             agents, value_metrics = self._update_critics(agents, drawn, reward, share, members, mixing)
-            agents, actor_metrics = self._update_actors(agents, members, resolution, of_actors)
+            agents, actor_metrics = self._update_actors(agents, members, resolution, told, of_actors)
             return agents, metrics | reward_metrics | value_metrics | actor_metrics | {"overlap": common.mean()}
 
         return scan_updates(update, agents, key, count)
@@ -242,7 +247,7 @@ class AgentSettings:
         return replace(agents, critics=critics, critic_optimiser=optimiser), {"value_loss": loss}
 
     def _update_actors(
-        self, agents: Agents, members: Array, resolution: Resolution, key: PRNGKeyArray
+        self, agents: Agents, members: Array, resolution: Resolution, told: Array | None, key: PRNGKeyArray
     ) -> tuple[Agents, dict[str, Array]]:
         entropy_weight = resolution.entropy_weight if self.entropy_weight is None else self.entropy_weight
         weight = prior_weight(agents.updates, time_constant=self.prior_time, largest=self.prior_largest)
@@ -260,10 +265,12 @@ class AgentSettings:
         loss, gradients = jax.value_and_grad(loss_of)(agents.actors)
         actors, optimiser = descend(adam(self.actor_rate), gradients, agents.actor_optimiser, agents.actors)
         due = (agents.updates + 1) % self.prior_every == 0
+        prior_rate = jnp.where(due, self.prior_rate, 0.0)
+        prior_rate = prior_rate if told is None else jnp.where(told, 0.0, prior_rate)
         following = replace(
             agents,
             actors=actors,
-            prior=moving_average(agents.prior, actors, jnp.where(due, self.prior_rate, 0.0)),
+            prior=moving_average(agents.prior, actors, prior_rate),
             average=moving_average(agents.average, actors, self.average_rate),
             actor_optimiser=optimiser,
             updates=agents.updates + 1,

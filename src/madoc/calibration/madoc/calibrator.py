@@ -16,6 +16,7 @@ from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.madoc import effects, grouping, innovations, watch
 from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.agents import OF_CHANGES, OF_INNOVATIONS, Agents, AgentSettings, Resolution
+from madoc.calibration.madoc.beginning import first_actors, sentence, told
 from madoc.calibration.madoc.collection import GEOMETRY, Collection, Features, StartMode
 from madoc.calibration.madoc.grouping import GroupingVAE
 from madoc.calibration.madoc.paper import PAPER
@@ -175,6 +176,7 @@ class Madoc:
             failures=state.failures,
             warnings=(*watch.warnings(state.watch, scaled, space.names), *self.collection(problem).warnings),
             settled=watch.settled(state.watch),
+            began=sentence(problem),
         )
 
     def embeddings(self, problem: CalibrationProblem, state: MadocState) -> np.ndarray | None:
@@ -214,8 +216,14 @@ class Madoc:
 
     def _fresh_agents(self, problem: CalibrationProblem, resolution: Resolution, key: PRNGKeyArray) -> Agents:
         window, observation = self.collection(problem).scaling.sizes
-        sizes = {"parameters": len(problem.simulator.parameters), "groups": self._group_count(problem)}
-        return self.agents.init(window=window, observation=observation, **sizes, resolution=resolution, key=key)
+        return self.agents.init(
+            window=window,
+            observation=observation,
+            actors=first_actors(problem),
+            groups=self._group_count(problem),
+            resolution=resolution,
+            key=key,
+        )
 
     def _begun_again(self, problem: CalibrationProblem, state: MadocState, key: PRNGKeyArray) -> Agents:
         """The agents where innovations begin: the same actors, fresh networks, as theirs have learnt of s' - s."""
@@ -328,7 +336,7 @@ class Madoc:
         agents, watched, reference, rows = state.agents, state.watch, state.reference, state.rows
         logged, described, resolution = collection.logged, None, OF_CHANGES
         steps, failures, unit = rollout.valid.size, rollout.failures, 1.0
-        if reference is not None and (reference.age >= 0 or watch.overlaps(watched, innovations.OVERLAP)):
+        if reference is not None and (reference.age >= 0 or _may_begin(problem, watched)):
             estimate = problem.simulator.parameters.to_physical(np.tanh(np.asarray(agents.actors.mean, np.float64)))
             seen = innovations.seen(problem, collection.scaling.scaling, reference, estimate, rollout, of_reference)
             steps, failures = steps + seen.control_steps, failures + seen.failures
@@ -357,6 +365,7 @@ class Madoc:
             mixing=self.mixing,
             resolution=resolution,
             count=self.updates,
+            told=told(problem),
         )
         metrics = scalars(device_metrics)
         watched = watch.observe(
@@ -383,3 +392,8 @@ class Madoc:
             metrics |= cloning.metrics
         stalled = watch.stalled(watched, self.patience) if self.patience else None
         return following, Epoch(metrics, control_steps=steps, converged=stalled)
+
+
+def _may_begin(problem: CalibrationProblem, watched: watch.Watch) -> bool:
+    """Whether simulated rows are where logged ones are, by the discriminators or as the actors began at a prior."""
+    return problem.prior is not None or watch.overlaps(watched, innovations.OVERLAP)
