@@ -32,7 +32,7 @@ TITLES = {
     "physics": "By what they move in the simulator, the default",
 }
 """By the hyperparameter `groups`, in the order in which they are drawn."""
-STABILITIES = {"learned": "its votes agree", "physics": "those of resampled states agree"}
+STABILITIES = {"learned": "of its votes", "physics": "of resampled states"}
 """What the stability of the groups is of: both are mean adjusted Rand indices."""
 ROBOT, PLANE, HEIGHT, HEAD = 330, 560, 330, 34
 """Widths of both panels, the height of a row, and that of its title."""
@@ -114,7 +114,7 @@ def _row(task: Task, kind: str, found: Mapping, top: float) -> str:
         height=HEIGHT,
     )
     placed = str(chart).replace("<svg ", f'<svg x="{ROBOT}" y="{HEAD}" width="{PLANE}" height="{HEIGHT}" ', 1)
-    stability = f"{STABILITIES[kind]} by an adjusted Rand index of {found['stability']:.2f}"
+    stability = f"adjusted Rand index {STABILITIES[kind]} {found['stability']:.2f}"
     return (
         f'<g transform="translate(0 {top})">\n<text class="title" x="12" y="22">{TITLES[kind]}: '
         f"{len(found['groups'])} groups, {stability}</text>\n{robot(task, colour)}{placed}</g>\n"

@@ -41,6 +41,7 @@ TITLES = {
     "figure-2": "Figure 2: correlation of the critic's value with the absolute error of gravity",
     "figure-3b": "Figure 3b: normalized return by the number of calibrated parameters",
     "figure-3b-errors": "Figure 3b: mean calibration error by the number of parameters, in % of their ranges",
+    "groups": "Groups, one agent, and one agent a parameter: mean absolute calibration error",
     "figure-4": "Figures 4 and 8: normalized return by rows and ranges",
     "figure-6": "Figure 6: normalized return with groups and without",
     "figure-7": "Figure 7: normalized return by the number of groups and α",
@@ -115,15 +116,23 @@ def beside_printed(column: str) -> list[tuple[str, float, float, int]]:
     """Of each task of tables 10 and 11: its name, our mean error over the seeds run, the printed one, and our seeds."""
     found = []
     for name in ("table-10", "table-11"):
-        values = defaultdict[str, list[float]](list)
-        for each in scores_of(planned(name), kept(name)):
-            if each.column == column and each.value is not None:
-                values[each.row].append(each.value)
-        for row, errors in values.items():
-            theirs = printed(name, row, column)
-            assert theirs is not None
-            found.append((row, float(np.mean(errors)), theirs[0], len(errors)))
+        for (row, system), values in by_seed(name).items():
+            if system == column and values:
+                theirs = printed(name, row, column)
+                assert theirs is not None
+                found.append((row, float(np.mean(list(values.values()))), theirs[0], len(values)))
     return found
+
+
+def by_seed(name: str) -> dict[tuple[str, str], dict[int, float]]:
+    """Values of a suite by row and column, those of each seed; empty where none was run."""
+    plan, found = planned(name), kept(name)
+    values = defaultdict[tuple[str, str], dict[int, float]](dict)
+    for cell in wanted(plan):
+        known = values[place(chain_of(cell, plan))]
+        if found.get(cell.name, {}).get("value") is not None:
+            known[asked(cell).get("seed", 0)] = found[cell.name]["value"]
+    return dict(values)
 
 
 def table(name: str) -> str:

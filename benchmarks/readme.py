@@ -2,11 +2,12 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import paper
+from scipy import stats
 
 README = Path(__file__).parents[1] / "README.md"
 NAMES = {"hopper": "Hopper", "halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "ant": "Ant"}
@@ -15,19 +16,18 @@ PLACES = ("calibrated", "truth", "midrange")
 _MARKED = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def rewritten(text: str, calibrations: Sequence[dict], policies: Sequence[dict]) -> str:
+def rewritten(text: str, policies: Sequence[dict]) -> str:
     """The README with its marked tables made anew.
 
     Args:
         text: The README.
-        calibrations: Every calibration that was run.
         policies: Every policy that was learnt and evaluated.
 
     Raises:
         KeyError: A mark names no table.
     """
     tables: dict[str, Callable[[], str]] = {
-        "errors": lambda: errors(calibrations),
+        "errors": errors,
         "minutes": lambda: minutes(policies),
         "returns": lambda: returns(policies),
         "tasks": tasks,
@@ -35,25 +35,46 @@ def rewritten(text: str, calibrations: Sequence[dict], policies: Sequence[dict])
     return _MARKED.sub(lambda found: found[1] + tables[found[2]]() + found[3], text)
 
 
-def errors(rows: Sequence[dict]) -> str:
-    """Error of Madoc on clean medium data with 300 000 control steps, beside medians of it on changes s' - s alone."""
-    cells = defaultdict[tuple[str, str, str], list[float]](list)
-    for row in rows:
-        if (row["quality"], row["data"], row["budget"]) == ("medium", "clean", 300_000) and "error" in row:
-            cells[row["robot"], row["method"], row["starts"]].append(row["error"]["mean_absolute"])
-    columns = {
-        "`madoc` on changes": ("madoc-changes", "policy"),
-        "the same, groups by a VAE": ("madoc-vae-changes", "policy"),
-        "the same, one group": ("madoc-s-changes", "policy"),
-    }
-    now = {task: error for task, error, _, _ in paper.beside_printed("madoc")}
-    lines = [f"| robot | `madoc` | {' | '.join(columns)} | paper |", "|---" * (len(columns) + 3) + "|"]
+def errors() -> str:
+    """Madoc's error on medium data by who its agents are, beside the printed ones, and whether groups pay."""
+    found = paper.by_seed("groups")
+    columns = {"madoc": "groups", "madoc-s": "one agent", "madoc-ungrouped": "one agent a parameter"}
+    lines = [
+        f"| robot | {' | '.join(f'{told} (`{name}`)' for name, told in columns.items())} | paper, groups | one agent |",
+        "|---" * (len(columns) + 3) + "|",
+    ]
     for robot, name in NAMES.items():
-        before = " | ".join(f"{np.median(cells[robot, *column]):.3f}" for column in columns.values())
-        printed = paper.printed("table-10", f"{robot}-medium", "madoc")
-        assert printed is not None
-        lines.append(f"| {name} | {now[f'{robot}-medium']:.3f} | {before} | {printed[0]:.2f} |")
-    return "\n".join(lines) + "\n"
+        task = f"{robot}-medium"
+        ours = " | ".join(_mean(list(found[task, column].values())) for column in columns)
+        theirs = [paper.printed("table-10", task, column) for column in ("madoc", "madoc-s")]
+        lines.append(f"| {name} | {ours} | {' | '.join(f'{each[0]:.2f}' for each in theirs if each)} |")
+    return "\n".join(lines) + "\n" + _comparison(found)
+
+
+def _comparison(found: Mapping[tuple[str, str], Mapping[int, float]]) -> str:
+    """How groups do beside one agent, over pairs of runs with the same log and seed."""
+    pairs = [
+        (error, one_agent[seed])
+        for (task, method), errors in found.items()
+        if method == "madoc"
+        for seed, error in errors.items()
+        if seed in (one_agent := found[task, "madoc-s"])
+    ]
+    if len(pairs) < 2:
+        return ""
+    ratios = stats.ttest_1samp(np.log([ours / theirs for ours, theirs in pairs]), 0.0)
+    low, high = np.exp(ratios.confidence_interval())
+    middle = np.exp(np.mean(np.log([ours / theirs for ours, theirs in pairs])))
+    return (
+        f"\nOf {len(pairs)} pairs of runs with the same log and seed, groups err less than one agent in "
+        f"{sum(ours < theirs for ours, theirs in pairs)}, and {middle:.2f}\ntimes as much in the geometric mean "
+        f"(95 % interval over seeds {low:.2f} to {high:.2f}).\n"
+    )
+
+
+def _mean(errors: Sequence[float]) -> str:
+    """Mean and number of seeds; nothing of none."""
+    return f"{np.mean(errors):.3f} ({len(errors)} seed{'s' * (len(errors) > 1)})" if errors else "not run"
 
 
 def minutes(rows: Sequence[dict]) -> str:

@@ -15,7 +15,7 @@ from madoc.errors import MadocError
 from robots import SPRING_TRUTH, recorded, spring
 
 KEY = jax.random.key(0)
-WHERE = "least squares' estimate"
+WHERE = "the estimate of least squares"
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_what_the_prior_leaves_open_begins_as_without_one(problem):
     assert (np.asarray(actors.log_std)[[0, 2]] == 0.0).all()
     assert actors.mean[1] == pytest.approx(np.arctanh(0.7))
     assert sentence(partly) == (
-        f"Madoc began at {WHERE}, which leaves {names[0]}, {names[2]} open: there at the middle of the range"
+        f"Madoc began at {WHERE}; it leaves {names[0]}, {names[2]} open, which began at the middle of the range"
     )
     nothing = at(problem, [0.7, 0.7, 0.7], [0.6, 0.6, 0.6])
     assert sentence(nothing) == f"Madoc began at the middle of every range, as {WHERE} leaves all parameters open"

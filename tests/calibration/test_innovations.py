@@ -171,15 +171,18 @@ def test_innovations_begin_where_rows_overlap_and_a_checkpoint_holds_them(monkey
         np.testing.assert_array_equal(one, other)
 
 
-def test_with_a_prior_innovations_begin_at_once():
+def test_with_a_prior_of_every_parameter_innovations_begin_at_once():
     problem, method = problem_of(), Madoc(groups="one", starts=None, cloning_epochs=0, epoch_steps=200, updates=2)
-    known = replace(problem, prior=Prior(problem.simulator.parameters.vector(TRUTH), np.full(3, 0.1), "a guess"))
+    truth = problem.simulator.parameters.vector(TRUTH)
+    half = (problem.simulator.parameters.high - problem.simulator.parameters.low) / 2.0
+    known = replace(problem, prior=Prior(truth, 0.1 * half, "a guess"))
+    partly = replace(problem, prior=Prior(truth, np.array([0.1, 0.1, 0.9]) * half, "a guess"))
     references = []
-    for each in (problem, known):
+    for each in (problem, partly, known):
         state, _ = method.step(each, method.init(each, KEY))
         references.append(state.reference)
-    assert [reference.age for reference in references] == [-1, 0]
-    np.testing.assert_allclose(references[1].parameters, problem.simulator.parameters.vector(TRUTH), rtol=1e-5)
+    assert [reference.age for reference in references] == [-1, -1, 0]
+    np.testing.assert_allclose(references[2].parameters, truth, rtol=1e-5)
 
 
 def test_where_innovations_begin_the_actors_stay_and_networks_are_fresh():

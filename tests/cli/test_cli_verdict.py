@@ -98,11 +98,11 @@ def test_auto_lets_madoc_begin_at_least_squares_estimate(log, tmp_path, capsys, 
     ask = words("calibrate", log, "--method", "auto", "--budget", 30_000, "--set", *comparing.TINY, "--out", out)
     asked_for_json(capsys, ask)
     first, second = (read(out / name / "result.json") for name in ("least-squares", "madoc-local"))
-    assert second["began"] == "Madoc began at least squares' estimate"
+    assert second["began"] == "Madoc began at the estimate of least squares"
     assert "began" not in first
     estimates = [row["estimate"] for row in first["parameters"].values()]
     prior = read(out / "madoc-local" / "spec.json")["prior"]
-    assert (prior["mean"], prior["origin"]) == (estimates, "least squares' estimate")
+    assert (prior["mean"], prior["origin"]) == (estimates, "the estimate of least squares")
     assert not {"prior"} & (read(out / "spec.json").keys() | read(out / "least-squares" / "spec.json").keys())
     (out / "result.json").unlink()
     (out / "comparison.json").unlink()

@@ -149,7 +149,7 @@ def first_candidate(area, *, settled=True):
 def test_what_least_squares_leaves_to_the_next_candidate(tmp_path):
     good, bad = Area(0.7, (0.67, 0.73), 400), Area(0.88, (0.85, 0.91), 400)
     prior = prior_for(tmp_path, first_candidate(good))
-    assert (prior.mean.tolist(), prior.origin) == ([2.0], "least squares' estimate")
+    assert (prior.mean.tolist(), prior.origin) == ([2.0], "the estimate of least squares")
     assert prior.std == pytest.approx([0.2 / 1.959964])  # the farther end of the interval counts
     assert prior_for(tmp_path, {}) is None
     assert prior_for(tmp_path, first_candidate(good, settled=False)) is None

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from logged_arm import write_csv
 
-from madoc import robots, simulation
-from madoc.data import logs
+from madoc import identification, robots, simulation
+from madoc.data import logs, stride
 from madoc.diagnosis import check
 from madoc.identification.coarseness import COARSE, coarseness
 from madoc.identification.states import states_of
@@ -66,8 +66,16 @@ def test_a_timestep_that_is_too_long_for_its_contacts_is_told_with_a_shorter_one
     found = check(dataset, simulation.make(robot.task, threads=1), robot=robot)
     (finding,) = [each for each in found.findings if "timestep" in each.what]
     assert (finding.level, finding.where) == ("warning", "the model")
-    assert "its timestep of 0.005 s is too long: with 0.00125 s predictions of z" in finding.what
+    assert "its timestep of 0.005 s is too long: with 0.00125 s predictions of half of the signals" in finding.what
     assert finding.do.startswith("give timestep: 0.00125 in the spec")
+
+
+def test_a_timestep_that_diverges_counts_as_too_long(box, monkeypatch):
+    robot, dataset = box
+    simulator = simulation.make(robot.task, threads=1)
+    both = iter([np.full((1, 64, 4), np.nan), np.zeros((1, 64, 4))])
+    monkeypatch.setattr(identification.coarseness, "window_residuals", lambda *_: next(both))
+    assert coarseness(dataset, states_of(dataset, simulator), simulator, np.zeros(1), np.ones(4)) == (1.0, 2 * 64)
 
 
 def test_smooth_motion_hardly_depends_on_the_timestep(tmp_path):
@@ -80,9 +88,7 @@ def test_smooth_motion_hardly_depends_on_the_timestep(tmp_path):
     }
     dataset = logs.read(write_csv(tmp_path / "log.csv", columns), robot)
     simulator = simulation.make(robot.task, threads=1)
-    changes, spent = coarseness(
-        dataset, states_of(dataset, simulator), simulator, np.zeros(len(simulator.parameters)), np.ones(2)
-    )
-    assert changes.shape == (2,)
-    assert changes.max() < COARSE / 10
-    assert spent > 0
+    middle = np.zeros(len(simulator.parameters))
+    change, spent = coarseness(dataset, states_of(dataset, simulator), simulator, middle, np.ones(2))
+    assert 0.0 < change < COARSE / 10
+    assert spent == 2 * 64 * stride(dataset)

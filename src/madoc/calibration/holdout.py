@@ -138,8 +138,8 @@ class Judged:
         tested: False where the log should tell whether the model lacks a term, but is too short for that.
         at_end: Parameters estimated at an end of their range that is no physical bound.
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
-        coarseness: By how many typical changes predictions of a signal one stride ahead change at most where the model
-            is integrated in steps of a quarter of the length; 0 for a robot that is no spec's.
+        coarseness: By how many typical changes predictions one stride ahead change where the model is integrated in
+            steps of a quarter of the length, the median over signals; 0 for a robot without a spec.
         candidates: The methods that were compared on this hold-out; None where only one was run.
         chosen: The name of the method among them whose estimate was kept.
     """

@@ -14,7 +14,9 @@ WINDOWS = 64
 FINER = 4
 """Number of integration steps that take the place of one."""
 COARSE = 0.25
-"""Change of a prediction in typical changes of a signal, above which the integration step is too long for its robot."""
+"""Change of predictions in typical changes of a signal, above which the integration step is too long for its robot."""
+_DIVERGED = 1.0
+"""Typical changes that a window counts for where only the model's own integration step diverges."""
 
 
 def coarseness(
@@ -23,7 +25,7 @@ def coarseness(
     simulator: Simulator,
     point: Float[np.ndarray, " d"],
     scale: Float[np.ndarray, " observation"],
-) -> tuple[Float[np.ndarray, " observation"], int]:
+) -> tuple[float, int]:
     """By how much predictions one stride ahead change with integration steps of a quarter of the length.
 
     Smooth motion hardly changes. Where contacts begin or end it may, and then parameters fitted to a machine, whose
@@ -37,13 +39,18 @@ def coarseness(
         scale: Typical change of each signal in a stride, of which the result is a multiple.
 
     Returns:
-        The root mean square of each signal's change over windows of the log, without those whose simulation failed; 0
-        where none is left. Then the control steps simulated.
+        The median over signals of the root mean square over windows of the log, as a signal that hardly moves may
+        change by much of its little. A window whose finer simulation fails is left out; 0 where none is left. Then the
+        control steps simulated.
     """
     windows = probing_windows(logged, dataset, simulator, steps=stride(dataset), count=WINDOWS)
     finer = simulation.make(simulator.task.with_time_step(1.0 / FINER, substeps=FINER))
-    coarse, fine = (window_residuals(each, windows, point[None], scale)[0] for each in (simulator, finer))
-    change = (fine - coarse).reshape(len(windows), windows.steps, len(scale))[:, -1]
-    change = change[np.isfinite(change).all(-1)]
+    coarse, fine = (
+        window_residuals(each, windows, point[None], scale)[0].reshape(len(windows), windows.steps, -1)[:, -1]
+        for each in (simulator, finer)
+    )
+    counted = np.isfinite(fine).all(-1)
+    change = np.abs(fine - coarse)[counted]
+    change = np.where(np.isfinite(change), change, _DIVERGED)
     spent = 2 * len(windows) * windows.steps
-    return np.sqrt((change**2).sum(0) / max(1, len(change))), spent
+    return (float(np.median(np.sqrt((change**2).mean(0)))) if len(change) else 0.0), spent

@@ -95,8 +95,8 @@ def _calibrate_by(
 def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool) -> CalibrationResult:
     """Try the candidates within the budget, each in a folder of its own, and keep what predicts the hold-out best.
 
-    Madoc begins at least squares' estimate, where that has settled and predicts the hold-out better than mid-range. The
-    first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and so does a
+    Madoc begins at the estimate of least squares, where that has settled and predicts the hold-out better than
+    mid-range. The first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and so does a
     verdict on the data itself. Killed at any moment and resumed, the result has the same bits but for its seconds.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What a candidate of `auto` leaves to those after it: least squares' estimate as their prior."""
+"""What a candidate of `auto` leaves to those after it: the estimate of least squares as their prior."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +27,7 @@ def prior_for(place: Path, tried: Mapping[str, tuple[CalibrationResult, Assessme
         return None
     result, assessment = tried[FIRST]
     useful = result.settled and beats_mid_range(assessment.holdout)
-    return result.as_prior("least squares' estimate") if useful else None
+    return result.as_prior("the estimate of least squares") if useful else None
 
 
 def stored(prior: Prior | None) -> dict[str, object]:

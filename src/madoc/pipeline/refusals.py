@@ -48,7 +48,7 @@ def check_search(search: Search, task: Task, name: str) -> None:
     """
     named = task.parameters.names if search.parameters is None else search.parameters
     if not named:
-        raise MadocError("expected the names of parameters to calibrate, got none; without the option all are")
+        raise MadocError("expected the names of parameters to calibrate, got none; leave it out to calibrate all")
     for parameter in named:
         if parameter not in task.parameters.names:
             raise unknown_name(f"parameter of {name}", parameter, task.parameters.names)

@@ -206,7 +206,7 @@ class _Session(Generic[State]):
     def begin(self, stack: ExitStack) -> None:
         """Open the logs, and write the first checkpoint, so that a bad state is refused before any budget is spent."""
         self._started = time.monotonic()
-        self._measured = forget_peak()
+        self._measured = self._folder is not None and forget_peak()
         self._look_at_memory()
         if self._folder:
             self._folder.result.unlink(missing_ok=True)

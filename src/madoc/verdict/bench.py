@@ -215,7 +215,7 @@ def judged(
             bench.held_out, bench.simulator, points, horizons(problem.dataset)[1], bench.change, contradicts=True
         )
         found, spent = (*exchanged, *found), spent + steps
-    coarse, steps = np.zeros(1), 0
+    coarse, steps = 0.0, 0
     if bench.simulator.task.source is not None:  # else no timestep can be given
         coarse, steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
     # Another estimate of other windows says that the search is not at its end, not that a parameter is open.
@@ -242,7 +242,7 @@ def judged(
         alternatives=doubts.alternatives,
         tested=doubts.tested,
         contradictions=tuple(each.sentence for each in found if each.contradicts),
-        coarseness=float(coarse.max()),
+        coarseness=coarse,
         at_end=tuple(
             row.name
             for row, value in zip(space.parameters, point, strict=True)

@@ -134,7 +134,7 @@ def _missing(holdout: HoldOut) -> Verdict | None:
             "MODEL_MISMATCH",
             f"{term.parameter} drifts: it changes over the log by {value} between its parts (t = {abs(term.t):.0f}), "
             f"which is {abs(term.shifts[term.parameter]):.2g} half-widths of its interval; "
-            "calibrate to each run by itself",
+            f"calibrate to each run by itself{_coarse(holdout)}",
             (term.parameter,),
         )
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
@@ -143,7 +143,7 @@ def _missing(holdout: HoldOut) -> Verdict | None:
         "MODEL_MISMATCH",
         f"the model lacks {_named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
         f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
-        f"{_others(holdout, term)}; {_remedy(term)}{_coarse(holdout, term)}{_at_end(holdout)}{_disagreeing(holdout)}",
+        f"{_others(holdout, term)}{_coarse(holdout, term)}; {_remedy(term)}{_at_end(holdout)}{_disagreeing(holdout)}",
         tuple(moved),
     )
 
@@ -163,11 +163,16 @@ def _coarse(holdout: HoldOut, named: MissingTerm | None = None) -> str:
 
     That is so where it changes predictions by much, or explains more than the term named.
     """
-    first = "; first take a smaller timestep of the model"
     if holdout.coarseness > COARSE:
-        return f"{first}: steps of a quarter change predictions by {holdout.coarseness:.2g} typical changes of a signal"
+        return (
+            "; the timestep of the model is too long, as with a quarter of it predictions of half of the signals "
+            f"change by {holdout.coarseness:.2g} typical changes or more: take a smaller one before anything else"
+        )
     step = None if named is None else coarse_step(holdout, named)
-    return "" if step is None else f"{first}, whose error explains {100 * step.explained:.2g} % (t = {abs(step.t):.0f})"
+    if step is None:
+        return ""
+    explains = f"explains {100 * step.explained:.2g} % (t = {abs(step.t):.0f})"
+    return f"; first take a smaller timestep of the model, whose error {explains}"
 
 
 def _at_end(holdout: HoldOut) -> str:
@@ -204,7 +209,7 @@ def _contradicted(holdout: HoldOut) -> Verdict | None:
     """A log that the check before the calibration found to contradict the spec."""
     if not holdout.contradictions:
         return None
-    return Verdict("MODEL_MISMATCH", f"the log contradicts the spec: {holdout.contradictions[0]}")
+    return Verdict("MODEL_MISMATCH", f"the log contradicts the spec: {holdout.contradictions[0]}{_coarse(holdout)}")
 
 
 def _outside(holdout: HoldOut) -> Verdict | None:

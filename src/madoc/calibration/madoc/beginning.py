@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 from madoc.calibration.base import CalibrationProblem, Prior
 from madoc.calibration.madoc.actors import Actors, initial_actors
+from madoc.errors import listed
 from madoc.parameters import ParameterSpace
 
 NARROWEST = 0.1
@@ -41,7 +42,7 @@ def sentence(problem: CalibrationProblem) -> str | None:
     open_ones = [name for name, known in zip(space.names, _known(space, prior), strict=True) if not known]
     if len(open_ones) == len(space):
         return f"Madoc began at the middle of every range, as {prior.origin} leaves all parameters open"
-    but = f", which leaves {', '.join(open_ones)} open: there at the middle of the range" if open_ones else ""
+    but = f"; it leaves {listed(open_ones)} open, which began at the middle of the range" if open_ones else ""
     return f"Madoc began at {prior.origin}{but}"
 
 

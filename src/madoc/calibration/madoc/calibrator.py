@@ -395,5 +395,6 @@ class Madoc:
 
 
 def _may_begin(problem: CalibrationProblem, watched: watch.Watch) -> bool:
-    """Whether simulated rows are where logged ones are, by the discriminators or as the actors began at a prior."""
-    return problem.prior is not None or watch.overlaps(watched, innovations.OVERLAP)
+    """Whether simulated rows are where logged ones are: by the discriminators, or by a prior of every parameter."""
+    known = told(problem)
+    return (known is not None and bool(known.all())) or watch.overlaps(watched, innovations.OVERLAP)
