@@ -96,8 +96,9 @@ def _calibrate_auto(out: Path, prepared: Prepared, *, resume: bool, quiet: bool)
     """Try the candidates within the budget, each in a folder of its own, and keep what predicts the hold-out best.
 
     Madoc begins at the estimate of least squares, where that has settled and predicts the hold-out better than
-    mid-range. The first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and so does a
-    verdict on the data itself. Killed at any moment and resumed, the result has the same bits but for its seconds.
+    mid-range. The first whose estimate explains the hold-out down to the noise and is CALIBRATED ends the search, and
+    so does a verdict on the data itself. Killed at any moment and resumed, the result has the same bits but for its
+    seconds.
 
     Returns:
         The best candidate's result, with the cost of all of them; `holdout` has a row for each candidate.
