@@ -56,7 +56,7 @@ def test_errors_of_replayed_rows_lead_to_the_truth_and_the_search_ends_there(rob
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize("weight", [0.0, 0.1])
+@pytest.mark.parametrize("weight", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_a_likely_distribution_stands_about_the_truth(robot, weight):
     error, _ = off(Dropo(entropy_weight=weight), robot)
     assert (error < LIKELY).all(), error

@@ -60,7 +60,7 @@ def test_mid_range_and_an_estimate_that_is_no_better_are_no_improvement():
 
 
 @EVERY
-@pytest.mark.parametrize("noise", [0.0, 0.1])
+@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_a_search_that_stopped_early_is_no_mismatch_where_velocities_are_hidden(robot, noise):
     task, truth = ROBOTS[robot]
     task = replace(task, velocities={"spring": 1, "arm": 2}[robot])
