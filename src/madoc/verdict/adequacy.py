@@ -10,6 +10,7 @@ from scipy.constants import g as standard_gravity
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult
 from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS
+from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
 from madoc.identification.term_tests import Alternative, MissingTerm
@@ -77,6 +78,23 @@ def coarse_step(holdout: HoldOut, named: MissingTerm) -> MissingTerm | None:
     step = next((term for term in holdout.missing_terms if term.cause == INTEGRATION), None)
     coarse = step is not None and abs(step.t) >= CERTAIN and step.explained > named.explained
     return step if coarse else None
+
+
+def about_timestep(holdout: HoldOut, named: MissingTerm | None = None) -> str:
+    """A clause that the model should be integrated more finely first, or none.
+
+    That is so where it changes predictions by much, or explains more than the term named.
+    """
+    if holdout.coarseness > COARSE:
+        return (
+            "; the timestep of the model is too long, as with a quarter of it predictions of half of the signals "
+            f"change by {holdout.coarseness:.2g} typical changes or more: take a smaller one before anything else"
+        )
+    step = None if named is None else coarse_step(holdout, named)
+    if step is None:
+        return ""
+    explains = f"explains {100 * step.explained:.2g} % (t = {abs(step.t):.0f})"
+    return f"; first take a smaller timestep of the model, whose error {explains}"
 
 
 def is_certain(term: MissingTerm) -> bool:

@@ -16,14 +16,13 @@ from madoc.calibration.holdout import (
     Word,
 )
 from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, SATURATION, SPACING, TILTS
-from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import MissingTerm
 from madoc.parameters import FIELDS
-from madoc.verdict.adequacy import as_likely, coarse_step, is_certain, likeliest, missing_term, numerical
+from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END
 from madoc.verdict.statistics import NEGLIGIBLE
 
@@ -134,7 +133,7 @@ def _missing(holdout: HoldOut) -> Verdict | None:
             "MODEL_MISMATCH",
             f"{term.parameter} drifts: it changes over the log by {value} between its parts (t = {abs(term.t):.0f}), "
             f"which is {abs(term.shifts[term.parameter]):.2g} half-widths of its interval; "
-            f"calibrate to each run by itself{_coarse(holdout)}",
+            f"calibrate to each run by itself{about_timestep(holdout)}",
             (term.parameter,),
         )
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
@@ -143,7 +142,8 @@ def _missing(holdout: HoldOut) -> Verdict | None:
         "MODEL_MISMATCH",
         f"the model lacks {_named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
         f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
-        f"{_others(holdout, term)}{_coarse(holdout, term)}; {_remedy(term)}{_at_end(holdout)}{_disagreeing(holdout)}",
+        f"{_others(holdout, term)}{about_timestep(holdout, term)}; {_remedy(term)}{_at_end(holdout)}"
+        f"{_disagreeing(holdout)}",
         tuple(moved),
     )
 
@@ -156,23 +156,6 @@ def _others(holdout: HoldOut, term: MissingTerm) -> str:
     """Which other terms are as likely as the one named."""
     others = [_named(other) for other in as_likely(holdout, term)][:_MOST_NAMED]
     return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
-
-
-def _coarse(holdout: HoldOut, named: MissingTerm | None = None) -> str:
-    """That the model should be integrated more finely first.
-
-    That is so where it changes predictions by much, or explains more than the term named.
-    """
-    if holdout.coarseness > COARSE:
-        return (
-            "; the timestep of the model is too long, as with a quarter of it predictions of half of the signals "
-            f"change by {holdout.coarseness:.2g} typical changes or more: take a smaller one before anything else"
-        )
-    step = None if named is None else coarse_step(holdout, named)
-    if step is None:
-        return ""
-    explains = f"explains {100 * step.explained:.2g} % (t = {abs(step.t):.0f})"
-    return f"; first take a smaller timestep of the model, whose error {explains}"
 
 
 def _at_end(holdout: HoldOut) -> str:
@@ -209,7 +192,9 @@ def _contradicted(holdout: HoldOut) -> Verdict | None:
     """A log that the check before the calibration found to contradict the spec."""
     if not holdout.contradictions:
         return None
-    return Verdict("MODEL_MISMATCH", f"the log contradicts the spec: {holdout.contradictions[0]}{_coarse(holdout)}")
+    return Verdict(
+        "MODEL_MISMATCH", f"the log contradicts the spec: {holdout.contradictions[0]}{about_timestep(holdout)}"
+    )
 
 
 def _outside(holdout: HoldOut) -> Verdict | None:
@@ -219,7 +204,7 @@ def _outside(holdout: HoldOut) -> Verdict | None:
     return Verdict(
         "MODEL_MISMATCH",
         f"{', '.join(holdout.at_end)} at the end of the range: the true value may lie beyond it, and then the other "
-        f"parameters make up for it; widen the range{_coarse(holdout)}",
+        f"parameters make up for it; widen the range{about_timestep(holdout)}",
         holdout.at_end,
     )
 
@@ -232,7 +217,7 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
         "MODEL_MISMATCH",
         "residuals have longer tails than noise has: the model does not explain some stretches of the log, and "
         "intervals do not count that; look there for a force that acts at times only, at contacts or in fast motion, "
-        f"and for wrong readings{_coarse(holdout)}",
+        f"and for wrong readings{about_timestep(holdout)}",
     )
 
 
@@ -254,7 +239,7 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
             f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}){_others(holdout, term)}; "
             f"{_remedy(term)}"
         )
-    return Verdict("MODEL_MISMATCH", f"{sentence}{_coarse(holdout)}", pinned)
+    return Verdict("MODEL_MISMATCH", f"{sentence}{about_timestep(holdout)}", pinned)
 
 
 def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
