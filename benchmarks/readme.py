@@ -1,5 +1,6 @@
 """The measured tables of the README, made from committed results, between marks that name them."""
 
+import json
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -11,6 +12,16 @@ from scipy import stats
 
 README = Path(__file__).parents[1] / "README.md"
 NAMES = {"hopper": "Hopper", "halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "ant": "Ant"}
+COLUMNS = {"madoc": "groups", "madoc-s": "one agent", "madoc-ungrouped": "one agent a parameter"}
+"""Variants of Madoc by who its agents are."""
+STUDIED = {
+    "one": "one agent",
+    "physics": "groups by physics",
+    "random": "random groups",
+    "learned": "groups by the VAE",
+    "each": "one agent a parameter",
+}
+"""Who the agents of `benchmarks/groups.py` are, in the order of the columns."""
 PLACES = ("calibrated", "truth", "midrange")
 """Parameters at which policies are learnt, in the order of the columns."""
 _MARKED = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -38,38 +49,72 @@ def rewritten(text: str, policies: Sequence[dict]) -> str:
 def errors() -> str:
     """Madoc's error on medium data by who its agents are, beside the printed ones, and whether groups pay."""
     found = paper.by_seed("groups")
-    columns = {"madoc": "groups", "madoc-s": "one agent", "madoc-ungrouped": "one agent a parameter"}
     lines = [
-        f"| robot | {' | '.join(f'{told} (`{name}`)' for name, told in columns.items())} | paper, groups | one agent |",
-        "|---" * (len(columns) + 3) + "|",
+        f"| robot | {' | '.join(f'{told} (`{name}`)' for name, told in COLUMNS.items())} | paper, groups | one agent |",
+        "|---" * (len(COLUMNS) + 3) + "|",
     ]
     for robot, name in NAMES.items():
         task = f"{robot}-medium"
-        ours = " | ".join(_mean(list(found[task, column].values())) for column in columns)
+        ours = " | ".join(_mean(list(found[task, column].values())) for column in COLUMNS)
         theirs = [paper.printed("table-10", task, column) for column in ("madoc", "madoc-s")]
         lines.append(f"| {name} | {ours} | {' | '.join(f'{each[0]:.2f}' for each in theirs if each)} |")
     return "\n".join(lines) + "\n" + _comparison(found)
 
 
 def _comparison(found: Mapping[tuple[str, str], Mapping[int, float]]) -> str:
-    """How groups do beside one agent, over pairs of runs with the same log and seed."""
-    pairs = [
-        (error, one_agent[seed])
-        for (task, method), errors in found.items()
-        if method == "madoc"
-        for seed, error in errors.items()
-        if seed in (one_agent := found[task, "madoc-s"])
-    ]
-    if len(pairs) < 2:
+    """Who errs less over pairs of runs with the same log and seed."""
+    lines = []
+    for first, second in (("madoc", "madoc-s"), ("madoc-ungrouped", "madoc-s"), ("madoc-ungrouped", "madoc")):
+        pairs = [
+            (error, beside[seed])
+            for (task, method), errors in found.items()
+            if method == first
+            for seed, error in errors.items()
+            if seed in (beside := found[task, second])
+        ]
+        if len(pairs) > 1:
+            less = sum(ours < theirs for ours, theirs in pairs)
+            names = f"{COLUMNS[first]} against {COLUMNS[second]}"
+            lines.append(f"| {names} | {len(pairs)} | {less} | {ratio(pairs)} |")
+    header = "\n| pairs of runs with the same log and seed | pairs | err less | ratio of errors |\n|---|---|---|---|\n"
+    return header + "\n".join(lines) + "\n" if lines else ""
+
+
+def ratio(pairs: Sequence[tuple[float, float]]) -> str:
+    """Geometric mean of the ratio of the first error of each pair to the second, and its 95 % interval."""
+    logs = np.log([ours / theirs for ours, theirs in pairs])
+    low, high = np.exp(stats.ttest_1samp(logs, 0.0).confidence_interval())
+    return f"{np.exp(logs.mean()):.2f} ({low:.2f} to {high:.2f})"
+
+
+def study() -> str:
+    """Error of `benchmarks/groups.py` by parameters, draws an epoch and agents, and each as a ratio to one agent."""
+    cells = defaultdict[tuple[int, int], defaultdict[str, dict[int, dict]]](lambda: defaultdict(dict))
+    for path in (Path(__file__).parent / "results" / "groups").glob("*.json"):
+        row = json.loads(path.read_text())
+        cells[row["parameters"], row["draws"]][row["groups"]][row["seed"]] = row
+    if not cells:
         return ""
-    ratios = stats.ttest_1samp(np.log([ours / theirs for ours, theirs in pairs]), 0.0)
-    low, high = np.exp(ratios.confidence_interval())
-    middle = np.exp(np.mean(np.log([ours / theirs for ours, theirs in pairs])))
-    return (
-        f"\nOf {len(pairs)} pairs of runs with the same log and seed, groups err less than one agent in "
-        f"{sum(ours < theirs for ours, theirs in pairs)}, and {middle:.2f}\ntimes as much in the geometric mean "
-        f"(95 % interval over seeds {low:.2f} to {high:.2f}).\n"
-    )
+    used = [name for name in STUDIED if any(name in rows for rows in cells.values())]
+    lines = [
+        "\n`python benchmarks/groups.py`: an Ant with planted parameters of our own. Mean error in % of the range, "
+        "over seeds; in brackets the ratio to one agent's, geometric mean and 95 % interval over seeds.\n",
+        f"| parameters | draws an epoch | seeds | {' | '.join(STUDIED[name] for name in used)} |",
+        "|---" * (len(used) + 3) + "|",
+    ]
+    for (count, draws), rows in sorted(cells.items()):
+        seeds = len({seed for runs in rows.values() for seed in runs})
+        lines.append(f"| {count} | {draws} | {seeds} | " + " | ".join(_studied(rows, name) for name in used) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _studied(rows: Mapping[str, Mapping[int, dict]], name: str) -> str:
+    if not (runs := rows.get(name)):
+        return "not run"
+    one = rows.get("one", {})
+    pairs = [(row["error"], one[seed]["error"]) for seed, row in runs.items() if seed in one]
+    beside = f" ({ratio(pairs)})" if name != "one" and len(pairs) > 1 else ""
+    return f"{np.mean([row['error'] for row in runs.values()]):.2f}{beside}"
 
 
 def _mean(errors: Sequence[float]) -> str:

@@ -89,28 +89,13 @@ def calibration() -> str:
 
 
 def groups() -> str:
-    """Error of groups and of one agent as they are, and before innovations with the paper's reward."""
-    cells = defaultdict(lambda: defaultdict(list))
-    for path in sorted((RESULTS / "groups").glob("*.json")):
-        row = json.loads(path.read_text())
-        cells[row["robot"], row["reward"], row["budget"]][row["method"]].append(row)
-    lines = [
+    """Error of groups, one agent and one agent a parameter: on the four robots, and by parameters and draws."""
+    return (
         "## Groups or one agent\n\n`madoc suite benchmarks/suites/groups.yaml` (each seed is in `paper/groups.json`). "
-        "Mean absolute error on medium data after 300,000 control steps, mean over seeds.\n",
-        readme.errors(),
-        "Before discriminators saw innovations, with the paper's reward, `python benchmarks/groups.py`; median (lowest "
-        "to highest) over seeds:\n",
-        "| robot | reward | control steps | seeds | groups (madoc) | one agent (madoc-s) | commit |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for (robot, reward, budget), rows in sorted(cells.items()):
-        found = [[row["error"]["mean_absolute"] for row in rows[name]] for name in ("madoc", "madoc-s")]
-        errors = [shown(each) if each else "" for each in found]
-        both = rows["madoc"] + rows["madoc-s"]
-        commits = ", ".join(sorted({row["commit"] for row in both}))
-        seeds = len({row["seed"] for row in both})
-        lines.append(f"| {robot} | {reward} | {budget:,} | {seeds} | {errors[0]} | {errors[1]} | {commits} |")
-    return "\n".join(lines) + "\n"
+        "Mean absolute error on medium data after 300,000 control steps, mean over seeds.\n\n"
+        + readme.errors()
+        + readme.study()
+    )
 
 
 def shown(errors: list[float]) -> str:
