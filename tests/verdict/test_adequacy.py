@@ -93,7 +93,9 @@ def test_beside_a_coarse_integration_step_nothing_else_is_named():
     assert numerical(held(coarse)) is coarse
     assert missing_term(held(coarse, term())) is None
     assert numerical(held(term(INTEGRATION, t=20.0, explained=0.2))) is None
-    assert numerical(held(term(INTEGRATION, t=4.9, explained=0.4))) is None
+    assert numerical(held(term(INTEGRATION, t=3.9, explained=0.4))) is None
+    assert numerical(held(replace(coarse, value=3.5))) is None
+    assert numerical(held(replace(coarse, value=-0.5))) is None
     delay = term("late actions", t=14.0, explained=0.8)
     assert numerical(held(coarse, delay)) is None
     assert missing_term(held(coarse, delay)) is delay

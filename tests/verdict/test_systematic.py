@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from madoc.verdict.systematic import autocorrelation, explained, persistence
+from madoc.verdict.systematic import (
+    autocorrelation,
+    disjoint_folds,
+    explained,
+    explained_at_end,
+    persistence,
+)
 
 PAIRS = np.random.default_rng(0).standard_normal((300, 3))
 NOISE = np.random.default_rng(1).standard_normal((300, 2))
@@ -29,6 +35,30 @@ def test_noise_is_not_explained():
 def test_half_noise_is_half_explained():
     line = PAIRS[:, :1] * np.sqrt(1.0)
     assert explained(PAIRS, line + NOISE[:, :1])[0] == pytest.approx(0.5, abs=0.1)
+
+
+def test_windows_are_predicted_from_those_that_do_not_overlap_them():
+    learnt, predicted = disjoint_folds(np.arange(50), steps=5)[1]
+    assert predicted.tolist() == [*range(10, 20)]
+    assert learnt.tolist() == [*range(6), *range(24, 50)]
+    assert disjoint_folds(np.arange(9), steps=2) == []
+
+
+def test_forces_at_random_that_windows_share_are_not_explained_by_the_state():
+    """Each window of 20 rows ends where 20 random pushes have added up; the state itself wanders slowly."""
+    random = np.random.default_rng(1)
+    pushes, state = (np.cumsum(random.standard_normal(shape), axis=0) for shape in ((120, 1), (120, 2)))
+    residuals = np.zeros((100, 20, 1))
+    residuals[:, -1] = (pushes[20:] - pushes[:100]) / 20.0
+    assert explained(state[:100], residuals[:, -1])[0] > 0.3
+    assert explained_at_end(state[:100], residuals, np.arange(100)) == 0.0
+
+
+def test_what_the_state_explains_at_the_end_of_windows_is_explained():
+    phase = np.arange(200) / 4.0
+    residuals = np.zeros((200, 20, 1))
+    residuals[:, -1, 0] = np.sin(phase)
+    assert explained_at_end(np.cos(phase[:, None] + [0.0, 1.0]), residuals, np.arange(200)) > 0.9
 
 
 def test_nothing_and_too_little_are_not_explained():

@@ -21,6 +21,11 @@ CERTAIN_DRIFT = 6.0
 """The same for a parameter that changes over the log, whose standard error rests on a third of the windows."""
 MOVES = 0.5
 """Shift of a parameter in half-widths of its 95 % interval; a term that moves all by less may be left out."""
+CERTAIN_STEP = 4.0
+"""The same for the error of the integration step, whose value is known beforehand: by chance one in 30 thousand."""
+WHOLE = 1.5
+"""Largest value of the error of the integration step; it is 1 / (1 - 4^-p) for an integrator of order p, as the steps
+compared with are a quarter as long."""
 NUMERICAL = 0.3
 """Share of squared residuals explained by the integration step; above it they are no mismatch of the model."""
 AS_SIGNIFICANT = 0.6
@@ -118,9 +123,13 @@ def _moved_together(holdout: HoldOut) -> bool:
 
 
 def numerical(holdout: HoldOut) -> MissingTerm | None:
-    """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
+    """The error of the integration step, where it explains much of the residuals, and no certain term explains more.
+
+    Smaller steps change predictions by that error once, and at contacts derivatives follow less than all of it. A value
+    beyond that, or of the other sign, is of something else, such as a late action.
+    """
     term = next((term for term in holdout.missing_terms if term.cause == INTEGRATION), None)
-    if term is None or abs(term.t) < CERTAIN or term.explained < NUMERICAL:
+    if term is None or not 0.0 < term.value <= WHOLE or term.t < CERTAIN_STEP or term.explained < NUMERICAL:
         return None
     others = (each.explained for each in holdout.missing_terms if is_certain(each) and each.cause != DRIFT)
     return term if max(others, default=0.0) <= term.explained else None

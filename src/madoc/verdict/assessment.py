@@ -16,7 +16,7 @@ from madoc.simulation.base import Simulator
 from madoc.verdict.adequacy import with_widened_intervals
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.fitted import fitted
-from madoc.verdict.judge import judge
+from madoc.verdict.judge import judge, noise_hides_gain
 from madoc.verdict.predicted import predicted
 
 
@@ -79,12 +79,16 @@ def assess(
 def measured(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None = None) -> HoldOut:
     """The hold-out's numbers for an estimate and its 95 % intervals in physical units, by the measure its states allow.
 
+    Where states can be rebuilt, but the sensors' noise in them hides what parameters do, initial states are fitted too.
+
     Raises:
         MadocError: No state of the hold-out can be rebuilt though the robot's observations determine it.
     """
     point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
     if bench.states_known:
-        return predicted(bench, point, interval)
+        holdout = predicted(bench, point, interval)
+        if not noise_hides_gain(holdout) or bench.fitted is None:
+            return holdout
     if bench.fitted is not None:
         return fitted(bench, bench.fitted, point, interval)
     noise = difference_noise(bench.problem.dataset) / bench.change

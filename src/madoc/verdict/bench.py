@@ -110,7 +110,7 @@ class Bench:
     @cached_property
     def fitted(self) -> FittedReplays | None:
         """Windows of the hold-out whose initial states are to be fitted; None where they cannot be."""
-        if self.states.kind != "approximate" or self.held_out.disturbance.shuffled != "none":
+        if self.states.kind == "unknown" or self.held_out.disturbance.shuffled != "none":
             return None
         return fitted_replays_of(self.held_out, self.simulator, self.change, stride(self.problem.dataset))
 

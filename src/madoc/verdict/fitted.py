@@ -55,7 +55,7 @@ def fitted(
             failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
             stride=stride(bench.problem.dataset),
         ),
-        explained=explained_at_end(start_and_actions, residuals[best]),
+        explained=explained_at_end(start_and_actions, residuals[best], replays.rows),
         fitted_steps=replays.fitted,
     )
     return judged(

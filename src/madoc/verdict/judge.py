@@ -25,6 +25,7 @@ from madoc.parameters import FIELDS
 from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END
 from madoc.verdict.statistics import NEGLIGIBLE
+from madoc.verdict.systematic import EXPLAINED
 
 REMEDIES = {
     EARLY: "log each action with what was seen just before it",
@@ -51,9 +52,6 @@ SKILL = 0.1
 ABOVE_NOISE = 2.0
 """Ratio of an error to that of noise alone, at least 1; above it noise does not explain the error. Noise estimated from
 a few hundred rows is within about 50 % of the true one."""
-EXPLAINED = 0.1
-"""Share in [0, 1] of squared residuals that state and action explain on unseen rows; above it residuals are
-systematic. Noise alone gives at most a few percent."""
 WHITE = 0.2
 """Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
 PERSISTENT = 0.1
@@ -109,6 +107,12 @@ def beats_mid_range(holdout: HoldOut) -> bool:
     if isinstance(holdout, ToldApart):
         return holdout.area_at_estimate.interval[1] < holdout.area_at_mid_range.area
     return holdout.errors.relative_interval[1] < 1.0
+
+
+def noise_hides_gain(holdout: Predicted) -> bool:
+    """Whether mid-range predicts the hold-out as well as parameters can, as errors are those of noise in any case."""
+    errors = holdout.errors
+    return errors.nearby_relative > 1.0 - WORTH_GAINING and not _beyond_noise(errors.mid_range, errors.noise)
 
 
 def _rejected(holdout: HoldOut) -> Verdict | None:

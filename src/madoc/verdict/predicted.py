@@ -10,13 +10,18 @@ from madoc.calibration.holdout import Predicted
 from madoc.data import stride
 from madoc.diagnosis.channels import signal_names
 from madoc.identification import noise as sensors
+from madoc.identification.gauss_newton import descend
 from madoc.identification.states import logged_states
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.prediction import nearby_best
 from madoc.verdict.statistics import best_of, independent_groups, prediction_errors, relative_to_first
-from madoc.verdict.systematic import autocorrelation, explained, explained_at_end, persistence
+from madoc.verdict.systematic import EXPLAINED, autocorrelation, explained, explained_at_end, persistence
 from madoc.verdict.two_sample import classify, replayed
 
+WHOLE_STEPS = 3
+"""Number of Gauss-Newton steps on whole windows, at least 1; they begin at the minimum of single steps."""
+_DAMPING = 1e-6
+"""Marquardt's damping of a step, relative to the squared lengths of the columns; 0 is none."""
 MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
 
@@ -37,8 +42,7 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
     area_at_mid_range, area_at_estimate = (
         classify(*replayed(replays, bench.scaling, part, noisy[0]), overlap=False) for part in residuals[:2]
     )
-    actions = replays.windows.actions.reshape(len(replays.windows), -1)
-    start_and_actions = np.concatenate([replays.observation, actions], axis=1)
+    at_end, refitting = _explained_at_end(bench, points[best], residuals[best], point, interval)
     record = partial(
         Predicted,
         errors=prediction_errors(
@@ -51,7 +55,7 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
             failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
             stride=stride(bench.problem.dataset),
         ),
-        explained=max(single.explained, explained_at_end(start_and_actions, residuals[best])),
+        explained=max(single.explained, at_end),
         autocorrelation=single.autocorrelation,
         persistence=lasting,
         area_at_mid_range=area_at_mid_range,
@@ -66,8 +70,40 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         residual=single.size,
         by_model=tuple(bench.against_chance(name, _simulated(bench, system)) for name, system in systems.items()),
         noise=single.noise,
-        control_steps=searching + residuals[..., 0].size + noisy[..., 0].size * 2 + spent,
+        control_steps=searching + residuals[..., 0].size + noisy[..., 0].size * 2 + spent + refitting,
     )
+
+
+def _explained_at_end(
+    bench: Bench,
+    best: Float[np.ndarray, " d"],
+    residuals: Float[np.ndarray, "windows steps observation"],
+    point: Float[np.ndarray, " d"],
+    interval: Float[np.ndarray, "d 2"] | None,
+) -> tuple[float, int]:
+    """The share of the last residuals of windows that their start and actions explain, and the control steps spent.
+
+    Over a whole window an error of a parameter adds up, and that of the estimate is no sign of another model: where
+    parameters fitted to whole windows are within the error of both fits of the estimate at `point`, the smaller share
+    of their residuals counts.
+    """
+    replays, space = bench.replays, bench.simulator.parameters
+    actions = replays.windows.actions.reshape(len(replays.windows), -1)
+    inputs = np.concatenate([replays.observation, actions], axis=1)
+    share = explained_at_end(inputs, residuals, replays.rows)
+    if share <= EXPLAINED or interval is None:
+        return share, 0
+    _, visited, spent = descend(
+        replays.simulator, replays.windows, best, replays.scale, steps=WHOLE_STEPS, loss="cauchy", damping=_DAMPING
+    )
+    if not len(visited):
+        return share, spent
+    half_width = np.abs(space.to_unit(interval.T) - point).max(0)
+    of_both = half_width * np.sqrt(1.0 + len(bench.problem.dataset) / len(bench.held_out))
+    if (np.abs(visited[-1] - point) > of_both).any():
+        return share, spent
+    refitted = replays.residuals(visited[-1:])[0]
+    return min(share, explained_at_end(inputs, refitted, replays.rows)), spent + refitted[..., 0].size
 
 
 def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:

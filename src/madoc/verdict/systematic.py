@@ -1,7 +1,7 @@
 """Whether residuals are noise, or a function of the robot's state and action."""
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from sklearn.ensemble import ExtraTreesRegressor
 from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import KFold, cross_val_predict
@@ -17,6 +17,14 @@ _FEWEST = 2 * FOLDS
 _ROUNDING = 1e-6
 """Residual in typical changes of a step; a smaller one is within the tolerance of MuJoCo's solver at contacts."""
 
+EXPLAINED = 0.1
+"""Share in [0, 1] of squared residuals that state and action explain on unseen rows; above it residuals are
+systematic. Noise alone gives at most a few percent of many independent rows."""
+REDRAWN = 39
+"""Number of draws of signs with which a share explained is compared."""
+SIGNIFICANT = 0.05
+"""Significance level in [0, 1] of a share explained."""
+
 LAGS = range(4, 9)
 """Distances in rows at which residuals are compared: long enough that sensor noise, filters and differences of readings
 no longer correlate."""
@@ -30,10 +38,22 @@ EXPLAINERS = {
 """Regressions of residuals on state and action: a linear one for smooth motion, trees for contacts."""
 
 
+Folds = list[tuple[Int[np.ndarray, " _"], Int[np.ndarray, " _"]]]
+"""Rows that are learnt from and rows that are predicted, of every fold of a cross-validation."""
+
+
 def explained(
-    inputs: Float[np.ndarray, "rows inputs"], residuals: Float[np.ndarray, "rows observation"]
+    inputs: Float[np.ndarray, "rows inputs"],
+    residuals: Float[np.ndarray, "rows observation"],
+    folds: Folds | None = None,
 ) -> tuple[float, Float[np.ndarray, "rows observation"]]:
     """The share of the squared residuals that a regression on the inputs explains, by cross-validation.
+
+    Args:
+        inputs: What residuals may depend on.
+        residuals: Simulated minus logged observations.
+        folds: Indices of the rows of each fold that are learnt from and predicted; by default consecutive fifths are
+            predicted from all others.
 
     Returns:
         The share of the better regression, at least 0 (a constant residual counts as explained), and its predictions.
@@ -41,10 +61,12 @@ def explained(
     total = float((residuals**2).sum())
     best, explanation = 0.0, np.zeros_like(residuals)
     wanted = residuals.ravel() if residuals.shape[1] == 1 else residuals
-    if len(inputs) < _FEWEST or np.sqrt((residuals**2).mean(0)).max() <= _ROUNDING:
+    folds = list(KFold(FOLDS).split(inputs)) if folds is None and len(inputs) >= _FEWEST else folds or []
+    enough = folds and min(len(learnt) for learnt, _ in folds) >= _FEWEST
+    if not enough or np.sqrt((residuals**2).mean(0)).max() <= _ROUNDING:
         return best, explanation
     for make in EXPLAINERS.values():
-        guess = cross_val_predict(make(), inputs, wanted, cv=KFold(FOLDS)).reshape(residuals.shape)
+        guess = cross_val_predict(make(), inputs, wanted, cv=folds).reshape(residuals.shape)
         share = 1.0 - float(((residuals - guess) ** 2).sum()) / total
         if share > best:
             best, explanation = share, guess
@@ -52,11 +74,40 @@ def explained(
 
 
 def explained_at_end(
-    inputs: Float[np.ndarray, "windows inputs"], residuals: Float[np.ndarray, "windows steps observation"]
+    inputs: Float[np.ndarray, "windows inputs"],
+    residuals: Float[np.ndarray, "windows steps observation"],
+    rows: Int[np.ndarray, " windows"],
 ) -> float:
-    """The share of windows' squared last residuals that the inputs explain; model errors have added up in them."""
-    done = np.isfinite(residuals).all((1, 2))
-    return explained(inputs[done], clipped(residuals[done, -1]))[0] if done.any() else 0.0
+    """The share of windows' squared last residuals that the inputs explain; model errors have added up in them.
+
+    Windows begin at the `rows`, in increasing order. Those that overlap share what forces at random did to them, which
+    a regression would recognise by the state: none is predicted from windows that overlap it. A short log has few that
+    do not, so by chance as well much may be explained: a share above `EXPLAINED` counts only where it is significant
+    among those of residuals whose sign is drawn anew for every stretch of a window's length.
+    """
+    done, steps = np.isfinite(residuals).all((1, 2)), residuals.shape[1]
+    rows, last = rows[done], clipped(residuals[done, -1])
+    folds = disjoint_folds(rows, steps)
+    share = explained(inputs[done], last, folds)[0]
+    if share <= EXPLAINED:
+        return share
+    random, stretch = np.random.default_rng(0), (rows - rows[0]) // steps
+    signs = random.choice([-1.0, 1.0], (REDRAWN, stretch[-1] + 1))[:, stretch, None]
+    by_chance = sum(explained(inputs[done], sign * last, folds)[0] >= share for sign in signs)
+    return share if (1 + by_chance) / (1 + REDRAWN) <= SIGNIFICANT else 0.0
+
+
+def disjoint_folds(rows: Int[np.ndarray, " windows"], steps: int) -> Folds:
+    """Consecutive fifths of windows, and for each the windows of the others that share no row with it.
+
+    The windows begin at `rows`, in increasing order, and are `steps` rows long.
+    """
+    if len(rows) < _FEWEST:
+        return []
+    return [
+        (np.flatnonzero((rows + steps <= rows[part[0]]) | (rows >= rows[part[-1]] + steps)), part)
+        for _, part in KFold(FOLDS).split(rows)
+    ]
 
 
 def autocorrelation(
