@@ -100,6 +100,16 @@ def test_a_mismatch_names_the_likeliest_term_though_it_hardly_moves_the_estimate
     assert verdict.sentence.endswith("{field: signal_bias, element: hip, low: 0, high: 0.2}")
 
 
+def test_errors_that_grow_far_faster_than_those_of_noise_are_a_mismatch():
+    noise = errors(0.1, 0.2)
+    assert judge(changed(PREDICTED, {"nearby_best": errors(0.2, 3.0), "noise": noise})).word == "CALIBRATED"
+    verdict = judge(changed(PREDICTED, {"nearby_best": errors(0.2, 3.4), "noise": noise}))
+    assert verdict.word == "MODEL_MISMATCH"
+    assert "it grows 8.5 times as much from 1 step on as noise does" in verdict.sentence
+    without_noise = {"nearby_best": errors(0.002, 0.1), "noise": errors(0.0, 0.0)}
+    assert judge(changed(PREDICTED, without_noise)).word == "CALIBRATED"
+
+
 def test_correlated_residuals_of_single_steps_are_a_mismatch():
     verdict = judge(changed(PREDICTED, LEFT_OVER, autocorrelation=0.5))
     assert verdict.word == "MODEL_MISMATCH"

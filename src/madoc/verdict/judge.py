@@ -1,6 +1,6 @@
 """The verdict on an estimate: one word, and a sentence with the numbers behind it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -9,7 +9,6 @@ from madoc.calibration.holdout import (
     Fitted,
     HoldOut,
     Predicted,
-    PredictionError,
     PredictionErrors,
     ToldApart,
     Verdict,
@@ -24,7 +23,7 @@ from madoc.identification.term_tests import MissingTerm
 from madoc.parameters import FIELDS
 from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END
-from madoc.verdict.statistics import NEGLIGIBLE
+from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise, growth_beside_noise
 from madoc.verdict.systematic import EXPLAINED
 
 REMEDIES = {
@@ -49,13 +48,13 @@ CHANCE = 0.01
 """Significance level in [0, 1]: data is rejected where no prediction is better than chance at this level."""
 SKILL = 0.1
 """Skill of the best prediction, at most 1; data is rejected below it, however significant the prediction is."""
-ABOVE_NOISE = 2.0
-"""Ratio of an error to that of noise alone, at least 1; above it noise does not explain the error. Noise estimated from
-a few hundred rows is within about 50 % of the true one."""
 WHITE = 0.2
 """Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
 PERSISTENT = 0.1
 """Correlation in [-1, 1] of residuals with those a few rows later, above which a force is missing that lasts."""
+GROWS = 8.0
+"""Growth of errors with the horizon over that of noise; above it something adds up that is not random. Random forces of
+each row make it 5 at most in simulated robots, a floor with a slope that the model lacks 10 and more."""
 GAINED = 0.75
 """Share in [0, 1] of the possible gain over mid-range on the hold-out; with less, an estimate is no improvement."""
 WORTH_GAINING = 0.05
@@ -99,7 +98,7 @@ def explains_all(holdout: HoldOut) -> bool:
     """Whether an estimate's errors on the hold-out are no larger than those of noise alone, at every horizon."""
     if isinstance(holdout, ToldApart):
         return holdout.area_at_estimate.interval[0] <= 0.5
-    return numerical(holdout) is not None or not _beyond_noise(holdout.errors.estimate, holdout.errors.noise)
+    return numerical(holdout) is not None or not beyond_noise(holdout.errors.estimate, holdout.errors.noise)
 
 
 def beats_mid_range(holdout: HoldOut) -> bool:
@@ -112,7 +111,7 @@ def beats_mid_range(holdout: HoldOut) -> bool:
 def noise_hides_gain(holdout: Predicted) -> bool:
     """Whether mid-range predicts the hold-out as well as parameters can, as errors are those of noise in any case."""
     errors = holdout.errors
-    return errors.nearby_relative > 1.0 - WORTH_GAINING and not _beyond_noise(errors.mid_range, errors.noise)
+    return errors.nearby_relative > 1.0 - WORTH_GAINING and not beyond_noise(errors.mid_range, errors.noise)
 
 
 def _rejected(holdout: HoldOut) -> Verdict | None:
@@ -257,8 +256,12 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
     if isinstance(holdout, Predicted) and holdout.persistence > PERSISTENT:
         lasts = f"it lasts over several rows (correlation {holdout.persistence:.2f})"
         reasons.append(f"{lasts}, as an external force does or a base that moves")
+    if direct and (grows := growth_beside_noise(errors)) > GROWS:
+        reasons.append(
+            f"it grows {grows:.2g} times as much from {_steps(errors.nearby_best[0].steps)} on as noise does"
+        )
     reasons += at_end
-    beyond = _beyond_noise(errors.nearby_best, errors.noise)
+    beyond = beyond_noise(errors.nearby_best, errors.noise)
     if not beyond or not reasons:
         return ""
     left, noise = max(beyond, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
@@ -318,7 +321,7 @@ def _mid_range_was_right(holdout: Predicted | Fitted) -> bool:
     errors, noise = holdout.errors, holdout.errors.noise
     as_good = errors.nearby_relative > 1.0 - WORTH_GAINING
     other_windows = any(each.causes == (OTHER_WINDOWS,) for each in holdout.alternatives)
-    beyond = _beyond_noise((*errors.mid_range, *errors.estimate), (*noise, *noise))
+    beyond = beyond_noise((*errors.mid_range, *errors.estimate), (*noise, *noise))
     return inside and as_good and not other_windows and not beyond
 
 
@@ -369,14 +372,6 @@ def _how_small(errors: PredictionErrors) -> str:
         f"the prediction error on the hold-out is {_percent(errors.relative)} of mid-range's (95 % interval {low} to "
         f"{high}; {_change(errors)}, in typical changes of {_steps(errors.stride)})"
     )
-
-
-def _beyond_noise(
-    errors: Sequence[PredictionError], noise: Iterable[PredictionError]
-) -> list[tuple[PredictionError, PredictionError]]:
-    """The errors that noise does not explain, each with the error of noise alone."""
-    pairs = zip(errors, noise, strict=True)
-    return [(left, alone) for left, alone in pairs if left.mean > max(NEGLIGIBLE, ABOVE_NOISE * alone.mean)]
 
 
 def _change(errors: PredictionErrors) -> str:

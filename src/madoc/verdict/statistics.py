@@ -1,6 +1,6 @@
-"""Means with confidence intervals from a bootstrap, and predictions compared with chance."""
+"""Means with confidence intervals from a bootstrap, and predictions compared with chance and with noise."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,6 +10,9 @@ from madoc.identification.information import CONFIDENCE
 
 NEGLIGIBLE = 1e-3
 """Residual in typical changes of a signal in a stride; no sensor is more precise, so smaller ones count as none."""
+ABOVE_NOISE = 2.0
+"""Ratio of an error to that of noise alone, at least 1; above it noise does not explain the error. Noise estimated from
+a few hundred rows is within about 50 % of the true one."""
 RESAMPLES = 500
 """Number of bootstrap samples. The ends of a 95 % interval then vary by about a tenth of its width (Efron and
 Tibshirani 1993, section 13.3)."""
@@ -160,3 +163,25 @@ def better_than_chance(
     chance = np.array([mean_error(shuffled()) for _ in range(SHUFFLES)])
     typical = float(np.median(chance))
     return 0.0 if typical == 0.0 else 1.0 - paired / typical, float((1 + (chance <= paired).sum()) / (1 + SHUFFLES))
+
+
+def beyond_noise(
+    errors: Sequence[PredictionError], noise: Iterable[PredictionError]
+) -> list[tuple[PredictionError, PredictionError]]:
+    """The errors that noise does not explain, each with the error of noise alone."""
+    pairs = zip(errors, noise, strict=True)
+    return [(left, alone) for left, alone in pairs if left.mean > max(NEGLIGIBLE, ABOVE_NOISE * alone.mean)]
+
+
+def growth_beside_noise(errors: PredictionErrors) -> float:
+    """The growth of errors from the shortest horizon to the longest, over that of the errors of noise alone.
+
+    The errors are those of the best parameters nearby; at the shortest horizon they count as noise's at least. It is 1
+    where there is no noise to compare with.
+    """
+    if errors.noise[0].mean <= NEGLIGIBLE:
+        return 1.0
+    beside_noise = [
+        max(left.mean, alone.mean) / alone.mean for left, alone in zip(errors.nearby_best, errors.noise, strict=True)
+    ]
+    return beside_noise[-1] / beside_noise[0]
