@@ -62,6 +62,22 @@ def test_intervals_and_combinations_cover_the_alternatives():
     assert wide.warnings == ["intervals were widened to cover what the data does not exclude: a spring"]
 
 
+def test_other_estimates_by_a_coarse_step_are_taken_in_full():
+    """At a value of a half, a shift of 3 half-widths is one of 6; what other terms do is as it is."""
+    result = CalibrationResult(
+        "m", "t", "finished", "", 0, 0.0, 0, [], {"mass": ParameterEstimate(5.0, 0.05, 0.0, 10.0, "kg", [4.9, 5.1])}
+    )
+    step = replace(term(INTEGRATION, t=20.0, explained=0.4, parameter=""), value=0.5)
+    by_step = Alternative((INTEGRATION,), True, {"mass": 3.0}, {"mass": 0.0})
+    for terms, alternative, high in (
+        ((step,), by_step, 5.7),
+        ((), by_step, 5.4),
+        ((step,), replace(by_step, causes=("a spring",)), 5.4),
+    ):
+        wide = with_widened_intervals(result, held(*terms, alternatives=(alternative,)))
+        assert wide.parameters["mass"].interval == pytest.approx([4.9, high])
+
+
 def test_the_term_that_explains_most_is_named_among_those_as_significant():
     friction, spring = term(explained=0.2), term("a spring", t=9.0, explained=0.05, parameter="jnt_stiffness.hip")
     assert missing_term(held(spring, friction)) is friction

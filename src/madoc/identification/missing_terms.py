@@ -42,8 +42,6 @@ DIVERGING = 0.1
 """Share in [0, 1] of windows; a candidate with which more of them diverge is not tested."""
 _AT_MINIMUM = 1e-3
 """Distance in [-1, 1] from the end of a range, up to which a parameter is at its minimum."""
-_AT_CONTACTS = 1.0 / 3.0
-"""Smallest value of the error of the integration step for which its effect is taken in proportion larger."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
 
 
@@ -225,17 +223,14 @@ def _with_terms(tests: TermTests, chosen: list[int]) -> Alternative:
     """The estimate of the model with these terms, by linear regression.
 
     The error of the integration step counts as uncertain by all of its effect, as that changes with the length of
-    windows. Where motion is smooth its value is about 1; at contacts it comes out smaller, as derivatives do not follow
-    their jumps, and its effect is taken in proportion larger.
+    windows.
     """
     _, shift, covariance = joint_shift(tests.products, [1 + tests.products.count + index for index in chosen])
     error = NORMAL_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     for index in chosen:
         if tests.tried[index].cause == INTEGRATION:
             alone = tests.score(index)
-            if alone is not None:
-                value = np.clip(alone.change, _AT_CONTACTS, 1.0) if alone.change > 0.0 else 1.0
-                error = np.hypot(error, alone.shifts / value)
+            error = np.hypot(error, 0.0 if alone is None else alone.shifts)
     causes = tuple(dict.fromkeys(_name(tests.tried[index]) for index in chosen))
     return Alternative(causes, True, tests.by_name(shift), tests.by_name(error))
 

@@ -13,6 +13,7 @@ from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS
 from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
+from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import Alternative, MissingTerm
 
 CERTAIN = 5.0
@@ -26,6 +27,8 @@ CERTAIN_STEP = 4.0
 WHOLE = 1.5
 """Largest value of the error of the integration step; it is 1 / (1 - 4^-p) for an integrator of order p, as the steps
 compared with are a quarter as long."""
+SMALLEST = 0.3
+"""Smallest value of the error of the integration step in proportion to which its effects are taken larger."""
 NUMERICAL = 0.3
 """Share of squared residuals explained by the integration step; above it they are no mismatch of the model."""
 AS_SIGNIFICANT = 0.6
@@ -154,14 +157,36 @@ def with_widened_intervals(result: CalibrationResult, holdout: HoldOut) -> Calib
     """The result with intervals that cover the alternatives as well, and a warning that says so."""
     if result.interval is None:
         return result
-    ends = widening(holdout.alternatives, tuple(result.parameters))
+    ends = widening(_in_full(holdout), tuple(result.parameters))
     grown = {
         name: (low, high) for name, (low, high) in zip(result.parameters, ends.tolist(), strict=True) if low + high
     }
     if not grown:
         return result
-    told = [_covering(combination, result, holdout.alternatives) for combination in result.combinations]
+    told = [_covering(combination, result, _in_full(holdout)) for combination in result.combinations]
     return replace(result.with_intervals(grown, _sentence(holdout.alternatives)), combinations=told)
+
+
+def _in_full(holdout: HoldOut) -> tuple[Alternative, ...]:
+    """The alternatives, those by the error of the integration step in full where it explains much of the residuals.
+
+    Where motion is smooth its value is about 1. At contacts it comes out smaller, as derivatives do not follow jumps,
+    and what follows from it, in windows of another length too, does so in proportion.
+    """
+    step = numerical(holdout)
+    if step is None or step.value >= 1.0:
+        return holdout.alternatives
+    factor = 1.0 / max(step.value, SMALLEST)
+    return tuple(
+        replace(
+            each,
+            shifts={name: factor * shift for name, shift in each.shifts.items()},
+            errors={name: factor * error for name, error in each.errors.items()},
+        )
+        if {INTEGRATION, OTHER_WINDOWS} & set(each.causes)
+        else each
+        for each in holdout.alternatives
+    )
 
 
 def _covering(
