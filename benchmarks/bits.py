@@ -37,7 +37,7 @@ CALIBRATIONS = {
         f"{method} clean": ("clean", method, 15_000, SMALL)
         for method in ("madoc", "madoc-local", "madoc-s", "madoc-vdn")
     },
-    **{f"{method} clean": ("clean", method, 15_000, SMALL) for method in ("madoc-isac", "madoc-ungrouped")},
+    **{f"{method} clean": ("clean", method, 15_000, SMALL) for method in ("madoc-isac", "madoc-grouped")},
     "madoc-paper clean": ("clean", "madoc-paper", 8_000, ["--set", "grouping_epochs=2", "cloning_epochs=2"]),
     "madoc replay": ("clean", "madoc", 15_000, ["--starts", "replay", *SMALL]),
     "madoc hidden": ("hidden", "madoc", 15_000, ["--starts", "policy", *SMALL]),

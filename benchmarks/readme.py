@@ -4,6 +4,7 @@ import json
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,10 @@ import paper
 from scipy import stats
 
 README = Path(__file__).parents[1] / "README.md"
+STUDY = Path(__file__).parent / "results" / "groups"
+"""Results of `benchmarks/groups.py`."""
 NAMES = {"hopper": "Hopper", "halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "ant": "Ant"}
-COLUMNS = {"madoc": "groups", "madoc-s": "one agent", "madoc-ungrouped": "one agent a parameter"}
+COLUMNS = {"madoc": "one agent a parameter", "madoc-grouped": "one a group", "madoc-s": "one for all"}
 """Variants of Madoc by who its agents are."""
 STUDIED = {
     "one": "one agent",
@@ -49,8 +52,9 @@ def rewritten(text: str, policies: Sequence[dict]) -> str:
 def errors() -> str:
     """Madoc's error on medium data by who its agents are, beside the printed ones, and whether groups pay."""
     found = paper.by_seed("groups")
+    names = " | ".join(f"{told} (`{name}`)" for name, told in COLUMNS.items())
     lines = [
-        f"| robot | {' | '.join(f'{told} (`{name}`)' for name, told in COLUMNS.items())} | paper, groups | one agent |",
+        f"| robot | {names} | paper, groups | one for all |",
         "|---" * (len(COLUMNS) + 3) + "|",
     ]
     for robot, name in NAMES.items():
@@ -64,7 +68,7 @@ def errors() -> str:
 def _comparison(found: Mapping[tuple[str, str], Mapping[int, float]]) -> str:
     """Who errs less over pairs of runs with the same log and seed."""
     lines = []
-    for first, second in (("madoc", "madoc-s"), ("madoc-ungrouped", "madoc-s"), ("madoc-ungrouped", "madoc")):
+    for first, second in combinations(COLUMNS, 2):
         pairs = [
             (error, beside[seed])
             for (task, method), errors in found.items()
@@ -74,7 +78,7 @@ def _comparison(found: Mapping[tuple[str, str], Mapping[int, float]]) -> str:
         ]
         if len(pairs) > 1:
             less = sum(ours < theirs for ours, theirs in pairs)
-            names = f"{COLUMNS[first]} against {COLUMNS[second]}"
+            names = f"`{first}` against `{second}`"
             lines.append(f"| {names} | {len(pairs)} | {less} | {ratio(pairs)} |")
     header = "\n| pairs of runs with the same log and seed | pairs | err less | ratio of errors |\n|---|---|---|---|\n"
     return header + "\n".join(lines) + "\n" if lines else ""
@@ -90,7 +94,7 @@ def ratio(pairs: Sequence[tuple[float, float]]) -> str:
 def study() -> str:
     """Error of `benchmarks/groups.py` by parameters, draws an epoch and agents, and each as a ratio to one agent."""
     cells = defaultdict[tuple[int, int], defaultdict[str, dict[int, dict]]](lambda: defaultdict(dict))
-    for path in (Path(__file__).parent / "results" / "groups").glob("*.json"):
+    for path in STUDY.glob("*.json"):
         row = json.loads(path.read_text())
         cells[row["parameters"], row["draws"]][row["groups"]][row["seed"]] = row
     if not cells:
@@ -98,7 +102,7 @@ def study() -> str:
     used = [name for name in STUDIED if any(name in rows for rows in cells.values())]
     lines = [
         "\n`python benchmarks/groups.py`: an Ant with planted parameters of our own. Mean error in % of the range, "
-        "over seeds; in brackets the ratio to one agent's, geometric mean and 95 % interval over seeds.\n",
+        "over seeds, and its ratio to one agent's: geometric mean and 95 % interval over seeds.\n",
         f"| parameters | draws an epoch | seeds | {' | '.join(STUDIED[name] for name in used)} |",
         "|---" * (len(used) + 3) + "|",
     ]
@@ -113,7 +117,7 @@ def _studied(rows: Mapping[str, Mapping[int, dict]], name: str) -> str:
         return "not run"
     one = rows.get("one", {})
     pairs = [(row["error"], one[seed]["error"]) for seed, row in runs.items() if seed in one]
-    beside = f" ({ratio(pairs)})" if name != "one" and len(pairs) > 1 else ""
+    beside = f", {ratio(pairs)}" if name != "one" and len(pairs) > 1 else ""
     return f"{np.mean([row['error'] for row in runs.values()]):.2f}{beside}"
 
 

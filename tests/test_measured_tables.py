@@ -72,7 +72,7 @@ def test_figure_3b_says_how_many_parameters_and_shares_the_cells_of_all():
     errors, returns = ({cell.name for cell in each.cells} for each in (plan, paper.planned("figure-3b")))
     assert errors < returns
     every = {cell.name for cell in paper.planned("table-10").cells}
-    assert len(errors & every) == 1 + 2 * 3  # the recording, and two methods at three seeds
+    assert len(errors & every) == 1 + 3 * 3  # the recording, and three methods at three seeds
     # What was measured before the option was asked for is still found.
     assert paper.kept("table-10").keys() <= every
 
@@ -84,15 +84,25 @@ def test_figure_3b_shows_errors_in_percent_of_the_ranges():
     assert (score.column, score.value) == ("madoc", 10.0)
 
 
-def test_groups_are_compared_in_pairs_of_the_same_log_and_seed(monkeypatch):
+def test_agents_are_compared_in_pairs_of_the_same_log_and_seed(monkeypatch):
     tasks = [f"{robot}-medium" for robot in readme.NAMES]
-    found = {(task, method): {} for task in tasks for method in ("madoc", "madoc-s", "madoc-ungrouped")}
+    found = {(task, method): {} for task in tasks for method in readme.COLUMNS}
     found["hopper-medium", "madoc"] = {0: 0.01, 1: 0.02, 5: 0.3}
     found["hopper-medium", "madoc-s"] = {0: 0.02, 1: 0.16}
     monkeypatch.setattr(paper, "by_seed", lambda name: found)
     told = readme.errors()
-    assert "| Hopper | 0.110 (3 seeds) | 0.090 (2 seeds) | not run | 0.33 | 0.34 |" in told
-    assert "Of 2 pairs of runs with the same log and seed, groups err less than one agent in 2, and 0.25" in told
+    assert "| Hopper | 0.110 (3 seeds) | not run | 0.090 (2 seeds) | 0.33 | 0.34 |" in told
+    assert "| `madoc` against `madoc-s` | 2 | 2 | 0.25 (0.00 to " in told
+
+
+def test_the_study_compares_with_one_agent_by_seed(monkeypatch, tmp_path):
+    monkeypatch.setattr(readme, "STUDY", tmp_path)
+    for groups, seed, error in (("one", 0, 4.0), ("one", 1, 1.0), ("each", 0, 1.0), ("each", 1, 1.0), ("each", 2, 4.0)):
+        row = {"parameters": 12, "draws": 10, "groups": groups, "seed": seed, "error": error}
+        (tmp_path / f"{groups}-{seed}.json").write_text(json.dumps(row))
+    told = readme.study()
+    assert "| parameters | draws an epoch | seeds | one agent | one agent a parameter |" in told
+    assert "| 12 | 10 | 3 | 2.50 | 2.00, 0.50 (0.00 to " in told
 
 
 def test_tasks_that_are_worse_than_printed_are_named(monkeypatch):
@@ -216,7 +226,7 @@ def test_what_was_collected_once_is_not_read_again(collected, monkeypatch):
     assert collected("figure-2", [(cell, files)])[0] == 1
     count, told = collected("figure-2", [(others[0], files)])
     assert (count, next(answers, None)) == (2, None)
-    assert "| madoc | drawn from the actors | -0.90 | -0.70 | not run | -0.80 | 300 |" in told
+    assert "| madoc-grouped | drawn from the actors | -0.90 | -0.70 | not run | -0.80 | 300 |" in told
     assert "| madoc-s | uniform over the ranges | not run | not run | not run |  |  |" in told
 
 

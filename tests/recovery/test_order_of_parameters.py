@@ -17,7 +17,7 @@ UNMOVED = ("nominal", "uniform")
 """They estimate nothing: the middle of the box, in whatever order."""
 QUICK = {"least-squares": 1e-6, "droid": 0.1, "cma-es": 0.1, "dropo": 5.0}
 """% of its range that each parameter may be off."""
-MADOC = ("madoc", "madoc-local", "madoc-s", "madoc-vdn", "madoc-isac", "madoc-ungrouped")
+MADOC = ("madoc", "madoc-local", "madoc-s", "madoc-vdn", "madoc-isac", "madoc-grouped")
 SLOW = {"e-dropo": 5.0, "oted": 20.0, "cma-es-distribution": 10.0} | dict.fromkeys(MADOC, 15.0)
 SAME_CODE = ("madoc-paper",)
 """Other constants of a method that is here, too slow for a spring."""

@@ -53,12 +53,12 @@ def _entry(
 
 
 _ENTRIES = (
-    _entry("madoc", Madoc, "one agent a group, free running: no states", _MADOC, 2024),
+    _entry("madoc", Madoc, "one agent a parameter, free running: no states", _MADOC, 2024),
     _entry("madoc-local", Madoc, "the same, from logged states where known", _MADOC, 2024, {"starts": None}),
     _entry("madoc-s", Madoc, "one agent for all parameters", _MADOC, 2024, {"groups": "one"}),
     _entry("madoc-vdn", Madoc, "credit by a plain sum (VDN)", _MADOC, 2024, {"mixing": "sum"}),
     _entry("madoc-isac", Madoc, "agents share one reward, no credit", _MADOC, 2024, {"mixing": "independent"}),
-    _entry("madoc-ungrouped", Madoc, "one agent a parameter", _MADOC, 2024, {"groups": "each"}),
+    _entry("madoc-grouped", Madoc, "one agent a group, by physics", _MADOC, 2024, {"groups": "physics"}),
     _entry(
         "madoc-paper", Madoc, "Madoc with the paper's own constants", _MADOC, 2024, PAPER, ("features", "keep_cloning")
     ),

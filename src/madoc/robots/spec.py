@@ -141,7 +141,9 @@ class RobotSpec(Part):
     signals: list[SignalSpec] = Field(min_length=1, description="The observation, in this order.")
     actions: list[ActionSpec] = Field(min_length=1, description="The action, in this order.")
     parameters: list[ParameterSpec] = Field(min_length=1, description="What can be calibrated.")
-    groups: Annotated[int, Field(ge=1)] | None = Field(None, description="Groups Madoc forms. Default: min(4, d).")
+    groups: Annotated[int, Field(ge=1)] | None = Field(
+        None, description="Groups Madoc's VAE forms. Default: min(4, d)."
+    )
     log: LogSpec = Field(default_factory=lambda: LogSpec.model_validate({}))
     reward: str | None = Field(
         None,

@@ -98,7 +98,7 @@ class Task:
         reset_noise: (key, count) -> offsets (count, state_size) added to the model's initial state.
         parameters: What can be calibrated, with the paper's normal ranges.
         ranges: Other boxes by level (`easy`, `normal`, `hard`).
-        groups: Number of parameter groups that Madoc forms.
+        groups: Number of parameter groups that Madoc's VAE forms.
         max_episode_steps: Time limit in control steps; reaching it truncates.
         reference_returns: Returns of (random, expert) for the normalized score, from D4RL.
         state_from_observation: observation -> (qpos, qvel); None where the observation does not determine them.

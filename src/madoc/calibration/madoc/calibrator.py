@@ -1,4 +1,4 @@
-"""Madoc: clone the behaviour policy, group the parameters, then calibrate each group with an agent of its own.
+"""Madoc: clone the behaviour policy, group the parameters if asked to, then calibrate with an agent for each group.
 
 Jiang et al. 2024, Algorithm 1. Its equations are in the files beside this one and in `learning`.
 """
@@ -17,8 +17,8 @@ from madoc.calibration.madoc import effects, grouping, innovations, watch
 from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.agents import OF_CHANGES, OF_INNOVATIONS, Agents, AgentSettings, Resolution
 from madoc.calibration.madoc.beginning import first_actors, sentence, told
-from madoc.calibration.madoc.collection import GEOMETRY, Collection, Features, StartMode
-from madoc.calibration.madoc.grouping import GroupingVAE
+from madoc.calibration.madoc.collection import Collection, Features, StartMode, geometry
+from madoc.calibration.madoc.grouping import VOTES, VOTING, Grouping, GroupingVAE
 from madoc.calibration.madoc.paper import PAPER
 from madoc.calibration.madoc.state import MadocState
 from madoc.calibration.madoc.value_decomposition import Mixing
@@ -32,11 +32,6 @@ from madoc.learning.networks import adam, scalars
 from madoc.simulation.rollout import out_of_step
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
-Grouping = Literal["physics", "learned", "one", "each"]
-VOTING = 0.05
-"""Share in [0, 1] of the epochs of grouping, the last ones, in which the VAE's groups are voted on; the authors'."""
-VOTES = 10
-"""Number of votes in each of these epochs: the authors take about 9, at random, in 1000 updates."""
 STATES = 100
 """Logged states in an epoch of grouping by physics."""
 
@@ -47,8 +42,8 @@ class Madoc:
 
     Attributes:
         mixing: `dop` (Madoc), `sum` (Madoc-VDN) or `independent` (Madoc-ISAC).
-        groups: `physics` (parameters that move the same signals, by derivatives of the simulator), `learned` (by the
-            paper's VAE), `one` agent for all (Madoc-S), or `each` parameter its own (ungrouped).
+        groups: `each` parameter an agent of its own (ungrouped), `physics` (an agent for parameters that move the same
+            signals, by derivatives of the simulator), `learned` (by the paper's VAE), or `one` agent for all (Madoc-S).
         group_count: Number of groups; None takes the most stable number, or that of the task for `learned`.
         starts: `policy` (the clone acts from resets on, as in the paper), `logged` (short rollouts of the clone from
             logged states; hidden velocities are taken from positions) or `replay` (one step from each logged state and
@@ -71,8 +66,9 @@ class Madoc:
         epoch_steps: Control steps of rollouts in an epoch. Predictions for innovations take as many again, and those of
             logged rows at a new reference come on top.
         updates: Calibration updates in an epoch.
-        draws: Parameter draws in an epoch; None takes 20, 100, 100 for `policy`, `logged`, `replay`.
-        horizon: Control steps under one draw; None takes 50, 5, 1 for `policy`, `logged`, `replay`.
+        draws: Parameter draws in an epoch; None takes 100, of `policy` 20 for up to `FEW` parameters.
+        horizon: Control steps under one draw; None takes 1 for `replay`, 5 for `logged`, for `policy` 10, or 50 for up
+            to `FEW` parameters.
         batch: Rows in an update of cloning or grouping.
         learning_rate: Adam's learning rate of clone and VAE.
         replay_capacity: Number of simulated rows that are kept.
@@ -81,7 +77,7 @@ class Madoc:
     """
 
     mixing: Mixing = "dop"
-    groups: Grouping = "physics"
+    groups: Grouping = "each"
     group_count: Count | None = None
     starts: StartMode | None = "policy"
     window: Count | None = None
@@ -105,6 +101,8 @@ class Madoc:
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
+        if self.groups in ("one", "each") and self.group_count:
+            raise MadocError(f"group_count is of groups=physics or learned; leave it out with groups={self.groups}")
         if self.starts == "replay" and self.horizon not in (None, 1):
             raise MadocError(f"starts=replay replays single steps: expected horizon 1 or none, got {self.horizon}")
         if self.starts == "replay" and self.window not in (None, 1):
@@ -192,7 +190,7 @@ class Madoc:
         mode = self.starts or ("logged" if problem.states.starts_known else "policy")
         one_row = problem.states.kind == "exact" or mode == "replay"
         window = self.window or (1 if one_row else HIDDEN_WINDOW)
-        systems, horizon = GEOMETRY[mode]
+        systems, horizon = geometry(mode, len(problem.simulator.parameters))
         kind: Literal["standardised", "raw"] = "raw" if self.features == "raw" else "standardised"
         scaling, logged = problem.features.windows(kind, window)
         return Collection(
@@ -336,7 +334,7 @@ class Madoc:
         agents, watched, reference, rows = state.agents, state.watch, state.reference, state.rows
         logged, described, resolution = collection.logged, None, OF_CHANGES
         steps, failures, unit = rollout.valid.size, rollout.failures, 1.0
-        if reference is not None and (reference.age >= 0 or _may_begin(problem, watched)):
+        if reference is not None and (reference.age >= 0 or innovations.may_begin(problem, watched)):
             estimate = problem.simulator.parameters.to_physical(np.tanh(np.asarray(agents.actors.mean, np.float64)))
             seen = innovations.seen(problem, collection.scaling.scaling, reference, estimate, rollout, of_reference)
             steps, failures = steps + seen.control_steps, failures + seen.failures
@@ -392,9 +390,3 @@ class Madoc:
             metrics |= cloning.metrics
         stalled = watch.stalled(watched, self.patience) if self.patience else None
         return following, Epoch(metrics, control_steps=steps, converged=stalled)
-
-
-def _may_begin(problem: CalibrationProblem, watched: watch.Watch) -> bool:
-    """Whether simulated rows are where logged ones are: by the discriminators, or by a prior of every parameter."""
-    known = told(problem)
-    return (known is not None and bool(known.all())) or watch.overlaps(watched, innovations.OVERLAP)

@@ -27,8 +27,19 @@ from madoc.types import Policy
 StartMode = Literal["policy", "logged", "replay"]
 Features = Literal["innovations", "standardised", "raw"]
 """How discriminators see s'; `Madoc` describes each."""
-GEOMETRY = {"policy": (20, 50), "logged": (100, 5), "replay": (100, 1)}
-"""Number of parameter draws in an epoch, and of control steps that each row is simulated under one draw, by mode."""
+
+
+FEW = 16
+"""Number of parameters up to which `policy` has few draws in an epoch, each of them for longer."""
+
+
+def geometry(mode: StartMode, parameters: int) -> tuple[int, int]:
+    """Number of parameter draws in an epoch, and of control steps that each row is simulated under one draw.
+
+    Critics of many parameters need more distinct draws.
+    """
+    free = (20, 50) if parameters <= FEW else (100, 10)
+    return {"policy": free, "logged": (100, 5), "replay": (100, 1)}[mode]
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Groups of parameters with similar effects: a VAE embeds parameters by their effects, k-means groups them."""
 
+from typing import Literal
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,11 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from madoc.learning import replay
 from madoc.learning.networks import Network, Observations, Scalar, minimise
 
+Grouping = Literal["physics", "learned", "one", "each"]
+VOTING = 0.05
+"""Share in [0, 1] of the epochs of grouping, the last ones, in which the VAE's groups are voted on; the authors'."""
+VOTES = 10
+"""Number of votes in each of these epochs: the authors take about 9, at random, in 1000 updates."""
 LATENT = 16
 """Width of the embedding, and number of repetitions of the parameter's value beside it (appendix C)."""
 PROJECTED = 3

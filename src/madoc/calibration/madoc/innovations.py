@@ -17,6 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.madoc.beginning import told
+from madoc.calibration.madoc.watch import Watch, overlaps
 from madoc.learning.features import Scaling
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import Rollout
@@ -224,3 +226,9 @@ def _features(
     innovations: Float[np.ndarray, "*rows observation"], scale: Float[np.ndarray, " observation"]
 ) -> Float[np.ndarray, "*rows observation"]:
     return (np.arcsinh(LINEAR * innovations / scale) / LINEAR).astype(np.float32)
+
+
+def may_begin(problem: CalibrationProblem, watched: Watch) -> bool:
+    """Whether simulated rows are where logged ones are: by the discriminators, or by a prior of every parameter."""
+    known = told(problem)
+    return (known is not None and bool(known.all())) or overlaps(watched, OVERLAP)
