@@ -78,7 +78,7 @@ def test_spec_as_tables(tmp_path, capsys):
     told = capsys.readouterr().out
     for words in (
         *("two_link_arm: signals", "shoulder_motor", "dof_damping.elbow", "N·m·s/rad", "shoulder, elbow"),
-        "one action every 0.02 s, 2 physics steps each; 7 parameters in 4 groups",
+        "one action every 0.02 s, 2 physics steps each; 7 parameters",
         "states cannot be rebuilt from the log, as no signal is the velocity of elbow: least-squares estimates them",
         "a state carries the last 2 actions",
         "no reward: madoc learn refuses this robot until the spec has one",

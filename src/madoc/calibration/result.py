@@ -151,6 +151,11 @@ class CalibrationResult:
                 f"this is not the result of a calibration by this version of Madoc ({place}: {first['msg']});{remedy}"
             ) from error
 
+    @property
+    def grouped(self) -> bool:
+        """Whether parameters are in groups, and not all in one or each in its own."""
+        return 1 < len(self.groups) < len(self.parameters)
+
     def table(self) -> Table:
         """The parameters as a rich table, with intervals and errors where they are known."""
         title = f"{self.method} on {self.task}"
@@ -159,7 +164,8 @@ class CalibrationResult:
         table.add_column("parameter", min_width=max(map(len, self.parameters)))
         table.add_column("unit")
         intervals = any(row.interval for row in self.parameters.values())
-        for heading in ("estimate ± std", *(["95 %"] if intervals else []), "range", "group"):
+        headings = ["estimate ± std", *(["95 %"] if intervals else []), "range", *(["group"] if self.grouped else [])]
+        for heading in headings:
             table.add_column(heading, justify="right")
         errors = self.error["per_parameter"] if self.error else {}
         if errors:
@@ -171,7 +177,7 @@ class CalibrationResult:
                 f"{row.estimate:.4g} ± {row.std:.2g}",
                 *([_span(row.interval)] if intervals else []),
                 f"[{row.low:g}, {row.high:g}]",
-                str(group_of.get(name, "")),
+                *([str(group_of[name])] if self.grouped else []),
             ]
             table.add_row(*cells, *([f"{errors[name]:.2g}"] if errors else []))
         return table

@@ -30,11 +30,11 @@ class Tasks:
 
         tasks = [make(name) for name in TASKS]
         table = Table("name", title="robots", title_justify="left")
-        for heading in ("observations", "motors", "parameters", "groups"):
+        for heading in ("observations", "motors", "parameters"):
             table.add_column(heading, justify="right")
         table.add_column("physics")
         for task in tasks:
-            counts = (task.observation_size, task.action_size, len(task.parameters), task.groups)
+            counts = (task.observation_size, task.action_size, len(task.parameters))
             table.add_row(task.name, *map(str, counts), ", ".join(PHYSICS))
         details = tuple(map(_parameter_table, tasks)) if self.verbose else ()
         return Answer({"tasks": [_described(task) for task in tasks]}, (table, *details))

@@ -106,7 +106,7 @@ def _sentences(robot: "Robot") -> list[str]:
     task = robot.task
     sentences = [
         f"one action every {robot.spec.control_step:g} s, {task.frame_skip} physics steps each; "
-        f"{len(task.parameters)} parameters in {task.groups} group{'s' * (task.groups > 1)}"
+        f"{len(task.parameters)} parameter{'s' * (len(task.parameters) > 1)}"
     ]
     if task.state_from_observation is not None:
         sentences.append("states can be rebuilt from the log: every method can calibrate this robot")

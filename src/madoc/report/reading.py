@@ -168,9 +168,9 @@ class Run:
 
     @cached_property
     def groups(self) -> dict[str, int]:
-        """Group of each parameter, from 0; empty where all are in one group."""
-        groups = [] if self.result is None else self.result.groups
-        return {name: index for index, names in enumerate(groups) for name in names} if len(groups) > 1 else {}
+        """Group of each parameter, from 0; empty where all are in one group, or each in its own."""
+        groups = self.result.groups if self.result is not None and self.result.grouped else []
+        return {name: index for index, names in enumerate(groups) for name in names}
 
     def colour(self, parameter: str) -> str:
         """Class in the style sheet of the colour of a parameter's group."""
