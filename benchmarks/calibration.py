@@ -48,7 +48,7 @@ def main() -> None:
     )
     parser.add_argument("--data-is", nargs="+", default=["clean"], choices=list(DATA), help="how it is disturbed")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--budget", type=int, default=300_000)
+    parser.add_argument("--budget", type=budget, default=300_000, help="300000, or a time as 60s")
     parser.add_argument("--transitions", type=int, default=200_000)
     parser.add_argument("--threads", type=int, default=None)
     parser.add_argument("--folder", type=Path, default=Path("runs/benchmark-data"), help="where recorded data is kept")
@@ -87,7 +87,12 @@ def main() -> None:
                 print(path.name, row["error"]["mean_absolute"] if "error" in row else row["refusal"], flush=True)
 
 
-def run(method, changes, problem: CalibrationProblem, dataset: Dataset, seed: int, budget: int) -> dict:
+def budget(text: str) -> int | str:
+    """A count, or a time as Madoc reads it."""
+    return int(text) if text.isdigit() else text
+
+
+def run(method, changes, problem: CalibrationProblem, dataset: Dataset, seed: int, budget: int | str) -> dict:
     """The result of one calibration, or the sentence it is refused with."""
     started = time.monotonic()
     try:

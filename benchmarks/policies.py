@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from calibration import RESULTS as CALIBRATIONS
-from calibration import commit, recorded
+from calibration import budget, commit, recorded
 from madoc import tasks
 from madoc.calibration import CalibrationResult
 from madoc.data.targets import paper_truth
@@ -79,11 +79,6 @@ def main() -> None:
                 return
             path.write_text(json.dumps(row, indent=1) + "\n")
             print(path.name, round(row["return"]), round(row["seconds"]), flush=True)
-
-
-def budget(text: str) -> int | str:
-    """A count, or a time as Madoc reads it."""
-    return int(text) if text.isdigit() else text
 
 
 def run(method, robot: str, at: str, arguments: argparse.Namespace, seed: int) -> dict:

@@ -54,6 +54,11 @@ def calibrations() -> list[dict]:
     return [{"robot": row.get("task"), "data": "clean", "budget": 300_000} | row for row in rows]
 
 
+def is_time(budget: int | str) -> bool:
+    """Whether a budget is a time, as "60s"."""
+    return isinstance(budget, str)
+
+
 def label(row: dict) -> str:
     """A method and where its rollouts start, if it can choose."""
     return row["method"] if row["starts"] == "-" else f"{row['method']}, {row['starts']}"
@@ -63,7 +68,7 @@ def calibration() -> str:
     """Error of every (robot, method, starts, budget) on clean data, median over seeds."""
     cells = defaultdict(list)
     for row in calibrations():
-        if row["data"] == "clean" and "error" in row:
+        if row["data"] == "clean" and "error" in row and not is_time(row["budget"]):
             cells[row["robot"], row["quality"], row["method"], row["starts"], row["budget"]].append(row)
     if not cells:
         return ""
@@ -105,40 +110,45 @@ def shown(errors: list[float]) -> str:
 
 
 def disturbed() -> str:
-    """Median error of every method on every kind of data, or that it refuses."""
+    """Error of every method on every kind of data, or that it refuses: at equal wall time, then at equal steps."""
+    timed = [row for row in calibrations() if is_time(row["budget"])]
+    counted = [row for row in calibrations() if not is_time(row["budget"])]
+    return (
+        "## Under disturbances\n\n`python benchmarks/calibration.py --data-is ...`. Median of the mean absolute error "
+        "over seeds, and in brackets in % of the range. *refuses*: with a sentence, kept in the result. Empty: not "
+        "run.\n\n" + "\n".join(_disturbed(rows) for rows in (timed, counted) if rows)
+    )
+
+
+def _disturbed(rows: list[dict]) -> str:
     cells, methods, robots = defaultdict(list), {}, set()
-    for row in calibrations():
+    for row in rows:
         cells[row["robot"], row["data"], row["budget"], label(row)].append(row)
         if row["data"] != "clean":
             methods[label(row)] = None
             robots.add(row["robot"])
-    if not methods:
-        return ""
-    lines = [
-        "## Under disturbances\n\n`python benchmarks/calibration.py --data-is ...`. Median of the mean absolute error "
-        "over seeds. *refuses*: with a sentence, kept in the result. Empty: not run.\n",
-        f"| robot | data | budget | {' | '.join(methods)} |",
-        "|---" * (3 + len(methods)) + "|",
-    ]
+    lines = [f"| robot | data | budget | {' | '.join(methods)} |", "|---" * (3 + len(methods)) + "|"]
     for robot, data, budget in sorted({cell[:3] for cell in cells}):
         columns = [cells.get((robot, data, budget, method), []) for method in methods]
         if robot in robots and any(columns):
-            lines.append(f"| {robot} | {data} | {budget:,} | {' | '.join(map(_cell, columns))} |")
+            of_all = budget if is_time(budget) else f"{budget:,}"
+            lines.append(f"| {robot} | {data} | {of_all} | {' | '.join(map(_cell, columns))} |")
     return "\n".join(lines) + "\n"
 
 
 def _cell(rows: list[dict]) -> str:
-    errors = [row["error"]["mean_absolute"] for row in rows if "error" in row]
-    if errors:
-        return shown(errors).partition(" ")[0]
-    return "refuses" if rows else ""
+    errors = [row["error"] for row in rows if "error" in row]
+    if not errors:
+        return "refuses" if rows else ""
+    percent = np.median([error["mean_percent_of_range"] for error in errors])
+    return f"{shown([error['mean_absolute'] for error in errors]).partition(' ')[0]} ({percent:.2g})"
 
 
 def policies() -> str:
     """Return in the target of every learner, where it learnt and how, over seeds."""
     cells = defaultdict(list)
     for row in learnt():
-        budget = row["budget"] if isinstance(row["budget"], str) else f"{row['budget']:,} {row['unit']}"
+        budget = row["budget"] if is_time(row["budget"]) else f"{row['budget']:,} {row['unit']}"
         cells[row["robot"], row["method"], row["at"], budget, " ".join(row["set"])].append(row)
     if not cells:
         return ""
@@ -339,15 +349,16 @@ DISTURBED = ("noise-1", "noise-10", "modern", "friction-20", "hidden", "shuffled
 
 
 def disturbed_not_run() -> list[str]:
-    """Of every calibrator and robot, the disturbances that it has not met."""
-    done = {(row.get("method"), row["robot"], row["data"]) for row in calibrations()}
+    """Of every calibrator and robot, the disturbances that it has not met for an equal wall time."""
+    timed = (row for row in calibrations() if is_time(row["budget"]))
+    done = {(row.get("method"), row["robot"], row["data"]) for row in timed}
     lines = []
     for method, robot in product((*CALIBRATORS, "madoc"), ROBOTS):
         data = [name for name in DISTURBED if (method, robot, name) not in done]
         if data:
             lines.append(
                 f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --data-is {' '.join(data)} "
-                "--budget 300000 --seeds 0`"
+                "--budget 60s --seeds 0`"
             )
     return lines
 
