@@ -78,6 +78,8 @@ def test_what_looks_unreal_starts_again_and_is_marked_but_is_no_fall():
     # even the better candidate, change 1, has D = sigmoid(-3), r = 0.0486 < 0.1
     under_way, rows, metrics = imagined(slope=-3.0, steps=1)
     assert rows["stopped"].all()
+    _, fallen, _ = imagined(slope=-3.0, steps=1, terminated=lambda o: o[:, 0] > -100)
+    assert fallen["terminated"].all() and not fallen["stopped"].any()
     assert not rows["terminated"].any()
     assert metrics["stopped"] == 1.0
     assert set(np.asarray(under_way.observation)[:, 0].tolist()) <= {0.0, 10.0}

@@ -98,7 +98,7 @@ def imagine(
         terminated: Whether the task ends at a state.
         state_of: The state at an observation.
         samples: Number of next states drawn from each elite.
-        threshold: A row whose best dynamics reward is below looks unreal; it is `stopped` and restarts.
+        threshold: A row whose best dynamics reward is below looks unreal; it is `stopped` and restarts, unless it fell.
         horizon: Number of steps after which a row restarts.
         penalty: λ of MOPO, the weight of the models' uncertainty in the reward.
         steps: Number of steps.
@@ -132,7 +132,8 @@ def imagine(
         following = jnp.clip(following, jnp.broadcast_to(low, following.shape), jnp.broadcast_to(high, following.shape))
         uncertainty = uncertainty_penalty(std, features)
         reward = features.reward_offset + features.reward_scale * outcome[:, -1]
-        unreal, fell = reality < threshold, terminated(state_of(following))
+        fell = terminated(state_of(following))
+        unreal = (reality < threshold) & ~fell
         ends = fell | unreal
         row = {
             "observation": observation,

@@ -86,7 +86,8 @@ class MOREC:
         discriminator_updates: Updates of generator and discriminator, after the models'. Chosen, not the authors'.
         noise: Standard deviation of the noise on the discriminators' inputs, in units of a step's change. Chosen.
         samples: Next states drawn from each elite.
-        threshold: A rollout ends before a step whose best dynamics reward is below, which is not learnt from.
+        threshold: A rollout ends before a step whose best dynamics reward is below; unless it is a fall, it is not
+            learnt from.
         horizon: Longest imagined rollout, in control steps.
         penalty: λ of MOPO, on rewards and state changes in their units. The authors chose it by dataset: 15 for Hopper
             medium, 0.5 for HalfCheetah and Walker2d medium; 2.5 is their code's default.
