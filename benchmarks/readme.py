@@ -92,7 +92,7 @@ def ratio(pairs: Sequence[tuple[float, float]]) -> str:
 
 
 def study() -> str:
-    """Error of `benchmarks/groups.py` by parameters, draws an epoch and agents, and each as a ratio to one agent."""
+    """Error of `benchmarks/groups.py` by parameters, draws an epoch and agents, beside that of an agent a parameter."""
     cells = defaultdict[tuple[int, int], defaultdict[str, dict[int, dict]]](lambda: defaultdict(dict))
     for path in STUDY.glob("*.json"):
         row = json.loads(path.read_text())
@@ -102,23 +102,24 @@ def study() -> str:
     used = [name for name in STUDIED if any(name in rows for rows in cells.values())]
     lines = [
         "\n`python benchmarks/groups.py`: an Ant with planted parameters of our own. Mean error in % of the range, "
-        "over seeds, and its ratio to one agent's: geometric mean and 95 % interval over seeds.\n",
-        f"| parameters | draws an epoch | seeds | {' | '.join(STUDIED[name] for name in used)} |",
-        "|---" * (len(used) + 3) + "|",
+        "mean over seeds, each of them another truth. Of three seeds and more, its ratio to that of an agent for each "
+        "parameter with the same truth: geometric mean and 95 % interval.\n",
+        f"| parameters | draws an epoch | {' | '.join(STUDIED[name] for name in used)} |",
+        "|---" * (len(used) + 2) + "|",
     ]
     for (count, draws), rows in sorted(cells.items()):
-        seeds = len({seed for runs in rows.values() for seed in runs})
-        lines.append(f"| {count} | {draws} | {seeds} | " + " | ".join(_studied(rows, name) for name in used) + " |")
+        lines.append(f"| {count} | {draws} | " + " | ".join(_studied(rows, name) for name in used) + " |")
     return "\n".join(lines) + "\n"
 
 
 def _studied(rows: Mapping[str, Mapping[int, dict]], name: str) -> str:
     if not (runs := rows.get(name)):
         return "not run"
-    one = rows.get("one", {})
-    pairs = [(row["error"], one[seed]["error"]) for seed, row in runs.items() if seed in one]
-    beside = f", {ratio(pairs)}" if name != "one" and len(pairs) > 1 else ""
-    return f"{np.mean([row['error'] for row in runs.values()]):.2f}{beside}"
+    beside = rows.get("each", {})
+    pairs = [(row["error"], beside[seed]["error"]) for seed, row in runs.items() if seed in beside]
+    compared = f": {ratio(pairs)}" if name != "each" and len(pairs) > 2 else ""
+    seeds = f"{len(runs)} seed{'s' * (len(runs) > 1)}"
+    return f"{np.mean([row['error'] for row in runs.values()]):.2f} ({seeds}){compared}"
 
 
 def _mean(errors: Sequence[float]) -> str:

@@ -95,14 +95,16 @@ def test_agents_are_compared_in_pairs_of_the_same_log_and_seed(monkeypatch):
     assert "| `madoc` against `madoc-s` | 2 | 2 | 0.25 (0.00 to " in told
 
 
-def test_the_study_compares_with_one_agent_by_seed(monkeypatch, tmp_path):
+def test_the_study_compares_agents_by_seed(monkeypatch, tmp_path):
     monkeypatch.setattr(readme, "STUDY", tmp_path)
-    for groups, seed, error in (("one", 0, 4.0), ("one", 1, 1.0), ("each", 0, 1.0), ("each", 1, 1.0), ("each", 2, 4.0)):
-        row = {"parameters": 12, "draws": 10, "groups": groups, "seed": seed, "error": error}
-        (tmp_path / f"{groups}-{seed}.json").write_text(json.dumps(row))
+    errors = {"each": (4.0, 1.0, 1.0), "physics": (2.0, 0.5, 0.4), "one": (7.0,)}
+    for groups, found in errors.items():
+        for seed, error in enumerate(found):
+            row = {"parameters": 12, "draws": 10, "groups": groups, "seed": seed, "error": error}
+            (tmp_path / f"{groups}-{seed}.json").write_text(json.dumps(row))
     told = readme.study()
-    assert "| parameters | draws an epoch | seeds | one agent | one agent a parameter |" in told
-    assert "| 12 | 10 | 3 | 2.50 | 2.00, 0.50 (0.00 to " in told
+    assert "| parameters | draws an epoch | one agent | groups by physics | one agent a parameter |" in told
+    assert "| 12 | 10 | 7.00 (1 seed) | 0.97 (3 seeds): 0.46 (0.34 to 0.64) | 2.00 (3 seeds) |" in told
 
 
 def test_tasks_that_are_worse_than_printed_are_named(monkeypatch):

@@ -53,7 +53,7 @@ def _entry(
 
 
 _ENTRIES = (
-    _entry("madoc", Madoc, "one agent a parameter, free running: no states", _MADOC, 2024),
+    _entry("madoc", Madoc, "one agent a parameter; needs no states", _MADOC, 2024),
     _entry("madoc-local", Madoc, "the same, from logged states where known", _MADOC, 2024, {"starts": None}),
     _entry("madoc-s", Madoc, "one agent for all parameters", _MADOC, 2024, {"groups": "one"}),
     _entry("madoc-vdn", Madoc, "credit by a plain sum (VDN)", _MADOC, 2024, {"mixing": "sum"}),
