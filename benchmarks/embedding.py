@@ -29,7 +29,7 @@ SUITE = "figure-3a"
 PICTURE = Path(__file__).parents[1] / "docs" / "concepts" / "groups.svg"
 TITLES = {
     "learned": "Learned by the VAE, as in the paper",
-    "physics": "By what they move in the simulator, the default",
+    "physics": "By what they move in the simulator",
 }
 """By the hyperparameter `groups`, in the order in which they are drawn."""
 STABILITIES = {"learned": "of its votes", "physics": "of resampled states"}

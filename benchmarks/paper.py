@@ -106,8 +106,9 @@ def tables() -> str:
     """All tables, as Markdown."""
     head = (
         "# The paper's tables\n\nMade by `python benchmarks/paper.py`; in brackets, as printed. "
-        "A calibration here learns from at most 300,000 control steps, the paper's from 1,000,000; Madoc's grouping "
-        "takes up to 60,000 more. [Figure 3a](../../docs/concepts/groups.svg) is by `benchmarks/embedding.py`.\n"
+        "A calibration here learns from at most 300,000 control steps, the paper's from 1,000,000; grouping, "
+        "where there is any, takes up to 60,000 more. [Figure 3a](../../docs/concepts/groups.svg) is by "
+        "`benchmarks/embedding.py`.\n"
     )
     return "\n".join([head, *(f"## {TITLES[name]}\n\n{table(name)}" for name in TITLES)])
 

@@ -7,6 +7,7 @@ import pytest
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, CmaEs, LeastSquares, Madoc, Oted
 from madoc.calibration.least_squares.calibrator import horizon_of
+from madoc.calibration.madoc.collection import geometry
 from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
 from madoc.data import Disturbance, disturb, observed_task, stride
 from madoc.errors import MadocError
@@ -35,6 +36,11 @@ def test_windows_are_as_long_as_the_observation_wants(log):
     assert Madoc(starts="replay").collection(hidden).scaling.length == 1
     with pytest.raises(MadocError, match=r"no episode .* has the 301 rows of a window; take a shorter one"):
         seen.features.windows("standardised", 301)
+
+
+def test_many_parameters_have_more_draws_for_a_shorter_time():
+    assert [geometry("policy", count) for count in (16, 17)] == [(20, 50), (100, 10)]
+    assert geometry("logged", 8) == geometry("logged", 40) == (100, 5)
 
 
 def test_as_many_rows_are_compared_as_tell_a_state(log):

@@ -15,6 +15,7 @@ from madoc.verdict import judge
 from madoc.verdict.adequacy import (
     as_likely,
     coarse_step,
+    in_full,
     likeliest,
     missing_term,
     numerical,
@@ -64,18 +65,13 @@ def test_intervals_and_combinations_cover_the_alternatives():
 
 def test_other_estimates_by_a_coarse_step_are_taken_in_full():
     """At a value of a half, a shift of 3 half-widths is one of 6; what other terms do is as it is."""
-    result = CalibrationResult(
-        "m", "t", "finished", "", 0, 0.0, 0, [], {"mass": ParameterEstimate(5.0, 0.05, 0.0, 10.0, "kg", [4.9, 5.1])}
-    )
     step = replace(term(INTEGRATION, t=20.0, explained=0.4, parameter=""), value=0.5)
-    by_step = Alternative((INTEGRATION,), True, {"mass": 3.0}, {"mass": 0.0})
-    for terms, alternative, high in (
-        ((step,), by_step, 5.7),
-        ((), by_step, 5.4),
-        ((step,), replace(by_step, causes=("a spring",)), 5.4),
-    ):
-        wide = with_widened_intervals(result, held(*terms, alternatives=(alternative,)))
-        assert wide.parameters["mass"].interval == pytest.approx([4.9, high])
+    by_step = Alternative((INTEGRATION,), True, {"mass": 3.0}, {"mass": 0.5})
+    (full,) = in_full((by_step,), [step])
+    assert (full.shifts, full.errors) == ({"mass": 6.0}, {"mass": 1.0})
+    spring = replace(by_step, causes=("a spring",))
+    assert in_full((spring,), [step]) == (spring,)
+    assert in_full((by_step,), [replace(step, explained=0.1)]) == (by_step,)
 
 
 def test_the_term_that_explains_most_is_named_among_those_as_significant():
@@ -132,3 +128,4 @@ def test_a_coarse_integration_step_that_explains_more_is_told_first():
     )
     assert coarse_step(held(step, friction), term(explained=0.2)) is None
     assert coarse_step(held(replace(step, t=4.0), friction), friction) is None
+    assert coarse_step(held(replace(step, value=3.5), friction), friction) is None

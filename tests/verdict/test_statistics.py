@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from madoc.verdict.statistics import better_than_chance, independent_groups, interval_of, resampled
+from madoc.calibration.holdout import PredictionError, PredictionErrors
+from madoc.verdict.statistics import better_than_chance, hides_gain, independent_groups, interval_of, resampled
 
 
 def test_the_interval_of_a_mean_is_as_wide_as_its_standard_error_says():
@@ -67,3 +70,18 @@ def test_telling_one_run_from_another_is_no_skill():
 def test_rows_of_their_own_are_exchanged_with_any():
     followed = np.random.default_rng(5).standard_normal((60, 1))
     assert better_than_chance(followed, followed, np.arange(60))[0] == 1.0
+
+
+def test_noise_hides_the_gain_where_mid_range_errs_by_no_more_than_noise_does():
+    def errors(*means):
+        return tuple(PredictionError(steps, mean, (mean, mean), {}) for steps, mean in zip((1, 20), means, strict=True))
+
+    hidden = PredictionErrors(
+        **{"mid_range": errors(0.12, 0.3), "estimate": errors(0.1, 0.3), "nearby_best": errors(0.1, 0.3)},
+        **{"noise": errors(0.1, 0.2), "relative": 1.0, "relative_interval": (0.9, 1.1), "nearby_relative": 0.99},
+        **{"windows": 400, "failed_windows": 0},
+    )
+    assert hides_gain(hidden)
+    assert not hides_gain(replace(hidden, nearby_relative=0.5))
+    assert not hides_gain(replace(hidden, mid_range=errors(0.12, 0.5)))
+    assert not hides_gain(replace(hidden, noise=errors(0.0, 0.0), mid_range=errors(0.0, 0.0)))

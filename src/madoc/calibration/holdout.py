@@ -216,9 +216,10 @@ class Predicted(JudgedByErrors):
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted(JudgedByErrors):
-    """Predictions from states that were fitted to the `fitted_steps` control steps before, where velocities are hidden.
+    """Predictions from states that were fitted to the `fitted_steps` control steps before.
 
-    The horizon of an error is counted from the end of those steps.
+    So it is where velocities are hidden, or readings so noisy that they hide what parameters do. The horizon of an error
+    is counted from the end of those steps.
     """
 
     fitted_steps: int

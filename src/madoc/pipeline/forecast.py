@@ -57,7 +57,7 @@ def _least_squares(problem: CalibrationProblem) -> Forecast:
 
 
 def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
-    method = Madoc(groups="one", starts=None, cloning_epochs=0)
+    method = Madoc(starts=None, cloning_epochs=0)
     name = "madoc-local"
     try:
         state = method.init(problem, jax.random.key(0))

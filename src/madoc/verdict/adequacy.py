@@ -20,13 +20,13 @@ CERTAIN = 5.0
 """|t| from which a term is missing; by chance one in two million is larger where residuals are normal."""
 CERTAIN_DRIFT = 6.0
 """The same for a parameter that changes over the log, whose standard error rests on a third of the windows."""
+CERTAIN_STEP = 4.0
+"""t of the error of the integration step, whose value is known beforehand; by chance one in 30 thousand is larger."""
 MOVES = 0.5
 """Shift of a parameter in half-widths of its 95 % interval; a term that moves all by less may be left out."""
-CERTAIN_STEP = 4.0
-"""The same for the error of the integration step, whose value is known beforehand: by chance one in 30 thousand."""
 WHOLE = 1.5
-"""Largest value of the error of the integration step; it is 1 / (1 - 4^-p) for an integrator of order p, as the steps
-compared with are a quarter as long."""
+"""Largest value of the error of the integration step. The value is 1 / (1 - 4^-p) for an integrator of order p, at
+most 4 / 3, as the steps compared with are a quarter as long."""
 SMALLEST = 0.3
 """Smallest value of the error of the integration step in proportion to which its effects are taken larger."""
 NUMERICAL = 0.3
@@ -83,8 +83,8 @@ def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
 
 def coarse_step(holdout: HoldOut, named: MissingTerm) -> MissingTerm | None:
     """The error of the integration step, where it is certain and explains more than the term named."""
-    step = next((term for term in holdout.missing_terms if term.cause == INTEGRATION), None)
-    coarse = step is not None and abs(step.t) >= CERTAIN and step.explained > named.explained
+    step = integration(holdout.missing_terms)
+    coarse = step is not None and step.t >= CERTAIN and step.explained > named.explained
     return step if coarse else None
 
 
@@ -126,16 +126,47 @@ def _moved_together(holdout: HoldOut) -> bool:
 
 
 def numerical(holdout: HoldOut) -> MissingTerm | None:
-    """The error of the integration step, where it explains much of the residuals, and no certain term explains more.
+    """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
+    return _numerical(holdout.missing_terms)
+
+
+def _numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:
+    step = integration(terms)
+    if step is None or step.t < CERTAIN_STEP or step.explained < NUMERICAL:
+        return None
+    others = (each.explained for each in terms if is_certain(each) and each.cause != DRIFT)
+    return step if max(others, default=0.0) <= step.explained else None
+
+
+def integration(terms: Sequence[MissingTerm]) -> MissingTerm | None:
+    """The error of the integration step, if its value is one that it can have.
 
     Smaller steps change predictions by that error once, and at contacts derivatives follow less than all of it. A value
     beyond that, or of the other sign, is of something else, such as a late action.
     """
-    term = next((term for term in holdout.missing_terms if term.cause == INTEGRATION), None)
-    if term is None or not 0.0 < term.value <= WHOLE or term.t < CERTAIN_STEP or term.explained < NUMERICAL:
-        return None
-    others = (each.explained for each in holdout.missing_terms if is_certain(each) and each.cause != DRIFT)
-    return term if max(others, default=0.0) <= term.explained else None
+    return next((term for term in terms if term.cause == INTEGRATION and 0.0 < term.value <= WHOLE), None)
+
+
+def in_full(alternatives: tuple[Alternative, ...], terms: Sequence[MissingTerm]) -> tuple[Alternative, ...]:
+    """The alternatives, with the error of the integration step in full where it explains much of the residuals.
+
+    Where motion is smooth its value is about 1. At contacts it comes out smaller, as derivatives do not follow jumps,
+    and other estimates that rest on it, alone or with other terms, or on windows of another length, move in proportion.
+    """
+    step = _numerical(terms)
+    if step is None or step.value >= 1.0:
+        return alternatives
+    factor = 1.0 / max(step.value, SMALLEST)
+    return tuple(
+        replace(
+            each,
+            shifts={name: factor * shift for name, shift in each.shifts.items()},
+            errors={name: factor * error for name, error in each.errors.items()},
+        )
+        if {INTEGRATION, OTHER_WINDOWS} & set(each.causes)
+        else each
+        for each in alternatives
+    )
 
 
 def widening(alternatives: tuple[Alternative, ...], names: tuple[str, ...]) -> Float[np.ndarray, "d 2"]:
@@ -157,36 +188,14 @@ def with_widened_intervals(result: CalibrationResult, holdout: HoldOut) -> Calib
     """The result with intervals that cover the alternatives as well, and a warning that says so."""
     if result.interval is None:
         return result
-    ends = widening(_in_full(holdout), tuple(result.parameters))
+    ends = widening(holdout.alternatives, tuple(result.parameters))
     grown = {
         name: (low, high) for name, (low, high) in zip(result.parameters, ends.tolist(), strict=True) if low + high
     }
     if not grown:
         return result
-    told = [_covering(combination, result, _in_full(holdout)) for combination in result.combinations]
+    told = [_covering(combination, result, holdout.alternatives) for combination in result.combinations]
     return replace(result.with_intervals(grown, _sentence(holdout.alternatives)), combinations=told)
-
-
-def _in_full(holdout: HoldOut) -> tuple[Alternative, ...]:
-    """The alternatives, those by the error of the integration step in full where it explains much of the residuals.
-
-    Where motion is smooth its value is about 1. At contacts it comes out smaller, as derivatives do not follow jumps,
-    and what follows from it, in windows of another length too, does so in proportion.
-    """
-    step = numerical(holdout)
-    if step is None or step.value >= 1.0:
-        return holdout.alternatives
-    factor = 1.0 / max(step.value, SMALLEST)
-    return tuple(
-        replace(
-            each,
-            shifts={name: factor * shift for name, shift in each.shifts.items()},
-            errors={name: factor * error for name, error in each.errors.items()},
-        )
-        if {INTEGRATION, OTHER_WINDOWS} & set(each.causes)
-        else each
-        for each in holdout.alternatives
-    )
 
 
 def _covering(

@@ -16,8 +16,8 @@ from madoc.simulation.base import Simulator
 from madoc.verdict.adequacy import with_widened_intervals
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.fitted import fitted
-from madoc.verdict.judge import judge, noise_hides_gain
-from madoc.verdict.predicted import predicted
+from madoc.verdict.judge import judge
+from madoc.verdict.predicted import noise_hides_gain, predicted
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,8 @@ def measured(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.nda
         MadocError: No state of the hold-out can be rebuilt though the robot's observations determine it.
     """
     point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
-    if bench.states_known:
-        holdout = predicted(bench, point, interval)
-        if not noise_hides_gain(holdout) or bench.fitted is None:
-            return holdout
+    if bench.states_known and (not noise_hides_gain(bench) or bench.fitted is None):
+        return predicted(bench, point, interval)
     if bench.fitted is not None:
         return fitted(bench, bench.fitted, point, interval)
     noise = difference_noise(bench.problem.dataset) / bench.change

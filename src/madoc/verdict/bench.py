@@ -27,7 +27,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
 from madoc.types import named_key
-from madoc.verdict.adequacy import is_certain, widening
+from madoc.verdict.adequacy import in_full, is_certain, widening
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
@@ -185,15 +185,16 @@ def judged(
     by_model: tuple[AgainstChance, ...],
     noise: Float[np.ndarray, " channels"],
     control_steps: int,
+    exact: bool = False,
 ) -> Measure:
     """Complete a measure's record by the fields that all measures have.
 
-    The best possible intervals are computed for parameters `at`, as if `residual` were the standard deviation of noise.
-    That and the sensors' `noise` are in typical changes of a stride.
+    The best possible intervals are computed for parameters `at`, as if `residual` were the standard deviation of noise:
+    of a single step from a logged state where states are `exact`, else of a reading. That and the sensors' `noise` are
+    in typical changes of a stride.
     """
     space, problem = bench.simulator.parameters, bench.problem
     residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
-    exact = bench.states_known
     half, spent = expected_half_widths(problem.states, problem.dataset, problem.simulator, at, residual, exact=exact)
     if exact and noise.any():  # then windows with fitted initial states may tell more than single noisy steps do
         sensors = np.maximum(noise, NEGLIGIBLE) * bench.change
@@ -215,11 +216,12 @@ def judged(
             bench.held_out, bench.simulator, points, horizons(problem.dataset)[1], bench.change, contradicts=True
         )
         found, spent = (*exchanged, *found), spent + steps
+    alternatives = in_full(doubts.alternatives, doubts.terms)
     coarse, steps = 0.0, 0
     if bench.simulator.task.source is not None:  # else no timestep can be given
         coarse, steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
     # Another estimate of other windows says that the search is not at its end, not that a parameter is open.
-    open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
+    open_by = tuple(each for each in alternatives if each.causes != (OTHER_WINDOWS,))
     best, own_ends = (point[:, None] + np.outer(each, (-1.0, 1.0)) for each in (half, own))
     ends = own_ends if interval is None else space.to_unit(interval.T).T
     ends = ends + own[:, None] * widening(open_by, space.names) * (-1.0, 1.0)
@@ -239,7 +241,7 @@ def judged(
             for place, term in enumerate(doubts.terms)
             if place < _MOST_TERMS or term.cause == INTEGRATION or is_certain(term)
         ),
-        alternatives=doubts.alternatives,
+        alternatives=alternatives,
         tested=doubts.tested,
         contradictions=tuple(each.sentence for each in found if each.contradicts),
         coarseness=coarse,

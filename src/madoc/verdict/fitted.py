@@ -1,4 +1,4 @@
-"""The hold-out predicted from fitted initial states, where positions are observed and velocities are hidden."""
+"""The hold-out predicted from fitted initial states, where velocities are hidden or readings very noisy."""
 
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,8 @@
-"""Prediction error on the hold-out where velocities are hidden: initial states are fitted to a window's first steps.
+"""Prediction error on the hold-out from initial states that are fitted to a window's first steps.
 
-The hidden part of a state shows in the observations that follow it. The first steps of each window serve to fit its
-initial state, for every estimate alike. Errors are those of the steps after them, which no fit has used.
+They are where velocities are hidden or readings very noisy. The hidden part of a state shows in the observations that
+follow it. The first steps of each window serve to fit its initial state, for every estimate alike. Errors are those of
+the steps after them, which no fit has used.
 """
 
 from dataclasses import dataclass, replace

@@ -23,7 +23,7 @@ from madoc.identification.term_tests import MissingTerm
 from madoc.parameters import FIELDS
 from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END
-from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise, growth_beside_noise
+from madoc.verdict.statistics import NEGLIGIBLE, WORTH_GAINING, beyond_noise, growth_beside_noise
 from madoc.verdict.systematic import EXPLAINED
 
 REMEDIES = {
@@ -57,8 +57,6 @@ GROWS = 8.0
 each row make it 5 at most in simulated robots, a floor with a slope that the model lacks 10 and more."""
 GAINED = 0.75
 """Share in [0, 1] of the possible gain over mid-range on the hold-out; with less, an estimate is no improvement."""
-WORTH_GAINING = 0.05
-"""Share in [0, 1] of mid-range's error that parameters can remove; below it mid-range is as good."""
 _MOST_NAMED = 3
 """Largest number of terms that a sentence names beside the likeliest."""
 SEPARABLE = 0.65
@@ -106,12 +104,6 @@ def beats_mid_range(holdout: HoldOut) -> bool:
     if isinstance(holdout, ToldApart):
         return holdout.area_at_estimate.interval[1] < holdout.area_at_mid_range.area
     return holdout.errors.relative_interval[1] < 1.0
-
-
-def noise_hides_gain(holdout: Predicted) -> bool:
-    """Whether mid-range predicts the hold-out as well as parameters can, as errors are those of noise in any case."""
-    errors = holdout.errors
-    return errors.nearby_relative > 1.0 - WORTH_GAINING and not beyond_noise(errors.mid_range, errors.noise)
 
 
 def _rejected(holdout: HoldOut) -> Verdict | None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.calibration.holdout import Predicted
+from madoc.calibration.holdout import Predicted, PredictionErrors
 from madoc.data import stride
 from madoc.diagnosis.channels import signal_names
 from madoc.identification import noise as sensors
@@ -14,7 +14,13 @@ from madoc.identification.gauss_newton import descend
 from madoc.identification.states import logged_states
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.prediction import nearby_best
-from madoc.verdict.statistics import best_of, independent_groups, prediction_errors, relative_to_first
+from madoc.verdict.statistics import (
+    best_of,
+    hides_gain,
+    independent_groups,
+    prediction_errors,
+    relative_to_first,
+)
 from madoc.verdict.systematic import EXPLAINED, autocorrelation, explained, explained_at_end, persistence
 from madoc.verdict.two_sample import classify, replayed
 
@@ -28,33 +34,18 @@ MOST_ROWS = 4000
 
 def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
     """The errors of an estimate, in [-1, 1], of mid-range, of the best parameters nearby, and of noise alone."""
-    replays, mid_range = bench.replays, np.zeros(len(point))
-    nearby, searching = nearby_best(replays, point)
-    points = np.concatenate([mid_range[None], point[None], nearby])
-    residuals = replays.residuals(points)
-    sizes = replays.magnitudes(residuals)
-    best = best_of(sizes)
-    single = _single_steps(bench, points[best])
-    noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
-    systems = {"the simulator at mid-range": mid_range, "the simulator at the best parameters nearby": points[best]}
-    lasting, rows = _persistence(bench, points[best])
-    spent = single.control_steps + rows
+    replays, found = bench.replays, _replayed(bench, point)
+    best, single = found.best, found.single
+    systems = {"the simulator at mid-range": np.zeros(len(point)), "the simulator at the best parameters nearby": best}
+    lasting, rows = _persistence(bench, best)
     area_at_mid_range, area_at_estimate = (
-        classify(*replayed(replays, bench.scaling, part, noisy[0]), overlap=False) for part in residuals[:2]
+        classify(*replayed(replays, bench.scaling, part, found.noisy), overlap=False)
+        for part in (found.at_mid_range, found.at_estimate)
     )
-    at_end, refitting = _explained_at_end(bench, points[best], residuals[best], point, interval)
+    at_end, refitting = _explained_at_end(bench, best, found.at_best, point, interval)
     record = partial(
         Predicted,
-        errors=prediction_errors(
-            sizes,
-            replays.magnitudes(noisy)[:, 0],
-            best,
-            groups=independent_groups(replays.episodes, replays.rows, replays.windows.steps),
-            horizons=replays.horizons,
-            signals=signal_names(bench.simulator.task),
-            failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
-            stride=stride(bench.problem.dataset),
-        ),
+        errors=found.errors,
         explained=max(single.explained, at_end),
         autocorrelation=single.autocorrelation,
         persistence=lasting,
@@ -66,12 +57,58 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         bench,
         point,
         interval,
-        at=points[best],
+        at=best,
         residual=single.size,
         by_model=tuple(bench.against_chance(name, _simulated(bench, system)) for name, system in systems.items()),
         noise=single.noise,
-        control_steps=searching + residuals[..., 0].size + noisy[..., 0].size * 2 + spent + refitting,
+        exact=True,
+        control_steps=found.control_steps + rows + refitting,
     )
+
+
+def noise_hides_gain(bench: Bench) -> bool:
+    """Whether the best parameters near mid-range predict no better than that, because all errors are those of noise."""
+    return hides_gain(_replayed(bench, np.zeros(len(bench.simulator.parameters))).errors)
+
+
+class _Replayed(NamedTuple):
+    """What replays of the hold-out leave at mid-range, at an estimate and at the `best` parameters nearby.
+
+    Residuals are in typical changes of a stride, of shape (windows, steps, observation); `noisy` are those that noise
+    alone would cause at the best parameters.
+    """
+
+    errors: PredictionErrors
+    best: Float[np.ndarray, " d"]
+    at_mid_range: Float[np.ndarray, "windows steps observation"]
+    at_estimate: Float[np.ndarray, "windows steps observation"]
+    at_best: Float[np.ndarray, "windows steps observation"]
+    noisy: Float[np.ndarray, "windows steps observation"]
+    single: "_SingleSteps"
+    control_steps: int
+
+
+def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
+    replays = bench.replays
+    nearby, searching = nearby_best(replays, point)
+    points = np.concatenate([np.zeros((1, len(point))), point[None], nearby])
+    residuals = replays.residuals(points)
+    sizes = replays.magnitudes(residuals)
+    best = best_of(sizes)
+    single = _single_steps(bench, points[best])
+    noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
+    errors = prediction_errors(
+        sizes,
+        replays.magnitudes(noisy)[:, 0],
+        best,
+        groups=independent_groups(replays.episodes, replays.rows, replays.windows.steps),
+        horizons=replays.horizons,
+        signals=signal_names(bench.simulator.task),
+        failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
+        stride=stride(bench.problem.dataset),
+    )
+    spent = searching + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps
+    return _Replayed(errors, points[best], residuals[0], residuals[1], residuals[best], noisy[0], single, spent)
 
 
 def _explained_at_end(

@@ -13,6 +13,8 @@ NEGLIGIBLE = 1e-3
 ABOVE_NOISE = 2.0
 """Ratio of an error to that of noise alone, at least 1; above it noise does not explain the error. Noise estimated from
 a few hundred rows is within about 50 % of the true one."""
+WORTH_GAINING = 0.05
+"""Share in [0, 1] of mid-range's error that parameters can remove; below it mid-range is as good."""
 RESAMPLES = 500
 """Number of bootstrap samples. The ends of a 95 % interval then vary by about a tenth of its width (Efron and
 Tibshirani 1993, section 13.3)."""
@@ -176,8 +178,8 @@ def beyond_noise(
 def growth_beside_noise(errors: PredictionErrors) -> float:
     """The growth of errors from the shortest horizon to the longest, over that of the errors of noise alone.
 
-    The errors are those of the best parameters nearby; at the shortest horizon they count as noise's at least. It is 1
-    where there is no noise to compare with.
+    The errors are those of the best parameters nearby; errors below those of noise count as those. It is 1 where there
+    is no noise to compare with.
     """
     if errors.noise[0].mean <= NEGLIGIBLE:
         return 1.0
@@ -185,3 +187,9 @@ def growth_beside_noise(errors: PredictionErrors) -> float:
         max(left.mean, alone.mean) / alone.mean for left, alone in zip(errors.nearby_best, errors.noise, strict=True)
     ]
     return beside_noise[-1] / beside_noise[0]
+
+
+def hides_gain(errors: PredictionErrors) -> bool:
+    """Whether noise hides what parameters gain: none nearby beats mid-range, and all errors are noise's."""
+    noisy = errors.noise[0].mean > NEGLIGIBLE
+    return noisy and errors.nearby_relative > 1.0 - WORTH_GAINING and not beyond_noise(errors.mid_range, errors.noise)

@@ -83,9 +83,12 @@ def explained_at_end(
     Windows begin at the `rows`, in increasing order. Those that overlap share what forces at random did to them, which
     a regression would recognise by the state: none is predicted from windows that overlap it. A short log has few that
     do not, so by chance as well much may be explained: a share above `EXPLAINED` counts only where it is significant
-    among those of residuals whose sign is drawn anew for every stretch of a window's length.
+    among those of residuals whose sign is drawn anew for every stretch of a window's length. That takes seven stretches
+    or so: of fewer, too many draws have the signs that are there.
     """
     done, steps = np.isfinite(residuals).all((1, 2)), residuals.shape[1]
+    if not done.any():
+        return 0.0
     rows, last = rows[done], clipped(residuals[done, -1])
     folds = disjoint_folds(rows, steps)
     share = explained(inputs[done], last, folds)[0]
