@@ -218,8 +218,8 @@ class Predicted(JudgedByErrors):
 class Fitted(JudgedByErrors):
     """Predictions from states that were fitted to the `fitted_steps` control steps before.
 
-    So it is where velocities are hidden, or readings so noisy that they hide what parameters do. The horizon of an error
-    is counted from the end of those steps.
+    So it is where velocities are hidden, or readings so noisy that they hide what parameters do. The horizon of an
+    error is counted from the end of those steps.
     """
 
     fitted_steps: int
