@@ -6,7 +6,7 @@ An Ant of our own truths, after figure 3b of Jiang et al. 2024: gravity, the tor
 dampings, armatures and friction losses, in an order that is drawn once, of which a run calibrates the first. What it
 does not calibrate has the same value in target and simulator. Each seed plants another truth, in the middle 80 % of
 every range, and records `medium` behaviour there. `random` has groups of the sizes of those by physics, of parameters
-drawn at random. Runs already there are skipped.
+drawn at random; of up to 4 parameters both make one group. Runs already there are skipped.
 """
 
 import argparse
