@@ -9,6 +9,7 @@ import pytest
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares
 from madoc.calibration.least_squares.lengthening import (
+    LONGER,
     continued,
     enough,
     hopeless,
@@ -139,7 +140,7 @@ def test_where_motion_is_smooth_they_make_noise_matter_less(pendulum):
 def test_a_run_killed_on_longer_windows_goes_on_with_the_same_bits(pendulum, tmp_path):
     problem, method = problem_of(pendulum), LeastSquares()
     state = method.init(problem, jax.random.key(0))
-    while state.length == 0 or not state.unknown[1].epochs:
+    while state.length == 0 or not state.unknown[LONGER].epochs:
         state, _ = method.step(problem, state)
     save(tmp_path / "checkpoint.npz", state, {})
     again, _ = load(tmp_path / "checkpoint.npz", method.init(problem, jax.random.key(0)))
@@ -164,6 +165,6 @@ def test_what_the_model_does_wrong_ends_them(pendulum, tmp_path):
     problem = CalibrationProblem(of_machine.dataset, simulation.make(pendulum, threads=1))
     state, _ = ended(LeastSquares(), problem)
     assert state.best == 0
-    assert state.unknown[1].epochs > 0
+    assert state.unknown[LONGER].epochs > 0
     warnings = LeastSquares().estimate(problem, state).warnings
     assert any("the simulator leaves more than noise" in warning for warning in warnings)

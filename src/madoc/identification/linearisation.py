@@ -89,15 +89,17 @@ def slopes_of_windows(
     points: Float[np.ndarray, "points d"],
     by_points: Float[np.ndarray, "points windows values"],
     by_shifts: Float[np.ndarray, "n windows values"],
+    widths: Float[np.ndarray, " physical"],
 ) -> WindowSlopes:
     """Derivatives by parameters and by initial states; the latter are one-sided.
 
     `by_points` are residuals at a point alone or at its `difference_points`, `by_shifts` those at the first point with
-    each value of the initial states in turn moved by `DIFFERENCE`.
+    each value of the initial states in turn moved by its width.
     """
     whole = np.isfinite(by_points).all((0, 2)) & np.isfinite(by_shifts).all((0, 2))
     with np.errstate(invalid="ignore"):
-        parts = (by_points[0], _central(points, by_points), (by_shifts - by_points[0]) / DIFFERENCE)
+        by_states = (by_shifts - by_points[0]) / widths[: len(by_shifts), None, None]
+        parts = (by_points[0], _central(points, by_points), by_states)
     residuals, by_parameters, by_states = (np.where(whole[:, None], part, 0.0) for part in parts)
     return WindowSlopes(residuals, np.moveaxis(by_parameters, 0, -1), np.moveaxis(by_states, 0, -1), whole)
 

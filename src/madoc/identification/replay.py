@@ -1,7 +1,7 @@
 """Windows of a log simulated under many parameter vectors, and their residuals."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -69,6 +69,10 @@ class Readings:
     def __len__(self) -> int:
         return len(self.actions)
 
+    def of(self, kept: Int[np.ndarray, " some"]) -> "Readings":
+        """These windows alone."""
+        return replace(self, actions=self.actions[kept], observed=self.observed[kept])
+
     @property
     def steps(self) -> int:
         """Length of each window in control steps."""
@@ -113,12 +117,14 @@ def slopes_at(
     *,
     parameters: bool = True,
     initial_states: bool = True,
+    width: Float[np.ndarray, " physical"] | None = None,
 ) -> list[WindowSlopes]:
     """Residuals and their derivatives around every point's parameters and initial states, in two batches.
 
     Differences by parameters are central, because confidence intervals are computed from them; those by the many state
     values are one-sided. Without `parameters` there are only the latter, and d is 0; without `initial_states` only the
-    former, and n is 0. It takes points · windows · (1 + 2 d + n) · steps control steps.
+    former, and n is 0. Differences are `DIFFERENCE` wide, those by initial states `width` where that is larger, in
+    standard deviations of each value over the log. It takes points · windows · (1 + 2 d + n) · steps control steps.
     """
     count, windows, size = states.shape
     around = np.stack([difference_points(point) if parameters else point[None] for point in points])
@@ -126,11 +132,12 @@ def slopes_at(
     by_points = readings.residuals(simulator, around.reshape(-1, points.shape[1]), np.repeat(states, each, axis=0))
     by_points = by_points.reshape(count, each, windows, -1)
     by_shifts = np.zeros((count, 0, *by_points.shape[2:]))
+    widths = np.maximum(DIFFERENCE, np.zeros(len(readings.spread)) if width is None else width)
     if initial_states:
-        shift = readings.in_state_units(DIFFERENCE * np.eye(len(readings.spread)), size)
+        shift = readings.in_state_units(np.diag(widths), size)
         shifted = states[:, None] + shift[:, None]
         by_shifts = readings.residuals(simulator, points, shifted.reshape(count, -1, size))
-    return [slopes_of_windows(*parts) for parts in zip(around, by_points, by_shifts, strict=True)]
+    return [slopes_of_windows(*parts, widths) for parts in zip(around, by_points, by_shifts, strict=True)]
 
 
 def _observations(

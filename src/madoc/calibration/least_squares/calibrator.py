@@ -14,7 +14,9 @@ from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.lengthening import (
     FEWEST,
     LENGTHS,
+    LONGER,
     READINGS,
+    WIDER,
     continued,
     enough,
     hopeless,
@@ -22,6 +24,7 @@ from madoc.calibration.least_squares.lengthening import (
     lengthened,
     noise_alone,
     tells_more,
+    widened,
 )
 from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.statistics import alternation, consecutive_residuals
@@ -33,11 +36,13 @@ from madoc.identification.noise import difference_noise
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
 
 InitialStates = Literal["logged", "estimated"]
-Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening"]
+Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening", "widening"]
 LOGGED_HORIZON = 1
 """Length in control steps of a window from a logged state: noise of the state disturbs the first step least."""
 WINDOWS: dict[InitialStates, int] = {"logged": 1000, "estimated": 100}
 """Largest number of windows in the end."""
+MOST = 1000
+"""Largest number of windows with estimated initial states where contacts forbid longer ones, which would tell more."""
 SEARCH_WINDOWS: dict[InitialStates, int] = {"logged": 64, "estimated": 24}
 """Largest number of windows while searching."""
 STARTING_STRIDES = 1
@@ -60,6 +65,7 @@ class LeastSquaresState:
         stage: `logged`: from logged states, to the end. `undecided`: from logged states, until residuals show whether
             these are noisy. `starting`: from logged states, to find parameters for `estimated` to begin at.
             `estimated`: with unknown initial states on the shortest windows. `lengthening`: the same on longer ones.
+            `widening`: the same on more windows of the shortest length.
         length: Index of the unknown search in progress.
         best: Index of the unknown search that has the estimate.
         finished: 1 once the next step would be too small to matter, else 0.
@@ -75,7 +81,7 @@ class LeastSquaresState:
     @property
     def estimates_starts(self) -> bool:
         """Whether the estimate is that of a search with unknown initial states."""
-        return self.stage in ("estimated", "lengthening")
+        return self.stage in ("estimated", "lengthening", "widening")
 
 
 @dataclass(frozen=True)
@@ -195,6 +201,8 @@ class LeastSquares:
             steps += self._known(problem).whole_run(problem, state.known, epochs)
         if state.stage != "undecided":
             for length, search in enumerate(state.unknown):
+                if length == WIDER and state.stage != "widening":
+                    continue
                 steps += self._unknown(problem, length).whole_run(problem, search, refining_epochs)
         return steps
 
@@ -228,10 +236,12 @@ class LeastSquares:
 
     def _all_lengths(self, problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[SearchState, ...]:
         """Searches on every length of windows that the episodes are long enough for; on one if `horizon` is given."""
-        searches = [self._unknown(problem).init(problem, key)]
-        for length in range(1, len(LENGTHS) if self.horizon is None else 1):
-            most = READINGS * len(searches[0].rows) // LENGTHS[length]
-            longer = lengthened(problem, searches[-1], self._unknown(problem, length).horizon, most)
+        shortest = self._unknown(problem)
+        first = shortest.init(problem, key)
+        searches = [first, replace(shortest, windows=self.windows or MOST, searches=1).init(problem, key)]
+        for length in range(LONGER, len(LENGTHS) if self.horizon is None else LONGER):
+            most = READINGS * len(first.rows) // LENGTHS[length]
+            longer = lengthened(problem, first, self._unknown(problem, length).horizon, most)
             if longer is None:
                 break
             searches.append(longer)
@@ -259,7 +269,8 @@ class LeastSquares:
         """Go on to longer windows once a search has settled, while they narrow the intervals.
 
         If longer windows show model errors, the estimate of the shortest is kept: model errors bias the estimate by
-        about as much for all lengths, and only wide intervals may cover that.
+        about as much for all lengths, and only wide intervals may cover that. At contacts longer windows may leave
+        residuals because their initial states were not found, and the longest that were explained are kept.
         """
         searches, length = state.unknown, state.length
         search = searches[length]
@@ -267,16 +278,20 @@ class LeastSquares:
             return state
         if not self._unknown(problem).settled(search):
             lost = hopeless(search, searches[0], searches[state.best]) or search.epochs >= self.search_epochs
-            return _finished(state, state.best) if length and lost else state
+            return _ended(state, state.best) if length >= LONGER and lost else state
+        if length == WIDER:
+            return _finished(state, WIDER)
         if length and not self._noise_alone(problem, state, length):
-            return _finished(state, 0)
+            return _ended(state, state.best if search.rough else 0)
         if length and not tells_more(search, searches[state.best]):
-            return _finished(state, state.best)
-        last = length + 1 == len(searches) or not enough(searches[length + 1], search)
-        if last or float(search.deviation.max()) < sentences.EXACT:
+            return _ended(state, state.best)
+        if float(search.deviation.max()) < sentences.EXACT:
             return _finished(state, length)
-        longer = _with(state, length + 1, continued(searches[length + 1], search))
-        return replace(longer, stage="lengthening", best=length, length=length + 1)
+        following = max(length + 1, LONGER)
+        if following == len(searches) or not enough(searches[following], search):
+            return _ended(state, length)
+        longer = _with(state, following, continued(searches[following], search))
+        return replace(longer, stage="lengthening", best=length, length=following)
 
     def _noise_alone(self, problem: CalibrationProblem, state: LeastSquaresState, length: int) -> bool:
         """Whether residuals of windows of this length are the noise that those of the shortest windows are."""
@@ -291,11 +306,12 @@ class LeastSquares:
         about = (sentences.about_estimated_states(problem, best, horizon), *sentences.about_residuals(best))
         if float(best.deviation.max()) < sentences.EXACT:
             return about
-        if state.stage == "lengthening" and not state.finished:
+        if state.stage in ("lengthening", "widening") and not state.finished:
             return (*about, sentences.STILL_LENGTHENING)
-        for longer in range(state.best + 1, len(state.unknown)):
-            settled = self._unknown(problem).settled(state.unknown[longer])
-            if settled and not self._noise_alone(problem, state, longer):
+        for longer in range(max(state.best + 1, LONGER), len(state.unknown)):
+            search = state.unknown[longer]
+            noise_alone = search.rough or self._noise_alone(problem, state, longer)
+            if self._unknown(problem).settled(search) and not noise_alone:
                 return (*about, sentences.about_model_errors(self._unknown(problem, longer).horizon))
         return about
 
@@ -313,6 +329,14 @@ def _begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
     """The stage of unknown initial states, begun at the best point of the search from logged ones."""
     first = replace(state.unknown[0], point=known.point[:1].copy())
     return replace(_with(state, 0, first), stage="estimated")
+
+
+def _ended(state: LeastSquaresState, best: int) -> LeastSquaresState:
+    """The end of lengthening; if only the shortest windows are explained, as at contacts, more of them follow."""
+    first, wider = state.unknown[:LONGER]
+    if best or not first.rough or len(wider.rows) == len(first.rows):
+        return _finished(state, best)
+    return replace(_with(state, WIDER, widened(wider, first)), stage="widening", best=0, length=WIDER)
 
 
 def _finished(state: LeastSquaresState, best: int) -> LeastSquaresState:

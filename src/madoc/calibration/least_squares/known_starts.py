@@ -95,6 +95,11 @@ class KnownStarts:
         """Number of systems simulated in an epoch: central differences, and the steps tried."""
         return 1 + 2 * len(problem.simulator.parameters) + len(TRIALS)
 
+    @staticmethod
+    def settling_columns(problem: CalibrationProblem) -> int:
+        """None, as initial states are known."""
+        return 0
+
     def plans(
         self,
         points: Float[np.ndarray, "searches d"],

@@ -11,12 +11,15 @@ from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.search import SearchState
+from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Dataset
 from madoc.identification.information import half_width, sandwich
 from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
-LENGTHS = (1, 3, 9)
-"""Lengths of windows, relative to the first."""
+LENGTHS = (1, 1, 3, 9)
+"""Lengths of windows of each search, relative to the first."""
+WIDER, LONGER = 1, 2
+"""Indices of the search on more windows of the first length, and of the first one on longer windows."""
 SHORTEST = 3
 """Smallest length of the first windows in control steps: shorter ones hold little information besides their initial
 state."""
@@ -77,7 +80,27 @@ def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, 
 
 def continued(longer: SearchState, shorter: SearchState) -> SearchState:
     """The longer search with the parameters and initial states of the shorter one."""
-    return replace(longer, point=shorter.point[:1].copy(), states=_states_at(shorter, longer.rows))
+    return replace(
+        longer,
+        point=shorter.point[:1].copy(),
+        states=_states_at(shorter, longer.rows),
+        state_errors=shorter.state_errors,
+        waiting=UnknownStarts.waiting,
+    )
+
+
+def widened(wider: SearchState, first: SearchState) -> SearchState:
+    """The search on more windows with the parameters of the first one, and its initial states of the same windows."""
+    states = wider.states.copy()
+    states[0, : len(first.rows)] = first.states[0]
+    return replace(
+        wider,
+        point=first.point[:1].copy(),
+        states=states,
+        state_errors=first.state_errors,
+        refining=1,
+        waiting=UnknownStarts.waiting,
+    )
 
 
 def _states_at(search: SearchState, rows: Int[np.ndarray, " windows"]) -> Float[np.ndarray, "1 windows state"]:

@@ -23,6 +23,16 @@ STATE_DAMPING_RANGE = (1e-9, 1e6)
 """Smallest and largest relative damping of an initial state's step; it is clipped to them."""
 LITTLE = 5e-3
 """Share in [0, 1] of the cost; after a step that saves less, unknown initial states count as settled too."""
+ROUGHLY_SETTLED = 0.3
+"""Ratio in [0, 1] of a step to the standard error, where initial states settle anew after each step: these end here and
+there in another minimum, and move the parameters by that much."""
+FOUND = (0.5, 0.9)
+"""Shares in [0, 1] of the unexplained windows and of the residuals' size; if no more is left by wide differences and
+restarts, the rest was for want of initial states."""
+NARROW = 2
+"""Number of steps of initial states after which those of smooth motion are explained, as they are nearly linear."""
+FAR = 3.0
+"""Distance in standard errors; once parameters have moved farther, initial states are looked for anew."""
 _SMALLEST = 1e-100
 """Smallest tolerance, so that the ratio of a step to a tolerance of 0 is finite."""
 
@@ -35,6 +45,7 @@ class SearchState:
     Attributes:
         point: The current point of each search, in [-1, 1].
         states: Initial state of every window there; without windows where they are known.
+        state_errors: Standard errors of an unknown initial state's values, by which differences are widened.
         damping: λ of each search's steps of the parameters.
         state_damping: λ of each unknown initial state's step.
         cost: Mean loss of a residual, `ALL_FAILED` before the first epoch. In squared typical changes of a step; in
@@ -48,6 +59,11 @@ class SearchState:
         explained: Number of windows from which these two were computed.
         autocorrelation: Correlation of these windows' residuals with the next reading's; 0 for known initial states.
         refining: 0 while searching on few windows, 1 on all of them.
+        settled_at: The point at which initial states last settled alone.
+        missed: Share of the windows that initial states did not explain after the first steps of that, and the size of
+            all windows' residuals in typical changes.
+        rough: 1 where wide differences and restarts have found initial states, as at contacts: each step of the
+            parameters is then followed by several of the states; else 0.
         waiting: Number of epochs to come in which only initial states move.
         epochs: Number of epochs of this stage so far, those of waiting not counted.
         failures: Number of windows whose simulation failed.
@@ -55,6 +71,7 @@ class SearchState:
 
     point: Float[np.ndarray, "searches d"]
     states: Float[np.ndarray, "searches unknown state"]
+    state_errors: Float[np.ndarray, " physical"]
     damping: Float[np.ndarray, " searches"]
     state_damping: Float[np.ndarray, "searches unknown"]
     cost: Float[np.ndarray, " searches"]
@@ -67,6 +84,9 @@ class SearchState:
     explained: int
     autocorrelation: float
     refining: int
+    settled_at: Float[np.ndarray, " d"]
+    missed: tuple[float, float]
+    rough: int
     waiting: int
     epochs: int
     failures: int
@@ -106,6 +126,7 @@ class Search:
         return SearchState(
             point=points,
             states=np.repeat(states[None], self.searches, axis=0),
+            state_errors=np.zeros(logged.physical_size if self.starts.unknown else 0),
             damping=np.full(self.searches, FIRST_DAMPING),
             state_damping=np.full((self.searches, len(states)), FIRST_DAMPING),
             cost=np.full(self.searches, ALL_FAILED),
@@ -118,6 +139,9 @@ class Search:
             explained=0,
             autocorrelation=0.0,
             refining=0,
+            settled_at=np.zeros(count),
+            missed=(0.0, 0.0),
+            rough=0,
             waiting=0,
             epochs=0,
             failures=0,
@@ -127,13 +151,17 @@ class Search:
         """One damped step of every point that still moves: derivatives in one batch, the steps tried in another."""
         running, count = self._running(state), self.window_count(state)
         windows = self.starts.at(problem, state.rows[:count], state.touching[:count], self.horizon, self.loss)
+        if isinstance(windows, UnknownStarts) and state.waiting:
+            return self._settled_states(windows, state)
+        if isinstance(windows, UnknownStarts) and state.rough:
+            return self._profiled(windows, state)
         points, states = state.point[:running], state.states[:running, :count]
         damping, state_damping = state.damping[:running], state.state_damping[:running, :count]
         plans = windows.plans(points, states, damping, state_damping, refining=bool(state.refining))
         outcomes = windows.outcomes(plans, states)
         new = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}
         for index, (plan, outcome) in enumerate(zip(plans, outcomes, strict=True)):
-            trial, factor = chosen(outcome, waiting=state.waiting > 0)
+            trial, factor = chosen(outcome)
             followed = outcome.followed[trial]
             new["point"][index] = np.clip(points[index] + plan.steps[trial], -1.0, 1.0)
             change = followed[:, None] * plan.state_steps[trial] * plan.spread
@@ -154,8 +182,7 @@ class Search:
             meat=best.meat,
             explained=int(best.kept.sum()),
             autocorrelation=best.autocorrelation,
-            waiting=max(0, state.waiting - 1),
-            epochs=state.epochs + (state.waiting == 0),
+            epochs=state.epochs + 1,
             failures=state.failures + sum(each.failures for each in plans) + sum(each.failures for each in outcomes),
         )
         noise = float(np.median(best.deviation))
@@ -169,6 +196,70 @@ class Search:
         stage = "calibrating" if state.refining else "searching"
         return following, Epoch(metrics, self._epoch_steps(problem, state), stage=stage)
 
+    def _settled_states(self, windows: UnknownStarts, state: SearchState) -> tuple[SearchState, Epoch]:
+        """One step of initial states alone, which every search on new windows begins with."""
+        states, damping = state.states[0], state.state_damping[0]
+        after, waiting = windows.settle(state.point[0], states, damping, state.state_errors, state.waiting)
+        new_states, new_damping = state.states.copy(), state.state_damping.copy()
+        new_states[0], new_damping[0] = after.states, after.damping
+        first = state.waiting > self.starts.waiting - NARROW
+        missed = windows.share_unexplained(after), float(np.sqrt(after.costs.mean()) * np.median(after.deviation))
+        before = missed if first else state.missed
+        found = not first and (missed[0] <= FOUND[0] * before[0] or missed[1] <= FOUND[1] * before[1])
+        following = replace(
+            state,
+            states=new_states,
+            state_damping=new_damping,
+            state_errors=after.errors,
+            deviation=after.deviation,
+            settled_at=state.point[0].copy(),
+            missed=before,
+            rough=int(found),
+            waiting=waiting,
+            failures=state.failures + after.failures,
+        )
+        noise = float(np.median(after.deviation))
+        metrics = {"residual": missed[1], "moved": float(state.moved[0])}
+        metrics["noise"] = noise
+        return following, Epoch(metrics, after.simulations * self.horizon, stage="calibrating")
+
+    def _profiled(self, windows: UnknownStarts, state: SearchState) -> tuple[SearchState, Epoch]:
+        """One step of the parameters after which initial states settle anew, kept unless that makes windows worse.
+
+        The cost is that of the best initial states for each parameter vector (variable projection, Golub and Pereyra
+        1973). A step with states that follow to first order alone would be refused at contacts.
+        """
+        states = state.states[:1]
+        undamped = np.full(states.shape[:2], STATE_DAMPING_RANGE[0])
+        (plan,) = windows.plans(state.point[:1], states, state.damping[:1], undamped, refining=True)
+        after, cost, better = windows.profiled(plan, states[0], state.state_errors)
+        factor = TRIALS[0] if better else 1e3
+        new, step = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}, plan.steps[0]
+        if better:
+            new["point"][0] = np.clip(plan.point + step, -1.0, 1.0)
+            new["states"][0], new["state_damping"][0] = after.states, after.damping
+        new["damping"][0] = np.clip(state.damping[0] * factor, *DAMPING_RANGE)
+        new["cost"][0], new["moved"][0] = cost, self._relative_step(plan, step, ROUGHLY_SETTLED)
+        following = replace(
+            state,
+            **new,
+            deviation=plan.deviation,
+            bread=plan.bread,
+            meat=plan.meat,
+            explained=int(plan.kept.sum()),
+            autocorrelation=plan.autocorrelation,
+            epochs=state.epochs + 1,
+            failures=state.failures + plan.failures + after.failures,
+        )
+        noise = float(np.median(plan.deviation))
+        metrics = {"residual": float(np.sqrt(cost)) * noise, "moved": float(following.moved[0]), "noise": noise}
+        if following.moved[0] < 1.0 and self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0:
+            moved = np.maximum(following.moved, 1.0)
+            following = replace(following, waiting=self.starts.waiting, moved=moved)
+        columns = 1 + 2 * len(step) + len(plan.spread)
+        spent = len(state.rows) * columns + after.simulations
+        return following, Epoch(metrics, spent * self.horizon, stage="calibrating")
+
     def settled(self, state: SearchState) -> bool:
         """Whether the last step on all windows was too small to matter; never while every window fails."""
         still = float(state.moved[0]) < 1.0 and float(state.cost[0]) < self.starts.failed_cost
@@ -180,14 +271,19 @@ class Search:
 
     def whole_run(self, problem: CalibrationProblem, state: SearchState, refining_epochs: int) -> int:
         """Control steps of the longest search, unless it has ended, and of `refining_epochs` on all windows."""
-        searching, refining = (self._epoch_steps(problem, replace(state, refining=stage)) for stage in (0, 1))
-        return searching * self.search_epochs * (1 - state.refining) + refining * refining_epochs
+        searching, refining, settling = (
+            self._epoch_steps(problem, replace(state, refining=stage, waiting=waiting))
+            for stage, waiting in ((0, 0), (1, 0), (1, 1))
+        )
+        waiting = min(1, self.starts.waiting) if not state.rough else state.waiting
+        return searching * self.search_epochs * (1 - state.refining) + refining * refining_epochs + settling * waiting
 
     def _running(self, state: SearchState) -> int:
         return 1 if state.refining else self.searches
 
     def _epoch_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
-        return self._running(state) * self.window_count(state) * self.starts.columns(problem) * self.horizon
+        columns = self.starts.settling_columns(problem) if state.waiting else self.starts.columns(problem)
+        return self._running(state) * self.window_count(state) * columns * self.horizon
 
     def _moved(self, plan: Plan, outcome: Outcome, trial: int, *, damping: float) -> float:
         """The largest component of a step relative to one that matters: a tenth of a standard error, or the tolerance.
@@ -195,10 +291,14 @@ class Search:
         While the damping is at most `starts.stuck` the least damped step counts, whether it helped or not: a damped one
         may be small far from the minimum too.
         """
-        tried = np.abs(plan.steps[0 if damping <= self.starts.stuck else min(trial, len(TRIALS) - 1)])
+        tried = plan.steps[0 if damping <= self.starts.stuck else min(trial, len(TRIALS) - 1)]
+        relative = self._relative_step(plan, tried, SETTLED)
+        return max(relative, 0.0 if plan.exact else outcome.saved(trial) / LITTLE)
+
+    def _relative_step(self, plan: Plan, step: Float[np.ndarray, " d"], share: float) -> float:
+        """The largest component of a step relative to a share of its standard error, or to the tolerance."""
         error = np.sqrt(np.maximum(np.diag(sandwich(plan.bread, plan.meat).covariance), 0.0))
-        worthwhile = np.maximum(2.0 * max(self.tolerance, _SMALLEST), SETTLED * error)
-        return max(float((tried / worthwhile).max()), 0.0 if plan.exact else outcome.saved(trial) / LITTLE)
+        return float((np.abs(step) / np.maximum(2.0 * max(self.tolerance, _SMALLEST), share * error)).max())
 
     def _refined(self, state: SearchState, leader: int) -> SearchState:
         """Put the best search first, which alone goes on, to all windows."""
@@ -206,13 +306,12 @@ class Search:
         searches = {name: getattr(state, name)[order] for name in _OF_EACH_SEARCH}
         if self.starts.waiting:
             searches["damping"] = np.full(self.searches, FIRST_DAMPING)
+            searches["state_damping"] = np.full_like(state.state_damping, FIRST_DAMPING)
         return replace(state, **searches, refining=1, waiting=self.starts.waiting, epochs=0)
 
 
-def chosen(outcome: Outcome, *, waiting: bool) -> tuple[int, float]:
+def chosen(outcome: Outcome) -> tuple[int, float]:
     """Index of the step with the smallest cost, the last one for none, and the factor of the damping."""
     last = len(outcome.totals) - 1
-    trial = last if waiting else int(np.argmin(outcome.totals))
-    if outcome.totals[trial] < outcome.totals[last]:
-        return trial, TRIALS[trial]
-    return last, 1.0 if waiting else 1e3
+    trial = int(np.argmin(outcome.totals))
+    return (trial, TRIALS[trial]) if outcome.totals[trial] < outcome.totals[last] else (last, 1e3)

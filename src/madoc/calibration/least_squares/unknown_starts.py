@@ -3,7 +3,7 @@
 Channels are weighted by their noise as estimated from the fit, and windows that no initial state explains are left out.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -16,24 +16,35 @@ from madoc.errors import MadocError
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.information import at_least_noise, bread, jackknife_meat, least_share
 from madoc.identification.linearisation import WindowSlopes
-from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope, loss_value
+from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
+from madoc.identification.settling import (
+    FAILED_WINDOW,
+    FEW,
+    FIRST_DAMPING,
+    LEAST_DAMPING,
+    RESETTLING,
+    RESTARTS,
+    WIDTHS,
+    Settled,
+    restart,
+    settle,
+    window_costs,
+)
 from madoc.identification.windows import disjoint_windows
 from madoc.simulation.base import Simulator
 
 FOLLOWED = (1.0, 0.3, 0.0)
 """Shares in [0, 1] of an initial state's step, of which every window takes the best: at contacts 1 may be too far."""
-FAILED_WINDOW = 1e6
-"""Cost of a window whose simulation failed, in squared standard deviations of the noise; no cost is larger."""
 LIKE_NOISE = 1.5
 """Cost of a window, in squared standard deviations; noise alone rarely exceeds it, as its mean is 0.8."""
+WORSE = 2.0
+"""Mean change of the windows' costs in its standard errors; above it a step makes them worse."""
 ROUNDING = 1e-8
 """Noise in typical changes of a channel; smaller residuals are rounding errors."""
 _SUFFICIENT = 0.02
 """Share in [0, 1] of the information about every direction that the trusted windows need; else all are trusted."""
-_LEAST_DAMPING = 1e-9
-"""Damping of an initial state where the covariance is computed, relative to the squared lengths of the columns."""
 
 
 @dataclass(frozen=True)
@@ -43,20 +54,22 @@ class UnknownStarts:
     Attributes:
         simulator: The simulator.
         readings: Actions and observations of the windows.
+        guesses: Initial states as the log tells them.
         loss: Loss of residuals in standard deviations of the noise.
         unknown: Whether initial states are unknown.
         failed_cost: Cost at which every window fails.
         stuck: Damping at which steps are so short that their length no longer shows how far the minimum is.
-        waiting: First epochs on all windows in which only initial states move, as those of new windows are guesses.
+        waiting: Number of epochs in which only initial states move, as those of new windows are guesses.
     """
 
     simulator: Simulator
     readings: Readings
+    guesses: Float[np.ndarray, "windows state"]
     loss: Loss
     unknown: ClassVar[bool] = True
     failed_cost: ClassVar[float] = FAILED_WINDOW
     stuck: ClassVar[float] = 1e3
-    waiting: ClassVar[int] = 2
+    waiting: ClassVar[int] = len(WIDTHS) + RESTARTS
 
     @classmethod
     def at(
@@ -69,7 +82,8 @@ class UnknownStarts:
     ) -> "UnknownStarts":
         """The windows that begin at the given rows; `touching` is of no use, as windows without a fit are left out."""
         readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
-        return cls(problem.simulator, readings, loss)
+        guesses = problem.states.states[np.searchsorted(problem.states.rows, rows)]
+        return cls(problem.simulator, readings, guesses, loss)
 
     @staticmethod
     def touched(
@@ -103,6 +117,61 @@ class UnknownStarts:
         unknown = 2 * len(problem.simulator.parameters) + problem.states.physical_size
         return 1 + unknown + len(FOLLOWED) * (len(TRIALS) + 1)
 
+    @staticmethod
+    def settling_columns(problem: CalibrationProblem) -> int:
+        """About how many systems are simulated in an epoch in which only initial states move."""
+        return 3 + problem.states.physical_size
+
+    def settle(
+        self,
+        point: Float[np.ndarray, " d"],
+        states: Float[np.ndarray, "windows state"],
+        damping: Float[np.ndarray, " windows"],
+        errors: Float[np.ndarray, " physical"],
+        waiting: int,
+    ) -> tuple[Settled, int]:
+        """Move initial states alone, with `waiting` epochs to go; also how many are to go after it.
+
+        None are once residuals of nearly all windows are noise. Until there are as many to go as restarts, differences
+        become narrower; then windows whose residuals are more than noise begin anew.
+        """
+        width = WIDTHS[max(0, self.waiting - waiting)] if waiting > RESTARTS else 0.0
+        after = settle(self.simulator, self.readings, point, states, damping, width * errors, self.loss)
+        if waiting <= RESTARTS:
+            random = np.random.default_rng(waiting)
+            after = restart(self.simulator, self.readings, point, self.guesses, after, self.loss, random)
+        noiseless = after.deviation.max() < ROUNDING
+        return after, 0 if self.share_unexplained(after) <= FEW or noiseless else waiting - 1
+
+    def share_unexplained(self, settled: Settled) -> float:
+        """Share of the windows whose residuals are more than noise."""
+        return float(settled.unexplained(self.readings.observed[0].size, self.loss).mean())
+
+    def profiled(
+        self, plan: Plan, states: Float[np.ndarray, "windows state"], errors: Float[np.ndarray, " physical"]
+    ) -> tuple[Settled, float, bool]:
+        """Initial states settled after the least damped step of a plan, the mean cost there, and whether it helps.
+
+        It does unless the windows' costs are significantly higher: at contacts initial states end here and there in
+        another minimum, and where they were before they had several chances.
+        """
+        point = np.clip(plan.point + plan.steps[0], -1.0, 1.0)
+        states = states + self.readings.in_state_units(plan.state_steps[0], states.shape[1])
+        damping, simulations = np.full(len(states), FIRST_DAMPING), 0
+        for width in RESETTLING:
+            after = settle(self.simulator, self.readings, point, states, damping, width * errors, self.loss)
+            states, damping, simulations = after.states, after.damping, simulations + after.simulations
+        residuals = self.readings.residuals(self.simulator, point[None], states[None])[0, 0]
+        costs = window_costs(residuals / np.tile(plan.deviation, self.readings.steps + 1), self.loss)
+        after = replace(after, simulations=simulations + len(states))
+        if not plan.kept.any():
+            return after, FAILED_WINDOW, False
+        before = window_costs(plan.residuals, self.loss)[plan.kept]
+        activity = self.readings.activity[plan.kept]
+        change = clipped_change(before, costs[None, plan.kept], activity, least=LIKE_NOISE, failed=FAILED_WINDOW)[0]
+        worse = WORSE * change.std() / np.sqrt(len(change))
+        return after, float((before + change).mean()), bool(change.mean() <= worse)
+
     def plans(
         self,
         points: Float[np.ndarray, "searches d"],
@@ -135,11 +204,11 @@ class UnknownStarts:
         ]
 
     def _outcome(self, plan: Plan, residuals: Float[np.ndarray, "trials ways windows values"]) -> Outcome:
-        costs = self._costs(residuals)
+        costs = window_costs(residuals, self.loss)
         followed = np.array(FOLLOWED)[costs.argmin(1)]
         if not plan.kept.any():
             return Outcome(FAILED_WINDOW, costs.min(1).mean(-1), followed, 0)
-        before, after = self._costs(plan.residuals)[plan.kept], costs.min(1)[:, plan.kept]
+        before, after = window_costs(plan.residuals, self.loss)[plan.kept], costs.min(1)[:, plan.kept]
         change = after - before
         if self.loss != "linear":
             activity = self.readings.activity[plan.kept]
@@ -157,7 +226,7 @@ class UnknownStarts:
     ) -> Plan:
         """The plan of one search; while refining, channels are weighted by noise, and untrusted windows left out."""
         channels, readings = len(self.readings.scale), self.readings.steps + 1
-        least = np.full(len(state_damping), _LEAST_DAMPING)
+        least = np.full(len(state_damping), LEAST_DAMPING)
         alike = eliminate(slopes, np.ones_like(slopes.residuals), least)
         kept = slopes.whole
         deviation = self._deviation(slopes, alike.spare, kept)
@@ -211,16 +280,9 @@ class UnknownStarts:
         whole = slopes.whole
         if self.loss == "linear" or not whole.any():
             return whole
-        costs = self._costs(slopes.residuals)
+        costs = window_costs(slopes.residuals, self.loss)
         middle, reach = outlier_limits(costs[whole], self.readings.activity[whole])
         kept = whole & (costs <= np.maximum(middle + reach, LIKE_NOISE))
         weights = loss_slope((slopes.residuals / TUNING[self.loss]) ** 2, self.loss)
-        reduced = eliminate(slopes, weights, np.full(len(whole), _LEAST_DAMPING)).reduced
+        reduced = eliminate(slopes, weights, np.full(len(whole), LEAST_DAMPING)).reduced
         return kept if least_share(reduced.of(kept), reduced.of(whole)) > _SUFFICIENT else whole
-
-    def _costs(self, residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray, "*windows"]:
-        """Mean loss of each window, at most `FAILED_WINDOW`."""
-        scale = TUNING[self.loss]
-        with np.errstate(invalid="ignore", over="ignore"):
-            cost = scale**2 * loss_value((residuals / scale) ** 2, self.loss).mean(-1)
-        return np.where(np.isfinite(cost), np.minimum(cost, FAILED_WINDOW), FAILED_WINDOW)

@@ -1,0 +1,181 @@
+"""Initial states of windows fitted at given parameters, by differences that are first as wide as the states' errors.
+
+At a contact the derivative at a noisy state is not that around it: a foot just above the ground feels nothing of it. A
+descent by narrow differences ends in the nearest of many minima, so that the states, and with them the parameters, are
+biased. Differences as wide as the errors tell the average slope (statistical linearisation, Gelb 1974, section 6.2);
+they are narrowed from step to step, as the filters that iterate it do (Garcia-Fernandez et al. 2015).
+"""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from madoc.identification.gauss_newton import eliminate, states_basis
+from madoc.identification.linearisation import DIFFERENCE, WindowSlopes
+from madoc.identification.losses import TUNING, Loss, loss_slope, loss_value
+from madoc.identification.noise import channel_noise
+from madoc.identification.replay import Readings, slopes_at
+from madoc.simulation.base import Simulator
+
+WIDTHS = (0.0, 3.0, 3.0, 1.5, 0.7, 0.3, 0.1, 0.0, 0.0)
+"""Widths of the differences from step to step, in standard errors of the initial states; 0 is `DIFFERENCE`."""
+RESETTLING = (1.0, 0.3, 0.0)
+"""The same after a step of the parameters, by which initial states have moved little."""
+RESTARTS = 5
+"""Number of times that windows whose residuals are more than noise begin anew, near the guess of their state."""
+BEYOND = 3.0
+"""Standard deviations of a window's cost under noise alone, above its mean; a higher cost is more than noise."""
+FEW = 0.01
+"""Share in [0, 1] of the windows whose residuals are more than noise, up to which no more is tried."""
+FOLLOWED = (1.0, 0.3)
+"""Shares in (0, 1] of a step that are tried: at contacts the whole one may be too far."""
+FIRST_DAMPING = 1e-2
+"""Damping of the first step, relative to the squared lengths of the columns."""
+DAMPING_RANGE = (1e-9, 1e6)
+"""Smallest and largest relative damping of an initial state's step; it is clipped to them."""
+WIDE_DAMPING = 1.0
+"""Largest relative damping after a step by wide differences, as the next ones are of other slopes."""
+LEAST_DAMPING = 1e-9
+"""Damping of an initial state where only its covariance is computed, relative to the squared lengths of the columns."""
+FAILED_WINDOW = 1e6
+"""Cost of a window whose simulation failed, in squared standard deviations of the noise; no cost is larger."""
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Initial states after a step.
+
+    Attributes:
+        states: Each window's.
+        damping: Relative damping of each window's next step.
+        errors: Standard error of each value of (qpos, qvel), median over the windows, in standard deviations of the
+            value over the log; at most 1.
+        deviation: Noise of each channel, in its typical changes: what no initial state explains, to first order.
+        costs: Mean loss of each window's residuals after the step, in squared standard deviations of the noise.
+        failures: Windows whose simulation failed before it.
+        simulations: Windows simulated.
+    """
+
+    states: Float[np.ndarray, "windows state"]
+    damping: Float[np.ndarray, " windows"]
+    errors: Float[np.ndarray, " physical"]
+    deviation: Float[np.ndarray, " channels"]
+    costs: Float[np.ndarray, " windows"]
+    failures: int
+    simulations: int
+
+    def unexplained(self, values: int, loss: Loss) -> Bool[np.ndarray, " windows"]:
+        """Windows of so many values whose residuals are more than noise."""
+        mean, deviation = cost_of_noise(loss)
+        return self.costs > mean + BEYOND * deviation / np.sqrt(values)
+
+
+def settle(
+    simulator: Simulator,
+    readings: Readings,
+    point: Float[np.ndarray, " d"],
+    states: Float[np.ndarray, "windows state"],
+    damping: Float[np.ndarray, " windows"],
+    width: Float[np.ndarray, " physical"],
+    loss: Loss,
+) -> Settled:
+    """One damped Gauss-Newton step of every window's initial state, of which a window takes the share that fits best.
+
+    `width` is that of the differences, in standard deviations of each value over the log, at least `DIFFERENCE`. It
+    takes 1 + n + 2 simulations of every window, for states of n values.
+    """
+    (slopes,) = slopes_at(simulator, readings, point[None], states[None], parameters=False, width=width)
+    deviation, errors = _noise_and_errors(slopes, readings)
+    scaled = slopes.over(np.tile(deviation, readings.steps + 1))
+    weights = loss_slope((scaled.residuals / TUNING[loss]) ** 2, loss) * scaled.whole[:, None]
+    step = eliminate(scaled, weights, damping).states_step(np.zeros(0))
+    shares = np.array(FOLLOWED)[:, None, None]
+    moved = states + shares * readings.in_state_units(step, states.shape[1])
+    after = readings.residuals(simulator, point[None], moved.reshape(1, -1, states.shape[1]))[0]
+    whole = np.where(slopes.whole[:, None], slopes.residuals, np.nan)
+    costs = window_costs(np.concatenate([after, whole[None]]) / np.tile(deviation, readings.steps + 1), loss)
+    best = costs.argmin(0)
+    factor = np.array([0.1, 1.0, 10.0])[best]
+    most = WIDE_DAMPING if (width > DIFFERENCE).any() else DAMPING_RANGE[1]
+    return Settled(
+        states=np.concatenate([moved, states[None]])[best, np.arange(len(states))],
+        damping=np.clip(damping * factor, DAMPING_RANGE[0], most),
+        errors=errors,
+        deviation=deviation,
+        costs=costs.min(0),
+        failures=int((~slopes.whole).sum()),
+        simulations=len(readings) * (1 + len(readings.spread) + len(FOLLOWED)),
+    )
+
+
+def restart(
+    simulator: Simulator,
+    readings: Readings,
+    point: Float[np.ndarray, " d"],
+    guesses: Float[np.ndarray, "windows state"],
+    before: Settled,
+    loss: Loss,
+    random: np.random.Generator,
+) -> Settled:
+    """Settle anew the windows whose residuals are more than noise, and keep what fits each of them better.
+
+    They begin at their guess and a normal error of the size of the states' standard errors.
+    """
+    worse = np.flatnonzero(before.unexplained(readings.observed[0].size, loss))
+    if not len(worse):
+        return before
+    part = readings.of(worse)
+    error = before.errors * random.standard_normal((len(worse), len(before.errors)))
+    states = guesses[worse] + readings.in_state_units(error, guesses.shape[1])
+    damping, simulations = np.full(len(worse), FIRST_DAMPING), 0
+    for width in WIDTHS[1:]:
+        after = settle(simulator, part, point, states, damping, width * before.errors, loss)
+        states, damping, simulations = after.states, after.damping, simulations + after.simulations
+    residuals = part.residuals(simulator, point[None], states[None])[0, 0]
+    costs = window_costs(residuals / np.tile(before.deviation, readings.steps + 1), loss)
+    better = costs < before.costs[worse]
+    new_states, new_damping, new_costs = before.states.copy(), before.damping.copy(), before.costs.copy()
+    chosen = worse[better]
+    new_states[chosen], new_damping[chosen], new_costs[chosen] = states[better], damping[better], costs[better]
+    return replace(
+        before,
+        states=new_states,
+        damping=new_damping,
+        costs=new_costs,
+        simulations=before.simulations + simulations + len(worse),
+    )
+
+
+@cache
+def cost_of_noise(loss: Loss) -> tuple[float, float]:
+    """Mean and standard deviation of the loss of a value that is normal noise, in squared standard deviations of it."""
+    at, weights = np.polynomial.hermite_e.hermegauss(100)
+    weights, losses = weights / weights.sum(), window_costs(at[:, None], loss)
+    mean = float(weights @ losses)
+    return mean, float(np.sqrt(weights @ (losses - mean) ** 2))
+
+
+def window_costs(residuals: Float[np.ndarray, "*windows values"], loss: Loss) -> Float[np.ndarray, "*windows"]:
+    """Mean loss of each window's residuals in standard deviations of the noise, at most `FAILED_WINDOW`."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        cost = TUNING[loss] ** 2 * loss_value((residuals / TUNING[loss]) ** 2, loss).mean(-1)
+    return np.where(np.isfinite(cost), np.minimum(cost, FAILED_WINDOW), FAILED_WINDOW)
+
+
+def _noise_and_errors(
+    slopes: WindowSlopes, readings: Readings
+) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " physical"]]:
+    """Noise of each channel by what initial states cannot explain, and the states' standard errors that follow."""
+    windows, least = len(readings), np.full(len(readings), LEAST_DAMPING)
+    shape = (windows, *readings.observed.shape[1:])
+    alike = eliminate(slopes, np.ones_like(slopes.residuals), least)
+    left = alike.reduced.residuals[:, : shape[1] * shape[2]].reshape(shape)
+    deviation = channel_noise(left[slopes.whole], alike.spare.reshape(shape)[slopes.whole])
+    if not slopes.whole.any():
+        return deviation, np.zeros(len(readings.spread))
+    by_states = slopes.by_states[slopes.whole] / np.tile(deviation, readings.steps + 1)[:, None]
+    factor = states_basis(by_states, least[slopes.whole])[1]
+    errors = np.linalg.norm(np.linalg.inv(factor), axis=-1)
+    return deviation, np.minimum(np.median(errors, axis=0), 1.0)

@@ -1,0 +1,75 @@
+"""Initial states of windows: the cost of noise, a smooth robot in two steps, a contact by wide differences."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from madoc import simulation, tasks
+from madoc.calibration import CalibrationProblem
+from madoc.data import Disturbance, disturb
+from madoc.identification import settling
+from madoc.identification.replay import Readings
+from madoc.identification.settling import FAILED_WINDOW, Settled, cost_of_noise, restart, settle, window_costs
+from robots import SPRING_TRUTH, recorded, spring
+
+
+def windows(task, truth, steps, noise):
+    """Readings of windows, and their initial states as read with noise."""
+    log = recorded(task, truth, 600, jax.random.key(0))
+    noisy = replace(disturb(log, Disturbance(noise=noise), task, jax.random.key(1)), disturbance=Disturbance())
+    problem = CalibrationProblem(noisy, simulation.make(task, threads=1))
+    rows = np.arange(0, 600 - steps, steps + 1)
+    rows = rows[rows % task.max_episode_steps + steps < task.max_episode_steps]
+    readings = Readings.at(noisy, problem.states, rows, steps, problem.typical_change)
+    guesses = problem.states.states[np.searchsorted(problem.states.rows, rows)]
+    return problem.simulator, readings, guesses
+
+
+def descended(simulator, readings, guesses, point, widths):
+    states, damping, errors = guesses, np.full(len(guesses), settling.FIRST_DAMPING), np.zeros(len(readings.spread))
+    for width in widths:
+        after = settle(simulator, readings, point, states, damping, width * errors, "cauchy")
+        states, damping, errors = after.states, after.damping, after.errors
+    return after
+
+
+def test_the_cost_of_normal_noise():
+    assert cost_of_noise("linear") == pytest.approx((1.0, np.sqrt(2.0)))
+    draws = np.random.default_rng(0).standard_normal((400_000, 1))
+    costs = window_costs(draws, "cauchy")
+    assert cost_of_noise("cauchy") == pytest.approx((costs.mean(), costs.std()), rel=0.01)
+    assert window_costs(np.array([[np.nan]]), "cauchy") == FAILED_WINDOW
+
+
+def test_a_window_is_unexplained_beyond_three_deviations_of_its_cost():
+    limit = 1.0 + 3.0 * np.sqrt(2.0) / 10.0
+    costs = np.array([1.0, limit - 1e-6, limit + 1e-6])
+    some = Settled(np.zeros((3, 1)), np.ones(3), np.ones(1), np.ones(1), costs, 0, 0)
+    assert some.unexplained(100, "linear").tolist() == [False, False, True]
+
+
+def test_states_of_a_smooth_robot_settle_in_two_steps_at_any_width():
+    task = spring(max_episode_steps=100)
+    simulator, readings, guesses = windows(task, SPRING_TRUTH, 9, 0.1)
+    point = task.parameters.to_unit(task.parameters.vector(SPRING_TRUTH))
+    narrow, wide = (descended(simulator, readings, guesses, point, widths) for widths in ((0, 0), (0, 3)))
+    np.testing.assert_allclose(narrow.states, wide.states, atol=2e-4)
+    np.testing.assert_allclose(narrow.deviation, 0.1, rtol=0.3)
+    assert not narrow.unexplained(readings.observed[0].size, "cauchy").any()
+    assert narrow.simulations == len(readings) * 5
+
+
+def test_wide_differences_and_restarts_find_states_at_contacts():
+    task = tasks.make("halfcheetah", "legacy")
+    truth = dict(zip(task.parameters.names, task.parameters.middle.tolist(), strict=True))
+    simulator, readings, guesses = windows(task, truth, 5, 0.1)
+    point, values = np.zeros(len(truth)), readings.observed[0].size
+    narrow = descended(simulator, readings, guesses, point, np.zeros(len(settling.WIDTHS)))
+    wide = descended(simulator, readings, guesses, point, settling.WIDTHS)
+    again = restart(simulator, readings, point, guesses, wide, "cauchy", np.random.default_rng(0))
+    missed = [int(each.unexplained(values, "cauchy").sum()) for each in (narrow, wide, again)]
+    assert missed[0] > 2 * missed[1] > 0
+    assert missed[2] < missed[1]
+    assert (again.costs <= wide.costs).all()
