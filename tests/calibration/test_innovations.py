@@ -1,12 +1,14 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, Madoc, Prior
-from madoc.calibration.madoc import innovations
+from madoc.calibration.madoc import innovations, slopes
+from madoc.calibration.madoc.actors import Actors
 from madoc.calibration.madoc.agents import OF_INNOVATIONS
 from madoc.calibration.madoc.watch import SETTLING
 from madoc.data import Disturbance
@@ -34,12 +36,15 @@ def rollout_of(problem, valid=None):
 
 
 def seen(problem, reference=None, estimate=None, rollout=None):
-    scaling = problem.features.standardised
+    """With actors at the physical values `estimate`, a tenth wide before squashing."""
+    scaling, space = problem.features.standardised, problem.simulator.parameters
+    mean = np.arctanh(space.to_unit(space.middle if estimate is None else estimate))
     return innovations.seen(
         problem,
         scaling,
-        innovations.no_reference(problem, scaling) if reference is None else reference,
-        problem.simulator.parameters.middle if estimate is None else estimate,
+        innovations.no_reference(problem, scaling, KEY) if reference is None else reference,
+        Actors(mean, np.full(len(space), np.log(0.1))),
+        np.zeros((4, len(space))),
         rollout_of(problem) if rollout is None else rollout,
         KEY,
     )
@@ -72,16 +77,32 @@ def test_the_scale_is_that_of_logged_and_simulated_innovations_together():
     problem = problem_of()
     middle = problem.simulator.parameters.middle
     found = seen(problem)
-    assert (found.reference.age, found.control_steps) == (0, 120 + 400)
+    assert (found.reference.age, found.control_steps) == (0, 120 + 400 + 150 * 3)
     logged = innovations.innovations(problem.simulator, middle, problem.dataset.transitions)
-    squares = np.concatenate([logged, logged[:120]]) ** 2
-    scale = np.sqrt(np.minimum(squares, np.quantile(squares, 0.99, axis=0)).mean(0))
-    np.testing.assert_allclose(found.reference.scale, np.maximum(scale, 1e-3 * problem.typical_change))
-    # asinh(3 e / scale) / 3
-    features = np.arcsinh(3.0 * logged / found.reference.scale) / 3.0
-    np.testing.assert_allclose(found.following.reshape(120, 2), features[:120], rtol=1e-5, atol=1e-7)
-    assert sorted(found.reference.following[:, 1].tolist()) == sorted(features[:, 1].astype(np.float32).tolist())
-    assert found.reference.size(2.0 * found.reference.scale) == pytest.approx(0.5)
+    scale = np.median(np.abs(np.concatenate([logged, logged[:120]])), axis=0)
+    reference = found.reference
+    np.testing.assert_allclose(reference.scale, np.maximum(scale, 1e-4 * problem.typical_change))
+    np.testing.assert_allclose(reference.slopes.floor, reference.scale / problem.typical_change, rtol=1e-6)
+    np.testing.assert_allclose(reference.slopes.deviation, 0.1, rtol=1e-6)
+    pair = problem.features.standardised.features(problem.dataset.transitions)[0]
+    spread = slopes.shares(reference.slopes, jnp.asarray(pair))[1]
+    features = np.arcsinh(logged / problem.typical_change / spread)
+    np.testing.assert_allclose(found.following.reshape(120, 2), features[:120], rtol=1e-3, atol=1e-6)
+    assert sorted(reference.following[:, 1].tolist()) == pytest.approx(sorted(features[:, 1].tolist()), rel=1e-3)
+    assert reference.size(2.0 * reference.scale) == pytest.approx(0.5)
+
+
+def test_derivatives_by_hand():
+    problem = problem_of(spring(Parameter("jnt_stiffness", "slide", 2.0, 6.0)))
+    rows, space = problem.dataset.transitions, problem.simulator.parameters
+    known = innovations.innovations(problem.simulator, space.middle, rows)
+    found = innovations._derivatives(problem, np.zeros(1), rows, known)
+    # A stiffness larger by 2 N/m, half the range, takes 2 · x h / m from the next speed; the cart has 2 kg.
+    position, step = rows.observation[:, 0], problem.simulator.control_step
+    far = np.abs(position) > 0.05
+    assert found.shape == (400, 2, 1)
+    expected = -2.0 * position[far] * step / 2.0 / problem.typical_change[1]
+    np.testing.assert_allclose(found[far, 1, 0], expected, rtol=0.1)
 
 
 def test_rounding_of_a_log_is_no_difference():
@@ -101,7 +122,7 @@ def test_a_reference_is_renewed_at_the_estimate_once_it_is_due():
     kept = seen(problem, first, truth)
     assert (kept.reference.age, kept.control_steps) == (1, 120)
     np.testing.assert_array_equal(kept.reference.parameters, first.parameters)
-    renewed = seen(problem, replace(first, age=innovations.RENEWAL - 1), truth).reference
+    renewed = seen(problem, replace(kept.reference, age=innovations.RENEWAL - 1), truth).reference
     assert renewed.age == 0
     np.testing.assert_array_equal(renewed.parameters, truth)
 
@@ -155,7 +176,7 @@ def test_innovations_begin_where_rows_overlap_and_a_checkpoint_holds_them(monkey
         assert state.reference is not None
         ages.append(state.reference.age)
     assert ages == [-1] * (SETTLING + 1) + [0, 1]
-    assert spent == [200] * (SETTLING + 1) + [800, 400]  # simulated, predicted, and 400 logged rows
+    assert spent == [200] * (SETTLING + 1) + [1250, 400]  # simulated, predicted, 400 logged rows, derivatives of 150
     assert state.watch.began == SETTLING + 1
     middle = problem.simulator.parameters.middle
     assert state.reference is not None

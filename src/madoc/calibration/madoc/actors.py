@@ -28,6 +28,12 @@ def initial_actors(count: int) -> Actors:
     return Actors(jnp.zeros(count), jnp.zeros(count))
 
 
+def squashed(actors: Actors) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """The actors' deterministic output in [-1, 1], and their deviations there, to first order."""
+    mean = np.tanh(np.asarray(actors.mean, np.float64))
+    return mean, (1.0 - mean**2) * np.exp(np.asarray(actors.log_std, np.float64))
+
+
 def draw_parameters(
     actors: Actors, key: PRNGKeyArray, count: int
 ) -> tuple[Float[Array, "count d"], Float[Array, " count"]]:

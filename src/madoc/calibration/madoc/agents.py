@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_parameters, prior_weight
+from madoc.calibration.madoc.slopes import Slopes, redrawn
 from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
@@ -29,18 +30,21 @@ class Resolution:
         largest: Upper limit of the blur.
         entropy_weight: α of Eq. (13). The entropy holds a parameter of small effect at the middle of its range where
             the reward is too blunt to move it; where the reward is sharp, less of it will do.
+        prior_rate: Rate of the prior's moving average. The actors move as fast as the prior follows them, so it is
+            slow where their steps are noisy.
     """
 
     blur: float
     smallest: float
     largest: float
     entropy_weight: float
+    prior_rate: float
 
 
-OF_CHANGES = Resolution(blur=0.3, smallest=0.01, largest=0.3, entropy_weight=0.05)
+OF_CHANGES = Resolution(blur=0.3, smallest=0.01, largest=0.3, entropy_weight=0.05, prior_rate=0.1)
 """Where s' is described by its change or as it is; the entropy's weight is the paper's."""
-OF_INNOVATIONS = Resolution(blur=0.5, smallest=0.01, largest=3.0, entropy_weight=0.01)
-"""Where s' is described by its innovation, whose scale is the spread that the actors leave."""
+OF_INNOVATIONS = Resolution(blur=2.0, smallest=0.01, largest=10.0, entropy_weight=0.01, prior_rate=0.3)
+"""Where s' is described by its innovation in multiples of the spread that the actors leave."""
 
 
 @jax.tree_util.register_dataclass
@@ -93,7 +97,7 @@ class AgentSettings:
         entropy_weight: α of Eq. (13); None takes that of the `Resolution`.
         prior_time: Number of updates in which λ of Eq. (13) grows by the factor e.
         prior_largest: Largest λ of Eq. (13).
-        prior_rate: Rate of the prior's moving average.
+        prior_rate: Rate of the prior's moving average; None takes that of the `Resolution`.
         prior_every: Updates between two moves of the prior.
         average_rate: Rate of the moving average from which the estimate is read.
         baseline: Whether b of Eq. (11) depends on (s, a), where credit has one (`dop`); in the paper it does not.
@@ -116,7 +120,7 @@ class AgentSettings:
     entropy_weight: NotNegative | None = None
     prior_time: Positive = 2e5
     prior_largest: NotNegative = 10.0
-    prior_rate: NotNegative = 0.1
+    prior_rate: NotNegative | None = None
     prior_every: Count = 10
     average_rate: NotNegative = 1e-3
     baseline: bool = True
@@ -172,6 +176,7 @@ class AgentSettings:
         resolution: Resolution,
         count: int,
         told: Bool[Array, " d"] | None = None,
+        slopes: Slopes | None = None,
     ) -> tuple[Agents, dict[str, Array]]:
         """`count` updates, Algorithm 1, lines 13 to 19, and the mean of each metric.
 
@@ -179,12 +184,15 @@ class AgentSettings:
 
         The discriminators learn from blurred s'; the reward is computed at s' without blur, where it is least noisy.
         Simulated rows are columns `pair`, `following` and `parameters` (in [-1, 1]), logged rows are (pair, following).
+        With `slopes`, each simulated row is seen as under a fresh draw of the actors.
         """
 
         def update(agents: Agents, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
-            of_logged, of_simulated, of_blur, of_dropout, of_actors = jax.random.split(key, 5)
+            of_logged, of_simulated, of_blur, of_dropout, of_actors, of_draws = jax.random.split(key, 6)
             rows = jax.random.randint(of_logged, (self.batch,), 0, len(logged[0]))
             drawn = replay.sample(simulated, of_simulated, self.batch)
+            if slopes is not None:
+                drawn = redrawn(slopes, drawn, draw_parameters(agents.actors, of_draws, self.batch)[0])
             scale = jnp.exp(agents.log_blur) if self.reward_size else 0.0
             target, source = blur((logged[1][rows], drawn["following"]), scale, of_blur)
             agents, metrics = self._update_discriminators(
@@ -265,7 +273,7 @@ class AgentSettings:
         loss, gradients = jax.value_and_grad(loss_of)(agents.actors)
         actors, optimiser = descend(adam(self.actor_rate), gradients, agents.actor_optimiser, agents.actors)
         due = (agents.updates + 1) % self.prior_every == 0
-        prior_rate = jnp.where(due, self.prior_rate, 0.0)
+        prior_rate = jnp.where(due, resolution.prior_rate if self.prior_rate is None else self.prior_rate, 0.0)
         prior_rate = prior_rate if told is None else jnp.where(told, 0.0, prior_rate)
         following = replace(
             agents,

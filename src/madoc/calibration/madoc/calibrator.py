@@ -14,7 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.madoc import effects, grouping, innovations, watch
-from madoc.calibration.madoc.actors import draw_parameters
+from madoc.calibration.madoc.actors import draw_parameters, squashed
 from madoc.calibration.madoc.agents import OF_CHANGES, OF_INNOVATIONS, Agents, AgentSettings, Resolution
 from madoc.calibration.madoc.beginning import first_actors, sentence, told
 from madoc.calibration.madoc.collection import Collection, Features, StartMode, geometry
@@ -64,7 +64,7 @@ class Madoc:
             physics, `epoch_steps` if groups are learned.
         grouping_updates: Updates of the VAE in each epoch of grouping, rounded up to tens while groups are voted on.
         epoch_steps: Control steps of rollouts in an epoch. Predictions for innovations take as many again, and those of
-            logged rows at a new reference come on top.
+            logged rows at a new reference, with derivatives of a few, come on top.
         updates: Calibration updates in an epoch.
         draws: Parameter draws in an epoch; None takes 100, of `policy` 20 for up to `FEW` parameters.
         horizon: Control steps under one draw; None takes 1 for `replay`, 5 for `logged`, for `policy` 10, or 50 for up
@@ -128,10 +128,10 @@ class Madoc:
         count, groups = len(problem.simulator.parameters), self._group_count(problem)
         collection = self.collection(problem)
         window, following = collection.scaling.sizes
-        of_policy, of_vae, of_agents, of_start, key = jax.random.split(key, 5)
+        of_policy, of_vae, of_agents, of_start, of_slopes, key = jax.random.split(key, 6)
         vae = GroupingVAE(count, window, following, self.hidden, key=of_vae)
         seen = self._sees_innovations(problem, collection)
-        reference = innovations.no_reference(problem, collection.scaling.scaling) if seen else None
+        reference = innovations.no_reference(problem, collection.scaling.scaling, of_slopes) if seen else None
         agents = self._fresh_agents(problem, OF_CHANGES, of_agents)
         logged, time_limit = problem.dataset.transitions, problem.simulator.task.max_episode_steps
         return MadocState(
@@ -162,13 +162,12 @@ class Madoc:
 
     def estimate(self, problem: CalibrationProblem, state: MadocState) -> Estimate:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
-        space, best = problem.simulator.parameters, state.watch.best
-        scaled, std = np.tanh(np.asarray(best.mean, np.float64)), np.exp(np.asarray(best.log_std, np.float64))
+        space, (scaled, std) = problem.simulator.parameters, squashed(state.watch.best)
         grouped = state.grouped == self.grouping_epochs
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
             mean=space.to_physical(scaled),
-            std=(1.0 - scaled**2) * std * (space.high - space.low) / 2.0,
+            std=std * (space.high - space.low) / 2.0,
             groups=tuple(tuple(group) for group in groups),
             group_stability=state.stability if self._finds_groups(state) and grouped else None,
             failures=state.failures,
@@ -335,15 +334,12 @@ class Madoc:
         logged, described, resolution = collection.logged, None, OF_CHANGES
         steps, failures, unit = rollout.valid.size, rollout.failures, 1.0
         if reference is not None and (reference.age >= 0 or innovations.may_begin(problem, watched)):
-            estimate = problem.simulator.parameters.to_physical(np.tanh(np.asarray(agents.actors.mean, np.float64)))
-            seen = innovations.seen(problem, collection.scaling.scaling, reference, estimate, rollout, of_reference)
+            scaling, actors = collection.scaling.scaling, agents.actors
+            seen = innovations.seen(problem, scaling, reference, actors, draws, rollout, of_reference)
             steps, failures = steps + seen.control_steps, failures + seen.failures
             if seen.following is not None:
                 if reference.age < 0:
                     agents, watched = self._begun_again(problem, state, of_networks), watch.begin_again(watched)
-                elif seen.reference.age == 0:
-                    was, now = (each.size(problem.typical_change) for each in (reference, seen.reference))
-                    agents = replace(agents, log_blur=agents.log_blur + np.float32(np.log(was / now)))
                 rows = replay.clear(rows) if seen.reference.age == 0 else rows
                 reference, described, resolution = seen.reference, seen.following, OF_INNOVATIONS
                 logged = reference.pair, reference.following
@@ -364,6 +360,7 @@ class Madoc:
             resolution=resolution,
             count=self.updates,
             told=told(problem),
+            slopes=reference.slopes if reference is not None and described is not None else None,
         )
         metrics = scalars(device_metrics)
         watched = watch.observe(

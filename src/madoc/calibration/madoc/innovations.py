@@ -2,11 +2,11 @@
 
 A discriminator that sees s' - s has to learn the robot's motion more exactly than a parameter changes it, and some
 change it by a hundredth of its usual size. The innovation e = s' - f(s, a; ξ̂), in filtering the term for a measurement
-less its prediction (Kailath 1968), is without that motion: where ξ̂ is the truth it is 0 in logged rows, and about
-J (ξ - ξ̂) in rows simulated under ξ. The reference ξ̂ is renewed from time to time, and the scale of e with it, so that
-parameters of small effect are seen once those of large effect are known. Not in the paper; an observation has to
-determine the state. Discriminators begin with s' - s: while simulated rows are seldom where logged ones are, the few
-logged rows that are predicted say too little.
+less its prediction (Kailath 1968), is without that motion: where ξ̂ is the truth it is 0 in logged rows, and about J (ξ
+- ξ̂) in rows simulated under ξ. `slopes` learns J, in whose spread e is seen. The reference ξ̂ is renewed from time to
+time, and the spread with it, so that parameters of small effect are seen once those of large effect are known. Not in
+the paper; an observation has to determine the state. Discriminators begin with s' - s: while simulated rows are seldom
+where logged ones are, the few logged rows that are predicted say too little.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +17,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.madoc import slopes
+from madoc.calibration.madoc.actors import Actors, squashed
 from madoc.calibration.madoc.beginning import told
+from madoc.calibration.madoc.slopes import Slopes
 from madoc.calibration.madoc.watch import Watch, overlaps
 from madoc.learning.features import Scaling
 from madoc.simulation.base import Simulator
@@ -32,13 +35,8 @@ OVERLAP = 0.3
 """Mean overlap of logged and simulated (s, a), in [0, 1], from which discriminators go on to innovations."""
 LOUDEST = 0.03
 """Noise of the sensors, in typical changes of a signal, above which a prediction from a reading tells too little."""
-IMPACTS = 0.99
-"""Quantile of the squared innovations of a channel beyond which they do not raise its scale."""
-FINEST = 1e-3
+FINEST = 1e-4
 """Smallest scale of a channel, in its typical changes: finer differences are rounding, of the log or the model."""
-LINEAR = 3.0
-"""Features are asinh(3 e / scale) / 3: linear up to a third of the scale, logarithmic beyond, as innovations at impacts
-are a hundred times those in flight."""
 
 
 @jax.tree_util.register_dataclass
@@ -48,10 +46,12 @@ class Reference:
 
     Attributes:
         parameters: In physical units.
-        scale: Scale of each channel's innovations.
+        scale: Scale of each channel's innovations: the median of their absolute values, as those at impacts are a
+            hundred times those in flight.
         pair: Features of (s, a) of the logged rows.
         following: Features of their innovations.
         age: Epochs since it was chosen; negative before the first is.
+        slopes: The derivatives of s', and the spreads by which features are innovations.
     """
 
     parameters: Float[np.ndarray, " d"]
@@ -59,6 +59,7 @@ class Reference:
     pair: Float[Array, "rows pair"]
     following: Float[Array, "rows observation"]
     age: int
+    slopes: Slopes
 
     def size(self, typical_change: Float[np.ndarray, " observation"]) -> float:
         """Root mean square, over channels, of the scale in typical changes: the unit of the features."""
@@ -104,41 +105,62 @@ def obstacle(problem: CalibrationProblem, window: int, noise: Float[np.ndarray, 
     return "" if window == 1 else f"discriminators see windows of {window} rows"
 
 
-def no_reference(problem: CalibrationProblem, scaling: Scaling) -> Reference:
+def no_reference(problem: CalibrationProblem, scaling: Scaling, key: PRNGKeyArray) -> Reference:
     """The reference before the first: no row of the log is seen."""
-    rows, channels = min(ROWS, len(problem.states.rows)), len(scaling.next_scale)
+    rows, channels, space = min(ROWS, len(problem.states.rows)), len(scaling.next_scale), problem.simulator.parameters
     pair, following = jnp.zeros((rows, len(scaling.pair_offset))), jnp.zeros((rows, channels))
-    return Reference(problem.simulator.parameters.middle, np.ones(channels), pair, following, -1)
+    unknown = slopes.no_slopes(pair.shape[1], channels, len(space), key)
+    return Reference(space.middle, np.ones(channels), pair, following, -1, unknown)
 
 
 def seen(
     problem: CalibrationProblem,
     scaling: Scaling,
     reference: Reference,
-    estimate: Float[np.ndarray, " d"],
+    actors: Actors,
+    draws: Float[np.ndarray, "systems d"],
     rollout: Rollout,
     key: PRNGKeyArray,
 ) -> Seen:
-    """An epoch's simulated rows, from the reference or, where it is due, from a new one at the estimate.
+    """An epoch's rows, simulated under `draws`, from the reference or, where it is due, a new one at the actors' mean.
 
     A new reference at which no row of the log, or none of the rollout, can be predicted is not taken: the next epoch is
     to find another.
     """
+    (mean, deviation), space = squashed(actors), problem.simulator.parameters
+    estimate = space.to_physical(mean)
+    pair = scaling.features(rollout.transitions)[0]
     following = _of_rollout(problem, estimate if _due(reference) else reference.parameters, rollout)
     steps, failures = rollout.valid.size, _failed(problem, rollout.transitions, following, rollout.valid)
     if not _due(reference):
-        aged = replace(reference, age=reference.age + 1)
-        return Seen(aged, _features(following, reference.scale), steps, failures)
-    rows, logged = _of_log(problem, estimate, len(reference.pair), key)
+        learnt = _observed(problem, reference.slopes, pair, following, draws - space.to_unit(reference.parameters))
+        aged = replace(reference, age=reference.age + 1, slopes=learnt)
+        return Seen(aged, _features(problem, learnt, pair, following), steps, failures)
+    of_rows, of_slopes = jax.random.split(key)
+    rows, logged = _of_log(problem, estimate, len(reference.pair), of_rows)
     steps, failures = steps + len(logged), failures + _failed(problem, rows, logged, np.ones(len(logged), bool))
-    new = _measured(problem, scaling, estimate, rows, logged, following)
-    if new is not None:
-        return Seen(new, _features(following, new.scale), steps, failures)
+    scale = _scale(problem, logged, following)
+    if scale is not None:
+        kept = np.resize(np.flatnonzero(np.isfinite(logged).all(-1)), len(logged))
+        known, logged = scaling.features(rows.take(kept))[0], logged[kept]
+        probed = slice(min(slopes.PROBED, len(kept)))
+        derivatives = _derivatives(problem, mean, rows.take(kept[probed]), logged[probed])
+        learnt = replace(
+            _observed(problem, reference.slopes, pair, following, draws - mean),
+            deviation=jnp.asarray(deviation, jnp.float32),
+            floor=jnp.asarray(scale / problem.typical_change, jnp.float32),
+        )
+        learnt = slopes.learn(learnt, known[probed], derivatives, of_slopes)
+        seen_of_log = jnp.asarray(_features(problem, learnt, known, logged))
+        new = Reference(estimate, scale, jnp.asarray(known), seen_of_log, 0, learnt)
+        steps += len(derivatives) * len(mean)
+        return Seen(new, _features(problem, learnt, pair, following), steps, failures)
     if reference.age < 0:
         return Seen(reference, None, steps, failures)
     following = _of_rollout(problem, reference.parameters, rollout)
     failures += _failed(problem, rollout.transitions, following, rollout.valid)
-    return Seen(reference, _features(following, reference.scale), steps + rollout.valid.size, failures)
+    steps += rollout.valid.size
+    return Seen(reference, _features(problem, reference.slopes, pair, following), steps, failures)
 
 
 def innovations(
@@ -184,25 +206,32 @@ def _of_log(
     return rows, innovations(problem.simulator, parameters, rows)
 
 
-def _measured(
+def _scale(
     problem: CalibrationProblem,
-    scaling: Scaling,
-    parameters: Float[np.ndarray, " d"],
-    rows: Transitions,
     logged: Float[np.ndarray, "rows observation"],
     simulated: Float[np.ndarray, "*rows observation"],
-) -> Reference | None:
-    """The reference of these rows, in the scale of logged and simulated innovations together; None without any."""
-    finite, of_simulated = np.isfinite(logged).all(-1), _flat(simulated)
-    of_simulated = of_simulated[np.isfinite(of_simulated).all(-1)]
-    if not finite.any() or not len(of_simulated):
+) -> Float[np.ndarray, " observation"] | None:
+    """The scale of logged and simulated innovations together; None where there are none of either."""
+    known = [each[np.isfinite(each).all(-1)] for each in (logged, _flat(simulated))]
+    if not all(map(len, known)):
         return None
-    squares = np.concatenate([logged[finite], of_simulated]) ** 2
-    scale = np.sqrt(np.minimum(squares, np.quantile(squares, IMPACTS, axis=0)).mean(0))
-    scale = np.maximum(scale, FINEST * problem.typical_change)
-    kept = np.resize(np.flatnonzero(finite), len(rows.observation))
-    pair = jnp.asarray(scaling.features(rows.take(kept))[0])
-    return Reference(parameters, scale, pair, jnp.asarray(_features(logged[kept], scale)), 0)
+    return np.maximum(np.median(np.abs(np.concatenate(known)), axis=0), FINEST * problem.typical_change)
+
+
+def _derivatives(
+    problem: CalibrationProblem,
+    point: Float[np.ndarray, " d"],
+    rows: Transitions,
+    known: Float[np.ndarray, "rows observation"],
+) -> Float[np.ndarray, "rows observation d"]:
+    """Derivatives of s' by the parameters in [-1, 1], in typical changes; `known` are the innovations at the point.
+
+    They are one-sided differences, of d control steps a row.
+    """
+    moves = np.where(point > 0.0, -slopes.STEP, slopes.STEP)
+    points = problem.simulator.parameters.to_physical(point + np.diag(moves))
+    moved = [innovations(problem.simulator, values, rows) for values in points]
+    return (known[..., None] - np.stack(moved, axis=-1)) / moves / problem.typical_change[:, None]
 
 
 def _failed(
@@ -222,10 +251,26 @@ def _flat(column: np.ndarray | Array) -> Float[np.ndarray, "rows channels"]:
     return np.asarray(column, dtype=np.float64).reshape(-1, column.shape[-1])
 
 
+def _observed(
+    problem: CalibrationProblem,
+    learnt: Slopes,
+    pair: Float[np.ndarray, "*rows pair"],
+    found: Float[np.ndarray, "steps systems rows observation"],
+    moved: Float[np.ndarray, "systems d"],
+) -> Slopes:
+    of_rows = np.broadcast_to(moved[:, None], (*found.shape[:-1], moved.shape[1]))
+    return slopes.observe(learnt, _flat(pair), _flat(found) / problem.typical_change, _flat(of_rows))
+
+
 def _features(
-    innovations: Float[np.ndarray, "*rows observation"], scale: Float[np.ndarray, " observation"]
+    problem: CalibrationProblem,
+    learnt: Slopes,
+    pair: Float[np.ndarray, "*rows pair"],
+    found: Float[np.ndarray, "*rows observation"],
 ) -> Float[np.ndarray, "*rows observation"]:
-    return (np.arcsinh(LINEAR * innovations / scale) / LINEAR).astype(np.float32)
+    change = (_flat(found) / problem.typical_change).astype(np.float32)
+    features = slopes.standardised(learnt, jnp.asarray(pair.reshape(-1, pair.shape[-1])), jnp.asarray(change))
+    return np.asarray(features).reshape(found.shape)
 
 
 def may_begin(problem: CalibrationProblem, watched: Watch) -> bool:
