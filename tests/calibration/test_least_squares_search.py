@@ -6,12 +6,13 @@ import jax
 import numpy as np
 import pytest
 
-from madoc import simulation
+from madoc import simulation, tasks
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.plan import Outcome, Plan
 from madoc.calibration.least_squares.search import Search, chosen
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
+from madoc.data import Disturbance, disturb
 from madoc.identification.losses import ALL_FAILED
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import windows_at
@@ -104,3 +105,40 @@ def test_known_windows_leave_the_residuals_of_a_replay():
     expected = window_residuals(problem.simulator, windows, point, problem.typical_change)[0]
     np.testing.assert_array_equal(plan.residuals, expected)
     assert (plan.steps[-1] == 0.0).all()
+
+
+def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_steps():
+    log = disturb(
+        recorded(SPRING, SPRING_TRUTH, 400, jax.random.key(0)), Disturbance(noise=0.1), SPRING, jax.random.key(1)
+    )
+    problem = CalibrationProblem(log, simulation.make(SPRING, threads=1))
+    search = Search(UnknownStarts, "cauchy", 5, 40, 1, 10, 1, 1e-7)
+    truth = SPRING.parameters.to_unit(SPRING.parameters.vector(SPRING_TRUTH))
+    first = search.init(problem, jax.random.key(1))
+    state = replace(first, point=truth[None], refining=1, waiting=UnknownStarts.waiting)
+    point = state.point.copy()
+    state, epoch = search.step(problem, state)
+    assert (state.waiting, state.rough) == (0, 0)
+    assert epoch.control_steps == 40 * 5 * (1 + 2 + 2)
+    np.testing.assert_array_equal(state.point, point)
+
+
+def test_at_contacts_states_settle_anew_after_each_step_of_the_parameters():
+    task = tasks.make("halfcheetah", "legacy")
+    truth = dict(zip(task.parameters.names, task.parameters.middle.tolist(), strict=True))
+    log = disturb(recorded(task, truth, 600, jax.random.key(0)), Disturbance(noise=0.1), task, jax.random.key(1))
+    problem = CalibrationProblem(log, simulation.make(task, threads=1))
+    search = Search(UnknownStarts, "cauchy", 4, 60, 1, 10, 1, 1e-7)
+    state = replace(search.init(problem, jax.random.key(1)), refining=1, waiting=UnknownStarts.waiting)
+    start = np.where(np.arange(len(truth)) % 2, 0.2, -0.2)[None]
+    state, before = replace(state, point=start), np.abs(start).mean()
+    while state.waiting:
+        state, _ = search.step(problem, state)
+    assert state.rough == 1
+    np.testing.assert_array_equal(state.point, start)
+    for _ in range(2):
+        states = state.states
+        state, epoch = search.step(problem, state)
+        assert (state.states != states).any()
+        assert epoch.control_steps >= 60 * 4 * (1 + 2 * len(truth) + 18 + 3 * 21)
+    assert np.abs(state.point[0]).mean() < 0.6 * before

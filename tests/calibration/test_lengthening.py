@@ -17,6 +17,7 @@ from madoc.calibration.least_squares.lengthening import (
     lengthened,
     noise_alone,
     tells_more,
+    widened,
 )
 from madoc.calibration.least_squares.search import Search
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
@@ -168,3 +169,19 @@ def test_what_the_model_does_wrong_ends_them(pendulum, tmp_path):
     assert state.unknown[LONGER].epochs > 0
     warnings = LeastSquares().estimate(problem, state).warnings
     assert any("the simulator leaves more than noise" in warning for warning in warnings)
+
+
+def test_more_windows_begin_with_the_states_of_the_first_and_the_readings_of_others(pendulum):
+    problem = problem_of(pendulum)
+    few, many = (
+        Search(UnknownStarts, "cauchy", 5, windows, 1, 4, 2, 1e-7).init(problem, jax.random.key(0))
+        for windows in (9, 20)
+    )
+    np.testing.assert_array_equal(many.rows[:9], few.rows)
+    settled = replace(few, point=few.point + 0.1, states=few.states + 1.0)
+    wider = widened(many, settled)
+    np.testing.assert_array_equal(wider.states[0, :9], settled.states[0])
+    np.testing.assert_array_equal(wider.states[0, 9:], many.states[0, 9:])
+    np.testing.assert_array_equal(wider.point, settled.point)
+    assert (wider.refining, wider.waiting) == (1, UnknownStarts.waiting)
+    assert difference(layout(wider), layout(many)) is None

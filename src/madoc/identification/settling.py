@@ -25,6 +25,8 @@ RESETTLING = (1.0, 0.3, 0.0)
 """The same after a step of the parameters, by which initial states have moved little."""
 RESTARTS = 5
 """Number of times that windows whose residuals are more than noise begin anew, near the guess of their state."""
+FARTHEST = 30.0
+"""Largest error of a guess in standard errors of the state: that of a velocity that jumps between two positions."""
 BEYOND = 3.0
 """Standard deviations of a window's cost under noise alone, above its mean; a higher cost is more than noise."""
 FEW = 0.01
@@ -121,13 +123,15 @@ def restart(
 ) -> Settled:
     """Settle anew the windows whose residuals are more than noise, and keep what fits each of them better.
 
-    They begin at their guess and a normal error of the size of the states' standard errors.
+    They begin at their guess and a normal error of the size of the states' standard errors or of up to `FARTHEST` times
+    that: where velocities jump, guesses may be far off.
     """
     worse = np.flatnonzero(before.unexplained(readings.observed[0].size, loss))
     if not len(worse):
         return before
     part = readings.of(worse)
-    error = before.errors * random.standard_normal((len(worse), len(before.errors)))
+    size = FARTHEST ** random.random((len(worse), 1)) * before.errors
+    error = np.minimum(size, 1.0) * random.standard_normal((len(worse), len(before.errors)))
     states = guesses[worse] + readings.in_state_units(error, guesses.shape[1])
     damping, simulations = np.full(len(worse), FIRST_DAMPING), 0
     for width in WIDTHS[1:]:

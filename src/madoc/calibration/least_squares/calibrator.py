@@ -92,7 +92,8 @@ class LeastSquares:
     exact, noise in them biases the estimate. With `estimated` ones each window's initial state is a further unknown,
     its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
     has settled, windows become three times as long, and again, while that narrows the intervals and residuals remain
-    noise: where motion is smooth, long windows hold more information, and they show model errors. By default states are
+    noise: where motion is smooth, long windows hold more information, and they show model errors. Where contacts forbid
+    longer windows, there are more of them in the end. By default states are
     estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of consecutive rows
     alternate as noise makes them: a reading that is too high makes the step to it look too long and the step from it
     too short.

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import TRIALS, Outcome, Plan
+from madoc.calibration.least_squares.statistics import touched
 from madoc.errors import MadocError
 from madoc.identification.gauss_newton import damped_step, triangular_factors
 from madoc.identification.information import bread, meat
@@ -59,14 +60,7 @@ class KnownStarts:
         problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
     ) -> Bool[np.ndarray, " windows"]:
         """Whether bodies were in contact at any logged state of a window, from its first to its last."""
-        states, known = problem.states.exact()
-        ends = problem.dataset.episode_ends[problem.dataset.episode_of(rows)]
-        touched = np.zeros(len(rows), dtype=bool)
-        for later in range(horizon + 1):
-            there = np.minimum(rows + later, ends - 1)
-            place = np.minimum(np.searchsorted(known, there), len(known) - 1)
-            touched |= problem.simulator.touching(states[place]) & (known[place] == there)
-        return touched
+        return touched(problem, *problem.states.exact(), rows, horizon)
 
     @staticmethod
     def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:

@@ -73,7 +73,7 @@ def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, 
         cost=shorter.cost[:1],
         moved=shorter.moved[:1],
         rows=chosen,
-        touching=np.zeros(len(chosen), dtype=bool),
+        touching=UnknownStarts.touched(problem, chosen, horizon),
         refining=1,
     )
 

@@ -52,7 +52,7 @@ class SearchState:
             squared standard deviations of the noise where initial states are unknown and the search refines.
         moved: The largest component of each search's last step, relative to one that matters; below 1 it has settled.
         rows: First rows of the windows.
-        touching: Whether a contact was seen in each window; False where initial states are unknown.
+        touching: Whether a contact was seen in each window, as far as its states are known.
         deviation: Noise of each channel in its typical changes; 1 where initial states are known.
         bread: Curvature of the best search's cost where it last linearised.
         meat: Scatter of the cost's gradient there.
@@ -205,7 +205,8 @@ class Search:
         first = state.waiting > self.starts.waiting - NARROW
         missed = windows.share_unexplained(after), float(np.sqrt(after.costs.mean()) * np.median(after.deviation))
         before = missed if first else state.missed
-        found = not first and (missed[0] <= FOUND[0] * before[0] or missed[1] <= FOUND[1] * before[1])
+        smooth = not state.touching.any()
+        found = not first and not smooth and (missed[0] <= FOUND[0] * before[0] or missed[1] <= FOUND[1] * before[1])
         following = replace(
             state,
             states=new_states,
@@ -214,8 +215,8 @@ class Search:
             deviation=after.deviation,
             settled_at=state.point[0].copy(),
             missed=before,
-            rough=int(found),
-            waiting=waiting,
+            rough=max(state.rough, int(found)),
+            waiting=0 if smooth and state.waiting < self.starts.waiting else waiting,
             failures=state.failures + after.failures,
         )
         noise = float(np.median(after.deviation))

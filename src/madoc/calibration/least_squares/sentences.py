@@ -13,7 +13,9 @@ EXACT = 1e-6
 NOT_SETTLED = (
     "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"
 )
-STILL_LENGTHENING = "longer windows were under way when it ended: a larger budget may narrow the intervals"
+STILL_LENGTHENING = (
+    "longer windows, or more of them, were under way when it ended: a larger budget may narrow the intervals"
+)
 
 
 def about_estimated_states(problem: CalibrationProblem, search: SearchState, horizon: int) -> str:

@@ -1,7 +1,7 @@
 """Statistics of residuals: which windows are outliers, and whether residuals are noise."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.identification.losses import NORMAL_MAD
@@ -32,6 +32,23 @@ def outlier_limits(
 
     middle = medians(values)
     return middle, OUTLIER * NORMAL_MAD * medians(np.abs(values - middle))
+
+
+def touched(
+    problem: CalibrationProblem,
+    states: Float[np.ndarray, "known state"],
+    known: Int[np.ndarray, " known"],
+    rows: Int[np.ndarray, " windows"],
+    horizon: int,
+) -> Bool[np.ndarray, " windows"]:
+    """Whether bodies were in contact at any state of a window, from its first to its last, whose row is known."""
+    ends = problem.dataset.episode_ends[problem.dataset.episode_of(rows)]
+    touching = np.zeros(len(rows), dtype=bool)
+    for later in range(horizon + 1):
+        there = np.minimum(rows + later, ends - 1)
+        place = np.minimum(np.searchsorted(known, there), len(known) - 1)
+        touching |= problem.simulator.touching(states[place]) & (known[place] == there)
+    return touching
 
 
 def clipped_change(

@@ -11,7 +11,13 @@ from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import TRIALS, Outcome, Plan
-from madoc.calibration.least_squares.statistics import autocorrelation, clipped_change, noise_ratio, outlier_limits
+from madoc.calibration.least_squares.statistics import (
+    autocorrelation,
+    clipped_change,
+    noise_ratio,
+    outlier_limits,
+    touched,
+)
 from madoc.errors import MadocError
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.information import at_least_noise, bread, jackknife_meat, least_share
@@ -39,6 +45,8 @@ FOLLOWED = (1.0, 0.3, 0.0)
 """Shares in [0, 1] of an initial state's step, of which every window takes the best: at contacts 1 may be too far."""
 LIKE_NOISE = 1.5
 """Cost of a window, in squared standard deviations; noise alone rarely exceeds it, as its mean is 0.8."""
+SECOND_CHANCES = 2
+"""Number of times that windows which a step of the parameters leaves unexplained begin anew."""
 WORSE = 2.0
 """Mean change of the windows' costs in its standard errors; above it a step makes them worse."""
 ROUNDING = 1e-8
@@ -89,8 +97,8 @@ class UnknownStarts:
     def touched(
         problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
     ) -> Bool[np.ndarray, " windows"]:
-        """No window: initial states are not known well enough to tell."""
-        return np.zeros(len(rows), dtype=bool)
+        """Whether bodies were in contact at any state of a window, as far as the log tells."""
+        return touched(problem, *problem.states.guesses(), rows, horizon)
 
     @staticmethod
     def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
@@ -163,12 +171,17 @@ class UnknownStarts:
             states, damping, simulations = after.states, after.damping, simulations + after.simulations
         residuals = self.readings.residuals(self.simulator, point[None], states[None])[0, 0]
         costs = window_costs(residuals / np.tile(plan.deviation, self.readings.steps + 1), self.loss)
-        after = replace(after, simulations=simulations + len(states))
+        after = replace(after, costs=costs, deviation=plan.deviation, errors=errors, simulations=simulations)
+        for again in range(SECOND_CHANCES):
+            random = np.random.default_rng(RESTARTS + 1 + again)
+            after = restart(self.simulator, self.readings, point, self.guesses, after, self.loss, random)
         if not plan.kept.any():
             return after, FAILED_WINDOW, False
         before = window_costs(plan.residuals, self.loss)[plan.kept]
         activity = self.readings.activity[plan.kept]
-        change = clipped_change(before, costs[None, plan.kept], activity, least=LIKE_NOISE, failed=FAILED_WINDOW)[0]
+        change = clipped_change(before, after.costs[None, plan.kept], activity, least=LIKE_NOISE, failed=FAILED_WINDOW)[
+            0
+        ]
         worse = WORSE * change.std() / np.sqrt(len(change))
         return after, float((before + change).mean()), bool(change.mean() <= worse)
 
