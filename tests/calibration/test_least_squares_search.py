@@ -140,5 +140,5 @@ def test_at_contacts_states_settle_anew_after_each_step_of_the_parameters():
         states = state.states
         state, epoch = search.step(problem, state)
         assert (state.states != states).any()
-        assert epoch.control_steps >= 60 * 4 * (1 + 2 * len(truth) + 18 + 3 * 21)
+        assert epoch.control_steps >= 60 * 4 * (1 + 2 * len(truth) + 18 + 3 * 21 + 1)
     assert np.abs(state.point[0]).mean() < 0.6 * before

@@ -185,3 +185,10 @@ def test_more_windows_begin_with_the_states_of_the_first_and_the_readings_of_oth
     np.testing.assert_array_equal(wider.point, settled.point)
     assert (wider.refining, wider.waiting) == (1, UnknownStarts.waiting)
     assert difference(layout(wider), layout(many)) is None
+
+
+def test_the_longest_windows_begin_where_shorter_ones_do(pendulum):
+    searches = LeastSquares().init(problem_of(pendulum, rows=4000), jax.random.key(0)).unknown
+    assert len(searches) == 4
+    assert np.isin(searches[3].rows, searches[2].rows).all()
+    assert np.isin(searches[2].rows, searches[0].rows).all()

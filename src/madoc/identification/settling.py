@@ -30,7 +30,7 @@ FARTHEST = 30.0
 BEYOND = 3.0
 """Standard deviations of a window's cost under noise alone, above its mean; a higher cost is more than noise."""
 FEW = 0.01
-"""Share in [0, 1] of the windows whose residuals are more than noise, up to which no more is tried."""
+"""Share in [0, 1] of the windows whose residuals are more than noise, up to which no further steps are tried."""
 FOLLOWED = (1.0, 0.3)
 """Shares in (0, 1] of a step that are tried: at contacts the whole one may be too far."""
 FIRST_DAMPING = 1e-2
@@ -57,7 +57,7 @@ class Settled:
         deviation: Noise of each channel, in its typical changes: what no initial state explains, to first order.
         costs: Mean loss of each window's residuals after the step, in squared standard deviations of the noise.
         failures: Windows whose simulation failed before it.
-        simulations: Windows simulated.
+        simulations: Simulations of a window that it took.
     """
 
     states: Float[np.ndarray, "windows state"]

@@ -60,8 +60,8 @@ class LeastSquaresState:
 
     Attributes:
         known: The search from logged states; None where they cannot be rebuilt.
-        unknown: Searches with unknown initial states, from the shortest windows to the longest; none are needed with
-            stage `logged`.
+        unknown: Searches with unknown initial states: on the shortest windows, on more of these, and on longer and
+            longer ones; none are needed with stage `logged`.
         stage: `logged`: from logged states, to the end. `undecided`: from logged states, until residuals show whether
             these are noisy. `starting`: from logged states, to find parameters for `estimated` to begin at.
             `estimated`: with unknown initial states on the shortest windows. `lengthening`: the same on longer ones.
@@ -93,22 +93,22 @@ class LeastSquares:
     its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
     has settled, windows become three times as long, and again, while that narrows the intervals and residuals remain
     noise: where motion is smooth, long windows hold more information, and they show model errors. Where contacts forbid
-    longer windows, there are more of them in the end. By default states are
-    estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of consecutive rows
-    alternate as noise makes them: a reading that is too high makes the step to it look too long and the step from it
-    too short.
+    longer windows, there are ten times as many of them in the end. By default states are estimated where they cannot be
+    rebuilt, where the data is declared noisy, and where residuals of consecutive rows alternate as noise makes them: a
+    reading that is too high makes the step to it look too long and the step from it too short.
 
     Attributes:
         initial_states: `logged`, `estimated`, or None to choose by the data.
         horizon: Length of a window in control steps; the observation after each of them counts. None is 1 from logged
             states, and with estimated ones `horizon_of` the data, then 3 and 9 times as many.
         loss: `linear`, or a robust one (`huber`, `soft-l1`, `cauchy`) whose scale follows the residuals.
-        windows: Largest number of windows. None is 1000 from logged states, 100 with estimated ones.
+        windows: Largest number of windows. None is 1000 from logged states, 100 with estimated ones, or
+            1000 where contacts forbid longer windows.
         searches: Number of points to search from: mid-range, then random ones. The best goes on.
         search_windows: Largest number of windows while searching. None is 64 from logged states, else 24.
         search_epochs: Largest number of epochs of searching, which ends once the best search has settled.
         tolerance: Share of each range; the search ends with a step that moves no parameter by more than this, nor by a
-            tenth of its standard error.
+            tenth of its standard error (three tenths at contacts).
     """
 
     initial_states: InitialStates | None = None
@@ -168,7 +168,12 @@ class LeastSquares:
             best = state.known
             windows, settled = self._known(problem).window_count(best), bool(state.finished)
         point = best.point[0 if best.refining else int(np.argmin(best.cost))]
-        uncertainty = sandwich(best.bread, best.meat)
+        spread = best
+        if state.best and self._with_model_errors(problem, state) is not None:
+            # Model errors bias all lengths about alike, and only the wide intervals of the shortest may cover that.
+            spread = state.unknown[0]
+            windows = spread.explained
+        uncertainty = sandwich(spread.bread, spread.meat)
         half = (space.high - space.low) / 2.0
         mean = space.to_physical(point)
         covariance = half[:, None] * uncertainty.covariance * half
@@ -236,13 +241,17 @@ class LeastSquares:
         return Search(starts, self.loss, horizon, windows, searches, search_windows, self.search_epochs, self.tolerance)
 
     def _all_lengths(self, problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[SearchState, ...]:
-        """Searches on every length of windows that the episodes are long enough for; on one if `horizon` is given."""
+        """Searches on few and many of the shortest windows, and on every length that the episodes are long enough for.
+
+        If `horizon` is given, there is one length.
+        """
         shortest = self._unknown(problem)
         first = shortest.init(problem, key)
         searches = [first, replace(shortest, windows=self.windows or MOST, searches=1).init(problem, key)]
         for length in range(LONGER, len(LENGTHS) if self.horizon is None else LONGER):
             most = READINGS * len(first.rows) // LENGTHS[length]
-            longer = lengthened(problem, first, self._unknown(problem, length).horizon, most)
+            shorter = searches[-1] if length > LONGER else first
+            longer = lengthened(problem, shorter, self._unknown(problem, length).horizon, most)
             if longer is None:
                 break
             searches.append(longer)
@@ -271,7 +280,8 @@ class LeastSquares:
 
         If longer windows show model errors, the estimate of the shortest is kept: model errors bias the estimate by
         about as much for all lengths, and only wide intervals may cover that. At contacts longer windows may leave
-        residuals because their initial states were not found, and the longest that were explained are kept.
+        residuals because their initial states were not found: there the estimate of the longest that were explained is
+        kept, with the intervals of the shortest.
         """
         searches, length = state.unknown, state.length
         search = searches[length]
@@ -279,7 +289,7 @@ class LeastSquares:
             return state
         if not self._unknown(problem).settled(search):
             lost = hopeless(search, searches[0], searches[state.best]) or search.epochs >= self.search_epochs
-            return _ended(state, state.best) if length >= LONGER and lost else state
+            return _ended(state, state.best) if length >= LONGER and lost and not search.waiting else state
         if length == WIDER:
             return _finished(state, WIDER)
         if length and not self._noise_alone(problem, state, length):
@@ -299,6 +309,14 @@ class LeastSquares:
         readings = self._unknown(problem, length).horizon + 1
         return noise_alone(state.unknown[length], state.unknown[0], readings)
 
+    def _with_model_errors(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:
+        """Index of the shortest longer windows than those of the estimate that leave more than noise; None for none."""
+        for longer in range(max(state.best + 1, LONGER), len(state.unknown)):
+            settled = self._unknown(problem).settled(state.unknown[longer])
+            if settled and not self._noise_alone(problem, state, longer):
+                return longer
+        return None
+
     def _about_states(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
         """Sentences on estimated initial states, unless the user asked for them."""
         if not state.estimates_starts or self.initial_states is not None:
@@ -309,11 +327,9 @@ class LeastSquares:
             return about
         if state.stage in ("lengthening", "widening") and not state.finished:
             return (*about, sentences.STILL_LENGTHENING)
-        for longer in range(max(state.best + 1, LONGER), len(state.unknown)):
-            search = state.unknown[longer]
-            noise_alone = search.rough or self._noise_alone(problem, state, longer)
-            if self._unknown(problem).settled(search) and not noise_alone:
-                return (*about, sentences.about_model_errors(self._unknown(problem, longer).horizon))
+        longer = self._with_model_errors(problem, state)
+        if longer is not None:
+            return (*about, sentences.about_model_errors(self._unknown(problem, longer).horizon))
         return about
 
 

@@ -17,14 +17,14 @@ from madoc.identification.information import half_width, sandwich
 from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
 LENGTHS = (1, 1, 3, 9)
-"""Lengths of windows of each search, relative to the first."""
+"""Length of the windows of each search, relative to the first's; the second has more windows."""
 WIDER, LONGER = 1, 2
 """Indices of the search on more windows of the first length, and of the first one on longer windows."""
 SHORTEST = 3
 """Smallest length of the first windows in control steps: shorter ones hold little information besides their initial
 state."""
 READINGS = 2
-"""Largest number of readings in all windows of a length, relative to the first; more only for `FEWEST` windows."""
+"""Largest number of readings in all longer windows, relative to the first search; more only for `FEWEST` windows."""
 FEWEST = 10
 """Smallest number of windows beyond that of parameters; with fewer, Student's t would widen the intervals."""
 AS_WELL = 1.2
@@ -98,6 +98,7 @@ def widened(wider: SearchState, first: SearchState) -> SearchState:
         point=first.point[:1].copy(),
         states=states,
         state_errors=first.state_errors,
+        rough=first.rough,
         refining=1,
         waiting=UnknownStarts.waiting,
     )
@@ -105,6 +106,7 @@ def widened(wider: SearchState, first: SearchState) -> SearchState:
 
 def _states_at(search: SearchState, rows: Int[np.ndarray, " windows"]) -> Float[np.ndarray, "1 windows state"]:
     """The best search's initial states at some of its rows."""
+    assert np.isin(rows, search.rows).all()
     return search.states[:1, np.argsort(search.rows)[np.searchsorted(np.sort(search.rows), rows)]].copy()
 
 

@@ -13,24 +13,23 @@ from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome, Plan
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
+from madoc.identification import settling
 from madoc.identification.information import SETTLED, sandwich
 from madoc.identification.losses import ALL_FAILED, Loss
 from madoc.types import Epoch, generator
 
 DAMPING_RANGE = (1e-10, 1e10)
 """Smallest and largest relative damping of the parameters' step; it is clipped to them."""
-STATE_DAMPING_RANGE = (1e-9, 1e6)
-"""Smallest and largest relative damping of an initial state's step; it is clipped to them."""
 LITTLE = 5e-3
 """Share in [0, 1] of the cost; after a step that saves less, unknown initial states count as settled too."""
 ROUGHLY_SETTLED = 0.3
-"""Ratio in [0, 1] of a step to the standard error, where initial states settle anew after each step: these end here and
-there in another minimum, and move the parameters by that much."""
+"""Ratio in [0, 1] of a step to the standard error where initial states settle anew after each step: some windows end in
+another minimum each time, which moves the parameters by about as much."""
 FOUND = (0.5, 0.9)
-"""Shares in [0, 1] of the unexplained windows and of the residuals' size; if no more is left by wide differences and
-restarts, the rest was for want of initial states."""
-NARROW = 2
-"""Number of steps of initial states after which those of smooth motion are explained, as they are nearly linear."""
+"""Shares in [0, 1]. If narrowing differences and restarts leave at most this share of the unexplained windows, or of
+the size of all residuals, those windows lacked an initial state, not a better model."""
+FIRST_STEPS = 2
+"""Number of steps of initial states, after which those of smooth motion are explained, as it is nearly linear."""
 FAR = 3.0
 """Distance in standard errors; once parameters have moved farther, initial states are looked for anew."""
 _SMALLEST = 1e-100
@@ -60,8 +59,8 @@ class SearchState:
         autocorrelation: Correlation of these windows' residuals with the next reading's; 0 for known initial states.
         refining: 0 while searching on few windows, 1 on all of them.
         settled_at: The point at which initial states last settled alone.
-        missed: Share of the windows that initial states did not explain after the first steps of that, and the size of
-            all windows' residuals in typical changes.
+        missed: Share of the windows that initial states did not explain after the first two steps of that, and the size
+            of all windows' residuals in typical changes.
         rough: 1 where wide differences and restarts have found initial states, as at contacts: each step of the
             parameters is then followed by several of the states; else 0.
         waiting: Number of epochs to come in which only initial states move.
@@ -168,7 +167,7 @@ class Search:
             new["states"][index, :count, : len(plan.spread)] += change
             new["damping"][index] = np.clip(damping[index] * factor, *DAMPING_RANGE)
             state_factor = np.select([followed == 1.0, followed > 0.0], [0.1, 1.0], 10.0)
-            new["state_damping"][index, :count] = np.clip(state_damping[index] * state_factor, *STATE_DAMPING_RANGE)
+            new["state_damping"][index, :count] = np.clip(state_damping[index] * state_factor, *settling.DAMPING_RANGE)
             cost = float(outcome.totals[trial])
             new["cost"][index] = cost if state.refining else plan.comparable(cost)
             new["moved"][index] = self._moved(plan, outcome, trial, damping=float(damping[index]))
@@ -202,7 +201,7 @@ class Search:
         after, waiting = windows.settle(state.point[0], states, damping, state.state_errors, state.waiting)
         new_states, new_damping = state.states.copy(), state.state_damping.copy()
         new_states[0], new_damping[0] = after.states, after.damping
-        first = state.waiting > self.starts.waiting - NARROW
+        first = state.waiting > self.starts.waiting - FIRST_STEPS
         missed = windows.share_unexplained(after), float(np.sqrt(after.costs.mean()) * np.median(after.deviation))
         before = missed if first else state.missed
         smooth = not state.touching.any()
@@ -231,9 +230,9 @@ class Search:
         1973). A step with states that follow to first order alone would be refused at contacts.
         """
         states = state.states[:1]
-        undamped = np.full(states.shape[:2], STATE_DAMPING_RANGE[0])
+        undamped = np.full(states.shape[:2], settling.DAMPING_RANGE[0])
         (plan,) = windows.plans(state.point[:1], states, state.damping[:1], undamped, refining=True)
-        after, cost, better = windows.profiled(plan, states[0], state.state_errors)
+        after, better, cost = windows.profiled(plan, states[0], state.state_errors)
         factor = TRIALS[0] if better else 1e3
         new, step = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}, plan.steps[0]
         if better:
@@ -241,6 +240,8 @@ class Search:
             new["states"][0], new["state_damping"][0] = after.states, after.damping
         new["damping"][0] = np.clip(state.damping[0] * factor, *DAMPING_RANGE)
         new["cost"][0], new["moved"][0] = cost, self._relative_step(plan, step, ROUGHLY_SETTLED)
+        if not better and state.damping[0] <= self.starts.stuck:
+            new["moved"][0] = max(new["moved"][0], 1.0)  # a damped step may be small far from the minimum too
         following = replace(
             state,
             **new,
@@ -271,7 +272,10 @@ class Search:
         return len(state.rows) if state.refining else min(self.search_windows, len(state.rows))
 
     def whole_run(self, problem: CalibrationProblem, state: SearchState, refining_epochs: int) -> int:
-        """Control steps of the longest search, unless it has ended, and of `refining_epochs` on all windows."""
+        """Control steps of the longest search, unless it has ended, and of `refining_epochs` on all windows.
+
+        At contacts, where initial states settle for longer and more windows may follow, it takes more.
+        """
         searching, refining, settling = (
             self._epoch_steps(problem, replace(state, refining=stage, waiting=waiting))
             for stage, waiting in ((0, 0), (1, 0), (1, 1))

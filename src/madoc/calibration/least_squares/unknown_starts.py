@@ -143,12 +143,12 @@ class UnknownStarts:
         None are once residuals of nearly all windows are noise. Until there are as many to go as restarts, differences
         become narrower; then windows whose residuals are more than noise begin anew.
         """
-        width = WIDTHS[max(0, self.waiting - waiting)] if waiting > RESTARTS else 0.0
+        width = WIDTHS[self.waiting - waiting] if waiting > RESTARTS else 0.0
         after = settle(self.simulator, self.readings, point, states, damping, width * errors, self.loss)
         if waiting <= RESTARTS:
             random = np.random.default_rng(waiting)
             after = restart(self.simulator, self.readings, point, self.guesses, after, self.loss, random)
-        noiseless = after.deviation.max() < ROUNDING
+        noiseless = after.deviation.max() < ROUNDING and after.costs.min() < FAILED_WINDOW
         return after, 0 if self.share_unexplained(after) <= FEW or noiseless else waiting - 1
 
     def share_unexplained(self, settled: Settled) -> float:
@@ -157,8 +157,8 @@ class UnknownStarts:
 
     def profiled(
         self, plan: Plan, states: Float[np.ndarray, "windows state"], errors: Float[np.ndarray, " physical"]
-    ) -> tuple[Settled, float, bool]:
-        """Initial states settled after the least damped step of a plan, the mean cost there, and whether it helps.
+    ) -> tuple[Settled, bool, float]:
+        """Initial states settled after the least damped step of a plan, whether it helps, and the mean cost then kept.
 
         It does unless the windows' costs are significantly higher: at contacts initial states end here and there in
         another minimum, and where they were before they had several chances.
@@ -171,19 +171,20 @@ class UnknownStarts:
             states, damping, simulations = after.states, after.damping, simulations + after.simulations
         residuals = self.readings.residuals(self.simulator, point[None], states[None])[0, 0]
         costs = window_costs(residuals / np.tile(plan.deviation, self.readings.steps + 1), self.loss)
+        simulations += len(states)
         after = replace(after, costs=costs, deviation=plan.deviation, errors=errors, simulations=simulations)
         for again in range(SECOND_CHANCES):
             random = np.random.default_rng(RESTARTS + 1 + again)
             after = restart(self.simulator, self.readings, point, self.guesses, after, self.loss, random)
         if not plan.kept.any():
-            return after, FAILED_WINDOW, False
+            return after, False, FAILED_WINDOW
         before = window_costs(plan.residuals, self.loss)[plan.kept]
-        activity = self.readings.activity[plan.kept]
-        change = clipped_change(before, after.costs[None, plan.kept], activity, least=LIKE_NOISE, failed=FAILED_WINDOW)[
-            0
-        ]
-        worse = WORSE * change.std() / np.sqrt(len(change))
-        return after, float((before + change).mean()), bool(change.mean() <= worse)
+        change = after.costs[plan.kept] - before
+        if self.loss != "linear":
+            activity, costs = self.readings.activity[plan.kept], after.costs[None, plan.kept]
+            change = clipped_change(before, costs, activity, least=LIKE_NOISE, failed=FAILED_WINDOW)[0]
+        helps = bool(change.mean() <= WORSE * change.std() / np.sqrt(len(change)))
+        return after, helps, float((before + change).mean() if helps else before.mean())
 
     def plans(
         self,

@@ -32,7 +32,9 @@ BATCH = 256
 RATE = 1e-3
 """Adam's learning rate."""
 CAPACITY = 20_000
-"""Number of rows that are kept of each kind, those at earlier references included: derivatives differ little."""
+"""Number of simulated rows that are kept, those at earlier references included: derivatives differ little."""
+PROBED_CAPACITY = 3_000
+"""Number of rows with derivatives that are kept."""
 TAIL = 30.0
 """Largest size of a derivative that is learnt, in multiples of its root mean square; impacts have larger ones."""
 OUTLYING = 0.99
@@ -53,7 +55,7 @@ class Slopes:
         probed: Features of (s, a), and derivatives there in multiples of `size`.
         simulated: Features of (s, a), innovations, and how far the parameters in [-1, 1] were from the reference.
         deviation: Deviations of the actors in [-1, 1] when the reference was chosen.
-        floor: What an innovation has of other causes than the parameters: the least spread of a signal.
+        floor: The median of |e| over logged and simulated rows: the least spread of a signal.
     """
 
     network: Network
@@ -72,7 +74,7 @@ def no_slopes(pair: int, channels: int, parameters: int, key: PRNGKeyArray) -> S
         network=network,
         optimiser=adam(RATE).init(eqx.filter(network, eqx.is_array)),
         size=jnp.ones((channels, parameters)),
-        probed=replay.empty(CAPACITY, pair=(pair,), slope=(channels, parameters)),
+        probed=replay.empty(PROBED_CAPACITY, pair=(pair,), slope=(channels, parameters)),
         simulated=replay.empty(CAPACITY, pair=(pair,), change=(channels,), moved=(parameters,)),
         deviation=jnp.ones(parameters),
         floor=jnp.ones(channels),
@@ -109,6 +111,8 @@ def learn(
     scaled = np.where(known[:, None, None], np.clip(derivatives / size, -TAIL, TAIL), 0.0)
     probed = replay.add(slopes.probed, {"pair": pair, "slope": scaled.astype(np.float32)}, known)
     slopes = replace(slopes, size=jnp.asarray(size, jnp.float32), probed=probed)
+    if not int(probed.written):
+        return slopes
     network, optimiser = _fit(slopes, key)
     return replace(slopes, network=network, optimiser=optimiser)
 
@@ -164,6 +168,6 @@ def standardised(
 
 def redrawn(slopes: Slopes, rows: dict[str, Array], draws: Float[Array, "rows d"]) -> dict[str, Array]:
     """Simulated rows as they were under other draws of the parameters in [-1, 1], to first order."""
-    share, _ = shares(slopes, rows["pair"])
-    moved = jnp.einsum("rcd,rd->rc", share, (draws - rows["parameters"]) / slopes.deviation[None])
+    slope = _derivatives(slopes, slopes.network, rows["pair"]) * slopes.size[None]
+    moved = jnp.einsum("rcd,rd->rc", slope, draws - rows["parameters"]) / shares(slopes, rows["pair"])[1]
     return rows | {"parameters": draws, "following": jnp.arcsinh(jnp.sinh(rows["following"]) + moved)}
