@@ -12,6 +12,8 @@ import paper
 from scipy import stats
 
 README = Path(__file__).parents[1] / "README.md"
+FEWEST_PAIRS = 6
+"""Smallest number of pairs of runs that are compared."""
 STUDY = Path(__file__).parent / "results" / "groups"
 """Results of `benchmarks/groups.py`."""
 NAMES = {"hopper": "Hopper", "halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "ant": "Ant"}
@@ -76,7 +78,7 @@ def _comparison(found: Mapping[tuple[str, str], Mapping[int, float]]) -> str:
             for seed, error in errors.items()
             if seed in (beside := found[task, second])
         ]
-        if len(pairs) > 1:
+        if len(pairs) >= FEWEST_PAIRS:
             less = sum(ours < theirs for ours, theirs in pairs)
             names = f"`{first}` against `{second}`"
             lines.append(f"| {names} | {len(pairs)} | {less} | {ratio(pairs)} |")

@@ -89,10 +89,14 @@ def test_agents_are_compared_in_pairs_of_the_same_log_and_seed(monkeypatch):
     found = {(task, method): {} for task in tasks for method in readme.COLUMNS}
     found["hopper-medium", "madoc"] = {0: 0.01, 1: 0.02, 5: 0.3}
     found["hopper-medium", "madoc-s"] = {0: 0.02, 1: 0.16}
+    for method, error in (("madoc", 0.01), ("madoc-s", 0.04)):
+        found["ant-medium", method] = dict.fromkeys(range(4), error)
+    found["ant-medium", "madoc-grouped"] = dict.fromkeys(range(5), 0.01)  # too few pairs to be compared
     monkeypatch.setattr(paper, "by_seed", lambda name: found)
     told = readme.errors()
     assert "| Hopper | 0.110 (3 seeds) | not run | 0.090 (2 seeds) | 0.33 | 0.34 |" in told
-    assert "| `madoc` against `madoc-s` | 2 | 2 | 0.25 (0.00 to " in told
+    assert "| `madoc` against `madoc-s` | 6 | 6 | 0.25 (0.1" in told
+    assert "against `madoc-grouped`" not in told
 
 
 def test_the_study_compares_agents_by_seed(monkeypatch, tmp_path):
