@@ -218,9 +218,7 @@ class Search:
             waiting=0 if smooth and state.waiting < self.starts.waiting else waiting,
             failures=state.failures + after.failures,
         )
-        noise = float(np.median(after.deviation))
-        metrics = {"residual": missed[1], "moved": float(state.moved[0])}
-        metrics["noise"] = noise
+        metrics = {"residual": missed[1], "noise": float(np.median(after.deviation))}
         return following, Epoch(metrics, after.simulations * self.horizon, stage="calibrating")
 
     def _profiled(self, windows: UnknownStarts, state: SearchState) -> tuple[SearchState, Epoch]:
