@@ -123,7 +123,7 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     np.testing.assert_array_equal(state.point, point)
 
 
-def test_at_contacts_states_settle_anew_after_each_step_of_the_parameters():
+def test_at_contacts_states_settle_anew_after_each_step_of_the_parameters(monkeypatch):
     task = tasks.make("halfcheetah", "legacy")
     truth = dict(zip(task.parameters.names, task.parameters.middle.tolist(), strict=True))
     log = disturb(recorded(task, truth, 600, jax.random.key(0)), Disturbance(noise=0.1), task, jax.random.key(1))
@@ -142,3 +142,12 @@ def test_at_contacts_states_settle_anew_after_each_step_of_the_parameters():
         assert (state.states != states).any()
         assert epoch.control_steps >= 60 * 4 * (1 + 2 * len(truth) + 18 + 3 * 21 + 1)
     assert np.abs(state.point[0]).mean() < 0.6 * before
+    # A step that makes windows worse changes neither parameters nor states, and is not taken for the end.
+    tried = UnknownStarts.profiled
+    monkeypatch.setattr(UnknownStarts, "profiled", lambda *given: (tried(*given)[0], False, 0.8))
+    refused, _ = search.step(problem, state)
+    np.testing.assert_array_equal(refused.point, state.point)
+    np.testing.assert_array_equal(refused.states, state.states)
+    assert refused.damping[0] == pytest.approx(1e3 * state.damping[0])
+    assert refused.cost[0] == 0.8
+    assert not search.settled(refused)
