@@ -6,9 +6,16 @@ import pytest
 
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, LeastSquares
-from madoc.calibration.least_squares.sentences import about_residuals, have_long_tails
-from madoc.calibration.least_squares.statistics import alternation, autocorrelation, clipped_change, outlier_limits
+from madoc.calibration.least_squares.sentences import LONG_TAILS, about_residuals, have_long_tails
+from madoc.calibration.least_squares.statistics import (
+    alternation,
+    autocorrelation,
+    clipped_change,
+    outlier_limits,
+    steady_cost,
+)
 from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE
+from madoc.identification.settling import cost_of_noise
 from robots import SPRING_TRUTH, recorded, spring
 
 LIMITS = {"least": LIKE_NOISE, "failed": FAILED_WINDOW}
@@ -81,7 +88,7 @@ def test_tails_are_long_where_the_cost_is_above_that_of_noise():
     search = replace(begun, refining=1, epochs=3, deviation=np.full(2, 0.1), explained=len(begun.rows))
 
     def costing(cost, **changes):
-        return replace(search, cost=np.full(len(search.cost), cost), **changes)
+        return replace(search, cost=np.full(len(search.cost), cost), **{"steady_cost": cost} | changes)
 
     assert not have_long_tails(costing(1.0))
     assert have_long_tails(costing(1.2))
@@ -90,3 +97,25 @@ def test_tails_are_long_where_the_cost_is_above_that_of_noise():
     )
     assert not have_long_tails(costing(1.2, epochs=0))  # not all windows are known yet
     assert not have_long_tails(costing(1.2, deviation=np.full(2, 1e-9)))  # rounding errors
+    at_contacts = costing(1.2, steady_cost=1.0)
+    assert not have_long_tails(at_contacts)
+    (sentence,) = about_residuals(at_contacts)
+    assert sentence.startswith("residuals have longer tails than noise has in windows in which contacts begin or end")
+
+
+def test_windows_with_and_without_contacts_have_their_own_noise_and_those_between_do_not_count():
+    readings, random = 4, np.random.default_rng(0)
+    resting, flying, landing = np.full((50, readings), 2), np.zeros((50, readings), int), np.zeros((50, readings), int)
+    landing[:, 2:] = 1
+    contacts = np.concatenate([resting, flying, landing])
+    sizes = np.repeat([0.1, 1.0, 30.0], 50)[:, None, None]
+    residuals, spare = sizes * random.standard_normal((150, readings, 3)), np.ones((150, readings, 3))
+    expected = cost_of_noise("cauchy")[0]
+    assert steady_cost(residuals, spare, contacts, "cauchy") == pytest.approx(expected, rel=0.1)
+    residuals[:50:3] *= 30.0  # every third resting window is not explained
+    assert steady_cost(residuals, spare, contacts, "cauchy") > LONG_TAILS
+    few = slice(41, 109)  # of nine windows that rest, and nine that land; those that fly decide
+    assert steady_cost(residuals[few], spare[few], contacts[few], "cauchy") == pytest.approx(expected, rel=0.1)
+    fewer = slice(91, 150)  # nine that fly are too few, so that all count
+    assert steady_cost(residuals[fewer], spare[fewer], contacts[fewer], "cauchy") < LONG_TAILS
+    assert steady_cost(residuals[:0], spare[:0], contacts[:0], "cauchy") == 0.0

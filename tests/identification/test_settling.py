@@ -73,3 +73,14 @@ def test_wide_differences_and_restarts_find_states_at_contacts():
     assert missed[0] > 2 * missed[1] > 0
     assert missed[2] < missed[1]
     assert (again.costs <= wide.costs).all()
+
+
+def test_contacts_of_a_simulated_window_begin_where_it_lands():
+    task = tasks.make("hopper", "legacy")
+    middle = dict(zip(task.parameters.names, task.parameters.middle.tolist(), strict=True))
+    simulator, readings, guesses = windows(task, middle, 5, 0.0)
+    states, point = guesses.copy(), np.zeros(len(middle))
+    states[:, 1] += 3.0
+    assert not readings.contacts(simulator, point, states).any()
+    states[:, 1] = simulator.initial_state[1] - 0.05
+    assert readings.contacts(simulator, point, states)[:, 0].all()

@@ -90,6 +90,21 @@ class Readings:
         differences[..., : len(self.spread)] = steps * self.spread
         return differences
 
+    def contacts(
+        self, simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
+    ) -> Int[np.ndarray, "windows readings"]:
+        """Number of pairs of geoms in contact at every reading of the simulated windows.
+
+        Spends windows · steps control steps.
+        """
+        system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
+        state = np.ascontiguousarray(states[None])
+        counts = [simulator.contacts(state[0])]
+        for action in np.moveaxis(self.actions, 1, 0):
+            state = system.step(state, np.ascontiguousarray(action[None]))
+            counts.append(simulator.contacts(state[0]))
+        return np.stack(counts, axis=1)
+
     def residuals(
         self,
         simulator: Simulator,

@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from madoc.parameters import ParameterSpace
 from madoc.tasks.base import Task
@@ -61,8 +61,8 @@ class Simulator(Protocol):
         """Dynamics at physical values: those of one system, by name or as a vector, or of one system in each row."""
         ...
 
-    def touching(self, state: Float[np.ndarray, "rows state"]) -> Bool[np.ndarray, " rows"]:
-        """Whether any two bodies are in contact in each state; no parameter changes the shape of a body."""
+    def contacts(self, state: Float[np.ndarray, "rows state"]) -> Int[np.ndarray, " rows"]:
+        """Number of pairs of geoms in contact in each state; no parameter changes the shape of a body."""
         ...
 
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:

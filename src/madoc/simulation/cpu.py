@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import mujoco
 import mujoco.rollout
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter
@@ -116,15 +116,15 @@ class CpuSimulator:
         control[..., self._actuators] = self._centre + self._half * action
         return control
 
-    def touching(self, state: Float[np.ndarray, "rows state"]) -> Bool[np.ndarray, " rows"]:
-        """Whether any two bodies are in contact in each state; no parameter changes the shape of a body."""
-        data, touching = self._data[0], np.zeros(len(state), dtype=bool)
+    def contacts(self, state: Float[np.ndarray, "rows state"]) -> Int[np.ndarray, " rows"]:
+        """Number of pairs of geoms in contact in each state; no parameter changes the shape of a body."""
+        data, contacts = self._data[0], np.zeros(len(state), dtype=np.int64)
         for row, position in enumerate(state[:, : self._model.nq]):
             data.qpos[:] = position
             mujoco.mj_kinematics(self._model, data)
             mujoco.mj_collision(self._model, data)
-            touching[row] = data.ncon > 0
-        return touching
+            contacts[row] = len(np.unique(data.contact.geom, axis=0)) if data.ncon > 1 else data.ncon
+        return contacts
 
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
         """A MuJoCo model at the given physical values, owned by the caller."""

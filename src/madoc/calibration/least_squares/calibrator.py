@@ -108,7 +108,7 @@ class LeastSquares:
         search_windows: Largest number of windows while searching. None is 64 from logged states, else 24.
         search_epochs: Largest number of epochs of searching, which ends once the best search has settled.
         tolerance: Share of each range; the search ends with a step that moves no parameter by more than this, nor by a
-            tenth of its standard error (three tenths at contacts).
+            tenth of its standard error (half of it at contacts).
     """
 
     initial_states: InitialStates | None = None

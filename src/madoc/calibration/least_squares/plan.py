@@ -34,6 +34,7 @@ class Plan:
         autocorrelation: Correlation of residuals of consecutive readings.
         exact: Whether residuals are rounding errors, so that their size cannot show whether initial states still move.
         left_out: Share of the windows that the cost does not count.
+        steady_cost: Cost of the windows in which no contact begins or ends; 0 where initial states are known.
     """
 
     point: Float[np.ndarray, " d"]
@@ -51,6 +52,7 @@ class Plan:
     autocorrelation: float = 0.0
     exact: bool = True
     left_out: float = 0.0
+    steady_cost: float = 0.0
 
     def comparable(self, cost: float) -> float:
         """A cost in typical changes, by which searches are compared; a window left out adds a whole change."""

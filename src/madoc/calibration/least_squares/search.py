@@ -22,9 +22,9 @@ DAMPING_RANGE = (1e-10, 1e10)
 """Smallest and largest relative damping of the parameters' step; it is clipped to them."""
 LITTLE = 5e-3
 """Share in [0, 1] of the cost; after a step that saves less, unknown initial states count as settled too."""
-ROUGHLY_SETTLED = 0.3
+ROUGHLY_SETTLED = 0.5
 """Ratio in [0, 1] of a step to the standard error where initial states settle anew after each step: some windows end in
-another minimum each time, which moves the parameters by about as much."""
+another minimum each time, which moves the parameters by about as much. Intervals count that."""
 FOUND = (0.5, 0.9)
 """Shares in [0, 1]. If narrowing differences and restarts leave at most this share of the unexplained windows, or of
 the size of all residuals, those windows lacked an initial state, not a better model."""
@@ -56,6 +56,7 @@ class SearchState:
         bread: Curvature of the best search's cost where it last linearised.
         meat: Scatter of the cost's gradient there.
         explained: Number of windows from which these two were computed.
+        steady_cost: Mean loss of a residual in those in which no contact begins or ends, each kind in its own noise.
         autocorrelation: Correlation of these windows' residuals with the next reading's; 0 for known initial states.
         refining: 0 while searching on few windows, 1 on all of them.
         settled_at: The point at which initial states last settled alone.
@@ -81,6 +82,7 @@ class SearchState:
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
     explained: int
+    steady_cost: float
     autocorrelation: float
     refining: int
     settled_at: Float[np.ndarray, " d"]
@@ -136,6 +138,7 @@ class Search:
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),
             explained=0,
+            steady_cost=0.0,
             autocorrelation=0.0,
             refining=0,
             settled_at=np.zeros(count),
@@ -180,6 +183,7 @@ class Search:
             bread=best.bread,
             meat=best.meat,
             explained=int(best.kept.sum()),
+            steady_cost=best.steady_cost,
             autocorrelation=best.autocorrelation,
             epochs=state.epochs + 1,
             failures=state.failures + sum(each.failures for each in plans) + sum(each.failures for each in outcomes),
@@ -225,7 +229,8 @@ class Search:
         """One step of the parameters after which initial states settle anew, kept unless that makes windows worse.
 
         The cost is that of the best initial states for each parameter vector (variable projection, Golub and Pereyra
-        1973). A step with states that follow to first order alone would be refused at contacts.
+        1973). A step with states that follow to first order alone would be refused at contacts. As states end in other
+        minima after each step, parameters do not come to rest: once settled, the covariance counts the last step too.
         """
         states = state.states[:1]
         undamped = np.full(states.shape[:2], settling.DAMPING_RANGE[0])
@@ -240,13 +245,15 @@ class Search:
         new["cost"][0], new["moved"][0] = cost, self._relative_step(plan, step, ROUGHLY_SETTLED)
         if not better and state.damping[0] <= self.starts.stuck:
             new["moved"][0] = max(new["moved"][0], 1.0)  # a damped step may be small far from the minimum too
+        pull = plan.bread @ step
         following = replace(
             state,
             **new,
             deviation=plan.deviation,
             bread=plan.bread,
-            meat=plan.meat,
+            meat=plan.meat + (np.outer(pull, pull) if new["moved"][0] < 1.0 else 0.0),
             explained=int(plan.kept.sum()),
+            steady_cost=plan.steady_cost,
             autocorrelation=plan.autocorrelation,
             epochs=state.epochs + 1,
             failures=state.failures + plan.failures + after.failures,

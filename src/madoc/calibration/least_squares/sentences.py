@@ -36,8 +36,11 @@ def about_estimated_states(problem: CalibrationProblem, search: SearchState, hor
 
 
 def have_long_tails(search: SearchState) -> bool:
-    """Whether residuals have longer tails than noise has; not known before the first step on all windows."""
-    return _noisy(search) and bool(search.cost[0] > LONG_TAILS)
+    """Whether residuals have longer tails than noise has; not known before the first step on all windows.
+
+    Windows in which a contact begins or ends do not count, where there are others.
+    """
+    return _noisy(search) and search.steady_cost > LONG_TAILS
 
 
 def about_residuals(search: SearchState) -> tuple[str, ...]:
@@ -50,7 +53,12 @@ def about_residuals(search: SearchState) -> tuple[str, ...]:
         "well as others, as where contacts begin, or their simulation failed"
     )
     tails = "residuals have longer tails than noise has: the intervals are too narrow"
-    return (*([sentence] if left_out else []), *([tails] if have_long_tails(search) else []))
+    jumps = (
+        "residuals have longer tails than noise has in windows in which contacts begin or end; these move the estimate "
+        "little, as the loss is robust, and intervals count how much they differ"
+    )
+    long = [tails] if have_long_tails(search) else [jumps] if search.cost[0] > LONG_TAILS else []
+    return (*([sentence] if left_out else []), *long)
 
 
 def about_model_errors(horizon: int) -> str:

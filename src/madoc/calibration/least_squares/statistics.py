@@ -4,11 +4,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.identification.losses import NORMAL_MAD
-from madoc.identification.noise import OUTLIER
+from madoc.identification.losses import NORMAL_MAD, Loss
+from madoc.identification.noise import OUTLIER, channel_noise
 from madoc.identification.replay import window_residuals
+from madoc.identification.settling import window_costs
 from madoc.identification.windows import consecutive_rows, windows_at
 
+FEWEST_STEADY = 10
+"""Smallest number of windows of a kind whose noise is estimated by itself."""
 _LARGEST = 3.0
 """Standard deviations of the noise at which residuals are clipped before they are correlated."""
 _SMALLEST = 1e-12
@@ -47,8 +50,33 @@ def touched(
     for later in range(horizon + 1):
         there = np.minimum(rows + later, ends - 1)
         place = np.minimum(np.searchsorted(known, there), len(known) - 1)
-        touching |= problem.simulator.touching(states[place]) & (known[place] == there)
+        touching |= (problem.simulator.contacts(states[place]) > 0) & (known[place] == there)
     return touching
+
+
+def steady_cost(
+    residuals: Float[np.ndarray, "windows readings channels"],
+    spare: Float[np.ndarray, "windows readings channels"],
+    contacts: Int[np.ndarray, "windows readings"],
+    loss: Loss,
+) -> float:
+    """Mean cost of the windows in which no contact begins or ends; 0 without windows.
+
+    Where one does, residuals jump with the error of the initial state. Windows with the same number of `contacts`
+    throughout are of one kind, whose cost is in standard deviations of its own noise: forces at random hardly move what
+    rests on the ground. Kinds of fewer than `FEWEST_STEADY` windows say nothing; if all are, all windows count as one
+    kind. `spare` is 1 - leverage of each residual.
+    """
+    if not len(residuals):
+        return 0.0
+    steady = (contacts == contacts[:, :1]).all(1)
+    kinds = [steady & (contacts[:, 0] == count) for count in np.unique(contacts[steady, 0])]
+    kinds = [kind for kind in kinds if kind.sum() >= FEWEST_STEADY] or [np.ones_like(steady)]
+    costs = [
+        window_costs((residuals[kind] / channel_noise(residuals[kind], spare[kind])).reshape(kind.sum(), -1), loss)
+        for kind in kinds
+    ]
+    return float(np.concatenate(costs).mean())
 
 
 def clipped_change(

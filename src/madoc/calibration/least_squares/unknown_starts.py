@@ -16,6 +16,7 @@ from madoc.calibration.least_squares.statistics import (
     clipped_change,
     noise_ratio,
     outlier_limits,
+    steady_cost,
     touched,
 )
 from madoc.errors import MadocError
@@ -63,6 +64,7 @@ class UnknownStarts:
         simulator: The simulator.
         readings: Actions and observations of the windows.
         guesses: Initial states as the log tells them.
+        touching: Whether the log shows a contact in each window.
         loss: Loss of residuals in standard deviations of the noise.
         unknown: Whether initial states are unknown.
         failed_cost: Cost at which every window fails.
@@ -73,6 +75,7 @@ class UnknownStarts:
     simulator: Simulator
     readings: Readings
     guesses: Float[np.ndarray, "windows state"]
+    touching: Bool[np.ndarray, " windows"]
     loss: Loss
     unknown: ClassVar[bool] = True
     failed_cost: ClassVar[float] = FAILED_WINDOW
@@ -88,10 +91,10 @@ class UnknownStarts:
         horizon: int,
         loss: Loss,
     ) -> "UnknownStarts":
-        """The windows that begin at the given rows; `touching` is of no use, as windows without a fit are left out."""
+        """The windows that begin at the given rows."""
         readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
         guesses = problem.states.states[np.searchsorted(problem.states.rows, rows)]
-        return cls(problem.simulator, readings, guesses, loss)
+        return cls(problem.simulator, readings, guesses, touching, loss)
 
     @staticmethod
     def touched(
@@ -198,7 +201,10 @@ class UnknownStarts:
         """Differences around every search's point and initial states, in one batch each."""
         slopes = slopes_at(self.simulator, self.readings, points, states)
         searches = zip(slopes, points, damping.tolist(), state_damping, strict=True)
-        return [self._plan(*each, refining=refining) for each in searches]
+        return [
+            self._plan(*each, contacts=self._contacts(each[1], state) if refining else None)
+            for each, state in zip(searches, states, strict=True)
+        ]
 
     def outcomes(self, plans: list[Plan], states: Float[np.ndarray, "searches windows state"]) -> list[Outcome]:
         """Costs after every step of every search, with the share of its state's step that fits each window best."""
@@ -236,15 +242,18 @@ class UnknownStarts:
         damping: float,
         state_damping: Float[np.ndarray, " windows"],
         *,
-        refining: bool,
+        contacts: Int[np.ndarray, "windows readings"] | None,
     ) -> Plan:
-        """The plan of one search; while refining, channels are weighted by noise, and untrusted windows left out."""
+        """The plan of one search; `contacts` are known while it refines.
+
+        Channels are weighted by noise then, and untrusted windows left out.
+        """
         channels, readings = len(self.readings.scale), self.readings.steps + 1
         least = np.full(len(state_damping), LEAST_DAMPING)
         alike = eliminate(slopes, np.ones_like(slopes.residuals), least)
         kept = slopes.whole
         deviation = self._deviation(slopes, alike.spare, kept)
-        if refining:
+        if contacts is not None:
             kept = self._trusted(slopes.over(np.tile(deviation, readings)))
             deviation = self._deviation(slopes, alike.spare, kept)
         else:
@@ -276,7 +285,26 @@ class UnknownStarts:
             exact=float(deviation.max()) < ROUNDING,
             left_out=1.0 - float(kept.mean()),
             failures=int((~slopes.whole).sum()),
+            steady_cost=0.0 if contacts is None else self._steady_cost(slopes, alike.spare, contacts, kept),
         )
+
+    def _contacts(
+        self, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
+    ) -> Int[np.ndarray, "windows readings"]:
+        """Number of contacts at every reading of the simulated windows; 0 if the log shows no contact in any."""
+        if self.touching.any():
+            return self.readings.contacts(self.simulator, point, states)
+        return np.zeros(self.readings.observed.shape[:2], np.int64)
+
+    def _steady_cost(
+        self,
+        slopes: WindowSlopes,
+        spare: Float[np.ndarray, "windows values"],
+        contacts: Int[np.ndarray, "windows readings"],
+        kept: Bool[np.ndarray, " windows"],
+    ) -> float:
+        shape = (int(kept.sum()), *self.readings.observed.shape[1:])
+        return steady_cost(slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape), contacts[kept], self.loss)
 
     def _deviation(
         self, slopes: WindowSlopes, spare: Float[np.ndarray, "windows values"], kept: Bool[np.ndarray, " windows"]
