@@ -263,7 +263,7 @@ class Search:
         if following.moved[0] < 1.0 and self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0:
             moved = np.maximum(following.moved, 1.0)
             following = replace(following, waiting=self.starts.waiting, moved=moved)
-        columns = 1 + 2 * len(step) + len(plan.spread)
+        columns = 2 + 2 * len(step) + len(plan.spread)  # the last for the contacts
         spent = len(state.rows) * columns + after.simulations
         return following, Epoch(metrics, spent * self.horizon, stage="calibrating")
 
@@ -293,6 +293,7 @@ class Search:
 
     def _epoch_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
         columns = self.starts.settling_columns(problem) if state.waiting else self.starts.columns(problem)
+        columns += int(self.starts.unknown and state.refining and not state.waiting and state.touching.any())
         return self._running(state) * self.window_count(state) * columns * self.horizon
 
     def _moved(self, plan: Plan, outcome: Outcome, trial: int, *, damping: float) -> float:
