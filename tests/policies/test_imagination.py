@@ -8,7 +8,16 @@ from affine import affine
 from madoc.learning.dynamics_ensemble import Ensemble
 from madoc.learning.features import Features
 from madoc.learning.networks import stack
-from madoc.policies.imagination import StateValue, WithoutNoise, chosen_candidate, imagine, mean_return, start_imagining
+from madoc.policies.imagination import (
+    ImaginedRows,
+    StateValue,
+    WithoutNoise,
+    chosen_candidate,
+    imagine,
+    imagined_return,
+    mean_return,
+    start_imagining,
+)
 
 FEATURES = Features(jnp.zeros(2), jnp.ones(2), jnp.array([0.5]), jnp.asarray(1.0), jnp.asarray(2.0))
 LOGGED = jnp.array([[0.0], [10.0]])
@@ -24,7 +33,9 @@ def certain(changes):
     return eqx.tree_at(lambda e: e.smallest, made, jnp.full(2, -30.0))
 
 
-def imagined(*, slope, steps=3, penalty=0.0, terminated=lambda o: o[:, 0] > 100, horizon=100, threshold=0.1, value=None):
+def imagined(
+    *, slope, steps=3, penalty=0.0, terminated=lambda o: o[:, 0] > 100, horizon=100, threshold=0.1, value=None
+):
     """Two models, changes 1 and 3 (0.5 and 1.5 physical); past discriminators whose logit rises by `slope` with it."""
     past = stack(2, lambda key: affine([[0.0, 0.0, slope]], [0.0]), jax.random.key(0))
     return imagine(
@@ -69,6 +80,28 @@ def test_the_mean_return_by_hand():
     reward = np.array([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
     ended = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
     assert mean_return(reward, ended) == (3.0 + 70.0) / 2
+
+
+def acting(ends_after, calls):
+    """Two steps at a time of two rows that earn 1 and 10 a step; a row ends in the given step, counted from 1."""
+
+    def act(under_way, key):
+        ages = np.asarray(under_way.age) + np.array([[1], [2]])
+        calls.append(ages)
+        ends = (ages == ends_after).astype(float).reshape(-1)
+        acted = {"reward": np.array([1.0, 10.0, 1.0, 10.0]), "terminated": ends, "stopped": np.zeros(4)}
+        return ImaginedRows(under_way.observation, under_way.age + 2), acted, {}
+
+    return act
+
+
+def test_the_imagined_return_by_hand():
+    start, calls = ImaginedRows(jnp.zeros((2, 1)), jnp.zeros(2, jnp.int32)), []
+    # the first row ends in its third step, the second in its first: 3 · 1 and 1 · 10; then no more steps are taken
+    assert imagined_return(acting([3, 1], calls), start, 100, jax.random.key(0)) == (3.0 + 10.0) / 2
+    assert len(calls) == 2
+    # the second never ends, and may take 5 steps
+    assert imagined_return(acting([3, 0], calls), start, 5, jax.random.key(0)) == (3.0 + 50.0) / 2
 
 
 def test_a_policy_is_judged_without_noise():

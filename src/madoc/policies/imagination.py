@@ -136,7 +136,8 @@ def imagine(
     low, high = low - (high - low), high + (high - low)
 
     def within_range(observation: Array) -> Array:
-        return jnp.clip(observation, jnp.broadcast_to(low, observation.shape), jnp.broadcast_to(high, observation.shape))
+        bounds = (jnp.broadcast_to(bound, observation.shape) for bound in (low, high))
+        return jnp.clip(observation, *bounds)
 
     def step(under_way: ImaginedRows, key: PRNGKeyArray) -> tuple[ImaginedRows, tuple[Batch, dict[str, Array]]]:
         of_action, of_sample, of_choice, of_restart = jax.random.split(key, 4)
@@ -193,6 +194,27 @@ def imagine(
     under_way, (rows, metrics) = jax.lax.scan(step, under_way, jax.random.split(key, steps))
     flat = {name: column.reshape(-1, *column.shape[2:]) for name, column in rows.items()}
     return under_way, flat, jax.tree.map(jnp.mean, metrics)
+
+
+def imagined_return(
+    act: Callable[..., tuple[ImaginedRows, Batch, dict[str, Array]]],
+    under_way: ImaginedRows,
+    longest: int,
+    key: PRNGKeyArray,
+) -> float:
+    """Mean return of rows until each first ends, or has taken `longest` steps.
+
+    `act` takes some steps, as `imagine` does, from given rows and with a given `key`; what looks unreal ends a row too.
+    """
+    rows = len(under_way.age)
+    reward, ended = np.zeros((0, rows)), np.zeros((0, rows))
+    while len(reward) < longest and not (len(ended) and ended.any(0).all()):
+        of_steps, key = jax.random.split(key)
+        under_way, acted, _ = act(under_way=under_way, key=of_steps)
+        ends = np.maximum(acted["terminated"], acted["stopped"])
+        reward = np.append(reward, np.reshape(acted["reward"], (-1, rows)), axis=0)
+        ended = np.append(ended, np.reshape(ends, (-1, rows)), axis=0)
+    return mean_return(reward[:longest], ended[:longest])
 
 
 def _some(logged: Array, rows: int, key: PRNGKeyArray) -> Array:

@@ -1,12 +1,13 @@
 """MOREC: SAC in a learnt model, of whose transitions only those that look real are kept (arXiv 2310.05422)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from pydantic import Field
@@ -21,9 +22,16 @@ from madoc.learning.networks import adam, falling_adam, scalars, scan_updates
 from madoc.learning.sac_losses import least_value
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.imagination import ImaginedRows, StateValue, WithoutNoise, imagine, mean_return, start_imagining
+from madoc.policies.imagination import (
+    ImaginedRows,
+    StateValue,
+    WithoutNoise,
+    imagine,
+    imagined_return,
+    start_imagining,
+)
 from madoc.policies.judging import Judged
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Policy, check_hyperparameters
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -71,18 +79,17 @@ class MOREC:
     not, the row ends. The budget counts updates of the policy; those of models and discriminators come before it.
 
     The constants are the authors' where they gave them (github.com/polixir/morec; of their two penalties, those of
-    MOBILE). They imagine up to 200 transitions for every update, on a GPU; here a twentieth of that. They learn for 3
-    million updates, and scale each past discriminator's logits by its means for real and for generated transitions;
-    here logits count as they are, and `threshold` with them. Unlike theirs, policy and critics see standardised
-    observations.
+    MOBILE). They imagine up to 200 transitions for every update, on a GPU; here a twentieth. They learn for 3 million
+    updates, and scale each past discriminator's logits by its means for real and for generated transitions; here
+    logits count as they are. Unlike theirs, policy and critics see standardised observations.
 
     Attributes:
         hidden: Numbers of units of the hidden layers of policy and critics.
         model_hidden: Units per layer of a dynamics model.
         models: Dynamics models.
         elites: How many of them are sampled from.
-        model_updates: Most updates of the models, before anything else. Their learning rate falls to 0 over these, which
-            the authors' does not.
+        model_updates: Most updates of the models, before anything else. Unlike the authors', their learning rate falls
+            to 0 over these.
         patience: Updates after which fitting ends if no model's error on held-out rows has fallen by 1 %, as in MOPO's
             code; each model is then as it was at its smallest error. 0 makes all `model_updates`, and keeps the last.
         discriminator_hidden: Units per layer of a discriminator.
@@ -91,11 +98,11 @@ class MOREC:
         discriminator_updates: Updates of generator and discriminator, after the models'. Chosen, not the authors'.
         noise: Standard deviation of the noise on the discriminators' inputs, in units of a step's change. Chosen.
         samples: Next states drawn from each elite.
-        temperature: Of the draw of one of these next states, whose probability rises with its dynamics reward; 0 takes
-            the one with the highest. The authors took 0.1 for most data sets.
+        temperature: Of the draw of one of these next states by dynamics reward; 0 takes the one with the highest. The
+            authors took 0.1 for most data sets.
         threshold: A rollout ends before a step whose dynamics reward is below; unless it is a fall, it is not learnt
-            from. The authors' 0.6 is of scaled logits. With ours it ended the rollouts of a policy that runs 1000 steps
-            after 12 to 40, most of them at contacts, so nothing was learnt of what keeps a robot up.
+            from. The authors' 0.6 is of scaled logits. With ours it ended rollouts of a policy that runs 1000 steps on
+            the Hopper after 12 to 40, so that nothing was learnt of what makes a robot fall later.
         horizon: Longest imagined rollout, in control steps.
         uncertainty: What lowers imagined rewards: `mobile`, how much the models differ on the value of what follows, or
             `mopo`, the largest of their standard deviations, in units of the state.
@@ -296,9 +303,7 @@ class MOREC:
         of_imagination, of_updates, of_judging = jax.random.split(state.key, 3)
         steps = -(-self.epoch_updates * self.imagined_per_update // self.imagined_rows)
         value = StateValue(state.learner.policy, state.learner.target_critic)
-        under_way, rows, imagined = self._imagine(
-            problem,
-            state,
+        under_way, rows, imagined = self._imagining(problem, state)(
             state.learner.policy,
             state.under_way,
             value if self.uncertainty == "mobile" else None,
@@ -317,72 +322,45 @@ class MOREC:
         learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
         updates, judged = state.updates + self.epoch_updates, state.judged
         if judged.due(updates, self.judge_every):
-            returns = self._imagined_return(problem, state, learner.policy, of_judging)
+            returns = self._judge(problem, state, learner.policy, of_judging)
             judged = judged.including(learner.policy, returns, updates)
             metrics |= {"judged_return": jnp.asarray(returns)}
         following = replace(state, learner=learner, replay=seen, under_way=under_way, judged=judged, updates=updates)
         return following, imagined | metrics
 
-    def _imagined_return(
-        self, problem: PolicyProblem, state: MORECState, policy: TanhGaussianPolicy, key: PRNGKeyArray
-    ) -> float:
-        """Mean return of whole episodes in the models, up to `horizon` steps at a time until each row has ended."""
-        of_starts, key = jax.random.split(key)
+    def _judge(self, problem: PolicyProblem, state: MORECState, policy: TanhGaussianPolicy, key: PRNGKeyArray) -> float:
+        """Mean return of whole episodes in the models, without noise."""
+        of_starts, of_steps = jax.random.split(key)
         begins = problem.logged["observation"][require_data(problem, rows=0).episode_starts]
-        under_way = start_imagining(begins, self.judge_rows, of_starts)
-        limit = problem.simulator.task.max_episode_steps
-        reward, ended = np.zeros((0, self.judge_rows)), np.zeros((0, self.judge_rows))
-        while len(reward) < limit and not (len(ended) and ended.any(0).all()):
-            of_steps, key = jax.random.split(key)
-            under_way, acted, _ = self._imagine(
-                problem,
-                state,
-                WithoutNoise(policy),
-                under_way,
-                None,
-                penalty=0.0 if self.uncertainty == "mobile" else self.penalty,
-                horizon=limit,
-                steps=min(self.horizon, limit),
-                key=of_steps,
-            )
-            ends = np.maximum(acted["terminated"], acted["stopped"])
-            reward = np.append(reward, np.reshape(acted["reward"], (-1, self.judge_rows)), axis=0)
-            ended = np.append(ended, np.reshape(ends, (-1, self.judge_rows)), axis=0)
-        return mean_return(reward[:limit], ended[:limit])
+        longest = problem.simulator.task.max_episode_steps
+        act = partial(
+            self._imagining(problem, state),
+            WithoutNoise(policy),
+            value=None,
+            penalty=0.0 if self.uncertainty == "mobile" else self.penalty,
+            horizon=longest,
+            steps=min(self.horizon, longest),
+        )
+        return imagined_return(act, start_imagining(begins, self.judge_rows, of_starts), longest, of_steps)
 
-    def _imagine(
-        self,
-        problem: PolicyProblem,
-        state: MORECState,
-        policy: Policy,
-        under_way: ImaginedRows,
-        value: StateValue | None,
-        *,
-        penalty: float,
-        horizon: int,
-        steps: int,
-        key: PRNGKeyArray,
-    ) -> tuple[ImaginedRows, Batch, dict[str, Array]]:
+    def _imagining(
+        self, problem: PolicyProblem, state: MORECState
+    ) -> Callable[..., tuple[ImaginedRows, Batch, dict[str, Array]]]:
+        """`imagine`, given the models and all that does not depend on who acts."""
         task = problem.simulator.task
         assert task.state_from_observation is not None
-        return imagine(
+        return partial(
+            imagine,
             state.ensemble,
             state.elites,
             state.opposition.past,
             problem.features,
-            policy,
-            under_way,
-            value,
             logged=problem.logged["observation"],
             terminated=task.terminated,
             state_of=task.state_from_observation,
             samples=self.samples,
             temperature=self.temperature,
             threshold=self.threshold,
-            horizon=horizon,
-            penalty=penalty,
-            steps=steps,
-            key=key,
         )
 
     @eqx.filter_jit
