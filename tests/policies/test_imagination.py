@@ -8,6 +8,7 @@ from affine import affine
 from madoc.learning.dynamics_ensemble import Ensemble
 from madoc.learning.features import Features
 from madoc.learning.networks import stack
+from madoc.learning.sac_losses import TwinCritic
 from madoc.policies.imagination import (
     ImaginedRows,
     StateValue,
@@ -162,8 +163,9 @@ def test_models_that_differ_on_what_follows_cost():
 
 
 def test_a_state_is_worth_the_smaller_of_two_values():
-    critics = lambda observation, action: (observation[..., 0] + action[..., 0], observation[..., 0])  # noqa: E731
-    value = StateValue(lambda observation: -observation, critics)
-    np.testing.assert_array_equal(value(LOGGED), [0.0, 0.0])
-    value = StateValue(lambda observation: 2.0 * observation, critics)
-    np.testing.assert_array_equal(value(LOGGED), [0.0, 10.0])
+    # of s + a and s, where a is -s and then 2 s
+    critic = TwinCritic(1, 1, (), key=jax.random.key(0))
+    twins = affine([[1.0, 1.0]], [0.0]), affine([[1.0, 0.0]], [0.0])
+    critic = eqx.tree_at(lambda critic: (critic.first, critic.second), critic, twins)
+    np.testing.assert_array_equal(StateValue(lambda observation: -observation, critic)(LOGGED), [0.0, 0.0])
+    np.testing.assert_array_equal(StateValue(lambda observation: 2.0 * observation, critic)(LOGGED), [0.0, 10.0])
