@@ -57,6 +57,7 @@ METHODS = {
         horizon=3,
         discriminator_hidden=(8,),
         discriminators=3,
+        judge_rows=4,
         discriminator_updates=EPOCH,
         imagined_per_update=2,
         imagined_rows=5,

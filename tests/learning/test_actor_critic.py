@@ -83,7 +83,8 @@ def test_how_observations_are_standardised_is_not_learnt():
         np.testing.assert_array_equal(before.scale, after.scale)
 
 
-def test_critic_update_by_hand(compiled):
+@pytest.mark.parametrize("least", [None, -1.5])
+def test_critic_update_by_hand(compiled, least):
     key = jax.random.key(3)
     batch = {
         "observation": column(STATE),
@@ -93,12 +94,14 @@ def test_critic_update_by_hand(compiled):
         "terminated": jnp.asarray(TERMINATED, jnp.float32),
     }
     before = learner(optax.sgd(1.0))
-    after, metrics = compiled(soft_critic_step)(before, batch, key, PLAIN, discount=0.9)
+    given = None if least is None else jnp.asarray(least)
+    after, metrics = compiled(soft_critic_step)(before, batch, key, PLAIN, discount=0.9, least=given)
 
     _, next_action, density = drawn(key, NEXT)
     next_value = np.minimum(value(TARGET_FIRST, NEXT, next_action), value(TARGET_SECOND, NEXT, next_action))
     target = REWARD + 0.9 * (1 - TERMINATED) * (next_value - TEMPERATURE * density)
     assert target[1] == -2.0
+    target = target if least is None else np.maximum(target, least)
     errors = [value(numbers, STATE, ACTION) - target for numbers in (FIRST, SECOND)]
     assert metrics["critic_loss"] == pytest.approx(0.5 * sum((error**2).mean() for error in errors), rel=1e-5)
     assert metrics["value_target"] == pytest.approx(target.mean(), rel=1e-5)

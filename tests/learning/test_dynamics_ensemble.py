@@ -7,6 +7,7 @@ import pytest
 from madoc.learning.dynamics_ensemble import (
     BOUNDS_WEIGHT,
     Ensemble,
+    bellman_inconsistency,
     fit,
     holdout_error,
     keep_best,
@@ -63,6 +64,12 @@ def test_penalty_is_the_largest_norm_in_physical_units(compiled):
     # (0.5, 2) is (1, 8), of norm sqrt 65
     std = jnp.array([[[1.0, 1.0]], [[0.5, 2.0]]])
     np.testing.assert_allclose(compiled(uncertainty_penalty)(std, FEATURES), [np.sqrt(65.0)], rtol=1e-6)
+
+
+def test_the_bellman_inconsistency_by_hand(compiled):
+    # two models that value what follows at 1 and 3: variance 2 of n - 1; two that agree: 0
+    value = jnp.array([[1.0, 5.0], [3.0, 5.0]])
+    np.testing.assert_allclose(compiled(bellman_inconsistency)(value), [np.sqrt(2.0), 0.0], rtol=1e-6)
 
 
 def test_held_out_rows_are_never_fitted_to():

@@ -54,6 +54,7 @@ def test_real_transitions_earn_more_than_wrong_ones():
     run = eqx.filter_jit(lambda *parts: reward.oppose(*parts, optimiser=adam(1e-3), batch=64, count=100, noise=0.1))
     for key in jax.random.split(jax.random.key(2), 10):
         opposition, metrics = run(opposition, rows, key)
+        opposition = reward.remember(opposition)
     assert all(np.isfinite(value) for value in metrics.values())
     right = reward.reward_of(opposition.past, *rows)
     wrong = reward.reward_of(opposition.past, rows[0], rows[1] + 2.0)

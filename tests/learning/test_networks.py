@@ -6,7 +6,15 @@ import optax
 import pytest
 
 from affine import affine, layered
-from madoc.learning.networks import Network, descend, drop, minimise, moving_average, scan_updates
+from madoc.learning.networks import (
+    Network,
+    descend,
+    drop,
+    falling_adam,
+    minimise,
+    moving_average,
+    scan_updates,
+)
 
 
 def test_network_is_affine_relu_affine(compiled):
@@ -115,6 +123,16 @@ def test_descend_takes_one_step_of_the_optimiser(compiled):
     moved, _ = step(gradients, optimiser.init(eqx.filter(network, eqx.is_array)), network)
     np.testing.assert_allclose(moved.layers[0].weight, [[1.5, -3.0]])  # 2 - 0.5·1, -1 - 0.5·4
     np.testing.assert_allclose(moved.layers[0].bias, [4.0])  # 3 + 0.5·2
+
+
+def test_the_rate_falls_along_half_a_cosine():
+    # Adam's step on a gradient that stays 1 is the rate: 0.5 of it after half the updates, 0 after all
+    optimiser = falling_adam(0.1, 4)
+    state, steps = optimiser.init(jnp.zeros(())), []
+    for _ in range(6):
+        step, state = optimiser.update(jnp.ones(()), state)
+        steps.append(-float(step))
+    np.testing.assert_allclose(steps, [0.1, 0.0853553, 0.05, 0.0146447, 0.0, 0.0], atol=1e-6)
 
 
 def test_moving_average_by_hand(compiled):

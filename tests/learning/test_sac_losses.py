@@ -51,6 +51,13 @@ def test_soft_target_by_hand(compiled):
     np.testing.assert_allclose(target, [12.8, 2.0], rtol=1e-6)
 
 
+def test_the_least_value_by_hand(compiled):
+    # a least reward of -2 at every step: -2 / (1 - 0.9); where no reward is below 0, an end is the least: 0
+    least = compiled(lambda rewards: sac_losses.least_value(rewards, 0.9))
+    assert least(jnp.array([1.0, -2.0, 3.0])) == pytest.approx(-20.0, rel=1e-5)
+    assert least(jnp.array([1.0, 3.0])) == 0.0
+
+
 def test_critic_loss_by_hand(compiled):
     # values (2.5, -1.5) and (2.5, 2.0) as above, targets (1.5, 0.5):
     # ½ (mean(1², 2²) + mean(1², 1.5²)) = ½ (2.5 + 1.625) = 2.0625

@@ -162,10 +162,17 @@ def actor_step(
 
 
 def soft_critic_step(
-    learner: ActorCritic, batch: Batch, noise: Noise, descent: Descent, *, discount: float | Array
+    learner: ActorCritic,
+    batch: Batch,
+    noise: Noise,
+    descent: Descent,
+    *,
+    discount: float | Array,
+    least: Scalar | None = None,
 ) -> tuple[ActorCritic, dict[str, Array]]:
-    """One gradient step of the critics down SAC's loss."""
+    """One gradient step of the critics down SAC's loss; targets are not below `least`."""
     target = bellman_target(learner, batch, noise, discount=discount)
+    target = target if least is None else jnp.maximum(target, jnp.broadcast_to(least, target.shape))
 
     def loss_of(critic: TwinCritic) -> tuple[Array, Array]:
         return sac_losses.critic_loss(critic, batch["observation"], batch["action"], target), target.mean()

@@ -125,6 +125,15 @@ def uncertainty_penalty(std: Float[Array, "models rows outputs"], features: Feat
     return jnp.linalg.norm(std * jnp.broadcast_to(scale, std.shape), axis=-1).max(0)
 
 
+def bellman_inconsistency(value: Float[Array, "models rows"]) -> PerRow:
+    """U(s, a) of MOBILE, Sun et al. 2023 (ICML): the standard deviation over models of the value of the next state.
+
+    Without the discount and with n - 1 in the denominator, as in their code. They average the values of ten next states
+    drawn from each model; here a model's is that of the next state it expects, so no noise of few draws is added.
+    """
+    return value.std(0, ddof=1)
+
+
 def training_rows(draws: Int[Array, "*rows"], holdout_every: int) -> Int[Array, "*rows"]:
     """Row numbers of the given draws from the training rows, which are all rows but every `holdout_every`-th."""
     return draws + draws // (holdout_every - 1)

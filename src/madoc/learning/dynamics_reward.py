@@ -109,7 +109,7 @@ def oppose(
     count: int,
     noise: float,
 ) -> tuple[Opposition, dict[str, Array]]:
-    """`count` alternating updates of discriminator and generator; the discriminator then joins the past ones."""
+    """`count` alternating updates of discriminator and generator."""
 
     def update(carry: Opposition, key: PRNGKeyArray) -> tuple[Opposition, dict[str, Array]]:
         of_rows, of_sample, of_real, of_generated = jax.random.split(key, 4)
@@ -138,5 +138,4 @@ def oppose(
         following = Opposition(generator, discriminator, carry.past, generator_optimiser, discriminator_optimiser)
         return following, {"discriminator_loss": loss, "generated_reward": -lost}
 
-    following, metrics = scan_updates(update, opposition, key, count)
-    return remember(following), metrics
+    return scan_updates(update, opposition, key, count)

@@ -147,6 +147,12 @@ def adam(learning_rate: float) -> optax.GradientTransformation:
     return optax.adam(learning_rate)
 
 
+@cache
+def falling_adam(learning_rate: float, updates: int) -> optax.GradientTransformation:
+    """Optax's Adam with a rate that falls to 0 over so many updates, along half a cosine (arXiv 1608.03983)."""
+    return optax.adam(optax.cosine_decay_schedule(learning_rate, updates))
+
+
 def descend(optimiser, gradients: PyTree, optimiser_state: PyTree, parameters: Carry) -> tuple[Carry, PyTree]:
     """One step of an Optax optimiser on the arrays of a module."""
     updates, optimiser_state = optimiser.update(gradients, optimiser_state)

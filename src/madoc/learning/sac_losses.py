@@ -54,6 +54,12 @@ def soft_target(
     return reward + discount * (1.0 - terminated) * (next_value - temperature * next_log_density)
 
 
+def least_value(reward: PerRow, discount: float) -> Scalar:
+    """The least sum of discounted rewards there can be if no reward is below the least one given, or below 0."""
+    least = jnp.minimum(reward.min(), 0.0)
+    return jnp.where(least < 0.0, least / max(1.0 - discount, 1e-6), 0.0)
+
+
 def critic_loss(critic: TwinCritic, observation: Array, action: Array, target: PerRow) -> Scalar:
     """Eq. (5): half the mean squared Bellman error, summed over the twins."""
     first, second = critic(observation, action)

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from madoc.learning.actor_critic import Batch
-from madoc.learning.dynamics_ensemble import Ensemble, uncertainty_penalty
+from madoc.learning.dynamics_ensemble import Ensemble, bellman_inconsistency, uncertainty_penalty
 from madoc.learning.dynamics_reward import reward_of
 from madoc.learning.features import Features
 from madoc.learning.networks import Network
+from madoc.learning.sac_losses import TwinCritic
 from madoc.types import Policy
 
 LARGEST_CHANGE = 10.0
@@ -45,22 +47,39 @@ class WithoutNoise(eqx.Module):
         return jnp.asarray(self.policy(observation))
 
 
-def mean_return(
-    reward: Float[Array, " transitions"], ended: Float[Array, " transitions"], *, rows: int
-) -> Float[Array, ""]:
-    """Mean over rows of the sum of rewards until each first ends, of transitions flat in time and row."""
-    reward, ended = reward.reshape(-1, rows), ended.reshape(-1, rows)
-    under_way = jnp.concatenate([jnp.ones((1, rows)), jnp.cumprod(1.0 - ended, axis=0)[:-1]])
-    return (reward * under_way).sum(0).mean()
+def mean_return(reward: Float[np.ndarray, "steps rows"], ended: Float[np.ndarray, "steps rows"]) -> float:
+    """Mean over rows of the sum of rewards until each first ends."""
+    under_way = np.concatenate([np.ones((1, reward.shape[1])), np.cumprod(1.0 - ended, axis=0)[:-1]])
+    return float((reward * under_way).sum(0).mean())
 
 
-def best_candidate(
-    candidates: Float[Array, "candidates rows outputs"], rewards: Float[Array, "candidates rows"]
+Value = Callable[[Float[Array, "rows observation"]], Float[Array, " rows"]]
+
+
+class StateValue(eqx.Module):
+    """V(s), estimated by the smaller of two critics at the action that a policy takes without noise."""
+
+    policy: Policy
+    critic: TwinCritic
+
+    def __call__(self, observation: Float[Array, "*rows observation"]) -> Float[Array, "*rows"]:
+        """The value of a batch of observations."""
+        return jnp.minimum(*self.critic(observation, jnp.asarray(self.policy(observation))))
+
+
+def chosen_candidate(
+    candidates: Float[Array, "candidates rows outputs"],
+    rewards: Float[Array, "candidates rows"],
+    temperature: float,
+    key: PRNGKeyArray,
 ) -> tuple[Float[Array, "rows outputs"], Float[Array, " rows"]]:
-    """For each row the candidate of the highest dynamics reward, and that reward."""
-    best = rewards.argmax(0)
+    """For each row one candidate and its dynamics reward, drawn with probability softmax(reward / temperature).
+
+    At temperature 0 the candidate of the highest reward.
+    """
+    chosen = jax.random.categorical(key, rewards / temperature, axis=0) if temperature else rewards.argmax(0)
     rows = jnp.arange(candidates.shape[1])
-    return candidates[best, rows], rewards[best, rows]
+    return candidates[chosen, rows], rewards[chosen, rows]
 
 
 @eqx.filter_jit
@@ -71,11 +90,13 @@ def imagine(
     features: Features,
     policy: Policy,
     under_way: ImaginedRows,
+    value: Value | None,
     *,
     logged: Float[Array, "logged observation"],
     terminated: Callable[[Array], Bool[Array, " rows"]],
     state_of: Callable[[Array], Array],
     samples: int,
+    temperature: float,
     threshold: float,
     horizon: int,
     penalty: float,
@@ -84,8 +105,8 @@ def imagine(
 ) -> tuple[ImaginedRows, Batch, dict[str, Array]]:
     """Act for `steps` steps in every row; rows that end restart at logged observations.
 
-    Of the next states drawn from the models, the one with the highest dynamics reward is kept (Luo et al. 2024, section
-    4). Observations are clipped to the range of the logged ones, widened by its width on either side.
+    Of the next states drawn from the models one is kept, the more likely the higher its dynamics reward (Luo et al.
+    2024, section 4). Observations are clipped to the range of the logged ones, widened by its width on either side.
 
     Args:
         ensemble: The dynamics models.
@@ -94,13 +115,15 @@ def imagine(
         features: The standardisation of the data.
         policy: The policy that acts.
         under_way: The rows.
+        value: The values by which the models' uncertainty is measured as in MOBILE; None measures it as in MOPO.
         logged: Observations to restart at.
         terminated: Whether the task ends at a state.
         state_of: The state at an observation.
         samples: Number of next states drawn from each elite.
-        threshold: A row whose best dynamics reward is below looks unreal; it is `stopped` and restarts, unless it fell.
+        temperature: Of the draw of one of them; 0 takes the one with the highest dynamics reward.
+        threshold: A row whose dynamics reward is below looks unreal; it is `stopped` and restarts, unless it fell.
         horizon: Number of steps after which a row restarts.
-        penalty: λ of MOPO, the weight of the models' uncertainty in the reward.
+        penalty: The weight of the models' uncertainty in the reward.
         steps: Number of steps.
         key: Randomness.
 
@@ -112,8 +135,12 @@ def imagine(
     low, high = logged.min(0), logged.max(0)
     low, high = low - (high - low), high + (high - low)
 
+    def within_range(observation: Array) -> Array:
+        bounds = (jnp.broadcast_to(bound, observation.shape) for bound in (low, high))
+        return jnp.clip(observation, *bounds)
+
     def step(under_way: ImaginedRows, key: PRNGKeyArray) -> tuple[ImaginedRows, tuple[Batch, dict[str, Array]]]:
-        of_action, of_sample, of_restart = jax.random.split(key, 3)
+        of_action, of_sample, of_choice, of_restart = jax.random.split(key, 4)
         observation = under_way.observation
         action = policy(observation, of_action)
         pair = features.pair(observation, action)
@@ -125,12 +152,21 @@ def imagine(
         candidates = drawn.reshape(-1, *elite_mean.shape[1:])
         change = jnp.clip(candidates[..., :-1], -LARGEST_CHANGE, LARGEST_CHANGE)
         pairs = jnp.broadcast_to(pair, (*change.shape[:2], pair.shape[-1]))
-        outcome, reality = best_candidate(
-            jnp.concatenate([change, candidates[..., -1:]], axis=-1), reward_of(past, pairs, change)
+        outcome, reality = chosen_candidate(
+            jnp.concatenate([change, candidates[..., -1:]], axis=-1),
+            reward_of(past, pairs, change),
+            temperature,
+            of_choice,
         )
-        following = features.following(observation, outcome[:, :-1])
-        following = jnp.clip(following, jnp.broadcast_to(low, following.shape), jnp.broadcast_to(high, following.shape))
-        uncertainty = uncertainty_penalty(std, features)
+        following = within_range(features.following(observation, outcome[:, :-1]))
+        if value is None:
+            uncertainty = uncertainty_penalty(std, features)
+        else:
+            expected = jnp.clip(elite_mean[..., :-1], -LARGEST_CHANGE, LARGEST_CHANGE)
+            beside = jnp.broadcast_to(observation, expected.shape)
+            could_follow = within_range(features.following(beside, expected)).reshape(-1, observation.shape[-1])
+            worth = value(could_follow) * ~terminated(state_of(could_follow))
+            uncertainty = bellman_inconsistency(worth.reshape(len(elites), -1))
         reward = features.reward_offset + features.reward_scale * outcome[:, -1]
         fell = terminated(state_of(following))
         unreal = (reality < threshold) & ~fell
@@ -158,6 +194,27 @@ def imagine(
     under_way, (rows, metrics) = jax.lax.scan(step, under_way, jax.random.split(key, steps))
     flat = {name: column.reshape(-1, *column.shape[2:]) for name, column in rows.items()}
     return under_way, flat, jax.tree.map(jnp.mean, metrics)
+
+
+def imagined_return(
+    act: Callable[..., tuple[ImaginedRows, Batch, dict[str, Array]]],
+    under_way: ImaginedRows,
+    longest: int,
+    key: PRNGKeyArray,
+) -> float:
+    """Mean return of rows until each first ends, or has taken `longest` steps.
+
+    `act` takes some steps, as `imagine` does, from given rows and with a given `key`; what looks unreal ends a row too.
+    """
+    rows = len(under_way.age)
+    reward, ended = np.zeros((0, rows)), np.zeros((0, rows))
+    while len(reward) < longest and not (len(ended) and ended.any(0).all()):
+        of_steps, key = jax.random.split(key)
+        under_way, acted, _ = act(under_way=under_way, key=of_steps)
+        ends = np.maximum(acted["terminated"], acted["stopped"])
+        reward = np.append(reward, np.reshape(acted["reward"], (-1, rows)), axis=0)
+        ended = np.append(ended, np.reshape(ends, (-1, rows)), axis=0)
+    return mean_return(reward[:longest], ended[:longest])
 
 
 def _some(logged: Array, rows: int, key: PRNGKeyArray) -> Array:
