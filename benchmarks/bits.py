@@ -74,7 +74,13 @@ POLICIES = {
     "h2o": (4_000, [*SMALL_NETWORKS, "warmup_steps=1000", "updates_per_step=0.1"]),
     "bc": (2_000, SMALL_NETWORKS),
     "cql": (2_000, [*SMALL_NETWORKS, "critic_hidden=[32, 32]"]),
-    "morec": (2_000, [*SMALL_NETWORKS, "model_updates=200", "discriminator_updates=400", "model_hidden=[32, 32]"]),
+    "morec": (
+        2_000,
+        [
+            *(*SMALL_NETWORKS, "model_hidden=[32, 32]", "model_updates=200", "judge_every=1000"),
+            *("discriminators=4", "discriminator_every=100", "discriminator_updates=400"),
+        ],
+    ),
 }
 """By learner: its budget, and more options."""
 

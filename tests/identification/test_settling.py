@@ -75,12 +75,18 @@ def test_wide_differences_and_restarts_find_states_at_contacts():
     assert (again.costs <= wide.costs).all()
 
 
-def test_contacts_of_a_simulated_window_begin_where_it_lands():
+def test_contacts_of_a_window_are_those_of_its_simulated_states():
     task = tasks.make("hopper", "legacy")
     middle = dict(zip(task.parameters.names, task.parameters.middle.tolist(), strict=True))
     simulator, readings, guesses = windows(task, middle, 5, 0.0)
     states, point = guesses.copy(), np.zeros(len(middle))
     states[:, 1] += 3.0
     assert not readings.contacts(simulator, point, states).any()
-    states[:, 1] = simulator.initial_state[1] - 0.05
-    assert readings.contacts(simulator, point, states)[:, 0].all()
+    states[:, 1] = simulator.initial_state[1]
+    counts = readings.contacts(simulator, point, states)
+    assert (counts != counts[:, :1]).any()
+    system, state = simulator.bind(task.parameters.middle[None]), states[None]
+    for step, expected in enumerate(counts.T):
+        np.testing.assert_array_equal(simulator.contacts(state[0]), expected)
+        if step < readings.steps:
+            state = system.step(state, readings.actions[None, :, step])

@@ -51,7 +51,7 @@ def imagined(
         terminated=terminated,
         state_of=lambda observation: observation,
         samples=2,
-        temperature=0.0,
+        selection_temperature=0.0,
         threshold=threshold,
         horizon=horizon,
         penalty=penalty,

@@ -129,7 +129,8 @@ def bellman_inconsistency(value: Float[Array, "models rows"]) -> PerRow:
     """U(s, a) of MOBILE, Sun et al. 2023 (ICML): the standard deviation over models of the value of the next state.
 
     Without the discount and with n - 1 in the denominator, as in their code. They average the values of ten next states
-    drawn from each model; here a model's is that of the next state it expects, so no noise of few draws is added.
+    drawn from each model, and of actions drawn there, at every update; here a model's value is that of the state it
+    expects and of the policy's action without noise, is 0 where the task has ended, and is not computed again later.
     """
     return value.std(0, ddof=1)
 

@@ -55,9 +55,12 @@ def soft_target(
 
 
 def least_value(reward: PerRow, discount: float) -> Scalar:
-    """The least sum of discounted rewards there can be if no reward is below the least one given, or below 0."""
+    """The least sum of discounted rewards if none is below the least one given; 0 if that is positive, as episodes end.
+
+    Entropy and penalties of the models are not counted. It is minus infinity for negative rewards without a discount.
+    """
     least = jnp.minimum(reward.min(), 0.0)
-    return jnp.where(least < 0.0, least / max(1.0 - discount, 1e-6), 0.0)
+    return jnp.where(least < 0.0, least / jnp.float32(1.0 - discount), 0.0)
 
 
 def critic_loss(critic: TwinCritic, observation: Array, action: Array, target: PerRow) -> Scalar:

@@ -70,14 +70,17 @@ class StateValue(eqx.Module):
 def chosen_candidate(
     candidates: Float[Array, "candidates rows outputs"],
     rewards: Float[Array, "candidates rows"],
-    temperature: float,
+    selection_temperature: float,
     key: PRNGKeyArray,
 ) -> tuple[Float[Array, "rows outputs"], Float[Array, " rows"]]:
     """For each row one candidate and its dynamics reward, drawn with probability softmax(reward / temperature).
 
-    At temperature 0 the candidate of the highest reward.
+    At a temperature of 0 the candidate of the highest reward.
     """
-    chosen = jax.random.categorical(key, rewards / temperature, axis=0) if temperature else rewards.argmax(0)
+    if selection_temperature:
+        chosen = jax.random.categorical(key, rewards / selection_temperature, axis=0)
+    else:
+        chosen = rewards.argmax(0)
     rows = jnp.arange(candidates.shape[1])
     return candidates[chosen, rows], rewards[chosen, rows]
 
@@ -96,7 +99,7 @@ def imagine(
     terminated: Callable[[Array], Bool[Array, " rows"]],
     state_of: Callable[[Array], Array],
     samples: int,
-    temperature: float,
+    selection_temperature: float,
     threshold: float,
     horizon: int,
     penalty: float,
@@ -120,7 +123,7 @@ def imagine(
         terminated: Whether the task ends at a state.
         state_of: The state at an observation.
         samples: Number of next states drawn from each elite.
-        temperature: Of the draw of one of them; 0 takes the one with the highest dynamics reward.
+        selection_temperature: Of the draw of one of them; 0 takes the one with the highest dynamics reward.
         threshold: A row whose dynamics reward is below looks unreal; it is `stopped` and restarts, unless it fell.
         horizon: Number of steps after which a row restarts.
         penalty: The weight of the models' uncertainty in the reward.
@@ -155,7 +158,7 @@ def imagine(
         outcome, reality = chosen_candidate(
             jnp.concatenate([change, candidates[..., -1:]], axis=-1),
             reward_of(past, pairs, change),
-            temperature,
+            selection_temperature,
             of_choice,
         )
         following = within_range(features.following(observation, outcome[:, :-1]))

@@ -78,51 +78,47 @@ class MOREC:
     imagined step each elite model draws candidates, of which one that past discriminators find real is kept; if it is
     not, the row ends. The budget counts updates of the policy; those of models and discriminators come before it.
 
-    The constants are the authors' where they gave them (github.com/polixir/morec; of their two penalties, those of
-    MOBILE). They imagine up to 200 transitions for every update, on a GPU; here a twentieth. They learn for 3 million
-    updates, and scale each past discriminator's logits by its means for real and for generated transitions; here
-    logits count as they are. Unlike theirs, policy and critics see standardised observations.
+    The constants are the authors' (github.com/polixir/morec; with MOBILE's penalty) but those said to be chosen. They
+    imagine up to 200 transitions for every update, on a GPU, learn for 3 million updates, and scale each past
+    discriminator's logits; here logits count as they are, and policy and critics see standardised observations.
 
     Attributes:
         hidden: Numbers of units of the hidden layers of policy and critics.
         model_hidden: Units per layer of a dynamics model.
         models: Dynamics models.
         elites: How many of them are sampled from.
-        model_updates: Most updates of the models, before anything else. Unlike the authors', their learning rate falls
-            to 0 over these.
+        model_updates: Most updates of the models. Unlike the authors', their learning rate falls to 0 over these.
         patience: Updates after which fitting ends if no model's error on held-out rows has fallen by 1 %, as in MOPO's
             code; each model is then as it was at its smallest error. 0 makes all `model_updates`, and keeps the last.
         discriminator_hidden: Units per layer of a discriminator.
         discriminators: Past discriminators that make up the dynamics reward.
-        discriminator_every: Updates after which one is kept. The authors', too, take ten that are far apart.
+        discriminator_every: Updates after which one is kept, at the end of an epoch.
         discriminator_updates: Updates of generator and discriminator, after the models'. Chosen, not the authors'.
         noise: Standard deviation of the noise on the discriminators' inputs, in units of a step's change. Chosen.
         samples: Next states drawn from each elite.
-        temperature: Of the draw of one of these next states by dynamics reward; 0 takes the one with the highest. The
-            authors took 0.1 for most data sets.
+        selection_temperature: Of the draw of one of these next states by dynamics reward; 0 takes the one with the
+            highest. The authors took 0.1 for most data sets, of scaled logits; ours differ by more.
         threshold: A rollout ends before a step whose dynamics reward is below; unless it is a fall, it is not learnt
-            from. The authors' 0.6 is of scaled logits. With ours it ended rollouts of a policy that runs 1000 steps on
-            the Hopper after 12 to 40, so that nothing was learnt of what makes a robot fall later.
+            from. Chosen: the authors' 0.6 is of scaled logits, and with ours ends rollouts on the Hopper too early.
         horizon: Longest imagined rollout, in control steps.
         uncertainty: What lowers imagined rewards: `mobile`, how much the models differ on the value of what follows, or
             `mopo`, the largest of their standard deviations, in units of the state.
         penalty: Its weight. The authors chose it by dataset: for Hopper medium 1.5 (`mobile`) or 15 (`mopo`), for
-            HalfCheetah medium 0.25 or 0.5, for Walker2d medium 0.75 or 0.5.
-        real: Share of logged rows in a batch; the authors took 0.05 or 0.5, by dataset.
+            HalfCheetah medium 0.25 or 0.5.
+        real: Share of logged rows in a batch. Chosen: the authors took 0.05 for most data sets, 0.5 for two.
         imagined_per_update: Imagined transitions for each update of the policy.
         imagined_rows: Rows imagined at a time.
         epoch_updates: Gradient updates per epoch.
         holdout_every: Every `holdout_every`-th logged row is held out: the models do not see it, and are stopped and
             chosen by it.
-        judge_every: Updates of the policy after which it acts whole episodes in the models, without noise, from where
-            logged episodes began; that of the highest mean return, net of MOPO's penalty (MOBILE's changes with the
-            critics), is what is handed back. 0 hands back the last.
-        judge_rows: Number of these episodes.
+        judge_every: Updates of the policy after which it acts whole episodes in the models; that of the highest mean
+            return, net of MOPO's penalty (MOBILE's changes with the critics), is handed back. 0 hands back the last.
+        judge_rows: Number of these episodes. By default they are as many imagined steps as learning takes.
         batch: Rows per update.
         discount: γ.
         target_rate: τ of the target critics.
         model_learning_rate: Adam's, for models (at first), generator and discriminators.
-        policy_learning_rate: Adam's, for policy and temperature. Three times the authors', who learn longer.
+        policy_learning_rate: Adam's, for policy and SAC's temperature; three times the authors', who learn longer.
         critic_learning_rate: Adam's, for the critics.
         replay_capacity: Imagined rows kept.
     """
@@ -139,7 +135,7 @@ class MOREC:
     discriminator_updates: CountOrZero = 8000
     noise: NotNegative = 0.1
     samples: Count = 2
-    temperature: NotNegative = 0.1
+    selection_temperature: NotNegative = 0.1
     threshold: float = 0.05
     horizon: Count = 100
     uncertainty: Literal["mobile", "mopo"] = "mobile"
@@ -163,6 +159,12 @@ class MOREC:
         check_hyperparameters(self)
         if self.models < self.elites:
             raise MadocError(f"expected at least as many models as elites, {self.elites}, got {self.models}")
+        fewest = self.discriminators * max(self.discriminator_every, self.epoch_updates)
+        if self.discriminator_updates and self.discriminator_updates < fewest:
+            raise MadocError(
+                f"expected at least {fewest} discriminator_updates for {self.discriminators} discriminators, got "
+                f"{self.discriminator_updates}; lower discriminators or discriminator_every"
+            )
 
     def init(self, problem: PolicyProblem, key: PRNGKeyArray) -> MORECState:
         """Fresh networks, an empty replay, rows at logged observations.
@@ -277,10 +279,10 @@ class MOREC:
     def _oppose(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
         """Train discriminators and their generator."""
         adversary, metrics = self._update_opposition(state.opposition, problem.logged, problem.features, state.key)
-        before, preparing = state.preparing, state.preparing + self.epoch_updates
+        preparing = state.preparing + self.epoch_updates
         state = replace(state, opposition=adversary, preparing=preparing)
-        every = self.discriminator_every
-        if before // every < preparing // every or self._stage(state) != "opposing":
+        since = (preparing - self.model_updates) % self.discriminator_every
+        if since < self.epoch_updates or self._stage(state) != "opposing":
             state = replace(state, opposition=remember(adversary))
         return state, metrics
 
@@ -329,7 +331,7 @@ class MOREC:
         return following, imagined | metrics
 
     def _judge(self, problem: PolicyProblem, state: MORECState, policy: TanhGaussianPolicy, key: PRNGKeyArray) -> float:
-        """Mean return of whole episodes in the models, without noise."""
+        """Mean return in the models of the policy without noise; episodes begin where logged ones did."""
         of_starts, of_steps = jax.random.split(key)
         begins = problem.logged["observation"][require_data(problem, rows=0).episode_starts]
         longest = problem.simulator.task.max_episode_steps
@@ -359,7 +361,7 @@ class MOREC:
             terminated=task.terminated,
             state_of=task.state_from_observation,
             samples=self.samples,
-            temperature=self.temperature,
+            selection_temperature=self.selection_temperature,
             threshold=self.threshold,
         )
 
@@ -367,7 +369,7 @@ class MOREC:
     def _update_policy(
         self, learner: ActorCritic, seen: replay.Replay, logged: Batch, key: PRNGKeyArray
     ) -> tuple[ActorCritic, dict[str, Array]]:
-        """SAC on logged and imagined rows; as in MOBILE, no target is below what the least logged reward allows."""
+        """SAC on logged and imagined rows; targets are at least what the least logged reward allows (MOBILE's: 0)."""
         real = round(self.real * self.batch)
         least = least_value(logged["reward"], self.discount)
 

@@ -123,7 +123,7 @@ class CpuSimulator:
             data.qpos[:] = position
             mujoco.mj_kinematics(self._model, data)
             mujoco.mj_collision(self._model, data)
-            contacts[row] = len(np.unique(data.contact.geom, axis=0)) if data.ncon > 1 else data.ncon
+            contacts[row] = len(set(map(tuple, data.contact.geom.tolist()))) if data.ncon > 1 else data.ncon
         return contacts
 
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:

@@ -34,7 +34,7 @@ class Plan:
         autocorrelation: Correlation of residuals of consecutive readings.
         exact: Whether residuals are rounding errors, so that their size cannot show whether initial states still move.
         left_out: Share of the windows that the cost does not count.
-        steady_cost: Cost of the windows in which no contact begins or ends; 0 where initial states are known.
+        steady_cost: Cost of the windows in which no contact begins or ends; 0 while searching and for known states.
     """
 
     point: Float[np.ndarray, " d"]

@@ -24,7 +24,7 @@ LITTLE = 5e-3
 """Share in [0, 1] of the cost; after a step that saves less, unknown initial states count as settled too."""
 ROUGHLY_SETTLED = 0.5
 """Ratio in [0, 1] of a step to the standard error where initial states settle anew after each step: some windows end in
-another minimum each time, which moves the parameters by about as much. Intervals count that."""
+another minimum each time, which moves the parameters by about as much."""
 FOUND = (0.5, 0.9)
 """Shares in [0, 1]. If narrowing differences and restarts leave at most this share of the unexplained windows, or of
 the size of all residuals, those windows lacked an initial state, not a better model."""
@@ -54,7 +54,7 @@ class SearchState:
         touching: Whether a contact was seen in each window, as far as its states are known.
         deviation: Noise of each channel in its typical changes; 1 where initial states are known.
         bread: Curvature of the best search's cost where it last linearised.
-        meat: Scatter of the cost's gradient there.
+        meat: Scatter of the cost's gradient there; at contacts also the last step's, once settled.
         explained: Number of windows from which these two were computed.
         steady_cost: Mean loss of a residual in those in which no contact begins or ends, each kind in its own noise.
         autocorrelation: Correlation of these windows' residuals with the next reading's; 0 for known initial states.
@@ -230,7 +230,8 @@ class Search:
 
         The cost is that of the best initial states for each parameter vector (variable projection, Golub and Pereyra
         1973). A step with states that follow to first order alone would be refused at contacts. As states end in other
-        minima after each step, parameters do not come to rest: once settled, the covariance counts the last step too.
+        minima after each step, parameters do not come to rest: once settled, the covariance counts the last step as an
+        error.
         """
         states = state.states[:1]
         undamped = np.full(states.shape[:2], settling.DAMPING_RANGE[0])

@@ -38,7 +38,7 @@ def about_estimated_states(problem: CalibrationProblem, search: SearchState, hor
 def have_long_tails(search: SearchState) -> bool:
     """Whether residuals have longer tails than noise has; not known before the first step on all windows.
 
-    Windows in which a contact begins or ends do not count, where there are others.
+    Windows in which a contact begins or ends do not count where there are enough others, see `steady_cost`.
     """
     return _noisy(search) and search.steady_cost > LONG_TAILS
 
@@ -54,8 +54,8 @@ def about_residuals(search: SearchState) -> tuple[str, ...]:
     )
     tails = "residuals have longer tails than noise has: the intervals are too narrow"
     jumps = (
-        "residuals have longer tails than noise has in windows in which contacts begin or end; these move the estimate "
-        "little, as the loss is robust, and intervals count how much they differ"
+        "residuals have longer tails than noise has only where contacts begin or end, or where windows of different "
+        "contacts are taken together; the verdict does not count that"
     )
     long = [tails] if have_long_tails(search) else [jumps] if search.cost[0] > LONG_TAILS else []
     return (*([sentence] if left_out else []), *long)

@@ -62,10 +62,10 @@ def steady_cost(
 ) -> float:
     """Mean cost of the windows in which no contact begins or ends; 0 without windows.
 
-    Where one does, residuals jump with the error of the initial state. Windows with the same number of `contacts`
-    throughout are of one kind, whose cost is in standard deviations of its own noise: forces at random hardly move what
-    rests on the ground. Kinds of fewer than `FEWEST_STEADY` windows say nothing; if all are, all windows count as one
-    kind. `spare` is 1 - leverage of each residual.
+    Where one does, residuals jump with the error of the initial state. Windows with the same number of `contacts` at
+    every reading are of one kind, whose cost is in standard deviations of its own noise: a force that disturbs a flying
+    body shows less where friction holds it. Kinds of fewer than `FEWEST_STEADY` windows say nothing; if all are, all
+    windows count as one kind. A contact between two readings is not seen. `spare` is 1 - leverage of each residual.
     """
     if not len(residuals):
         return 0.0
