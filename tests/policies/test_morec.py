@@ -10,7 +10,10 @@ from madoc.policies import LEARNERS
     ("options", "message"),
     [
         ({"models": 3, "elites": 4}, "expected at least as many models as elites, 4, got 3"),
-        ({"discriminator_updates": 3999}, "expected at least 4000 discriminator_updates for 10 discriminators, got 3999"),
+        (
+            {"discriminator_updates": 3999},
+            "expected at least 4000 discriminator_updates for 10 discriminators, got 3999",
+        ),
         ({"discriminator_every": 1, "discriminator_updates": 999}, "expected at least 1000 discriminator_updates"),
     ],
 )
