@@ -6,7 +6,7 @@ import pytest
 from madoc.identification.qr import BLOCK, thin_qr, triangle
 
 
-@pytest.mark.parametrize("rows", [1, 3, BLOCK, 5 * BLOCK + 7])
+@pytest.mark.parametrize("rows", [0, 1, 3, BLOCK, 5 * BLOCK + 7])
 def test_triangle_has_the_matrix_s_products(rows: int) -> None:
     matrix = np.random.default_rng(rows).standard_normal((rows, 3))
     factor = triangle(matrix)

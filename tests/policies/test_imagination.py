@@ -53,6 +53,7 @@ def imagined(
         samples=2,
         selection_temperature=0.0,
         threshold=threshold,
+        worst=jnp.asarray(-7.0),
         horizon=horizon,
         penalty=penalty,
         steps=steps,
@@ -90,7 +91,7 @@ def acting(ends_after, calls):
         ages = np.asarray(under_way.age) + np.array([[1], [2]])
         calls.append(ages)
         ends = (ages == ends_after).astype(float).reshape(-1)
-        acted = {"reward": np.array([1.0, 10.0, 1.0, 10.0]), "terminated": ends, "stopped": np.zeros(4)}
+        acted = {"reward": np.array([1.0, 10.0, 1.0, 10.0]), "terminated": ends}
         return ImaginedRows(under_way.observation, under_way.age + 2), acted, {}
 
     return act
@@ -120,16 +121,18 @@ def test_what_looks_most_real_is_what_happens():
         assert not rows["terminated"].any()
 
 
-def test_what_looks_unreal_starts_again_and_is_marked_but_is_no_fall():
+def test_what_looks_unreal_ends_and_is_worth_the_worst_but_a_fall_is_a_fall():
     # even the better candidate, change 1, has D = sigmoid(-3), r = 0.0486 < 0.1
     under_way, rows, metrics = imagined(slope=-3.0, steps=1)
-    assert rows["stopped"].all()
-    _, fallen, _ = imagined(slope=-3.0, steps=1, terminated=lambda o: o[:, 0] > -100)
-    assert fallen["terminated"].all() and not fallen["stopped"].any()
-    assert not rows["terminated"].any()
-    assert metrics["stopped"] == 1.0
+    assert rows["terminated"].all()
+    np.testing.assert_array_equal(rows["reward"], -7.0)
+    assert metrics["unreal"] == 1.0
     assert set(np.asarray(under_way.observation)[:, 0].tolist()) <= {0.0, 10.0}
     assert (np.asarray(under_way.age) == 0).all()
+    _, fallen, metrics = imagined(slope=-3.0, steps=1, terminated=lambda o: o[:, 0] > -100)
+    assert fallen["terminated"].all()
+    np.testing.assert_allclose(fallen["reward"], 1.0, rtol=1e-5)
+    assert metrics["unreal"] == 0.0
 
 
 def test_a_fall_ends_and_the_horizon_only_starts_again():

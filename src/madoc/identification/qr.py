@@ -14,6 +14,8 @@ BLOCK = 128
 def triangle(matrix: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
     """R of the QR decomposition, for a matrix of any number of rows; missing rows count as zeros."""
     columns = matrix.shape[1]
+    if not len(matrix):
+        return np.zeros((columns, columns))
     rows = max(BLOCK, 2 * columns)
     while len(matrix) > 2 * rows:
         blocks = _padded(matrix, rows).reshape(-1, rows, columns)

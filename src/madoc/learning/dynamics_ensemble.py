@@ -1,5 +1,7 @@
 """An ensemble of probabilistic dynamics models (Chua et al. 2018, arXiv 1805.12114; MOPO's, arXiv 2005.13239)."""
 
+from dataclasses import dataclass, replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -117,6 +119,41 @@ def keep_best(
     bounds = (jnp.where(any_fell, latest.largest, kept.largest), jnp.where(any_fell, latest.smallest, kept.smallest))
     best = eqx.tree_at(lambda models: (models.networks, models.largest, models.smallest), kept, (networks, *bounds))
     return best, jnp.where(fell, error, smallest), any_fell
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Fitting:
+    """Models that are fitted until their errors on held-out rows no longer fall.
+
+    Attributes:
+        models: The models after the last update.
+        optimiser: The state of their optimiser.
+        best: Each model as it was when its error on held-out rows was smallest.
+        smallest: Those errors.
+        stale: Updates since the error of any model last fell.
+    """
+
+    models: Ensemble
+    optimiser: PyTree
+    best: Ensemble
+    smallest: Float[Array, " models"]
+    stale: int
+
+    @classmethod
+    def of(cls, models: Ensemble, optimiser: optax.GradientTransformation) -> "Fitting":
+        """Before the first update."""
+        largest = jnp.full(models.count, jnp.finfo(jnp.float32).max)
+        return cls(models, optimiser.init(eqx.filter(models, eqx.is_array)), models, largest, 0)
+
+    def after(self, models: Ensemble, optimiser: PyTree, errors: Float[Array, " models"], count: int) -> "Fitting":
+        """After `count` more updates, that lead to models of these errors on held-out rows."""
+        best, smallest, fell = keep_best(self.best, self.smallest, models, errors)
+        return Fitting(models, optimiser, best, smallest, 0 if bool(fell) else self.stale + count)
+
+    def ended(self) -> "Fitting":
+        """With each model as it was at its smallest error."""
+        return replace(self, models=self.best)
 
 
 def uncertainty_penalty(std: Float[Array, "models rows outputs"], features: Features) -> PerRow:

@@ -101,6 +101,7 @@ def imagine(
     samples: int,
     selection_temperature: float,
     threshold: float,
+    worst: Float[Array, ""],
     horizon: int,
     penalty: float,
     steps: int,
@@ -110,6 +111,10 @@ def imagine(
 
     Of the next states drawn from the models one is kept, the more likely the higher its dynamics reward (Luo et al.
     2024, section 4). Observations are clipped to the range of the logged ones, widened by its width on either side.
+
+    A row whose dynamics reward is below the threshold looks unreal: nothing is known of what follows, so it ends and is
+    worth the worst, as in MOReL (Kidambi et al. 2020, section 4). Left out of the replay, as the authors of MOREC leave
+    it, an action that leads there has no target at all, and the policy comes to prefer it.
 
     Args:
         ensemble: The dynamics models.
@@ -124,16 +129,15 @@ def imagine(
         state_of: The state at an observation.
         samples: Number of next states drawn from each elite.
         selection_temperature: Of the draw of one of them; 0 takes the one with the highest dynamics reward.
-        threshold: A row whose dynamics reward is below looks unreal; it is `stopped` and restarts, unless it fell.
+        threshold: The smallest dynamics reward of a row that looks real; a fall is a fall, whatever it looks like.
+        worst: Value of a step that looks unreal and of all that follows it, which stands in the place of its reward.
         horizon: Number of steps after which a row restarts.
         penalty: The weight of the models' uncertainty in the reward.
         steps: Number of steps.
         key: Randomness.
 
     Returns:
-        The rows after the last step, the transitions flat in time and row, and metrics. Transitions have a column more
-        than logged ones, `stopped`: those that look unreal are not to be learnt from, as nothing is known of what
-        follows them.
+        The rows after the last step, the transitions flat in time and row, and metrics.
     """
     low, high = logged.min(0), logged.max(0)
     low, high = low - (high - low), high + (high - low)
@@ -177,17 +181,16 @@ def imagine(
         row = {
             "observation": observation,
             "action": action,
-            "reward": reward - penalty * uncertainty,
+            "reward": jnp.where(unreal, worst, reward - penalty * uncertainty),
             "next_observation": following,
-            "terminated": fell.astype(jnp.float32),
-            "stopped": unreal.astype(jnp.float32),
+            "terminated": ends.astype(jnp.float32),
         }
         again = ends | (under_way.age + 1 >= horizon)
         fresh = _some(logged, len(observation), of_restart)
         state = jnp.where(jnp.broadcast_to(again[:, None], fresh.shape), fresh, following)
         metrics = {
             "dynamics_reward": reality.mean(),
-            "stopped": unreal.mean(),
+            "unreal": unreal.mean(),
             "penalty": uncertainty.mean(),
             "imagined_reward": reward.mean(),
             "net_reward": row["reward"].mean(),
@@ -207,16 +210,15 @@ def imagined_return(
 ) -> float:
     """Mean return of rows until each first ends, or has taken `longest` steps.
 
-    `act` takes some steps, as `imagine` does, from given rows and with a given `key`; what looks unreal ends a row too.
+    `act` takes some steps, as `imagine` does, from given rows and with a given `key`.
     """
     rows = len(under_way.age)
     reward, ended = np.zeros((0, rows)), np.zeros((0, rows))
     while len(reward) < longest and not (len(ended) and ended.any(0).all()):
         of_steps, key = jax.random.split(key)
         under_way, acted, _ = act(under_way=under_way, key=of_steps)
-        ends = np.maximum(acted["terminated"], acted["stopped"])
         reward = np.append(reward, np.reshape(acted["reward"], (-1, rows)), axis=0)
-        ended = np.append(ended, np.reshape(ends, (-1, rows)), axis=0)
+        ended = np.append(ended, np.reshape(acted["terminated"], (-1, rows)), axis=0)
     return mean_return(reward[:longest], ended[:longest])
 
 

@@ -15,10 +15,10 @@ from pydantic import Field
 from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step
-from madoc.learning.dynamics_ensemble import Ensemble, fit, holdout_error, keep_best
+from madoc.learning.dynamics_ensemble import Ensemble, Fitting, fit, holdout_error
 from madoc.learning.dynamics_reward import Opposition, oppose, opposition, remember
 from madoc.learning.features import Features
-from madoc.learning.networks import adam, falling_adam, scalars, scan_updates
+from madoc.learning.networks import adam, falling_adam, moving_average, scalars, scan_updates
 from madoc.learning.sac_losses import least_value
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
@@ -40,29 +40,24 @@ class MORECState:
     """The state of MOREC.
 
     Attributes:
-        ensemble: The models; while they are fitted, as they are after the last update.
-        fitted: Each model as it was when its error on held-out rows was smallest.
-        smallest: Those errors.
-        stale: Updates since the error of any model last fell.
+        fitting: The models.
         elites: Indices of the models of the smallest error on held-out rows.
         opposition: Generator and discriminators; the past discriminators make up the dynamics reward.
         replay: Imagined transitions.
         under_way: Imagined rows in progress.
-        judged: The policy of the highest imagined return so far; counts in updates of the policy.
+        average: The policy with weights that are averages over its last updates.
+        judged: The average of the highest imagined return so far; counts in updates of the policy.
         preparing: Updates of models and discriminators so far; those that early stopping saves count as done.
         updates: Updates of the policy so far.
     """
 
-    ensemble: Ensemble
-    ensemble_optimiser: PyTree
-    fitted: Ensemble
-    smallest: Float[Array, " models"]
-    stale: int
+    fitting: Fitting
     elites: Int[Array, " elites"]
     opposition: Opposition
     learner: ActorCritic
     replay: replay.Replay
     under_way: ImaginedRows
+    average: TanhGaussianPolicy
     judged: Judged
     key: PRNGKeyArray
     preparing: int
@@ -98,8 +93,9 @@ class MOREC:
         samples: Next states drawn from each elite.
         selection_temperature: Of the draw of one of these next states by dynamics reward; 0 takes the one with the
             highest. The authors took 0.1 for most data sets, of scaled logits; ours differ by more.
-        threshold: A rollout ends before a step whose dynamics reward is below; unless it is a fall, it is not learnt
-            from. Chosen: the authors' 0.6 is of scaled logits, and with ours ends rollouts on the Hopper too early.
+        threshold: A rollout ends with a step whose dynamics reward is below, which is worth the worst unless it is a
+            fall. The authors leave it out; then no target says what such an action is worth, and the policy comes to
+            prefer it. Chosen: their 0.6 is of scaled logits, and with ours ends rollouts on the Hopper too early.
         horizon: Longest imagined rollout, in control steps.
         uncertainty: What lowers imagined rewards: `mobile`, how much the models differ on the value of what follows, or
             `mopo`, the largest of their standard deviations, in units of the state.
@@ -111,11 +107,14 @@ class MOREC:
         epoch_updates: Gradient updates per epoch.
         holdout_every: Every `holdout_every`-th logged row is held out: the models do not see it, and are stopped and
             chosen by it.
-        judge_every: Updates of the policy after which it acts whole episodes in the models; that of the highest mean
-            return, net of MOPO's penalty (MOBILE's changes with the critics), is handed back. 0 hands back the last.
+        averaged: Updates over which the weights of the policy are averaged, exponentially; 1 is the policy itself. The
+            average is what is judged and handed back, as policies swing from update to update. Chosen.
+        judge_every: Updates of the policy after which the average acts whole episodes in the models; that of the
+            highest mean return, net of MOPO's penalty (MOBILE's changes with the critics), is handed back. 0 hands back
+            the last.
         judge_rows: Number of these episodes. By default they are as many imagined steps as learning takes.
         batch: Rows per update.
-        discount: γ.
+        discount: γ, below 1. Chosen; the authors' is 0.99, by which a fall 300 steps on counts for a twentieth.
         target_rate: τ of the target critics.
         model_learning_rate: Adam's, for models (at first), generator and discriminators.
         policy_learning_rate: Adam's, for policy and SAC's temperature; three times the authors', who learn longer.
@@ -138,20 +137,21 @@ class MOREC:
     selection_temperature: NotNegative = 0.1
     threshold: float = 0.05
     horizon: Count = 100
-    uncertainty: Literal["mobile", "mopo"] = "mobile"
-    penalty: NotNegative = 1.5
+    uncertainty: Literal["mobile", "mopo"] = "mopo"
+    penalty: NotNegative = 1.0
     real: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
     imagined_per_update: Count = 10
     imagined_rows: Count = 200
     epoch_updates: Count = 100
     holdout_every: Annotated[int, Field(ge=2)] = 100
     batch: Annotated[int, Field(ge=2)] = 256
-    discount: NotNegative = 0.99
+    discount: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.995
     target_rate: NotNegative = 0.005
     model_learning_rate: NotNegative = 1e-3
     policy_learning_rate: NotNegative = 3e-4
     critic_learning_rate: NotNegative = 3e-4
     replay_capacity: Count = 100_000
+    averaged: Count = 10_000
     judge_every: CountOrZero = 5000
     judge_rows: Count = 50
 
@@ -194,16 +194,13 @@ class MOREC:
         )
         columns = {"observation": (observation,), "action": (action,), "next_observation": (observation,)}
         return MORECState(
-            ensemble,
-            self._fitting.init(eqx.filter(ensemble, eqx.is_array)),
-            ensemble,
-            jnp.full(self.models, jnp.finfo(jnp.float32).max),
-            0,
+            Fitting.of(ensemble, self._fitting),
             jnp.arange(self.elites),
             adversary,
             learner,
             replay.empty(self.replay_capacity, **columns, reward=(), terminated=()),
             start_imagining(problem.logged["observation"], self.imagined_rows, keys[3]),
+            learner.policy,
             Judged.none(learner.policy),
             keys[4],
             0,
@@ -230,29 +227,20 @@ class MOREC:
 
     def _fit(self, problem: PolicyProblem, state: MORECState) -> tuple[MORECState, dict[str, Array]]:
         """Fit the models, and choose the elites; once their errors no longer fall, take each at its smallest."""
-        ensemble, optimiser, errors, metrics = self._update_models(
-            state.ensemble, state.ensemble_optimiser, problem.logged, problem.features, state.key
+        latest, optimiser, errors, metrics = self._update_models(
+            state.fitting.models, state.fitting.optimiser, problem.logged, problem.features, state.key
         )
-        fitted, smallest, fell = keep_best(state.fitted, state.smallest, ensemble, errors)
-        stale = 0 if bool(fell) else state.stale + self.epoch_updates
+        fitting = state.fitting.after(latest, optimiser, errors, self.epoch_updates)
         preparing = state.preparing + self.epoch_updates
-        if self.patience and stale >= self.patience:
+        if self.patience and fitting.stale >= self.patience:
             preparing = max(preparing, self.model_updates)
         if preparing >= self.model_updates and self.patience:
-            ensemble, errors = fitted, smallest
+            fitting, errors = fitting.ended(), fitting.smallest
         elites = jnp.argsort(errors)[: self.elites]
-        state = replace(
-            state,
-            ensemble=ensemble,
-            ensemble_optimiser=optimiser,
-            fitted=fitted,
-            smallest=smallest,
-            stale=stale,
-            elites=elites,
-            preparing=preparing,
-        )
+        state = replace(state, fitting=fitting, elites=elites, preparing=preparing)
         if self._stage(state) != "fitting":
-            state = replace(state, opposition=replace(state.opposition, generator=ensemble.only(elites[0])))
+            generator = fitting.models.only(elites[0])
+            state = replace(state, opposition=replace(state.opposition, generator=generator))
         return state, metrics | {"model_error": errors[elites].mean()}
 
     @eqx.filter_jit
@@ -314,21 +302,22 @@ class MOREC:
             steps=steps,
             key=of_imagination,
         )
-        stopped = rows.pop("stopped")
-        seen = replay.add(state.replay, rows, stopped == 0.0)
-        if not int(seen.written):
+        if not state.updates and float(imagined["unreal"]) == 1.0:
             raise MadocError(
-                f"MOREC: every row imagined so far looks unreal (dynamics reward below {self.threshold:g}), so there "
-                "is nothing to learn from; lower threshold, or give the models more updates"
+                f"MOREC: every imagined row looks unreal (dynamics reward below {self.threshold:g}), so there is "
+                "nothing to learn from; lower threshold, or give the models more updates"
             )
+        seen = replay.add(state.replay, rows, jnp.ones(len(rows["reward"]), bool))
         learner, metrics = self._update_policy(state.learner, seen, problem.logged, of_updates)
         updates, judged = state.updates + self.epoch_updates, state.judged
+        rate = min(1.0, self.epoch_updates / min(updates, self.averaged))
+        average = moving_average(state.average, learner.policy, rate)
         if judged.due(updates, self.judge_every):
-            returns = self._judge(problem, state, learner.policy, of_judging)
-            judged = judged.including(learner.policy, returns, updates)
+            returns = self._judge(problem, state, average, of_judging)
+            judged = judged.including(average, returns, updates)
             metrics |= {"judged_return": jnp.asarray(returns)}
-        following = replace(state, learner=learner, replay=seen, under_way=under_way, judged=judged, updates=updates)
-        return following, imagined | metrics
+        state = replace(state, learner=learner, replay=seen, under_way=under_way, average=average)
+        return replace(state, judged=judged, updates=updates), imagined | metrics
 
     def _judge(self, problem: PolicyProblem, state: MORECState, policy: TanhGaussianPolicy, key: PRNGKeyArray) -> float:
         """Mean return in the models of the policy without noise; episodes begin where logged ones did."""
@@ -353,7 +342,7 @@ class MOREC:
         assert task.state_from_observation is not None
         return partial(
             imagine,
-            state.ensemble,
+            state.fitting.models,
             state.elites,
             state.opposition.past,
             problem.features,
@@ -363,6 +352,7 @@ class MOREC:
             samples=self.samples,
             selection_temperature=self.selection_temperature,
             threshold=self.threshold,
+            worst=least_value(problem.logged["reward"], self.discount),
         )
 
     @eqx.filter_jit
@@ -396,5 +386,5 @@ class MOREC:
         )
 
     def policy(self, state: MORECState) -> TanhGaussianPolicy:
-        """The best policy so far, the latest where none was judged; deterministic without a key."""
-        return state.judged.handed_back(state.learner.policy)
+        """The best average so far, the latest where none was judged; deterministic without a key."""
+        return state.judged.handed_back(state.average)
