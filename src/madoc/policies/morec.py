@@ -73,7 +73,7 @@ class MOREC:
     imagined step each elite model draws candidates, of which one that past discriminators find real is kept; if it is
     not, the row ends. The budget counts updates of the policy; those of models and discriminators come before it.
 
-    The constants are the authors' (github.com/polixir/morec; with MOBILE's penalty) but those said to be chosen. They
+    The constants are the authors' (github.com/polixir/morec) but those said to be chosen. They
     imagine up to 200 transitions for every update, on a GPU, learn for 3 million updates, and scale each past
     discriminator's logits; here logits count as they are, and policy and critics see standardised observations.
 
@@ -99,8 +99,8 @@ class MOREC:
         horizon: Longest imagined rollout, in control steps.
         uncertainty: What lowers imagined rewards: `mobile`, how much the models differ on the value of what follows, or
             `mopo`, the largest of their standard deviations, in units of the state.
-        penalty: Its weight. The authors chose it by dataset: for Hopper medium 1.5 (`mobile`) or 15 (`mopo`), for
-            HalfCheetah medium 0.25 or 0.5.
+        penalty: Its weight. Chosen, as is `mopo`. The authors chose it by dataset: for Hopper medium 1.5 (`mobile`) or
+            15 (`mopo`), for HalfCheetah medium 0.25 or 0.5.
         real: Share of logged rows in a batch. Chosen: the authors took 0.05 for most data sets, 0.5 for two.
         imagined_per_update: Imagined transitions for each update of the policy.
         imagined_rows: Rows imagined at a time.
