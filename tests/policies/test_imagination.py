@@ -18,6 +18,7 @@ from madoc.policies.imagination import (
     imagined_return,
     mean_return,
     start_imagining,
+    worst_value,
 )
 
 FEATURES = Features(jnp.zeros(2), jnp.ones(2), jnp.array([0.5]), jnp.asarray(1.0), jnp.asarray(2.0))
@@ -119,6 +120,13 @@ def test_what_looks_most_real_is_what_happens():
         np.testing.assert_allclose(under_way.observation, 3 * change, rtol=1e-4)
         assert (np.asarray(under_way.age) == 3).all()
         assert not rows["terminated"].any()
+
+
+def test_the_worst_value_by_hand():
+    reward = np.array([-9.0, 3.0, 1.0, -2.0, -3.0, -1.0], np.float32)
+    # Mean rewards of episodes: (-9 + 3 + 1 - 2) / 4 = -1.75 and (-3 - 1) / 2 = -2; -2 / (1 - 0.9) = -20.
+    assert float(worst_value(reward, np.array([0, 4]), 0.9)) == pytest.approx(-20.0)
+    assert float(worst_value(reward + 3.0, np.array([0, 4]), 0.9)) == 0.0
 
 
 def test_what_looks_unreal_ends_and_is_worth_the_worst_but_a_fall_is_a_fall():

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from pydantic import Field
@@ -29,6 +30,7 @@ from madoc.policies.imagination import (
     imagine,
     imagined_return,
     start_imagining,
+    worst_value,
 )
 from madoc.policies.judging import Judged
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
@@ -340,6 +342,7 @@ class MOREC:
         """`imagine`, given the models and all that does not depend on who acts."""
         task = problem.simulator.task
         assert task.state_from_observation is not None
+        starts = require_data(problem, rows=0).episode_starts
         return partial(
             imagine,
             state.fitting.models,
@@ -352,7 +355,7 @@ class MOREC:
             samples=self.samples,
             selection_temperature=self.selection_temperature,
             threshold=self.threshold,
-            worst=least_value(problem.logged["reward"], self.discount),
+            worst=worst_value(np.asarray(problem.logged["reward"]), starts, self.discount),
         )
 
     @eqx.filter_jit
