@@ -8,7 +8,7 @@ import pytest
 from madoc import robots, simulation
 from madoc.data import logs, typical_change
 from madoc.identification import missing_terms as terms
-from madoc.identification.candidate_terms import EARLY, Candidate, _cut_off
+from madoc.identification.candidate_terms import CAUSES, EARLY, Candidate, _cut_off
 from madoc.identification.drifts import DRIFT, _between_runs
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
@@ -185,6 +185,32 @@ def test_a_term_that_explains_the_same_is_a_rival():
     (chosen,) = terms._chosen(tests)
     ((rival,),) = terms._rivals(tests, [chosen])
     assert {chosen, rival} == {0, 2}
+
+
+@pytest.mark.parametrize(("noise", "counts"), [(0.06, True), (0.12, False)])
+def test_friction_that_is_likely_counts_though_it_is_not_significant(noise, counts):
+    """Two sorts of windows: friction f and slope 1 of residuals that friction of 0.02 imitates by half.
+
+    In each window the friction's effect is (1, 1) and the parameter's (1, 0), so that a change c of friction moves
+    the parameter by -c, and what the parameter cannot explain of it is the second row: 0.02 ± noise.
+    """
+    effect, slope = np.ones((16, 2)), np.tile([1.0, 0.0], (16, 1))
+    residuals = -0.02 * effect + noise * np.array([[0.0, 1.0], [0.0, -1.0]] * 8)
+    products = Products.of(residuals, slope[..., None], effect[..., None])
+    tried = (Candidate(CAUSES["dof_frictionloss"], "dof_frictionloss.hinge", "N·m", 0.0, 1.0, 0.0),)
+    space = ParameterSpace((Parameter("gravity", "", -11, -9),))
+    tests = TermTests(products, tried, space, np.full(1, 0.01), np.zeros(16, int))
+    (name,) = space.names
+    found = list(terms._of_friction(tests, []))
+    assert terms._chosen(tests) == [] and bool(found) is counts
+    if counts:
+        # The interval of the friction is 0.02 ± 0.036, of which [0, 0.056] is physical: the parameter moves by as much
+        # back, in half-widths of 0.01.
+        high = 0.02 + tests.score(0).reach
+        assert high == pytest.approx(0.056, abs=0.002)
+        assert found[0].shifts[name] == pytest.approx(-50.0 * high)
+        assert found[0].errors[name] == pytest.approx(50.0 * high)
+    assert list(terms._of_friction(tests, [0])) == []
 
 
 def test_a_drive_saturates_at_both_ends_of_what_it_is_asked_for(tmp_path):

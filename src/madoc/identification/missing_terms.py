@@ -13,7 +13,15 @@ from jaxtyping import Float
 
 from madoc import simulation
 from madoc.data.dataset import Dataset
-from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, INTEGRATION, Candidate, candidates, effects
+from madoc.identification.candidate_terms import (
+    BELOW_MINIMUM,
+    CAUSES,
+    EARLY,
+    INTEGRATION,
+    Candidate,
+    candidates,
+    effects,
+)
 from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import Fit, fit_windows, negligible, products_of, windows_of
 from madoc.identification.information import NORMAL_95
@@ -42,6 +50,8 @@ DIVERGING = 0.1
 """Share in [0, 1] of windows; a candidate with which more of them diverge is not tested."""
 _AT_MINIMUM = 1e-3
 """Distance in [-1, 1] from the end of a range, up to which a parameter is at its minimum."""
+LIKELY_FRICTION = 1.0
+"""t from which Coulomb friction counts though it is not significant; 16 % of joints without any reach it by chance."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
 
 
@@ -120,6 +130,7 @@ def suspicions(
             others.append(together)
         further = [*_rivals(tests, chosen), *_further(tests, chosen)]
         others += [replace(_with_terms(tests, rivals), terms=False) for rivals in further]
+    others += _of_friction(tests, chosen)
     return Suspicions(tuple(sorted(terms, key=lambda term: -abs(term.t))), tuple(others), spent)
 
 
@@ -281,6 +292,26 @@ def _fitted(
             terms[candidate.parameter] = term
     causes = tuple(_name(candidate) for candidate, _, _ in possible)
     return _RicherModel(terms, Alternative(causes, True, shifts, tests.by_name(beyond)), fit.control_steps)
+
+
+def _of_friction(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
+    """The estimates with as much Coulomb friction in a joint as its 95 % interval holds, cut off at its least value.
+
+    Nearly every joint has some. Where noise hides it, it biases a damping by several standard errors before it is
+    significant itself. A joint whose friction is among the `chosen` terms has an alternative already.
+    """
+    for index, candidate in enumerate(tests.tried):
+        if candidate.cause != CAUSES["dof_frictionloss"] or index in chosen:
+            continue
+        found = tests.score(index)
+        if found is None or found.t < LIKELY_FRICTION:
+            continue
+        least = (candidate.least - candidate.nominal) / candidate.reference
+        low, high = (max(least, found.change + sign * found.reach) for sign in (-1.0, 1.0))
+        by_friction = found.shifts / found.change
+        shift, error = 0.5 * (low + high) * by_friction, 0.5 * (high - low) * np.abs(by_friction)
+        if np.max((np.abs(shift) + error) / tests.half_widths) >= WORTH_FITTING:
+            yield Alternative((_name(candidate),), False, tests.by_name(shift), tests.by_name(error))
 
 
 def _of_other_windows(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[Alternative]:

@@ -89,6 +89,13 @@ class Score:
         """The change over its standard error; see `deviate`."""
         return deviate(self.change / self.error, self.freedom)
 
+    @property
+    def reach(self) -> float:
+        """Half of the 95 % interval of the change, by Student's t."""
+        from scipy.stats import t as student  # slow to import, and only tests of terms need it
+
+        return float(student.ppf(0.975, self.freedom)) * self.error
+
 
 def deviate(ratio: float, freedom: float) -> float:
     """The normal deviate of the same probability as this ratio of an estimate to its standard error.
