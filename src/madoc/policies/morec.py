@@ -101,8 +101,9 @@ class MOREC:
         horizon: Longest imagined rollout, in control steps.
         uncertainty: What lowers imagined rewards: `mobile`, how much the models differ on the value of what follows, or
             `mopo`, the largest of their standard deviations, in units of the state.
-        penalty: Its weight. Chosen, as is `mopo`. The authors chose it by dataset: for Hopper medium 1.5 (`mobile`) or
-            15 (`mopo`), for HalfCheetah medium 0.25 or 0.5.
+        penalty: Its weight. Chosen, as is `mopo`. It is to be chosen by dataset: the authors took 1.5 (`mobile`) or 15
+            (`mopo`) for Hopper medium, 0.25 or 0.5 for HalfCheetah medium; here (`mopo`) 2.5 does on the Hopper, 1 on
+            HalfCheetah. With too little the imagined return rises while the real one falls.
         real: Share of logged rows in a batch. Chosen: the authors took 0.05 for most data sets, 0.5 for two.
         imagined_per_update: Imagined transitions for each update of the policy.
         imagined_rows: Rows imagined at a time.
