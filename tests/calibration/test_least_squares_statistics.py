@@ -90,17 +90,27 @@ def test_tails_are_long_where_the_cost_is_above_that_of_noise():
     def costing(cost, **changes):
         return replace(search, cost=np.full(len(search.cost), cost), **{"steady_cost": cost} | changes)
 
-    assert not have_long_tails(costing(1.0))
-    assert have_long_tails(costing(1.2))
-    assert about_residuals(costing(1.2)) == (
+    def long(search):
+        return have_long_tails(problem, search)
+
+    assert not long(costing(1.0))
+    assert long(costing(1.2))
+    assert about_residuals(problem, costing(1.2)) == (
         "residuals have longer tails than noise has: the intervals are too narrow",
     )
-    assert not have_long_tails(costing(1.2, epochs=0))  # not all windows are known yet
-    assert not have_long_tails(costing(1.2, deviation=np.full(2, 1e-9)))  # rounding errors
+    assert not long(costing(1.2, epochs=0))  # not all windows are known yet
+    assert not long(costing(1.2, deviation=np.full(2, 1e-9)))  # rounding errors
     at_contacts = costing(1.2, steady_cost=1.0)
-    assert not have_long_tails(at_contacts)
-    (sentence,) = about_residuals(at_contacts)
+    assert not long(at_contacts)
+    (sentence,) = about_residuals(problem, at_contacts)
     assert sentence.startswith("residuals have longer tails than noise has only where contacts begin or end")
+
+    def leaving_out(count, **changes):
+        return costing(1.0, explained=len(begun.rows) - count, **changes)
+
+    assert not long(leaving_out(2))  # of 10
+    assert long(leaving_out(3))
+    assert not long(leaving_out(3, touching=np.arange(len(begun.rows)) == 0))  # as where a contact begins
 
 
 def test_windows_with_and_without_contacts_have_their_own_noise_and_those_between_do_not_count():

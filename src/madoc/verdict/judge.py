@@ -212,7 +212,7 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
         "MODEL_MISMATCH",
         "residuals have longer tails than noise has: the model does not explain some stretches of the log, and "
         "intervals do not count that; look there for a force that acts at times only, at contacts or in fast motion, "
-        f"and for wrong readings{about_timestep(holdout)}",
+        f"for wrong or missing readings and for values that differ between runs{about_timestep(holdout)}",
     )
 
 

@@ -196,7 +196,7 @@ class LeastSquares:
             interval=interval,
             quantile=errors,
             settled=settled,
-            long_tails=settled and state.estimates_starts and sentences.have_long_tails(best),
+            long_tails=settled and state.estimates_starts and sentences.have_long_tails(problem, best),
         )
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:
@@ -322,7 +322,7 @@ class LeastSquares:
         if not state.estimates_starts or self.initial_states is not None:
             return ()
         best, horizon = state.unknown[state.best], self._unknown(problem, state.best).horizon
-        about = (sentences.about_estimated_states(problem, best, horizon), *sentences.about_residuals(best))
+        about = (sentences.about_estimated_states(problem, best, horizon), *sentences.about_residuals(problem, best))
         if float(best.deviation.max()) < sentences.EXACT:
             return about
         if state.stage in ("lengthening", "widening") and not state.finished:

@@ -8,6 +8,10 @@ from madoc.calibration.least_squares.search import SearchState
 LONG_TAILS = 1.1
 """Cost of residuals, in squared standard deviations; above it they are not normal noise, whose cost is 0.8 with
 Cauchy's loss and 1 with squares."""
+MOST_LEFT_OUT = 0.05
+"""Share in [0, 1] of windows that no initial state explains; without contacts, noise alone leaves out fewer."""
+FEWEST_LEFT_OUT = 3
+"""Number of windows; fewer may be left out by chance, however few there are."""
 EXACT = 1e-6
 """Residual in typical changes of a step; smaller ones mean that states were logged without noise."""
 NOT_SETTLED = (
@@ -35,19 +39,25 @@ def about_estimated_states(problem: CalibrationProblem, search: SearchState, hor
     return f"{sentence}; the noise it finds is {noise:.2g} % of a step's change"
 
 
-def have_long_tails(search: SearchState) -> bool:
+def have_long_tails(problem: CalibrationProblem, search: SearchState) -> bool:
     """Whether residuals have longer tails than noise has; not known before the first step on all windows.
 
-    Windows in which a contact begins or ends do not count where there are enough others, see `steady_cost`.
+    Windows in which a contact begins or ends do not count where there are enough others, see `steady_cost`. Without any
+    contact, more than `MOST_LEFT_OUT` of the windows that no initial state explains are a long tail too: they are left
+    out of the cost.
     """
-    return _noisy(search) and search.steady_cost > LONG_TAILS
+    if not _noisy(search):
+        return False
+    left_out, windows = _left_out(search)
+    smooth = problem.states.starts_known and not search.touching.any()
+    return search.steady_cost > LONG_TAILS or (smooth and left_out >= max(FEWEST_LEFT_OUT, MOST_LEFT_OUT * windows))
 
 
-def about_residuals(search: SearchState) -> tuple[str, ...]:
+def about_residuals(problem: CalibrationProblem, search: SearchState) -> tuple[str, ...]:
     """Sentences on windows left out and on residuals with long tails; none before the first step on all windows."""
     if not _noisy(search):
         return ()
-    left_out, windows = len(search.rows) - search.explained, len(search.rows)
+    left_out, windows = _left_out(search)
     sentence = (
         f"{left_out} of {windows} windows count for nothing: no initial state found explains them as "
         "well as others, as where contacts begin, or their simulation failed"
@@ -57,7 +67,7 @@ def about_residuals(search: SearchState) -> tuple[str, ...]:
         "residuals have longer tails than noise has only where contacts begin or end, or where windows of different "
         "contacts are taken together; the verdict does not count that"
     )
-    long = [tails] if have_long_tails(search) else [jumps] if search.cost[0] > LONG_TAILS else []
+    long = [tails] if have_long_tails(problem, search) else [jumps] if search.cost[0] > LONG_TAILS else []
     return (*([sentence] if left_out else []), *long)
 
 
@@ -67,6 +77,11 @@ def about_model_errors(horizon: int) -> str:
         f"over {horizon} control steps the simulator leaves more than noise: something the model lacks, "
         "which intervals do not count"
     )
+
+
+def _left_out(search: SearchState) -> tuple[int, int]:
+    """Number of windows that no initial state explains, and of all."""
+    return len(search.rows) - search.explained, len(search.rows)
 
 
 def _noisy(search: SearchState) -> bool:
