@@ -23,8 +23,6 @@ from ruamel.yaml import YAML
 from calibration import commit
 from madoc import robots
 from madoc.pipeline import CalibrationOrder, Search, Source, calibrate_in
-from madoc.pipeline.methods import CANDIDATES
-from madoc.pipeline.preparation import AUTO_BUDGET
 from madoc.robots.document import yaml_text
 
 RESULTS = Path(__file__).parent / "results" / "planted"
@@ -81,11 +79,13 @@ def main() -> None:
     parser.add_argument("--situations", nargs="+", default=list(SITUATIONS), choices=SITUATIONS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--coverage", type=int, default=0, help="problems on the pendulum; the table is then left out")
-    parser.add_argument("--budget", type=int, default=AUTO_BUDGET, help="control steps of a calibration")
+    parser.add_argument(
+        "--budget", default=None, help="of a calibration, such as 300000 or 60s; as `madoc calibrate` by default"
+    )
     arguments = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     if arguments.coverage:
-        cover(arguments.coverage, round(CANDIDATES["least-squares"] * arguments.budget))
+        cover(arguments.coverage, arguments.budget)
         return
     for robot in arguments.robots:
         for situation in arguments.situations:
@@ -99,7 +99,7 @@ def main() -> None:
                 print(path.name, row["verdict"]["word"], f"{row['seconds']:.0f} s", flush=True)
 
 
-def planted(folder: Path, robot: str, situation: str, seed: int, budget: int) -> dict:
+def planted(folder: Path, robot: str, situation: str, seed: int, budget: str | None) -> dict:
     """Record the pretended machine, calibrate as a user would, compare with what was planted."""
     machine, truth = base(robot), dict(TRUTHS[robot])
     known = deepcopy(machine)
@@ -132,11 +132,8 @@ def planted(folder: Path, robot: str, situation: str, seed: int, budget: int) ->
     }
 
 
-def cover(problems: int, budget: int) -> None:
-    """How often 95 % intervals cover the truth: a new truth, new commands and new noise each time.
-
-    Least squares, with what it may have of the budget under auto.
-    """
+def cover(problems: int, budget: str | None) -> None:
+    """How often 95 % intervals of least squares cover the truth: a new truth, new commands and new noise each time."""
     path = RESULTS / f"pendulum-coverage-{problems}.json"
     rows = json.loads(path.read_text())["rows"] if path.exists() else []
     machine = base("pendulum")
