@@ -22,7 +22,7 @@ SPRING = spring(max_episode_steps=100)
 
 
 def outcome(*totals, before=4.0):
-    return Outcome(before, np.array(totals), np.zeros((len(totals), 0)), 0)
+    return Outcome(before, np.array(totals), np.zeros((len(totals), 0)), 0, 0)
 
 
 def test_the_step_that_helps_most_is_taken_and_its_damping_kept():
@@ -121,6 +121,16 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     assert (state.waiting, state.rough) == (0, 0)
     assert epoch.control_steps == 40 * 5 * (1 + 2 + 2)
     np.testing.assert_array_equal(state.point, point)
+    state, epoch = search.step(problem, state)
+    derivatives, tried = 1 + 2 * len(truth) + 2, 1  # the first step helps, so no other is tried
+    assert epoch.control_steps == 40 * 5 * (derivatives + tried)
+    assert (state.point != point).all()
+    windows = UnknownStarts.at(problem, state.rows, state.touching, 5, "cauchy")
+    (plan,) = windows.plans(state.point, state.states, state.damping, state.state_damping, refining=True)
+    astray = replace(plan, steps=np.concatenate([[1.0 - plan.point], plan.steps[1:]]))
+    (outcome,) = windows.outcomes([astray], state.states, refining=True)
+    assert outcome.simulations == 40 * (tried + 4 * 3)  # it does not help: every step with every share of the states'
+    assert chosen(outcome)[0] != 0
 
 
 def test_at_contacts_states_settle_anew_after_each_step_of_the_parameters(monkeypatch):

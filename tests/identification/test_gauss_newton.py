@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from madoc.identification.gauss_newton import eliminate
+from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.linearisation import WindowSlopes
+from madoc.identification.losses import TUNING, curvature_share, loss_slope
 
 NOTHING = np.zeros(1)
 
@@ -59,3 +60,22 @@ def test_damping_shortens_a_states_step(damping):
     slopes = slopes_of([[3.0, 1.0]], [[[1.0], [0.0]]], [[[1.0], [1.0]]])
     found = eliminate(slopes, np.ones((1, 2)), np.array([damping]))
     np.testing.assert_allclose(found.states_step(np.zeros(1)), [[-4.0 / (2.0 + 2.0 * damping)]])
+
+
+def test_newtons_step_of_a_loss_ends_at_its_minimum_where_one_of_weighted_squares_leaves_a_fifth_of_the_way():
+    random = np.random.default_rng(0)
+    by_parameters, noise = random.standard_normal((500, 9, 2)), random.standard_normal((500, 9))
+    by_states = random.standard_normal((500, 9, 1))
+    start, left = np.array([0.2, -0.1]), {}
+    for newton in (False, True):
+        point, way = start, []
+        for _ in range(20):
+            slopes = WindowSlopes(noise + by_parameters @ point, by_parameters, by_states, np.ones(500, bool))
+            z = (slopes.residuals / TUNING["cauchy"]) ** 2
+            curved = slopes.curved(curvature_share(z, "cauchy")) if newton else slopes
+            reduced = eliminate(curved, loss_slope(z, "cauchy"), np.zeros(500)).reduced
+            point = point + damped_step(*triangular_factors(reduced, 1.0, "linear"), point, 0.0)
+            way.append(point)
+        left[newton] = np.linalg.norm(way[0] - way[-1]) / np.linalg.norm(start - way[-1])
+    assert left[False] == pytest.approx(0.2, abs=0.05)
+    assert left[True] < 0.05

@@ -1,6 +1,6 @@
 """Derivatives of residuals by central differences, whose points are simulated in one batch by `replay`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -57,6 +57,14 @@ class WindowSlopes:
         """Residuals and derivatives divided by the deviation of each value."""
         wide = deviation[:, None]
         return WindowSlopes(self.residuals / deviation, self.by_parameters / wide, self.by_states / wide, self.whole)
+
+    def curved(self, share: float) -> "WindowSlopes":
+        """Residuals divided by the curvature of their loss over that of its weighted squares, in (0, 1].
+
+        A Gauss-Newton step of the weighted squares is then Newton's step of the loss (Huber 1981, section 7.8). Without
+        it each step leaves the same share of the way, a fifth under noise.
+        """
+        return replace(self, residuals=self.residuals / share)
 
     def at(self, residuals: Float[np.ndarray, "windows values"]) -> "WindowSlopes":
         """The same derivatives with the residuals of a point nearby, NaN in windows whose simulation fails there."""

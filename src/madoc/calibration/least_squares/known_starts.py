@@ -86,8 +86,13 @@ class KnownStarts:
 
     @staticmethod
     def columns(problem: CalibrationProblem) -> int:
-        """Number of systems simulated in an epoch: central differences, and the steps tried."""
-        return 1 + 2 * len(problem.simulator.parameters) + len(TRIALS)
+        """Number of systems simulated for the derivatives of an epoch: central differences."""
+        return 1 + 2 * len(problem.simulator.parameters)
+
+    @staticmethod
+    def trial_columns(*, smooth: bool) -> int:
+        """Number of systems simulated for the steps tried in an epoch."""
+        return len(TRIALS)
 
     @staticmethod
     def settling_columns(problem: CalibrationProblem) -> int:
@@ -108,7 +113,9 @@ class KnownStarts:
         residuals = self._residuals(around)
         return [self._plan(*each) for each in zip(around, residuals, damping.tolist(), strict=True)]
 
-    def outcomes(self, plans: list[Plan], states: Float[np.ndarray, "searches 0 0"]) -> list[Outcome]:
+    def outcomes(
+        self, plans: list[Plan], states: Float[np.ndarray, "searches 0 0"], *, refining: bool
+    ) -> list[Outcome]:
         """Costs after every step of every search, in one batch."""
         tried = np.stack([plan.point + plan.steps[:-1] for plan in plans])
         outcomes = []
@@ -117,7 +124,8 @@ class KnownStarts:
             before = mean_cost(plan.residuals, plan.scale, self.loss)
             totals = np.array([*(mean_cost(each, plan.scale, self.loss) for each in residuals), before])
             failures = int((~np.isfinite(residuals).all(-1)).sum())
-            outcomes.append(Outcome(before, totals, np.zeros((len(totals), 0)), failures))
+            simulations = residuals.shape[0] * residuals.shape[1]
+            outcomes.append(Outcome(before, totals, np.zeros((len(totals), 0)), failures, simulations))
         return outcomes
 
     def _plan(

@@ -65,15 +65,17 @@ class Outcome:
 
     Attributes:
         before: Cost at the plan's point.
-        totals: Cost after each step; the last has no step of the parameters.
+        totals: Cost after each step that was tried; the last has no step of the parameters.
         followed: Share of its initial state's step that fits each window best, where initial states are unknown.
         failures: Number of simulations that failed.
+        simulations: Number of simulations of a window that it took.
     """
 
     before: float
     totals: Float[np.ndarray, " trials"]
     followed: Float[np.ndarray, "trials unknown"]
     failures: int
+    simulations: int
 
     def saved(self, trial: int) -> float:
         """Share of the cost that a step saves."""

@@ -160,7 +160,7 @@ class Search:
         points, states = state.point[:running], state.states[:running, :count]
         damping, state_damping = state.damping[:running], state.state_damping[:running, :count]
         plans = windows.plans(points, states, damping, state_damping, refining=bool(state.refining))
-        outcomes = windows.outcomes(plans, states)
+        outcomes = windows.outcomes(plans, states, refining=bool(state.refining))
         new = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}
         for index, (plan, outcome) in enumerate(zip(plans, outcomes, strict=True)):
             trial, factor = chosen(outcome)
@@ -197,7 +197,8 @@ class Search:
         if not state.refining and (new["moved"][leader] < 1.0 or following.epochs >= self.search_epochs):
             following = self._refined(following, leader)
         stage = "calibrating" if state.refining else "searching"
-        return following, Epoch(metrics, self._epoch_steps(problem, state), stage=stage)
+        spent = self._derivative_steps(problem, state) + self.horizon * sum(each.simulations for each in outcomes)
+        return following, Epoch(metrics, spent, stage=stage)
 
     def _settled_states(self, windows: UnknownStarts, state: SearchState) -> tuple[SearchState, Epoch]:
         """One step of initial states alone, which every search on new windows begins with."""
@@ -293,9 +294,24 @@ class Search:
         return 1 if state.refining else self.searches
 
     def _epoch_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
+        """About how many control steps an epoch simulates."""
+        trials = 0 if state.waiting else self.starts.trial_columns(smooth=self._smooth(state))
+        return self._derivative_steps(problem, state) + self._window_steps(state) * trials
+
+    def _derivative_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
+        """Control steps of an epoch's derivatives, and at contacts of counting these."""
         columns = self.starts.settling_columns(problem) if state.waiting else self.starts.columns(problem)
-        columns += int(self.starts.unknown and state.refining and not state.waiting and state.touching.any())
-        return self._running(state) * self.window_count(state) * columns * self.horizon
+        counted = self.starts.unknown and state.refining and not state.waiting and state.touching.any()
+        return self._window_steps(state) * (columns + int(counted))
+
+    def _window_steps(self, state: SearchState) -> int:
+        """Control steps of all windows of all searches under one system each."""
+        return self._running(state) * self.window_count(state) * self.horizon
+
+    @staticmethod
+    def _smooth(state: SearchState) -> bool:
+        """Whether a search refines on windows without contacts."""
+        return bool(state.refining) and not state.touching.any()
 
     def _moved(self, plan: Plan, outcome: Outcome, trial: int, *, damping: float) -> float:
         """The largest component of a step relative to one that matters: a tenth of a standard error, or the tolerance.

@@ -52,6 +52,8 @@ WORSE = 2.0
 """Mean change of the windows' costs in its standard errors; above it a step makes them worse."""
 ROUNDING = 1e-8
 """Noise in typical changes of a channel; smaller residuals are rounding errors."""
+LEAST_CURVATURE = 0.5
+"""Curvature of the loss over that of the weighted squares; where it is smaller, residuals are not noise."""
 _SUFFICIENT = 0.02
 """Share in [0, 1] of the information about every direction that the trusted windows need; else all are trusted."""
 
@@ -124,9 +126,13 @@ class UnknownStarts:
 
     @staticmethod
     def columns(problem: CalibrationProblem) -> int:
-        """Number of systems simulated in an epoch: differences by parameters and states, and the steps tried."""
-        unknown = 2 * len(problem.simulator.parameters) + problem.states.physical_size
-        return 1 + unknown + len(FOLLOWED) * (len(TRIALS) + 1)
+        """Number of systems simulated for the derivatives of an epoch: differences by parameters and states."""
+        return 1 + 2 * len(problem.simulator.parameters) + problem.states.physical_size
+
+    @staticmethod
+    def trial_columns(*, smooth: bool) -> int:
+        """Number of systems simulated for the steps tried in an epoch; for smooth motion the first mostly serves."""
+        return 1 if smooth else len(FOLLOWED) * (len(TRIALS) + 1)
 
     @staticmethod
     def settling_columns(problem: CalibrationProblem) -> int:
@@ -206,34 +212,59 @@ class UnknownStarts:
             for each, state in zip(searches, states, strict=True)
         ]
 
-    def outcomes(self, plans: list[Plan], states: Float[np.ndarray, "searches windows state"]) -> list[Outcome]:
-        """Costs after every step of every search, with the share of its state's step that fits each window best."""
-        ways = np.array(FOLLOWED)[:, None, None]
-        readings, size = self.readings, states.shape[2]
+    def outcomes(
+        self, plans: list[Plan], states: Float[np.ndarray, "searches windows state"], *, refining: bool
+    ) -> list[Outcome]:
+        """Costs after every step of every search, with the share of its state's step that fits each window best.
+
+        Where a search refines on windows without contacts, the least damped step is tried first, and the others only if
+        that does not help: motion is smooth there, and the whole step mostly leads to the minimum.
+        """
+        spent = 0
+        if refining and not self.touching.any():
+            alone = self._tried(plans, states, trials=1, ways=FOLLOWED[:1])
+            if all(outcome.totals[0] <= outcome.before for outcome in alone):
+                return alone
+            spent = len(self.readings)
+        every = self._tried(plans, states, trials=len(TRIALS) + 1, ways=FOLLOWED)
+        return [replace(outcome, simulations=outcome.simulations + spent) for outcome in every]
+
+    def _tried(
+        self,
+        plans: list[Plan],
+        states: Float[np.ndarray, "searches windows state"],
+        *,
+        trials: int,
+        ways: tuple[float, ...],
+    ) -> list[Outcome]:
+        """Costs after the first steps of every search, each with these shares of the initial states' steps."""
+        shares, readings, size = np.array(ways)[:, None, None], self.readings, states.shape[2]
         starts = [
-            state + ways * readings.in_state_units(plan.state_steps, size)[:, None]
+            state + shares * readings.in_state_units(plan.state_steps[:trials], size)[:, None]
             for plan, state in zip(plans, states, strict=True)
         ]
-        flat = np.concatenate(starts).reshape(-1, len(FOLLOWED) * len(readings), size)
-        points = np.concatenate([plan.point + plan.steps for plan in plans])
+        flat = np.concatenate(starts).reshape(-1, len(ways) * len(readings), size)
+        points = np.concatenate([plan.point + plan.steps[:trials] for plan in plans])
         residuals = readings.residuals(self.simulator, points, flat)
-        residuals = residuals.reshape(len(plans), -1, *residuals.shape[1:])
+        residuals = residuals.reshape(len(plans), trials, *residuals.shape[1:])
         return [
-            self._outcome(plan, part / np.tile(plan.deviation, readings.steps + 1))
+            self._outcome(plan, part / np.tile(plan.deviation, readings.steps + 1), ways)
             for part, plan in zip(residuals, plans, strict=True)
         ]
 
-    def _outcome(self, plan: Plan, residuals: Float[np.ndarray, "trials ways windows values"]) -> Outcome:
-        costs = window_costs(residuals, self.loss)
-        followed = np.array(FOLLOWED)[costs.argmin(1)]
+    def _outcome(
+        self, plan: Plan, residuals: Float[np.ndarray, "trials ways windows values"], ways: tuple[float, ...]
+    ) -> Outcome:
+        costs, simulations = window_costs(residuals, self.loss), int(np.prod(residuals.shape[:-1]))
+        followed = np.array(ways)[costs.argmin(1)]
         if not plan.kept.any():
-            return Outcome(FAILED_WINDOW, costs.min(1).mean(-1), followed, 0)
+            return Outcome(FAILED_WINDOW, costs.min(1).mean(-1), followed, 0, simulations)
         before, after = window_costs(plan.residuals, self.loss)[plan.kept], costs.min(1)[:, plan.kept]
         change = after - before
         if self.loss != "linear":
             activity = self.readings.activity[plan.kept]
             change = clipped_change(before, after, activity, least=LIKE_NOISE, failed=FAILED_WINDOW)
-        return Outcome(float(before.mean()), before.mean() + change.mean(-1), followed, 0)
+        return Outcome(float(before.mean()), before.mean() + change.mean(-1), followed, 0, simulations)
 
     def _plan(
         self,
@@ -261,11 +292,11 @@ class UnknownStarts:
         slopes = slopes.over(np.tile(deviation, readings))
         z = (slopes.residuals / TUNING[self.loss]) ** 2
         weights = loss_slope(z, self.loss) * slopes.whole[:, None]
-        damped = eliminate(slopes, weights, state_damping)
+        share = curvature_share(z[kept], self.loss)
+        damped = eliminate(slopes.curved(max(share, LEAST_CURVATURE)), weights, state_damping)
         factors = triangular_factors(damped.reduced.where(kept), 1.0, "linear")
         steps = [*(damped_step(*factors, point, damping * trial) for trial in TRIALS), np.zeros_like(point)]
         exact = eliminate(slopes, weights, least).reduced.of(kept)
-        share = curvature_share(z[kept], self.loss)
         curved = share * bread(exact, 1.0, "linear")
         freedom = float(alike.spare[kept].sum()) - len(point)
         ratio = noise_ratio(slopes.residuals[kept], weights[kept], share, freedom)
