@@ -21,6 +21,8 @@ _CLOCK = 1.0
 
 _ROWS_FOR_ALL_THREADS = 8
 """Number of rows from which all threads step them; with fewer, waking a second thread costs more than it saves."""
+_CHUNKS = 2
+"""Number of parts of a batch that each thread steps; with ten, the default, 200 rows take a tenth longer."""
 
 
 class CpuSimulator:
@@ -232,6 +234,7 @@ class CpuSystem:
             start[bad, 1:] = simulator.initial_state[: self._physical]
         many = total >= _ROWS_FOR_ALL_THREADS
         pool = simulator._pool if many else simulator._alone
+        chunk = -(-total // (_CHUNKS * simulator.threads))
         trajectory = np.zeros((total, steps, 1 + self._physical))
         sensors = np.zeros((total, steps, self.models[0].nsensordata))
         with without_warnings():
@@ -242,6 +245,7 @@ class CpuSystem:
                 control.reshape(total, steps, -1),
                 skip_checks=True,
                 nstep=steps,
+                chunk_size=chunk,
                 state=trajectory,
                 sensordata=sensors,
             )
