@@ -35,6 +35,8 @@ AS_SIGNIFICANT = 0.6
 """|t| over that of the most significant term; among terms above it the one that explains most is named."""
 NEARLY = 0.8
 """Share explained by a term over that of the one named; terms above it are as likely."""
+SURER = 1.314
+"""Half of a 99 % interval over half of a 95 % interval: an alternative is covered unless one in a hundred is worse."""
 EARTH = 0.03
 """m/s², by which gravity on the ground differs from the standard 9.80665 (poles, equator, mountains)."""
 
@@ -173,13 +175,15 @@ def widening(alternatives: tuple[Alternative, ...], names: tuple[str, ...]) -> F
     """By how many half-widths each interval's low and high end must move out to cover every alternative as well.
 
     An alternative's own interval is its estimate and, to either side, the root of the sum of the squares of the given
-    half-width and of the error of the shift: the two are independent, as terms are tested beside the parameters.
+    half-width and of half the 99 % interval of the shift: the two are independent, as terms are tested beside the
+    parameters. The shift's interval is the wider one because a model that lacks something is to be covered more surely
+    than a right one.
     """
     ends = np.ones((len(names), 2))
     for each in alternatives:
         for index, name in enumerate(names):
             if name in each.shifts:
-                shift, reach = each.shifts[name], float(np.hypot(1.0, each.errors[name]))
+                shift, reach = each.shifts[name], float(np.hypot(1.0, SURER * each.errors[name]))
                 ends[index] = np.maximum(ends[index], [reach - shift, reach + shift])
     return ends - 1.0
 
@@ -211,7 +215,7 @@ def _covering(
             if name in each.shifts and row.interval is not None:
                 slope = factor if combination.kind == "sum" else factor * combination.estimate / row.estimate
                 half = slope * row.half_width
-                shift, reach = shift + half * each.shifts[name], reach + abs(half) * each.errors[name]
+                shift, reach = shift + half * each.shifts[name], reach + abs(half) * SURER * each.errors[name]
         low = min(low, combination.estimate + shift - float(np.hypot(below, reach)))
         high = max(high, combination.estimate + shift + float(np.hypot(above, reach)))
     return replace(combination, interval=(low, high))
