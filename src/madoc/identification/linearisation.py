@@ -11,6 +11,10 @@ states (1e-16, and the solver's 1e-10 at contacts) divided by it is below 1e-6 o
 TORN = 0.5
 """Difference of the one-sided derivatives relative to the larger one, above which a value jumps or bends there."""
 
+LEAST_CURVATURE = 0.5
+"""Curvature of a loss over that of its weighted squares; where it is smaller, residuals are not noise, and a step by it
+would be too long."""
+
 
 @dataclass(frozen=True)
 class Linearisation:
@@ -59,12 +63,12 @@ class WindowSlopes:
         return WindowSlopes(self.residuals / deviation, self.by_parameters / wide, self.by_states / wide, self.whole)
 
     def curved(self, share: float) -> "WindowSlopes":
-        """Residuals divided by the curvature of their loss over that of its weighted squares, in (0, 1].
+        """Residuals divided by the curvature of their loss over that of its weighted squares, a share in (0, 1].
 
         A Gauss-Newton step of the weighted squares is then Newton's step of the loss (Huber 1981, section 7.8). Without
         it each step leaves the same share of the way, a fifth under noise.
         """
-        return replace(self, residuals=self.residuals / share)
+        return replace(self, residuals=self.residuals / max(share, LEAST_CURVATURE))
 
     def at(self, residuals: Float[np.ndarray, "windows values"]) -> "WindowSlopes":
         """The same derivatives with the residuals of a point nearby, NaN in windows whose simulation fails there."""

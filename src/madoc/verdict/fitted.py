@@ -11,7 +11,7 @@ from madoc.calibration.holdout import AgainstChance, Fitted
 from madoc.data import stride
 from madoc.diagnosis.channels import signal_names
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
-from madoc.identification.losses import loss_slope, scale_of
+from madoc.identification.losses import curvature_share, loss_slope, scale_of
 from madoc.identification.noise import residual_noise
 from madoc.identification.replay import slopes_at
 from madoc.verdict.bench import Bench, judged
@@ -22,6 +22,8 @@ from madoc.verdict.systematic import explained_at_end
 
 NEARBY_STEPS = 6
 """Largest number of Gauss-Newton steps from an estimate, at least 1: enough to reach the nearest local minimum."""
+SHORTEST = 1e-5
+"""Distance in [-1, 1]; after a step that moves no parameter by more the search ends."""
 _CANDIDATES = 2
 """Number of last points whose predictions are compared: an earlier one may be better where the last went too far."""
 _DAMPING = 1e-6
@@ -34,13 +36,11 @@ def fitted(
     """The errors of an estimate, in [-1, 1], of mid-range, of the best parameters nearby, and of noise alone."""
     nearby, searching = _nearby_best(replays, point)
     points = np.concatenate([np.zeros((1, len(point))), point[None], nearby])
-    residuals = replays.residuals(points)
+    residuals, predicting = replays.residuals(points)
     sizes = magnitudes(replays.at_horizons(residuals))
     best = best_of(sizes)
     noise = residual_noise(residuals[best][:, : replays.fitted + 1], len(replays.readings.spread))
-    alone = _with_noise_alone(bench, replays, points[best], residuals[best], noise)
-    fitting = (len(points) + 1) * replays.fit_cost
-    predicting = residuals[:, :, 1:, 0].size + alone[:, :, 1:, 0].size
+    alone, comparing = _with_noise_alone(bench, replays, points[best], residuals[best], noise)
     observed, actions = replays.readings.observed, replays.readings.actions
     start_and_actions = np.concatenate([observed[:, 0], observed[:, 1], actions.reshape(len(actions), -1)], axis=1)
     record = partial(
@@ -67,7 +67,7 @@ def fitted(
         residual=noise,
         by_model=(_against_chance(replays, residuals[best]),),
         noise=noise,
-        control_steps=searching + fitting + predicting,
+        control_steps=searching + predicting + comparing,
     )
 
 
@@ -77,8 +77,11 @@ def _with_noise_alone(
     point: Float[np.ndarray, " d"],
     residuals: Float[np.ndarray, "windows readings channels"],
     deviation: Float[np.ndarray, " channels"],
-) -> Float[np.ndarray, "1 windows readings channels"]:
-    """Residuals of the same windows had the system at `point` been the robot, its sensors' noise of `deviation`."""
+) -> tuple[Float[np.ndarray, "1 windows readings channels"], int]:
+    """Residuals of the same windows had the system at `point` been the robot, its sensors' noise of `deviation`.
+
+    Also the control steps that were simulated.
+    """
     key, readings = jax.random.fold_in(bench.key, 2), replays.readings
     noise = np.asarray(jax.random.normal(key, residuals.shape), np.float64) * deviation
     simulated = np.where(np.isfinite(residuals), residuals, 0.0) + noise
@@ -93,20 +96,24 @@ def _nearby_best(replays: FittedReplays, point: Float[np.ndarray, " d"]) -> tupl
     show what parameters could reach.
     """
     simulator, readings = replays.simulator, replays.readings
-    states, visited = replays.starts(point[None])[0], []
+    starts, spent = replays.starts(point[None])
+    states, visited = starts[0], []
     for _ in range(NEARBY_STEPS):
         slopes = slopes_at(simulator, readings, point[None], states[None])[0]
         if not slopes.whole.any():
             break
         scale = scale_of(slopes.residuals[slopes.whole], "cauchy")
-        weights = loss_slope((slopes.residuals / scale) ** 2, "cauchy")
-        eliminated = eliminate(slopes, weights, np.full(len(readings), _DAMPING))
+        z = (slopes.residuals / scale) ** 2
+        newton = slopes.curved(curvature_share(z[slopes.whole], "cauchy"))
+        eliminated = eliminate(newton, loss_slope(z, "cauchy"), np.full(len(readings), _DAMPING))
         step = damped_step(*triangular_factors(eliminated.reduced, 1.0, "linear"), point, _DAMPING)
         states = states + readings.in_state_units(eliminated.states_step(step), states.shape[1])
         point = point + step
         visited.append(point)
+        if np.abs(step).max() < SHORTEST:
+            break
     columns = 1 + 2 * len(point) + len(readings.spread)
-    spent = replays.fit_cost + len(visited) * columns * len(readings) * readings.steps
+    spent += len(visited) * columns * len(readings) * readings.steps
     return np.array(visited[-_CANDIDATES:]).reshape(-1, len(point)), spent
 
 

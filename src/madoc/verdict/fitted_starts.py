@@ -25,9 +25,12 @@ AHEAD = (1, 5, 10)
 MOST = 150
 """Largest number of windows."""
 FIT_STEPS = 10
-"""Number of damped Gauss-Newton steps of an initial state: more than it needs, as it begins at finite differences."""
-_SHARES = np.array([1.0, 0.3, 0.1, 0.0])
-"""Shares in [0, 1] of a step, of which every window takes the one that fits it best."""
+"""Largest number of damped Gauss-Newton steps of an initial state, which begins at finite differences."""
+GAIN = 1e-4
+"""Share in (0, 1] of the squared residuals of all windows; after a step that saves less initial states are fitted."""
+_SHARES = np.array([1.0, 0.3, 0.1])
+"""Shares in (0, 1] of a step, of which every window takes the one that fits it best; none where none does."""
+_SMALLEST = 1e-100
 _DAMPING = 1e-8
 """Damping of an initial state's step, relative to the squared lengths of the columns; 0 is none."""
 
@@ -61,34 +64,55 @@ class FittedReplays:
 
     def residuals(
         self, points: Float[np.ndarray, "systems d"]
-    ) -> Float[np.ndarray, "systems windows readings channels"]:
-        """Simulated minus measured observations of whole windows, in typical changes of a step; NaN if one failed."""
-        flat = self.readings.residuals(self.simulator, points, self.starts(points))[:, 0]
-        return flat.reshape(*flat.shape[:2], *self.readings.observed.shape[1:])
+    ) -> tuple[Float[np.ndarray, "systems windows readings channels"], int]:
+        """Simulated minus measured observations of whole windows, and the control steps that were simulated.
 
-    def starts(self, points: Float[np.ndarray, "systems d"]) -> Float[np.ndarray, "systems windows state"]:
-        """The initial states from which each system comes nearest to the observations of the fitted steps."""
+        They are in typical changes of a step; NaN in a window whose simulation failed.
+        """
+        states, spent = self.starts(points)
+        flat = self.readings.residuals(self.simulator, points, states)[:, 0]
+        spent += len(points) * len(self.readings) * self.readings.steps
+        return flat.reshape(*flat.shape[:2], *self.readings.observed.shape[1:]), spent
+
+    def starts(self, points: Float[np.ndarray, "systems d"]) -> tuple[Float[np.ndarray, "systems windows state"], int]:
+        """The initial states from which each system comes nearest to the observations of the fitted steps.
+
+        Also the control steps that were simulated. Steps end once they gain little for every system.
+        """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
         states = np.repeat(self.near[None], len(points), axis=0)
-        damping, size = np.full(len(first), _DAMPING), states.shape[2]
+        damping, spent = np.full(len(first), _DAMPING), 0
         for _ in range(FIT_STEPS):
             around = slopes_at(self.simulator, first, points, states, parameters=False)
             fits = [eliminate(slopes, np.ones_like(slopes.residuals), damping) for slopes in around]
-            step = first.in_state_units(np.stack([fit.states_step(np.zeros(0)) for fit in fits]), size)
+            step = first.in_state_units(np.stack([fit.states_step(np.zeros(0)) for fit in fits]), states.shape[2])
             tried = states[:, None] + _SHARES[:, None, None] * step[:, None]
-            residuals = first.residuals(self.simulator, points, tried.reshape(len(points), -1, size))
-            with np.errstate(over="ignore", invalid="ignore"):
-                cost = (residuals**2).sum(-1)
-            cost = np.where(np.isfinite(cost), cost, np.inf)
-            states = np.take_along_axis(tried, cost.argmin(1)[:, None, :, None], axis=1)[:, 0]
-        return states
+            residuals = first.residuals(self.simulator, points, tried.reshape(len(points), -1, states.shape[2]))
+            spent += len(points) * len(first) * first.steps * (1 + len(first.spread) + len(_SHARES))
+            before = np.stack([np.where(each.whole, (each.residuals**2).sum(-1), np.inf) for each in around])
+            costs = np.concatenate([_squares(residuals), before[:, None]], axis=1)
+            best = costs.argmin(1)[:, None, :, None]
+            states = np.take_along_axis(np.concatenate([tried, states[:, None]], axis=1), best, axis=1)[:, 0]
+            if _gains(before, costs.min(1)) <= GAIN:
+                break
+        return states, spent
 
-    @property
-    def fit_cost(self) -> int:
-        """Number of control steps that fitting the initial states of one system takes."""
-        columns = 1 + len(self.readings.spread) + len(_SHARES)
-        return FIT_STEPS * columns * len(self.readings) * self.fitted
+
+def _squares(residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray, "*windows"]:
+    """Sums of squares, infinite for a window whose simulation failed."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        cost = (residuals**2).sum(-1)
+    return np.where(np.isfinite(cost), cost, np.inf)
+
+
+def _gains(before: Float[np.ndarray, "systems windows"], after: Float[np.ndarray, "systems windows"]) -> float:
+    """The largest share of its squared residuals that a system saves; 1 where a window that failed simulates now."""
+    simulated = np.isfinite(before)
+    if (np.isfinite(after) & ~simulated).any():
+        return 1.0
+    then, now = (np.where(simulated, costs, 0.0).sum(1) for costs in (before, after))
+    return float(np.max((then - now) / np.maximum(then, _SMALLEST)))
 
 
 def fitted_replays_of(

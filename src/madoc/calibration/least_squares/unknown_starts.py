@@ -52,8 +52,6 @@ WORSE = 2.0
 """Mean change of the windows' costs in its standard errors; above it a step makes them worse."""
 ROUNDING = 1e-8
 """Noise in typical changes of a channel; smaller residuals are rounding errors."""
-LEAST_CURVATURE = 0.5
-"""Curvature of the loss over that of the weighted squares; where it is smaller, residuals are not noise."""
 _SUFFICIENT = 0.02
 """Share in [0, 1] of the information about every direction that the trusted windows need; else all are trusted."""
 
@@ -293,7 +291,7 @@ class UnknownStarts:
         z = (slopes.residuals / TUNING[self.loss]) ** 2
         weights = loss_slope(z, self.loss) * slopes.whole[:, None]
         share = curvature_share(z[kept], self.loss)
-        damped = eliminate(slopes.curved(max(share, LEAST_CURVATURE)), weights, state_damping)
+        damped = eliminate(slopes.curved(share), weights, state_damping)
         factors = triangular_factors(damped.reduced.where(kept), 1.0, "linear")
         steps = [*(damped_step(*factors, point, damping * trial) for trial in TRIALS), np.zeros_like(point)]
         exact = eliminate(slopes, weights, least).reduced.of(kept)

@@ -1,0 +1,39 @@
+"""Initial states fitted to the first steps of held-out windows whose velocities are hidden."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+from planted import ROBOTS, log_of
+
+from madoc import simulation
+from madoc.data import Disturbance, disturb, hide_velocities
+from madoc.verdict.fitted_starts import FIT_STEPS, fitted_replays_of
+
+ARM, TRUTH = replace(ROBOTS["arm"][0], velocities=2), ROBOTS["arm"][1]
+AT_TRUTH = ARM.parameters.to_unit(ARM.parameters.vector(TRUTH))[None]
+
+
+def replays_under(noise):
+    log = disturb(log_of("arm", rows=600, noise=noise), Disturbance(hidden_velocities=True), ARM, jax.random.key(0))
+    simulator = simulation.make(hide_velocities(ARM), threads=1)
+    return fitted_replays_of(log, simulator, np.full(2, 0.1), 1)
+
+
+def test_hidden_velocities_are_found_at_the_truth():
+    residuals, _ = replays_under(0.0).residuals(AT_TRUTH)
+    assert np.abs(residuals).max() < 1e-8
+
+
+def test_fits_end_where_steps_gain_little():
+    replays = replays_under(0.2)
+    _, spent = replays.starts(AT_TRUTH)
+    of_a_step = (1 + 4 + 3) * replays.fitted * len(replays.readings)  # residuals, differences, shares of the step
+    assert spent % of_a_step == 0
+    assert of_a_step < spent < FIT_STEPS * of_a_step
+    residuals, whole = replays.residuals(AT_TRUTH)
+    assert whole == spent + len(replays.readings) * replays.readings.steps
+    fitted, ahead = residuals[0, :, : replays.fitted + 1], residuals[0, :, replays.fitted + 1 :]
+    assert (
+        0.3 < fitted.std() / ahead.std() < 1.0
+    )  # noise alone is left of the one, errors of the state grow in the other
