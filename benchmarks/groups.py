@@ -123,7 +123,7 @@ def planted(simulator: CpuSimulator, seed: int, transitions: int) -> Dataset:
 def agents(groups: str, draws: int) -> Madoc:
     """Madoc, freely running, with `draws` an epoch and these groups."""
     settings = {"draws": draws, "horizon": -(-STEPS // draws), "epoch_steps": STEPS}
-    return AtRandom(**settings) if groups == "random" else Madoc(groups=groups, **settings)
+    return AtRandom(groups="physics", **settings) if groups == "random" else Madoc(groups=groups, **settings)
 
 
 def run(method: Madoc, problem: CalibrationProblem, dataset: Dataset, seed: int, budget: int) -> dict:
