@@ -9,7 +9,7 @@ from madoc import robots, simulation
 from madoc.data import logs, typical_change
 from madoc.identification import missing_terms as terms
 from madoc.identification.candidate_terms import CAUSES, EARLY, Candidate, _cut_off
-from madoc.identification.drifts import DRIFT, _between_runs
+from madoc.identification.drifts import DRIFT, WITHIN_RUNS, _between_runs, _drifts
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
 from madoc.identification.term_tests import TermTests
@@ -155,6 +155,24 @@ def test_a_parameter_that_alternates_from_run_to_run_is_told():
         assert bool(others) == (apart > 0.0)
     assert term.value == pytest.approx(0.5, rel=0.2)  # the range is 2 wide, so 0.5 in [-1, 1] is 0.5 m/s²
     assert others[0].errors["gravity"] == pytest.approx(1.96 * 0.5 * np.sqrt(1.0 + 1.0 / 11.0) / 0.01, rel=0.2)
+
+
+def test_a_parameter_that_changes_within_each_run_is_told():
+    """As where a drive warms up: its mean is the same in all runs and over the log."""
+    random = np.random.default_rng(0)
+    runs, age = np.repeat(np.arange(6), 20), np.tile(np.linspace(-1.0, 1.0, 20), 6)[:, None]
+    slope, space = random.standard_normal((120, 6)), ParameterSpace((Parameter("gravity", "", -11, -9),))
+    for change in (0.0, 0.3):
+        # Residuals are simulated less logged: a value that is larger than the model's leaves them negative.
+        residuals = -slope * change * age + 0.5 * random.standard_normal((120, 6))
+        tests = TermTests(
+            Products.of(residuals, slope[..., None], np.zeros((120, 6, 0))), (), space, np.array([0.01]), runs
+        )
+        (within,) = [term for term in _drifts(tests) if term.cause == WITHIN_RUNS]
+        assert (within.t > 6.0) == (change > 0.0)
+        assert all(abs(term.t) < 3.0 for term in _drifts(tests) if term.cause == DRIFT)
+    assert within.value == pytest.approx(0.3, rel=0.2)
+    assert within.shifts["gravity"] == pytest.approx(within.value / 0.01)
 
 
 def test_runs_that_repeat_one_motion_agree_and_are_no_sign_of_a_change():

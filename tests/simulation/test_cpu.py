@@ -8,7 +8,7 @@ import pytest
 
 import madoc.tasks
 from madoc.errors import MadocError
-from madoc.parameters import Parameter
+from madoc.parameters import Parameter, ParameterSpace
 from madoc.robots import load
 from madoc.simulation.cpu import CpuSimulator
 from own_robots import CART_SPEC, write_robot
@@ -261,3 +261,34 @@ def test_a_model_that_keeps_a_history_is_refused():
 
     with pytest.raises(MadocError, match=r"actuators or sensors keep a history \(delay, nsample\)"):
         CpuSimulator(replace(spring(), spec=delayed))
+
+
+def test_a_force_from_outside_acts_as_an_actuator_would_and_is_gone_after_its_step():
+    simulator = CpuSimulator(spring(), threads=1)
+    system, action = simulator.bind(simulator.parameters.middle[None]), np.full((1, 1, 1), 0.4)
+    state, idle = np.array([[[0.2, -0.1]]]), np.zeros((1, 1, 1))
+    force = simulator.actuator_forces(simulator.parameters.middle, state, action)
+    assert force.shape == (1, 1, 1)
+    pushed = system.step(state, idle, force)
+    np.testing.assert_allclose(pushed, system.step(state, action), rtol=0, atol=1e-12)
+    assert (pushed != system.step(state, idle)).any()
+    np.testing.assert_array_equal(system.step(state, idle), system.step(state, idle, np.zeros((1, 1, 1))))
+
+
+def test_what_motors_and_position_servos_exert():
+    motor, servo, other = (
+        '<motor joint="a" gear="3" ctrllimited="true" ctrlrange="-1 1"/>',
+        '<position joint="b" kp="10" kv="2" forcelimited="true" forcerange="-4 4"/>',
+        '<motor tendon="both"/>',
+    )
+    xml = f"""<mujoco><worldbody>
+      <body><joint name="a" type="hinge"/><geom size="0.1"/>
+        <body pos="1 0 0"><joint name="b" type="slide"/><geom size="0.1"/></body></body></worldbody>
+      <tendon><fixed name="both"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed></tendon>
+      <actuator>{motor}{servo}{other}</actuator></mujoco>"""
+    gravity = Parameter("gravity", "", -10.0, -9.0)
+    task = replace(spring(), spec=lambda: mujoco.MjSpec.from_string(xml), parameters=ParameterSpace((gravity,)))
+    state, action = np.array([[0.3, 0.1, 0.5, -0.2]]), np.array([[2.0, 0.2, 1.0]])
+    found = CpuSimulator(task, threads=1).actuator_forces(np.array([-9.5]), state, action)
+    # The motor is asked for more than it can. The servo: 10 (0.2 - 0.1) - 2 (-0.2) N. Tendons are left out.
+    np.testing.assert_allclose(found, [[3.0, 1.4]])

@@ -41,7 +41,7 @@ INTEGRATION = "the error of the model's integration step"
 _KNOWN_BEFORE = ("body_mass", "body_com")
 _STILL = 1e-9
 """Standard deviation of a joint's position below which it does not move, so that nothing tells of a spring."""
-_CHANGE = 1e-3
+CHANGE = 1e-3
 """Change of a candidate, as a share of what would balance the joint's typical torque, for its one-sided difference."""
 _SATURATED = 0.3
 """Share of the largest logged action by which actions are cut off, to compute the effect of a drive that saturates."""
@@ -100,7 +100,7 @@ def candidates(
     wanted: list[tuple[str, str, float]] = []
     for name in (model.joint(joint).name for joint in range(model.njnt)):
         if name:
-            references = _references(logged, simulator, model.joint(name))
+            references = references_of(logged, simulator, model.joint(name))
             wanted += [(field, name, reference) for field, reference in references.items()]
     for channel in task.actions:
         wanted.append(
@@ -122,7 +122,7 @@ def candidates(
             yield _candidate(partial(nominal_values, model), field, element, reference)
 
 
-def _references(logged: LoggedStates, simulator: Simulator, joint: Any) -> dict[str, float]:
+def references_of(logged: LoggedStates, simulator: Simulator, joint: Any) -> dict[str, float]:
     """By field, the value with which a term would balance the torque that typically accelerates a joint.
 
     All degrees of freedom of a free or a ball joint share one value, and it has no spring.
@@ -173,9 +173,9 @@ def effects(
     """
     count, base = len(added), readings.residuals(wide, at[None], states[None])[0, 0]
     points = np.repeat(at[None], count, axis=0)
-    points[np.arange(count), len(at) - count + np.arange(count)] += 2.0 * _CHANGE
+    points[np.arange(count), len(at) - count + np.arange(count)] += 2.0 * CHANGE
     by_candidate = readings.residuals(wide, points, np.repeat(states[None], count, axis=0))[:, 0] - base
-    tried, found = [candidate for candidate, _ in added], list(by_candidate / _CHANGE)
+    tried, found = [candidate for candidate, _ in added], list(by_candidate / CHANGE)
     for candidate, column in _of_groups(simulator, added, np.stack(found)):
         tried.append(candidate)
         found.append(column)
@@ -183,7 +183,7 @@ def effects(
     earlier = np.concatenate([before[:, None], readings.actions[:, :-1]], axis=1)
     late = replace(readings, actions=readings.actions + _LATER * (earlier - readings.actions))
     saturated = replace(readings, actions=_cut_off(readings.actions, simulator))
-    stretched = simulation.make(simulator.task.with_time_step(1.0 + _CHANGE))
+    stretched = simulation.make(simulator.task.with_time_step(1.0 + CHANGE))
     finer = simulation.make(simulator.task.with_time_step(0.25, substeps=4))
     fields = {each.field for each in simulator.parameters.parameters}
     tilts = TILTS if np.any(simulator.task.model.opt.gravity) else ()
@@ -191,15 +191,15 @@ def effects(
         *(
             (
                 Candidate(cause, "", "rad", 0.0, 1.0, -np.inf, known_before=True),
-                simulation.make(simulator.task.with_tilt(axis, _CHANGE)),
+                simulation.make(simulator.task.with_tilt(axis, CHANGE)),
                 readings,
-                _CHANGE,
+                CHANGE,
             )
             for axis, cause in enumerate(tilts)
         ),
         (Candidate(DELAY, "action_delay", "s", 0.0, step, -np.inf), simulator, late, _LATER),
         (Candidate(SATURATION, "", "of the largest action cut off", 0.0, 1.0, 0.0), simulator, saturated, _SATURATED),
-        (Candidate(SPACING, "", "s", step, step, 0.0), stretched, readings, _CHANGE),
+        (Candidate(SPACING, "", "s", step, step, 0.0), stretched, readings, CHANGE),
         (Candidate(INTEGRATION, "", "", 0.0, 1.0, -np.inf), finer, readings, 1.0),
     ):
         if candidate.parameter not in fields:

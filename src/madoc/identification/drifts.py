@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from madoc.identification.candidate_terms import Candidate
 from madoc.identification.fitted_windows import Fit, fit_windows, products_of
@@ -24,7 +24,9 @@ from madoc.identification.term_tests import (
 from madoc.simulation.base import Simulator
 
 DRIFT = "a value that changes over the log"
-"""The cause of a missing term that is a parameter itself, as it changes."""
+WITHIN_RUNS = "a value that changes within each run"
+DRIFTS = (DRIFT, WITHIN_RUNS)
+"""Causes of a missing term that is a parameter itself, as it changes."""
 FEWEST_RUNS = 3
 """Fewest degrees of freedom of a variance between runs; with fewer, runs of their own motions would seem to differ."""
 
@@ -32,7 +34,9 @@ FEWEST_RUNS = 3
 def drifts_of(
     tests: TermTests, simulator: Simulator, readings: Readings, fit: Fit, point: Float[np.ndarray, " d"]
 ) -> tuple[list[MissingTerm], list[Alternative], int]:
-    """The most significant change of each parameter over the log or between runs, and estimates of parts that disagree.
+    """The most significant change of each parameter over the log, and estimates of parts that disagree.
+
+    A parameter may change over the log, within each run, as where a drive warms up, or from run to run.
 
     Thirds of the log are fitted by themselves only where a score test says that a parameter changes.
 
@@ -50,7 +54,7 @@ def drifts_of(
     others = list(_of_parts(drifts))
     between, of_runs = _between_runs(tests)
     others += of_runs
-    if any(abs(term.t) >= DISAGREEING for term in drifts):
+    if any(term.cause == DRIFT and abs(term.t) >= DISAGREEING for term in drifts):
         thirds, spent = _fitted_thirds(simulator, readings, fit)
         drifts += list(_changes(tests, thirds, drifts))
         others += _of_thirds(tests, thirds, drifts, point)
@@ -58,15 +62,25 @@ def drifts_of(
 
 
 def _drifts(tests: TermTests) -> Iterator[MissingTerm]:
-    """How each parameter changes over the log: in a straight line, in its first third, and in its last."""
-    time = np.linspace(-1.0, 1.0, len(tests.products))
-    shapes = [shape - np.mean(shape) for shape in (time, time < -1.0 / 3.0, time > 1.0 / 3.0)]
+    """How each parameter changes over the log: in a straight line, in its first third, in its last, in every run."""
+    time, age = np.linspace(-1.0, 1.0, len(tests.products)), _since_begin(tests.runs)
+    shapes = [(DRIFT, shape - np.mean(shape)) for shape in (time, time < -1.0 / 3.0, time > 1.0 / 3.0)]
+    shapes += [(WITHIN_RUNS, age)] if len(np.unique(tests.runs)) > 1 and age.any() else []
     for index, row in enumerate(tests.space.parameters):
-        candidate = Candidate(DRIFT, row.name, row.unit, 0.0, (row.high - row.low) / 2.0, -np.inf)
-        for shape in shapes:
+        for cause, shape in shapes:
+            candidate = Candidate(cause, row.name, row.unit, 0.0, (row.high - row.low) / 2.0, -np.inf)
             found = score(tests.products, 1 + index, shape=shape)
             if found is not None:
                 yield term_of(candidate, found, {row.name: found.change / float(tests.half_widths[index])})
+
+
+def _since_begin(runs: Int[np.ndarray, " windows"]) -> Float[np.ndarray, " windows"]:
+    """Time of each window from -1 at the begin of its run to 1 at its end; 0 in a run of a single window."""
+    age = np.zeros(len(runs))
+    for run in np.unique(runs):
+        own = runs == run
+        age[own] = np.linspace(-1.0, 1.0, own.sum()) if own.sum() > 1 else 0.0
+    return age
 
 
 def _between_runs(tests: TermTests) -> tuple[list[MissingTerm], list[Alternative]]:
@@ -160,7 +174,7 @@ def _of_thirds(
     tests: TermTests, thirds: list[_Third], drifts: Iterable[MissingTerm], point: Float[np.ndarray, " d"]
 ) -> Iterator[Alternative]:
     """The estimates of both thirds for each parameter that certainly differs between parts of the log."""
-    disagreeing = dict.fromkeys(term.parameter for term in drifts if abs(term.t) >= DISAGREEING)
+    disagreeing = dict.fromkeys(term.parameter for term in drifts if term.cause == DRIFT and abs(term.t) >= DISAGREEING)
     for third in thirds:
         shifts = tests.by_name(third.point - point)
         errors = tests.by_name(NORMAL_95 * np.sqrt(third.variance))
@@ -185,5 +199,6 @@ def _of_parts(drifts: Iterable[MissingTerm]) -> Iterator[Alternative]:
             shift = term.shifts[term.parameter]
             errors = {term.parameter: abs(NORMAL_95 * shift / term.t)}
             for side in (-shift, shift):
-                causes, shifts = (f"{term.parameter} changing over the log",), {term.parameter: side}
+                when = "over the log" if term.cause == DRIFT else "within each run"
+                causes, shifts = (f"{term.parameter} changing {when}",), {term.parameter: side}
                 yield Alternative(causes, False, shifts, errors, parts=True)

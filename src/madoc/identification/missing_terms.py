@@ -25,6 +25,7 @@ from madoc.identification.candidate_terms import (
 from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import Fit, fit_windows, negligible, products_of, windows_of
 from madoc.identification.information import NORMAL_95
+from madoc.identification.joint_forces import force_effects
 from madoc.identification.replay import Readings
 from madoc.identification.score_tests import deviate, joint_shift, parameter_shift, score
 from madoc.identification.states import LoggedStates
@@ -101,7 +102,9 @@ def suspicions(
     wide = simulation.make(replace(simulator.task, parameters=space))
     at_nominal = np.concatenate([led, -np.ones(len(added))])
     tried, by_terms = effects(simulator, wide, readings, before, at_nominal, fit.states, added)
-    spent = fit.control_steps + (1 + len(tried)) * len(readings) * readings.steps
+    forces, by_forces = force_effects(simulator, readings, logged, led, fit.states)
+    tried, by_terms = [*tried, *forces], np.concatenate([by_terms, by_forces], axis=-1)
+    spent = fit.control_steps + (3 + len(tried)) * len(readings) * readings.steps
     if fit.slopes.whole.any():
         diverges = (~np.isfinite(by_terms).all(1)[fit.slopes.whole]).mean(0) > DIVERGING
         by_terms[..., diverges] = 0.0  # so that a term which most windows cannot bear is not tested, but others are

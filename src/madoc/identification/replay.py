@@ -105,20 +105,33 @@ class Readings:
             counts.append(simulator.contacts(state[0]))
         return np.stack(counts, axis=1)
 
+    def trajectories(
+        self, simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
+    ) -> Float[np.ndarray, "windows steps state"]:
+        """The simulated state before each action of the windows. Spends windows · steps control steps."""
+        system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
+        state, visited = np.ascontiguousarray(states[None]), list[Float[np.ndarray, "windows state"]]()
+        for action in np.moveaxis(self.actions, 1, 0):
+            visited.append(state[0])
+            state = system.step(state, np.ascontiguousarray(action[None]))
+        return np.stack(visited, axis=1)
+
     def residuals(
         self,
         simulator: Simulator,
         points: Float[np.ndarray, "systems d"],
         states: Float[np.ndarray, "systems rows state"],
+        force: Float[np.ndarray, "systems rows steps dof"] | None = None,
     ) -> Float[np.ndarray, "systems times windows values"]:
         """Simulated minus measured observations, where each system's states are those of the windows, repeated.
 
-        NaN in windows whose simulation failed. Spends systems · rows · steps control steps.
+        NaN in windows whose simulation failed. `force` acts on each degree of freedom in each control step, in N or
+        N·m. Spends systems · rows · steps control steps.
         """
         times = states.shape[1] // len(self)
         system = simulator.bind(simulator.parameters.to_physical(np.clip(points, -1.0, 1.0)))
         start = np.ascontiguousarray(states)
-        following = _observations(system, start, np.tile(self.actions, (times, 1, 1)))
+        following = _observations(system, start, np.tile(self.actions, (times, 1, 1)), force)
         simulated = np.stack([system.observe(start), *following], axis=2)[..., : len(self.scale)]
         residuals = (simulated.reshape(len(points), times, *self.observed.shape) - self.observed) / self.scale
         return residuals.reshape(len(points), times, len(self), -1)
@@ -156,9 +169,13 @@ def slopes_at(
 
 
 def _observations(
-    system: System, state: Float[np.ndarray, "systems rows state"], actions: Float[np.ndarray, "rows steps action"]
+    system: System,
+    state: Float[np.ndarray, "systems rows state"],
+    actions: Float[np.ndarray, "rows steps action"],
+    force: Float[np.ndarray, "systems rows steps dof"] | None = None,
 ) -> Iterator[Float[np.ndarray, "systems rows observation"]]:
     """The observation after each of the actions."""
-    for action in np.moveaxis(actions, 1, 0):
-        state = system.step(state, np.ascontiguousarray(np.broadcast_to(action, (system.count, *action.shape))))
+    for step, action in enumerate(np.moveaxis(actions, 1, 0)):
+        same = np.ascontiguousarray(np.broadcast_to(action, (system.count, *action.shape)))
+        state = system.step(state, same, None if force is None else force[:, :, step])
         yield system.observe(state)

@@ -18,9 +18,15 @@ class System(Protocol):
     count: int
 
     def step(
-        self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
+        self,
+        state: Float[np.ndarray, "systems rows state"],
+        action: Float[np.ndarray, "systems rows action"],
+        force: Float[np.ndarray, "systems rows dof"] | None = None,
     ) -> Float[np.ndarray, "systems rows state"]:
-        """One control step. A row whose simulation failed comes back as NaN; the others are untouched."""
+        """One control step. A row whose simulation failed comes back as NaN; the others are untouched.
+
+        `force` acts on each degree of freedom from outside all the while, in N or N·m.
+        """
         ...
 
     def observe(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows observation"]:
@@ -63,6 +69,18 @@ class Simulator(Protocol):
 
     def contacts(self, state: Float[np.ndarray, "rows state"]) -> Int[np.ndarray, " rows"]:
         """Number of pairs of geoms in contact in each state; no parameter changes the shape of a body."""
+        ...
+
+    def actuator_forces(
+        self,
+        values: Float[np.ndarray, " parameters"],
+        state: Float[np.ndarray, "*rows state"],
+        action: Float[np.ndarray, "*rows action"],
+    ) -> Float[np.ndarray, "*rows dof"]:
+        """What the actuators of joints exert on each degree of freedom under actions in effect, in N or N·m.
+
+        It is 0 where an actuator has another transmission, or another gain than a constant or bias than a linear one.
+        """
         ...
 
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:

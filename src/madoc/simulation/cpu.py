@@ -21,6 +21,9 @@ _CLOCK = 1.0
 
 _ROWS_FOR_ALL_THREADS = 8
 """Number of rows from which all threads step them; with fewer, waking a second thread costs more than it saves."""
+_OF_ONE_DOF = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_USUAL_BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
+"""Biases of motors, and of position and velocity servos."""
 _CHUNKS = 2
 """Number of parts of a batch that each thread steps; with ten, the default, 200 rows take a tenth longer."""
 
@@ -128,6 +131,39 @@ class CpuSimulator:
             contacts[row] = len(set(map(tuple, data.contact.geom.tolist()))) if data.ncon > 1 else data.ncon
         return contacts
 
+    def actuator_forces(
+        self,
+        values: Float[np.ndarray, " parameters"],
+        state: Float[np.ndarray, "*rows state"],
+        action: Float[np.ndarray, "*rows action"],
+    ) -> Float[np.ndarray, "*rows dof"]:
+        """What the actuators of joints exert on each degree of freedom under actions in effect, in N or N·m.
+
+        It is 0 where an actuator has another transmission, or another gain than a constant or bias than a linear one.
+        """
+        model, control = self.model(values), self._controls(action)
+        forces = np.zeros((*state.shape[:-1], model.nv))
+        for index in range(model.nu):
+            joint = int(model.actuator_trnid[index, 0])
+            usual = (
+                model.actuator_trntype[index] == int(mujoco.mjtTrn.mjTRN_JOINT)
+                and model.actuator_gaintype[index] == int(mujoco.mjtGain.mjGAIN_FIXED)
+                and model.actuator_biastype[index] in _USUAL_BIASES
+            )
+            if not usual or model.jnt_type[joint] not in _OF_ONE_DOF:
+                continue
+            dof, gear = int(model.jnt_dofadr[joint]), float(model.actuator_gear[index, 0])
+            position, speed = state[..., int(model.jnt_qposadr[joint])], state[..., model.nq + dof]
+            given = control[..., index]
+            if model.actuator_ctrllimited[index]:
+                given = np.clip(given, *model.actuator_ctrlrange[index])
+            bias = model.actuator_biasprm[index, :3]
+            exerted = model.actuator_gainprm[index, 0] * given + bias[0] + gear * (bias[1] * position + bias[2] * speed)
+            if model.actuator_forcelimited[index]:
+                exerted = np.clip(exerted, *model.actuator_forcerange[index])
+            forces[..., dof] += gear * exerted
+        return forces
+
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
         """A MuJoCo model at the given physical values, owned by the caller."""
         return self.bind(np.asarray(values)[None]).models[0]
@@ -169,15 +205,21 @@ class CpuSystem:
         delay[systems], bias[systems] = new._delay, new._bias
         return CpuSystem(self._simulator, models, delay, bias)
 
-    def step(self, state: Float[np.ndarray, "..."], action: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def step(
+        self,
+        state: Float[np.ndarray, "..."],
+        action: Float[np.ndarray, "..."],
+        force: Float[np.ndarray, "systems rows dof"] | None = None,
+    ) -> Float[np.ndarray, "..."]:
         """One control step of `frame_skip` physics steps; a row whose simulation diverges comes back as NaN.
 
-        States and actions that are not of shape (systems, rows, values) are refused.
+        `force` acts on each degree of freedom from outside all the while. States and actions that are not of shape
+        (systems, rows, values) are refused.
         """
         self._check_shapes(state.shape, action.shape)
         history = np.concatenate([action[..., None, :], self._pending(state)], axis=-2)
         control = self._simulator._controls(blend(self._weights, history))
-        moved, _ = self._roll_out(state[..., : self._physical], control)
+        moved, _ = self._roll_out(state[..., : self._physical], control, force)
         pending = history[..., :-1, :].reshape(*state.shape[:2], self._goals - self._physical)
         kept = np.concatenate([pending, state[..., self._goals :]], axis=-1)
         return np.concatenate([moved, np.where(np.isnan(moved[..., :1]), np.nan, kept)], axis=-1)
@@ -221,9 +263,14 @@ class CpuSystem:
         self,
         state: Float[np.ndarray, "systems rows physical"],
         control: Float[np.ndarray, "systems rows steps control"],
+        force: Float[np.ndarray, "systems rows dof"] | None = None,
     ) -> tuple[Float[np.ndarray, "systems rows physical"], Float[np.ndarray, "systems rows sensor"]]:
         """States after the physics steps, NaN where they diverge, and what the sensors read in the first of them."""
         simulator, (_, rows, steps, _) = self._simulator, control.shape
+        inputs = mujoco.mjtState.mjSTATE_CTRL
+        if force is not None:
+            inputs |= mujoco.mjtState.mjSTATE_QFRC_APPLIED
+            control = np.concatenate([control, np.repeat(force[:, :, None], steps, axis=2)], axis=-1)
         total = self.count * rows
         if not total:
             return state, np.zeros((*state.shape[:2], self.models[0].nsensordata))
@@ -243,6 +290,7 @@ class CpuSystem:
                 simulator._data if many else simulator._data[:1],
                 start,
                 control.reshape(total, steps, -1),
+                control_spec=inputs,
                 skip_checks=True,
                 nstep=steps,
                 chunk_size=chunk,

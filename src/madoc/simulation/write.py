@@ -1,6 +1,7 @@
 """Parameters into a MuJoCo model: elements found by name, values written, derived constants recomputed."""
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -75,6 +76,16 @@ def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
     object_type, count = _KINDS[kind]
     names = (mujoco.mj_id2name(model, object_type, index) for index in range(getattr(model, count)))
     return [name for name in names if name]
+
+
+def single_joints(model: mujoco.MjModel) -> list[tuple[Any, bool]]:
+    """Views of the joints that have a name and one degree of freedom, and whether each is a hinge."""
+    joints = (model.joint(index) for index in range(model.njnt))
+    return [
+        (joint, int(joint.type[0]) == int(mujoco.mjtJoint.mjJNT_HINGE))
+        for joint in joints
+        if joint.name and len(joint.damping) == 1
+    ]
 
 
 def heavy_bodies(model: mujoco.MjModel) -> Iterator[str]:

@@ -12,7 +12,8 @@ from madoc.calibration.result import CalibrationResult
 from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS
 from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
-from madoc.identification.drifts import DRIFT
+from madoc.identification.drifts import DRIFTS
+from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import Alternative, MissingTerm
 
@@ -51,7 +52,7 @@ def missing_term(holdout: HoldOut) -> MissingTerm | None:
     certain = [term for term in holdout.missing_terms if is_certain(term)]
     moving = [term for term in certain if moves_certainly(term)]
     if certain and not moving and _moved_together(holdout):
-        moving = [term for term in holdout.missing_terms if term.cause not in (DRIFT, INTEGRATION)]
+        moving = [term for term in holdout.missing_terms if term.cause not in (*DRIFTS, INTEGRATION)]
     return likeliest(moving)
 
 
@@ -59,7 +60,8 @@ def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     """Of significant terms the one that explains most, or nearly as much if that is unusual; None of none.
 
     A tilted base looks like an offset of a sensor, which is more usual, and a gravity that is not the earth's like a
-    wrong mass or gain. Actions that seem to come early are more often a sign of forces that the model lacks.
+    wrong mass or gain. Actions that seem to come early are more often a sign of forces that the model lacks. A force
+    that no parameter adds is named only where no other term explains as much.
     """
     most = max((abs(term.t) for term in terms), default=0.0)
     significant = [term for term in terms if abs(term.t) >= AS_SIGNIFICANT * most]
@@ -71,7 +73,7 @@ def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
 def _unusual(term: MissingTerm) -> bool:
     if term.parameter == "gravity":
         return abs(abs(term.value) - standard_gravity) > EARTH + 2.0 * term.standard_error
-    return term.cause in (EARLY, *TILTS)
+    return term.cause in (EARLY, *TILTS) or is_joint_force(term.cause)
 
 
 def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
@@ -79,7 +81,10 @@ def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
     return [
         term
         for term in holdout.missing_terms
-        if term != named and is_certain(term) and term.cause != DRIFT and term.explained >= NEARLY * named.explained
+        if term != named
+        and is_certain(term)
+        and term.cause not in DRIFTS
+        and term.explained >= NEARLY * named.explained
     ]
 
 
@@ -109,7 +114,7 @@ def about_timestep(holdout: HoldOut, named: MissingTerm | None = None) -> str:
 
 def is_certain(term: MissingTerm) -> bool:
     """Whether a term is so significant that it is missing, whatever it does to the estimate."""
-    return term.cause != INTEGRATION and abs(term.t) >= (CERTAIN_DRIFT if term.cause == DRIFT else CERTAIN)
+    return term.cause != INTEGRATION and abs(term.t) >= (CERTAIN_DRIFT if term.cause in DRIFTS else CERTAIN)
 
 
 def moves_certainly(term: MissingTerm) -> bool:
@@ -136,7 +141,7 @@ def _numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     step = integration(terms)
     if step is None or step.t < CERTAIN_STEP or step.explained < NUMERICAL:
         return None
-    others = (each.explained for each in terms if is_certain(each) and each.cause != DRIFT)
+    others = (each.explained for each in terms if is_certain(each) and each.cause not in DRIFTS)
     return step if max(others, default=0.0) <= step.explained else None
 
 

@@ -16,8 +16,9 @@ from madoc.calibration.holdout import (
 )
 from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, SATURATION, SPACING, TILTS
 from madoc.identification.combinations import Combination
-from madoc.identification.drifts import DRIFT
+from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
 from madoc.identification.information import OPEN
+from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import MissingTerm
 from madoc.parameters import FIELDS
@@ -34,6 +35,8 @@ REMEDIES = {
     **dict.fromkeys(TILTS, "level it, or tilt the gravity of the model (its option gravity) as the base is"),
 }
 """What to do about terms that no further parameter of a spec adds."""
+WARM_UP = "let the machine warm up before it is logged, or leave the begin of each run out"
+CHANGE_MODEL = "no parameter of a spec adds it: take it out of the machine, or log motions in which it is small"
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
 
 WORDS: dict[Word, str] = {
@@ -123,12 +126,14 @@ def _missing(holdout: HoldOut) -> Verdict | None:
     if term is None:
         return None
     value = _value(term)
-    if term.cause == DRIFT:
+    if term.cause in DRIFTS:
+        within = term.cause == WITHIN_RUNS
         return Verdict(
             "MODEL_MISMATCH",
-            f"{term.parameter} drifts: it changes over the log by {value} between its parts (t = {abs(term.t):.0f}), "
+            f"{term.parameter} drifts: it changes {'within each run' if within else 'over the log'} by {value} between "
+            f"{'the middle of a run and its ends' if within else 'its parts'} (t = {abs(term.t):.0f}), "
             f"which is {abs(term.shifts[term.parameter]):.2g} half-widths of its interval; "
-            f"calibrate to each run by itself{about_timestep(holdout)}",
+            f"{WARM_UP if within else 'calibrate to each run by itself'}{about_timestep(holdout)}",
             (term.parameter,),
         )
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
@@ -174,6 +179,8 @@ def _remedy(term: MissingTerm) -> str:
     field, _, element = term.parameter.partition(".")
     if term.cause in REMEDIES:
         return REMEDIES[term.cause]
+    if is_joint_force(term.cause):
+        return CHANGE_MODEL
     high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
     low = 0.0 if term.value >= 0.0 else max(-high, FIELDS[field].minimum)
     high = 0.0 if field == "gravity" and term.value < 0.0 else high  # it points downwards
@@ -227,7 +234,7 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
         sentence = _systematic(holdout, at_end)
     if not sentence:
         return None
-    term = likeliest([each for each in holdout.missing_terms if is_certain(each) and each.cause != DRIFT])
+    term = likeliest([each for each in holdout.missing_terms if is_certain(each) and each.cause not in DRIFTS])
     if term is not None:
         sentence += (
             f"; of single terms {_named(term)} is the likeliest: {_value(term)} explains {100 * term.explained:.2g} % "

@@ -1,0 +1,108 @@
+"""Forces at a joint that no parameter of a spec adds: what each stands for, and its effect on simulated windows.
+
+Each is a function of the joint's speed and of what its drive exerts. To first order the motion under a small force is
+that under its values along the motion without it, so one simulation of each window gives its effect.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from madoc.identification.candidate_terms import CHANGE, Candidate, references_of
+from madoc.identification.replay import Readings
+from madoc.identification.states import LoggedStates
+from madoc.parameters import Parameter
+from madoc.simulation.base import Simulator
+from madoc.simulation.write import single_joints
+
+CONSTANT = "a constant force, as friction that differs by direction"
+LOADED = "friction that grows with the load"
+SLOW = "friction that is larger at low speed"
+WEAKENING = "a drive that weakens with speed"
+RIPPLE = "a drive whose gain depends on where the joint is"
+UNEVEN = "friction that depends on where the joint is"
+PLACED = "a force that depends on where the joint is"
+FORCES = (CONSTANT, LOADED, SLOW, WEAKENING, RIPPLE, UNEVEN, PLACED)
+"""What each stands for, in words, the most usual first; the joint's name follows in brackets."""
+USUAL = 4
+"""Number of `FORCES` that are tried at every joint; the others only at robots of few joints."""
+FEW_JOINTS = 4
+"""Largest number of joints of such a robot."""
+TURNING = 0.1
+"""Speed relative to the joint's root mean square, at which friction has turned to the direction of motion."""
+LOW_SPEED = 0.3
+"""The same, below which friction at low speed acts (Stribeck)."""
+_SMALLEST = 1e-9
+"""Root mean square of a speed or a force below which a joint or its drive does nothing."""
+
+
+def is_joint_force(cause: str) -> bool:
+    """Whether the cause of a term is one of `FORCES`."""
+    return cause.startswith(FORCES)
+
+
+def joint_forces(
+    position: Float[np.ndarray, "windows steps"],
+    speed: Float[np.ndarray, "windows steps"],
+    exerted: Float[np.ndarray, "windows steps"],
+    *,
+    turns: bool,
+) -> dict[str, list[Float[np.ndarray, "windows steps"]]]:
+    """Each of `FORCES` along the motion of a joint, of about 1 in size, as one or two functions of time.
+
+    Args:
+        position: Of the joint, in rad or m.
+        speed: Of the joint.
+        exerted: What its drive exerts.
+        turns: Whether it is a hinge: what depends on its position then repeats with every turn.
+    """
+    fast, strong = (float(np.sqrt(np.nanmean(values**2))) for values in (speed, exerted))
+    moves, drives = fast > _SMALLEST, strong > _SMALLEST
+    direction = np.tanh(speed / (TURNING * fast)) if moves else speed
+    drive = exerted / strong if drives else exerted
+    places = [np.sin(position), np.cos(position)]
+    if not turns:
+        along = (position - np.nanmean(position)) / max(float(np.nanstd(position)), _SMALLEST)
+        places = [along, along**2]
+    found = {CONSTANT: [np.ones_like(speed)]}
+    if moves and drives:
+        found |= {LOADED: [-direction * np.abs(drive)], WEAKENING: [-drive * np.abs(speed) / fast]}
+    if moves:
+        found |= {SLOW: [-direction * np.exp(-((speed / (LOW_SPEED * fast)) ** 2))]}
+        found |= {UNEVEN: [-direction * place for place in places], PLACED: places}
+    if moves and drives:
+        found |= {RIPPLE: [drive * place for place in places]}
+    return found
+
+
+def force_effects(
+    simulator: Simulator,
+    readings: Readings,
+    logged: LoggedStates,
+    point: Float[np.ndarray, " d"],
+    states: Float[np.ndarray, "windows state"],
+) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"]]:
+    """Every force at a joint of one degree of freedom, and the derivative of the residuals by it, in its reference.
+
+    It takes one simulation of every window for each, and two besides.
+    """
+    model, values = simulator.task.model, simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))
+    motion = readings.trajectories(simulator, point, states)
+    exerted = simulator.actuator_forces(values, motion, readings.actions)
+    tried, forces = list[Candidate](), list[Float[np.ndarray, "windows steps dof"]]()
+    joints = single_joints(model)
+    causes = FORCES if len(joints) <= FEW_JOINTS else FORCES[:USUAL]
+    for joint, turns in joints:
+        dof, torque = int(joint.dofadr[0]), references_of(logged, simulator, joint)["dof_frictionloss"]
+        unit = Parameter("dof_frictionloss", joint.name, 0.0, 1.0).unit
+        along = motion[..., int(joint.qposadr[0])], motion[..., model.nq + dof], exerted[..., dof]
+        found = joint_forces(*along, turns=turns)
+        for cause, shape in [(each, shape) for each in causes for shape in found.get(each, [])]:
+            tried.append(Candidate(f"{cause} ({joint.name})", "", unit, 0.0, torque, -np.inf, known_before=True))
+            forces.append(np.zeros((*shape.shape, model.nv)))
+            forces[-1][..., dof] = CHANGE * torque * np.nan_to_num(shape)
+    base = readings.residuals(simulator, point[None], states[None])[0, 0]
+    if not tried:
+        return [], np.zeros((*base.shape, 0))
+    points, starts = (np.repeat(each[None], len(tried), axis=0) for each in (point, states))
+    moved = readings.residuals(simulator, points, starts, np.stack(forces))[:, 0]
+    return tried, np.moveaxis((moved - base) / CHANGE, 0, -1)

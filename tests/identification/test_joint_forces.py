@@ -1,0 +1,77 @@
+"""Forces at a joint that no parameter of a spec adds: by hand, and on a pendulum that has one."""
+
+import numpy as np
+import pytest
+from test_missing_terms import MODEL, NOISE, SPEC, scores
+
+from madoc import robots, simulation
+from madoc.data import logs
+from madoc.identification.joint_forces import (
+    CONSTANT,
+    LOADED,
+    PLACED,
+    RIPPLE,
+    SLOW,
+    UNEVEN,
+    WEAKENING,
+    is_joint_force,
+    joint_forces,
+)
+
+
+def test_forces_along_a_motion():
+    # A joint that always moves at 2 rad/s under 3 N·m, at 0 and at a quarter of a turn: tanh(10) is 1, as is |drive|.
+    position, speed, exerted = np.array([[0.0, np.pi / 2.0]]), np.full((1, 2), 2.0), np.full((1, 2), 3.0)
+    found = joint_forces(position, speed, exerted, turns=True)
+    ones = np.ones((1, 2))
+    assert found[CONSTANT][0] == pytest.approx(ones)
+    assert found[LOADED][0] == pytest.approx(-ones)
+    assert found[WEAKENING][0] == pytest.approx(-ones)
+    assert found[SLOW][0] == pytest.approx(-np.exp(-1.0 / 0.09) * ones)
+    for cause, sign in ((PLACED, 1.0), (UNEVEN, -1.0), (RIPPLE, 1.0)):
+        assert found[cause][0] == pytest.approx(sign * np.array([[0.0, 1.0]]), abs=1e-8)
+        assert found[cause][1] == pytest.approx(sign * np.array([[1.0, 0.0]]), abs=1e-8)
+    along, squared = joint_forces(position, speed, exerted, turns=False)[PLACED]
+    assert along == pytest.approx(np.array([[-1.0, 1.0]]))
+    assert squared == pytest.approx(ones)
+
+
+def test_what_neither_moves_nor_drives_has_a_constant_force_alone():
+    still = np.zeros((1, 3))
+    assert joint_forces(still, still, still, turns=True).keys() == {CONSTANT}
+    assert LOADED not in joint_forces(still, still + 1.0, still, turns=True)
+
+
+def test_causes_are_known_by_their_begin():
+    assert is_joint_force(f"{LOADED} (hinge)")
+    assert not is_joint_force("Coulomb friction")
+
+
+@pytest.mark.parametrize(
+    ("force", "cause"),
+    [
+        (lambda q, v, u: 0.02, CONSTANT),
+        (lambda q, v, u: -0.08 * abs(u) * np.tanh(v / 0.05), LOADED),
+        (lambda q, v, u: -0.06 * np.tanh(v / 0.05) * np.exp(-((v / 0.4) ** 2)), SLOW),
+        (lambda q, v, u: 0.1 * u * np.sin(q), RIPPLE),
+    ],
+    ids=["constant", "loaded", "slow", "ripple"],
+)
+def test_a_force_at_the_joint_is_certain_and_named(tmp_path, force, cause):
+    """Candidates that a spec adds may come near: what is asked is that this one is certain, and no other more so."""
+    (tmp_path / "model.xml").write_text(MODEL.format(damping=0.1, friction=0.03, drag=""))
+    (tmp_path / "pendulum.yaml").write_text(SPEC)
+    robot = robots.load(tmp_path / "pendulum.yaml")
+    simulator = simulation.make(robot.task)
+    system, random = simulator.bind(np.array([[0.1]])), np.random.default_rng(0)
+    torque, state, seen = np.repeat(random.uniform(-1, 1, 320), 5), simulator.initial_state[None, None], []
+    for each in torque:
+        seen.append(state[0, 0, :2])
+        outside = np.full((1, 1, 1), force(*state[0, 0, :2], each))
+        state = system.step(state, np.full((1, 1, 1), each), outside)
+    seen = np.array(seen) + NOISE * random.standard_normal((len(torque), 2))
+    columns = np.column_stack([0.02 * np.arange(len(torque)), seen, torque])
+    np.savetxt(tmp_path / "log.csv", columns, "%.9g", ",", header="time,angle,speed,torque", comments="")
+    told = scores(logs.read([tmp_path / "log.csv"], robot), simulator)
+    (own,) = [term for term in told if term.cause.startswith(cause) and abs(term.t) > 5.0][:1]
+    assert own.explained > 0.8 * max(term.explained for term in told)
