@@ -107,6 +107,11 @@ class Plant:
         limit: Largest command that the motors follow, as a share of the logged limit.
         drag: Quadratic drag on every joint, N·s²/m² or N·m·s²/rad².
         stribeck: Stribeck friction on every joint, N or N·m; it falls to half of that with speed.
+        loaded: Friction on every joint, as a share of what its motor exerts.
+        warming: Friction on every joint at the begin of each run, N or N·m; it falls off within seconds.
+        uneven: Friction on every joint, N or N·m, times the sine of its position.
+        ripple: Share of what its motor exerts on every joint that goes with the sine of its position.
+        sag: Share of what the motors exert that they lose within seconds of each run.
         sway: Amplitude (m/s²) of a sideways acceleration of the base at 0.7 Hz.
         wind: Constant force on the first joint, N or N·m.
         process: Random force on every joint, one draw a row, as a share of the largest command.
@@ -124,6 +129,11 @@ class Plant:
     limit: float = 1.0
     drag: float = 0.0
     stribeck: float = 0.0
+    loaded: float = 0.0
+    warming: float = 0.0
+    uneven: float = 0.0
+    ripple: float = 0.0
+    sag: float = 0.0
     sway: float = 0.0
     wind: float = 0.0
     process: float = 0.0

@@ -21,6 +21,7 @@ RANGE = "outside|ends? of (its|their|the) range|beyond"
 LOOSE = r"elastic|flexib|backlash|\bplay\b|second mass|spring"
 LIMIT = "saturat|limit|clip"
 DRIFT = r"drift|runs differ|between runs|\bthirds\b|change over"
+PLACE = "where the joint is"
 CLOCK = r"clock|drift|spacing|\brates?\b"
 FORCE = r"constant|wind|external|offset|\bbias"
 CONTACT = r"contact|\bwall|collision"
@@ -32,6 +33,7 @@ NOISY = Log(noise=0.02)
 COUNTED = Log(noise=0.0, quantum=ENCODER, velocities="none")
 SHORT = Log(runs=4, seconds=4.0)
 THREE = ("length", "damping", "gain")
+FRICTIONAL = ("length", "damping", "friction")
 
 
 def in_all_conditions(robot: Robot, name: str, values: Mapping[str, float], cause: str) -> tuple[Case, ...]:
@@ -125,6 +127,12 @@ _PENDULUM = (
     Case(PENDULUM, "base-sways", Plant(sway=1.5), cause=BASE),
     Case(PENDULUM, "contact", Plant({"wall": 0.7}), cause=CONTACT),
     Case(PENDULUM, "wind", Plant(wind=0.3), cause=FORCE),
+    Case(PENDULUM, "wind-0.03", Plant(wind=0.03), cause=FORCE),
+    Case(PENDULUM, "loaded", Plant(loaded=0.06), spec=Spec(free=FRICTIONAL), cause=FRICTION),
+    Case(PENDULUM, "warming", Plant(warming=0.1), spec=Spec(free=FRICTIONAL), cause=DRIFT),
+    Case(PENDULUM, "uneven", Plant(uneven=0.08), spec=Spec(free=FRICTIONAL), cause=PLACE),
+    Case(PENDULUM, "ripple", Plant(ripple=0.15), cause=PLACE),
+    Case(PENDULUM, "sag", Plant(sag=0.1), spec=Spec(free=THREE), cause=DRIFT),
 )
 
 _ARM = (
@@ -165,6 +173,10 @@ _ARM = (
     Case(ARM, "range-far", Plant({"mass_fore": 1.6}), cause=RANGE),
     Case(ARM, "limit", Plant(limit=0.5), cause=LIMIT),
     Case(ARM, "base-sways", Plant(sway=1.5), cause=BASE),
+    Case(ARM, "wind-0.05", Plant(wind=0.05), cause=FORCE),
+    Case(ARM, "loaded", Plant(loaded=0.06), cause=FRICTION),
+    Case(ARM, "warming", Plant(warming=0.1), cause=DRIFT + "|" + FRICTION),
+    Case(ARM, "sag", Plant(sag=0.1), cause=DRIFT),
 )
 
 _BOX = (

@@ -13,7 +13,9 @@ SWAY_HZ = 0.7
 STRIBECK_SPEED = 0.3
 """rad/s or m/s, at which Stribeck friction has fallen by 63 % of its fall."""
 REVERSAL_SPEED = 0.01
-"""rad/s or m/s, below which Stribeck friction rises linearly with speed, so that it has no step."""
+"""rad/s or m/s, below which such friction rises linearly with speed, so that it has no step."""
+WARM_AFTER = 3.0
+"""s, in which a machine has warmed up by 63 %, so that its friction or what its motors exert has changed as much."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +104,9 @@ def move(
     for step in range(steps):
         wanted = late(commands, plant.delay - step / steps)
         motor = wanted if motor is None else wanted + keep * (motor - wanted)
-        data.ctrl[:] = np.clip(motor, middle - reach, middle + reach)
-        data.qfrc_applied[:] = push + resistance(plant, data.qvel)
+        cold = np.exp(-data.time / WARM_AFTER)
+        data.ctrl[:] = np.clip(motor, middle - reach, middle + reach) * (1.0 - plant.sag * (1.0 - cold))
+        data.qfrc_applied[:] = push + resistance(plant, data.qvel) + of_gear(plant, data, cold)
         data.qfrc_applied[0] += plant.wind
         if plant.sway:
             model.opt.gravity[0] = plant.sway * np.sin(2 * np.pi * SWAY_HZ * data.time)
@@ -131,6 +134,15 @@ def resistance(plant: Plant, speed: np.ndarray) -> np.ndarray:
     """Quadratic drag and Stribeck friction on every joint."""
     fall = 0.5 * (1.0 + np.exp(-((speed / STRIBECK_SPEED) ** 2)))
     return -plant.drag * np.abs(speed) * speed - plant.stribeck * fall * np.tanh(speed / REVERSAL_SPEED)
+
+
+def of_gear(plant: Plant, data: mujoco.MjData, cold: float) -> np.ndarray:
+    """What the gears of joints of one degree of freedom take: friction, and a ripple of what their motors exert."""
+    if not (plant.loaded or plant.warming or plant.uneven or plant.ripple):
+        return np.zeros_like(data.qvel)
+    turn = np.sin(data.qpos)
+    friction = plant.loaded * np.abs(data.qfrc_actuator) + plant.warming * cold + plant.uneven * turn
+    return plant.ripple * data.qfrc_actuator * turn - friction * np.tanh(data.qvel / REVERSAL_SPEED)
 
 
 def excitation(case: Case, rows: int, random: np.random.Generator) -> np.ndarray:
