@@ -180,9 +180,9 @@ class CountingSimulator:
         system = self._simulator.bind(parameters)
         step = system.step
 
-        def counted(state, action):
+        def counted(state, action, force=None):
             self.rows += state.shape[0] * state.shape[1]
-            return step(state, action)
+            return step(state, action, force)
 
         system.step = counted
         return system

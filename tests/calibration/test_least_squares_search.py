@@ -9,7 +9,7 @@ import pytest
 from madoc import simulation, tasks
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
-from madoc.calibration.least_squares.plan import Outcome, Plan
+from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome, Plan
 from madoc.calibration.least_squares.search import Search, chosen
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Disturbance, disturb
@@ -33,6 +33,11 @@ def test_the_step_that_helps_most_is_taken_and_its_damping_kept():
 def test_where_no_step_helps_none_is_taken_and_damping_grows():
     assert chosen(outcome(5.0, 4.0, 6.0, 4.0)) == (3, 1e3)
     assert chosen(outcome(4.0, 4.0, 4.0, 4.0)) == (3, 1e3)
+
+
+def test_a_step_tried_alone_is_compared_with_staying():
+    assert chosen(outcome(3.0).with_no_step()) == (0, 1e-2)
+    assert chosen(outcome(4.0).with_no_step()) == (1, 1e3)
 
 
 def test_the_share_that_a_step_saves():
@@ -122,9 +127,10 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     assert epoch.control_steps == 40 * 5 * (1 + 2 + 2)
     np.testing.assert_array_equal(state.point, point)
     state, epoch = search.step(problem, state)
-    derivatives, tried = 1 + 2 * len(truth) + 2, 1  # the first step helps, so no other is tried
+    derivatives, tried = 1 + 2 * len(truth) + 2, 3  # the first step helps, so no other is tried
     assert epoch.control_steps == 40 * 5 * (derivatives + tried)
     assert (state.point != point).all()
+    assert state.damping[0] == FIRST_DAMPING * TRIALS[0]
     windows = UnknownStarts.at(problem, state.rows, state.touching, 5, "cauchy")
     (plan,) = windows.plans(state.point, state.states, state.damping, state.state_damping, refining=True)
     astray = replace(plan, steps=np.concatenate([[1.0 - plan.point], plan.steps[1:]]))

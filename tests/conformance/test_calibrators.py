@@ -248,8 +248,8 @@ class Fragile(CountingSimulator):
         system = super().bind(parameters)
         step = system.step
 
-        def exploding(state, action):
-            following = step(state, action)
+        def exploding(state, action, force=None):
+            following = step(state, action, force)
             following[parameters[:, 2] < 0.5] = np.nan
             return following
 

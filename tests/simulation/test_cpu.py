@@ -8,9 +8,10 @@ import pytest
 
 import madoc.tasks
 from madoc.errors import MadocError
-from madoc.parameters import Parameter, ParameterSpace
+from madoc.parameters import Parameter
 from madoc.robots import load
 from madoc.simulation.cpu import CpuSimulator
+from madoc.simulation.drives import joint_drives
 from own_robots import CART_SPEC, write_robot
 from robots import spring
 
@@ -267,7 +268,7 @@ def test_a_force_from_outside_acts_as_an_actuator_would_and_is_gone_after_its_st
     simulator = CpuSimulator(spring(), threads=1)
     system, action = simulator.bind(simulator.parameters.middle[None]), np.full((1, 1, 1), 0.4)
     state, idle = np.array([[[0.2, -0.1]]]), np.zeros((1, 1, 1))
-    force = simulator.actuator_forces(simulator.parameters.middle, state, action)
+    force = system.actuator_forces(state, action)
     assert force.shape == (1, 1, 1)
     pushed = system.step(state, idle, force)
     np.testing.assert_allclose(pushed, system.step(state, action), rtol=0, atol=1e-12)
@@ -282,13 +283,26 @@ def test_what_motors_and_position_servos_exert():
         '<motor tendon="both"/>',
     )
     xml = f"""<mujoco><worldbody>
-      <body><joint name="a" type="hinge"/><geom size="0.1"/>
+      <body><joint name="a" type="hinge" actuatorfrcrange="-2.5 2.5"/><geom size="0.1"/>
         <body pos="1 0 0"><joint name="b" type="slide"/><geom size="0.1"/></body></body></worldbody>
       <tendon><fixed name="both"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed></tendon>
       <actuator>{motor}{servo}{other}</actuator></mujoco>"""
-    gravity = Parameter("gravity", "", -10.0, -9.0)
-    task = replace(spring(), spec=lambda: mujoco.MjSpec.from_string(xml), parameters=ParameterSpace((gravity,)))
-    state, action = np.array([[0.3, 0.1, 0.5, -0.2]]), np.array([[2.0, 0.2, 1.0]])
-    found = CpuSimulator(task, threads=1).actuator_forces(np.array([-9.5]), state, action)
-    # The motor is asked for more than it can. The servo: 10 (0.2 - 0.1) - 2 (-0.2) N. Tendons are left out.
-    np.testing.assert_allclose(found, [[3.0, 1.4]])
+    model = mujoco.MjModel.from_xml_string(xml)
+    state, control = np.array([[0.3, 0.1, 0.5, -0.2]]), np.array([[2.0, 0.2, 0.0]])
+    found = joint_drives(model, state, control)
+    # The motor is asked for more than it can, and its joint bears less still. The servo: 10 (0.2 - 0.1) - 2 (-0.2) N.
+    np.testing.assert_allclose(found, [[2.5, 1.4]])
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = state[0, :2], state[0, 2:], control[0]
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(found[0], data.qfrc_actuator)
+
+
+def test_drives_exert_what_late_actions_ask_for():
+    late = replace(spring(Parameter("action_delay", "", 0.0, 0.1)), pending=5)
+    simulator = CpuSimulator(late, threads=1)
+    prompt, delayed = (simulator.bind(np.array([[delay]])) for delay in (0.0, simulator.control_step))
+    first, second = (np.full((1, 1, 1), value) for value in (0.4, -0.7))
+    state = delayed.step(simulator.initial_state[None, None].copy(), first)
+    assert (delayed.actuator_forces(state, second) == prompt.actuator_forces(state, first)).all()
+    assert (prompt.actuator_forces(state, second) != prompt.actuator_forces(state, first)).all()

@@ -33,13 +33,16 @@ class Script:
         self._end = end
         self._step = 0
 
-    def step(self, state, action):
+    def step(self, state, action, force=None):
         end = self._end(state, self._step)
         self._step += 1
         return end
 
     def observe(self, state):
         return state
+
+    def actuator_forces(self, state, action):
+        raise NotImplementedError
 
     def unbiased(self, state):
         return state

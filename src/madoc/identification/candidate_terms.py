@@ -63,8 +63,8 @@ class Candidate:
         reference: Unit change of its value.
         least: Its smallest physical value.
         elements: Elements of the model that share the value; empty for a term of the whole robot.
-        known_before: Whether users know the value well without the log, as by scales or a level, so that only a
-            certain sign of another counts.
+        known_before: Whether users know the value well without the log, as by scales or a level, or no parameter of
+            a spec adds the term: only a certain sign of it counts then.
     """
 
     cause: str

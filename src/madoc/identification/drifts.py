@@ -34,7 +34,7 @@ FEWEST_RUNS = 3
 def drifts_of(
     tests: TermTests, simulator: Simulator, readings: Readings, fit: Fit, point: Float[np.ndarray, " d"]
 ) -> tuple[list[MissingTerm], list[Alternative], int]:
-    """The most significant change of each parameter over the log, and estimates of parts that disagree.
+    """The most significant change of each parameter, and estimates of parts of the log that disagree.
 
     A parameter may change over the log, within each run, as where a drive warms up, or from run to run.
 
@@ -75,7 +75,7 @@ def _drifts(tests: TermTests) -> Iterator[MissingTerm]:
 
 
 def _since_begin(runs: Int[np.ndarray, " windows"]) -> Float[np.ndarray, " windows"]:
-    """Time of each window from -1 at the begin of its run to 1 at its end; 0 in a run of a single window."""
+    """Place of each window among those of its run, from -1 for the first to 1 for the last; 0 for a single one."""
     age = np.zeros(len(runs))
     for run in np.unique(runs):
         own = runs == run

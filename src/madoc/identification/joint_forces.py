@@ -1,16 +1,16 @@
 """Forces at a joint that no parameter of a spec adds: what each stands for, and its effect on simulated windows.
 
-Each is a function of the joint's speed and of what its drive exerts. To first order the motion under a small force is
-that under its values along the motion without it, so one simulation of each window gives its effect.
+Each is a function of the joint's position, its speed and what its drive exerts. To first order the motion under a small
+force is that under its values along the motion without it, so one simulation of each window gives its effect. During a
+control step a force has its value at the begin of that.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from madoc.identification.candidate_terms import CHANGE, Candidate, references_of
 from madoc.identification.replay import Readings
 from madoc.identification.states import LoggedStates
-from madoc.parameters import Parameter
 from madoc.simulation.base import Simulator
 from madoc.simulation.write import single_joints
 
@@ -49,6 +49,8 @@ def joint_forces(
 ) -> dict[str, list[Float[np.ndarray, "windows steps"]]]:
     """Each of `FORCES` along the motion of a joint, of about 1 in size, as one or two functions of time.
 
+    Values that are not finite are those of windows that do not count.
+
     Args:
         position: Of the joint, in rad or m.
         speed: Of the joint.
@@ -57,8 +59,7 @@ def joint_forces(
     """
     fast, strong = (float(np.sqrt(np.nanmean(values**2))) for values in (speed, exerted))
     moves, drives = fast > _SMALLEST, strong > _SMALLEST
-    direction = np.tanh(speed / (TURNING * fast)) if moves else speed
-    drive = exerted / strong if drives else exerted
+    direction, drive = np.tanh(speed / (TURNING * max(fast, _SMALLEST))), exerted / max(strong, _SMALLEST)
     places = [np.sin(position), np.cos(position)]
     if not turns:
         along = (position - np.nanmean(position)) / max(float(np.nanstd(position)), _SMALLEST)
@@ -80,29 +81,32 @@ def force_effects(
     logged: LoggedStates,
     point: Float[np.ndarray, " d"],
     states: Float[np.ndarray, "windows state"],
+    whole: Bool[np.ndarray, " windows"],
 ) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"]]:
     """Every force at a joint of one degree of freedom, and the derivative of the residuals by it, in its reference.
 
-    It takes one simulation of every window for each, and two besides.
+    `whole` are the windows that count; a force with which one of these diverges has no effect. It takes one simulation
+    of every window for each force, and two besides.
     """
-    model, values = simulator.task.model, simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))
-    motion = readings.trajectories(simulator, point, states)
-    exerted = simulator.actuator_forces(values, motion, readings.actions)
+    model, joints = simulator.task.model, single_joints(simulator.task.model)
     tried, forces = list[Candidate](), list[Float[np.ndarray, "windows steps dof"]]()
-    joints = single_joints(model)
-    causes = FORCES if len(joints) <= FEW_JOINTS else FORCES[:USUAL]
+    if not joints or not whole.any():
+        return tried, np.zeros((len(readings), readings.observed[0].size, 0))
+    motion, exerted = readings.trajectories(simulator, point, states)
+    motion, exerted = (np.where(whole[:, None, None], each, np.nan) for each in (motion, exerted))
     for joint, turns in joints:
         dof, torque = int(joint.dofadr[0]), references_of(logged, simulator, joint)["dof_frictionloss"]
-        unit = Parameter("dof_frictionloss", joint.name, 0.0, 1.0).unit
         along = motion[..., int(joint.qposadr[0])], motion[..., model.nq + dof], exerted[..., dof]
         found = joint_forces(*along, turns=turns)
+        causes = FORCES if model.njnt <= FEW_JOINTS else FORCES[:USUAL]
         for cause, shape in [(each, shape) for each in causes for shape in found.get(each, [])]:
+            unit = "N·m" if turns else "N"
             tried.append(Candidate(f"{cause} ({joint.name})", "", unit, 0.0, torque, -np.inf, known_before=True))
             forces.append(np.zeros((*shape.shape, model.nv)))
             forces[-1][..., dof] = CHANGE * torque * np.nan_to_num(shape)
     base = readings.residuals(simulator, point[None], states[None])[0, 0]
-    if not tried:
-        return [], np.zeros((*base.shape, 0))
     points, starts = (np.repeat(each[None], len(tried), axis=0) for each in (point, states))
     moved = readings.residuals(simulator, points, starts, np.stack(forces))[:, 0]
-    return tried, np.moveaxis((moved - base) / CHANGE, 0, -1)
+    effects = np.moveaxis((moved - base) / CHANGE, 0, -1)
+    effects[..., ~np.isfinite(effects[whole]).all((0, 1))] = 0.0
+    return tried, effects

@@ -102,7 +102,7 @@ def suspicions(
     wide = simulation.make(replace(simulator.task, parameters=space))
     at_nominal = np.concatenate([led, -np.ones(len(added))])
     tried, by_terms = effects(simulator, wide, readings, before, at_nominal, fit.states, added)
-    forces, by_forces = force_effects(simulator, readings, logged, led, fit.states)
+    forces, by_forces = force_effects(simulator, readings, logged, led, fit.states, fit.slopes.whole)
     tried, by_terms = [*tried, *forces], np.concatenate([by_terms, by_forces], axis=-1)
     spent = fit.control_steps + (3 + len(tried)) * len(readings) * readings.steps
     if fit.slopes.whole.any():
@@ -314,7 +314,7 @@ def _of_friction(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
         by_friction = found.shifts / found.change
         shift, error = 0.5 * (low + high) * by_friction, 0.5 * (high - low) * np.abs(by_friction)
         if np.max((np.abs(shift) + error) / tests.half_widths) >= WORTH_FITTING:
-            yield Alternative((_name(candidate),), False, tests.by_name(shift), tests.by_name(error))
+            yield Alternative((_name(candidate),), False, tests.by_name(shift), tests.by_name(error), bounded=True)
 
 
 def _of_other_windows(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[Alternative]:

@@ -107,14 +107,19 @@ class Readings:
 
     def trajectories(
         self, simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
-    ) -> Float[np.ndarray, "windows steps state"]:
-        """The simulated state before each action of the windows. Spends windows · steps control steps."""
+    ) -> tuple[Float[np.ndarray, "windows steps state"], Float[np.ndarray, "windows steps dof"]]:
+        """The simulated state before each action, and what the actuators of joints exert there, in N or N·m.
+
+        Spends windows · steps control steps.
+        """
         system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
-        state, visited = np.ascontiguousarray(states[None]), list[Float[np.ndarray, "windows state"]]()
+        state, visited, exerted = np.ascontiguousarray(states[None]), [], []
         for action in np.moveaxis(self.actions, 1, 0):
+            given = np.ascontiguousarray(action[None])
             visited.append(state[0])
-            state = system.step(state, np.ascontiguousarray(action[None]))
-        return np.stack(visited, axis=1)
+            exerted.append(system.actuator_forces(state, given)[0])
+            state = system.step(state, given)
+        return np.stack(visited, axis=1), np.stack(exerted, axis=1)
 
     def residuals(
         self,

@@ -55,6 +55,7 @@ class Alternative:
         shifts: By how much it moves each calibrated parameter, in half-widths of its 95 % interval.
         errors: Half of the 95 % interval of each shift, in the same unit.
         parts: Whether it is the estimate of a part of the log.
+        bounded: Whether the errors are bounds, so that no shift is farther off.
     """
 
     causes: tuple[str, ...]
@@ -62,6 +63,7 @@ class Alternative:
     shifts: dict[str, float]
     errors: dict[str, float]
     parts: bool = False
+    bounded: bool = False
 
 
 @dataclass(frozen=True)

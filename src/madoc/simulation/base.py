@@ -33,6 +33,16 @@ class System(Protocol):
         """Observations of these states with the bias of each system's sensors; NaN where a state is NaN."""
         ...
 
+    def actuator_forces(
+        self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
+    ) -> Float[np.ndarray, "systems rows dof"]:
+        """What the actuators of joints exert on each degree of freedom at the begin of a step, in N or N·m.
+
+        Late actions count as late. It is 0 where an actuator has another transmission than a joint, another gain than a
+        constant, or another bias than a linear one.
+        """
+        ...
+
     def unbiased(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows state"]:
         """States rebuilt from logged observations, corrected for the bias of each system's sensors."""
         ...
@@ -69,18 +79,6 @@ class Simulator(Protocol):
 
     def contacts(self, state: Float[np.ndarray, "rows state"]) -> Int[np.ndarray, " rows"]:
         """Number of pairs of geoms in contact in each state; no parameter changes the shape of a body."""
-        ...
-
-    def actuator_forces(
-        self,
-        values: Float[np.ndarray, " parameters"],
-        state: Float[np.ndarray, "*rows state"],
-        action: Float[np.ndarray, "*rows action"],
-    ) -> Float[np.ndarray, "*rows dof"]:
-        """What the actuators of joints exert on each degree of freedom under actions in effect, in N or N·m.
-
-        It is 0 where an actuator has another transmission, or another gain than a constant or bias than a linear one.
-        """
         ...
 
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter
 from madoc.simulation.delay import blend, delay_weights, in_effect
+from madoc.simulation.drives import joint_drives
 from madoc.simulation.write import find_elements, write_parameters
 from madoc.tasks.base import Task
 
@@ -21,9 +22,6 @@ _CLOCK = 1.0
 
 _ROWS_FOR_ALL_THREADS = 8
 """Number of rows from which all threads step them; with fewer, waking a second thread costs more than it saves."""
-_OF_ONE_DOF = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-_USUAL_BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
-"""Biases of motors, and of position and velocity servos."""
 _CHUNKS = 2
 """Number of parts of a batch that each thread steps; with ten, the default, 200 rows take a tenth longer."""
 
@@ -131,39 +129,6 @@ class CpuSimulator:
             contacts[row] = len(set(map(tuple, data.contact.geom.tolist()))) if data.ncon > 1 else data.ncon
         return contacts
 
-    def actuator_forces(
-        self,
-        values: Float[np.ndarray, " parameters"],
-        state: Float[np.ndarray, "*rows state"],
-        action: Float[np.ndarray, "*rows action"],
-    ) -> Float[np.ndarray, "*rows dof"]:
-        """What the actuators of joints exert on each degree of freedom under actions in effect, in N or N·m.
-
-        It is 0 where an actuator has another transmission, or another gain than a constant or bias than a linear one.
-        """
-        model, control = self.model(values), self._controls(action)
-        forces = np.zeros((*state.shape[:-1], model.nv))
-        for index in range(model.nu):
-            joint = int(model.actuator_trnid[index, 0])
-            usual = (
-                model.actuator_trntype[index] == int(mujoco.mjtTrn.mjTRN_JOINT)
-                and model.actuator_gaintype[index] == int(mujoco.mjtGain.mjGAIN_FIXED)
-                and model.actuator_biastype[index] in _USUAL_BIASES
-            )
-            if not usual or model.jnt_type[joint] not in _OF_ONE_DOF:
-                continue
-            dof, gear = int(model.jnt_dofadr[joint]), float(model.actuator_gear[index, 0])
-            position, speed = state[..., int(model.jnt_qposadr[joint])], state[..., model.nq + dof]
-            given = control[..., index]
-            if model.actuator_ctrllimited[index]:
-                given = np.clip(given, *model.actuator_ctrlrange[index])
-            bias = model.actuator_biasprm[index, :3]
-            exerted = model.actuator_gainprm[index, 0] * given + bias[0] + gear * (bias[1] * position + bias[2] * speed)
-            if model.actuator_forcelimited[index]:
-                exerted = np.clip(exerted, *model.actuator_forcerange[index])
-            forces[..., dof] += gear * exerted
-        return forces
-
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
         """A MuJoCo model at the given physical values, owned by the caller."""
         return self.bind(np.asarray(values)[None]).models[0]
@@ -217,7 +182,7 @@ class CpuSystem:
         (systems, rows, values) are refused.
         """
         self._check_shapes(state.shape, action.shape)
-        history = np.concatenate([action[..., None, :], self._pending(state)], axis=-2)
+        history = self._history(state, action)
         control = self._simulator._controls(blend(self._weights, history))
         moved, _ = self._roll_out(state[..., : self._physical], control, force)
         pending = history[..., :-1, :].reshape(*state.shape[:2], self._goals - self._physical)
@@ -233,6 +198,17 @@ class CpuSystem:
         task = self._simulator.task
         seen = task.observe(state) if task.sense is None else task.sense(state, self._sensordata(state))
         return seen + self._bias[:, None] if self._simulator._biased else seen
+
+    def actuator_forces(
+        self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
+    ) -> Float[np.ndarray, "systems rows dof"]:
+        """What the actuators of joints exert on each degree of freedom at the begin of a step, in N or N·m.
+
+        Late actions count as late. It is 0 where an actuator has another transmission than a joint, another gain than a
+        constant, or another bias than a linear one.
+        """
+        control = self._simulator._controls(blend(self._weights, self._history(state, action)))[:, :, 0]
+        return np.stack([joint_drives(*each) for each in zip(self.models, state, control, strict=True)])
 
     def unbiased(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows state"]:
         """States rebuilt from logged observations, corrected for the bias of each system's sensors."""
@@ -251,6 +227,12 @@ class CpuSystem:
             control[..., 0, :] = self._simulator._controls(last)
         moved, sensors = self._roll_out(state[..., : self._physical], control)
         return np.where(np.isnan(moved).any(-1, keepdims=True), np.nan, sensors)
+
+    def _history(
+        self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
+    ) -> Float[np.ndarray, "systems rows actions action"]:
+        """An action and those before it that are pending, newest first."""
+        return np.concatenate([action[..., None, :], self._pending(state)], axis=-2)
 
     def _pending(
         self, state: Float[np.ndarray, "systems rows state"]

@@ -12,7 +12,7 @@ from madoc.calibration.result import CalibrationResult
 from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS
 from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
-from madoc.identification.drifts import DRIFTS
+from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
 from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import Alternative, MissingTerm
@@ -20,7 +20,8 @@ from madoc.identification.term_tests import Alternative, MissingTerm
 CERTAIN = 5.0
 """|t| from which a term is missing; by chance one in two million is larger where residuals are normal."""
 CERTAIN_DRIFT = 6.0
-"""The same for a parameter that changes over the log, whose standard error rests on a third of the windows."""
+"""The same for a parameter that changes over the log or within each run: its standard error may rest on a third of the
+windows, and many changes are looked for."""
 CERTAIN_STEP = 4.0
 """t of the error of the integration step, whose value is known beforehand; by chance one in 30 thousand is larger."""
 MOVES = 0.5
@@ -52,7 +53,9 @@ def missing_term(holdout: HoldOut) -> MissingTerm | None:
     certain = [term for term in holdout.missing_terms if is_certain(term)]
     moving = [term for term in certain if moves_certainly(term)]
     if certain and not moving and _moved_together(holdout):
-        moving = [term for term in holdout.missing_terms if term.cause not in (*DRIFTS, INTEGRATION)]
+        uncertain = (*DRIFTS, INTEGRATION)  # by themselves, as are forces that no parameter adds
+        others = (term for term in holdout.missing_terms if term.cause not in uncertain)
+        moving = [term for term in others if is_certain(term) or not is_joint_force(term.cause)]
     return likeliest(moving)
 
 
@@ -60,8 +63,9 @@ def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     """Of significant terms the one that explains most, or nearly as much if that is unusual; None of none.
 
     A tilted base looks like an offset of a sensor, which is more usual, and a gravity that is not the earth's like a
-    wrong mass or gain. Actions that seem to come early are more often a sign of forces that the model lacks. A force
-    that no parameter adds is named only where no other term explains as much.
+    wrong mass or gain. Actions that seem to come early are more often a sign of forces that the model lacks, and values
+    that change within each run may be one of motions that do. A force that no parameter adds is named only where no
+    other term explains nearly as much.
     """
     most = max((abs(term.t) for term in terms), default=0.0)
     significant = [term for term in terms if abs(term.t) >= AS_SIGNIFICANT * most]
@@ -73,7 +77,7 @@ def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
 def _unusual(term: MissingTerm) -> bool:
     if term.parameter == "gravity":
         return abs(abs(term.value) - standard_gravity) > EARTH + 2.0 * term.standard_error
-    return term.cause in (EARLY, *TILTS) or is_joint_force(term.cause)
+    return term.cause in (EARLY, WITHIN_RUNS, *TILTS) or is_joint_force(term.cause)
 
 
 def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
@@ -188,9 +192,14 @@ def widening(alternatives: tuple[Alternative, ...], names: tuple[str, ...]) -> F
     for each in alternatives:
         for index, name in enumerate(names):
             if name in each.shifts:
-                shift, reach = each.shifts[name], float(np.hypot(1.0, SURER * each.errors[name]))
+                shift, reach = each.shifts[name], float(np.hypot(1.0, _reach(each, name)))
                 ends[index] = np.maximum(ends[index], [reach - shift, reach + shift])
     return ends - 1.0
+
+
+def _reach(alternative: Alternative, name: str) -> float:
+    """Half of the 99 % interval of a shift, or its bound."""
+    return (1.0 if alternative.bounded else SURER) * alternative.errors[name]
 
 
 def with_widened_intervals(result: CalibrationResult, holdout: HoldOut) -> CalibrationResult:
@@ -220,7 +229,7 @@ def _covering(
             if name in each.shifts and row.interval is not None:
                 slope = factor if combination.kind == "sum" else factor * combination.estimate / row.estimate
                 half = slope * row.half_width
-                shift, reach = shift + half * each.shifts[name], reach + abs(half) * SURER * each.errors[name]
+                shift, reach = shift + half * each.shifts[name], reach + abs(half) * _reach(each, name)
         low = min(low, combination.estimate + shift - float(np.hypot(below, reach)))
         high = max(high, combination.estimate + shift + float(np.hypot(above, reach)))
     return replace(combination, interval=(low, high))

@@ -26,11 +26,12 @@ MOST = 150
 """Largest number of windows."""
 FIT_STEPS = 10
 """Largest number of damped Gauss-Newton steps of an initial state, which begins at finite differences."""
-GAIN = 1e-4
-"""Share in (0, 1] of the squared residuals of all windows; after a step that saves less initial states are fitted."""
+GAIN = 1e-3
+"""Share in (0, 1] of a window's squared residuals; after a step that saves less its initial state is fitted."""
+FEW = 0.01
+"""Share in [0, 1] of the windows, up to which no further step is taken for those that are not fitted."""
 _SHARES = np.array([1.0, 0.3, 0.1])
 """Shares in (0, 1] of a step, of which every window takes the one that fits it best; none where none does."""
-_SMALLEST = 1e-100
 _DAMPING = 1e-8
 """Damping of an initial state's step, relative to the squared lengths of the columns; 0 is none."""
 
@@ -77,7 +78,7 @@ class FittedReplays:
     def starts(self, points: Float[np.ndarray, "systems d"]) -> tuple[Float[np.ndarray, "systems windows state"], int]:
         """The initial states from which each system comes nearest to the observations of the fitted steps.
 
-        Also the control steps that were simulated. Steps end once they gain little for every system.
+        Also the control steps that were simulated. Steps end once they gain little in nearly all windows.
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
@@ -94,7 +95,7 @@ class FittedReplays:
             costs = np.concatenate([_squares(residuals), before[:, None]], axis=1)
             best = costs.argmin(1)[:, None, :, None]
             states = np.take_along_axis(np.concatenate([tried, states[:, None]], axis=1), best, axis=1)[:, 0]
-            if _gains(before, costs.min(1)) <= GAIN:
+            if _unfitted(before, costs.min(1)) <= FEW:
                 break
         return states, spent
 
@@ -106,13 +107,9 @@ def _squares(residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarra
     return np.where(np.isfinite(cost), cost, np.inf)
 
 
-def _gains(before: Float[np.ndarray, "systems windows"], after: Float[np.ndarray, "systems windows"]) -> float:
-    """The largest share of its squared residuals that a system saves; 1 where a window that failed simulates now."""
-    simulated = np.isfinite(before)
-    if (np.isfinite(after) & ~simulated).any():
-        return 1.0
-    then, now = (np.where(simulated, costs, 0.0).sum(1) for costs in (before, after))
-    return float(np.max((then - now) / np.maximum(then, _SMALLEST)))
+def _unfitted(before: Float[np.ndarray, "systems windows"], after: Float[np.ndarray, "systems windows"]) -> float:
+    """The largest share over systems of the windows in which a step saved more than `GAIN`, or that simulate now."""
+    return float((after < (1.0 - GAIN) * before).mean(1).max())
 
 
 def fitted_replays_of(

@@ -1,6 +1,7 @@
 """The verdict on an estimate: one word, and a sentence with the numbers behind it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,7 +37,9 @@ REMEDIES = {
 }
 """What to do about terms that no further parameter of a spec adds."""
 WARM_UP = "let the machine warm up before it is logged, or leave the begin of each run out"
-CHANGE_MODEL = "no parameter of a spec adds it: take it out of the machine, or log motions in which it is small"
+"""The same for a parameter that changes within each run."""
+CHANGE_MACHINE = "no parameter of a spec adds it: take it out of the machine, or log motions in which it is small"
+"""The same for a force at a joint."""
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
 
 WORDS: dict[Word, str] = {
@@ -128,12 +131,13 @@ def _missing(holdout: HoldOut) -> Verdict | None:
     value = _value(term)
     if term.cause in DRIFTS:
         within = term.cause == WITHIN_RUNS
+        change = _value(replace(term, value=2.0 * term.value, standard_error=2.0 * term.standard_error))
+        where = f"by {change} from the begin of a run to its end" if within else f"by {value} between its parts"
         return Verdict(
             "MODEL_MISMATCH",
-            f"{term.parameter} drifts: it changes {'within each run' if within else 'over the log'} by {value} between "
-            f"{'the middle of a run and its ends' if within else 'its parts'} (t = {abs(term.t):.0f}), "
-            f"which is {abs(term.shifts[term.parameter]):.2g} half-widths of its interval; "
-            f"{WARM_UP if within else 'calibrate to each run by itself'}{about_timestep(holdout)}",
+            f"{term.parameter} drifts: it changes {'within each run' if within else 'over the log'} {where} "
+            f"(t = {abs(term.t):.0f}), which is {(1 + within) * abs(term.shifts[term.parameter]):.2g} half-widths of "
+            f"its interval; {WARM_UP if within else 'calibrate to each run by itself'}{about_timestep(holdout)}",
             (term.parameter,),
         )
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
@@ -180,7 +184,7 @@ def _remedy(term: MissingTerm) -> str:
     if term.cause in REMEDIES:
         return REMEDIES[term.cause]
     if is_joint_force(term.cause):
-        return CHANGE_MODEL
+        return CHANGE_MACHINE
     high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
     low = 0.0 if term.value >= 0.0 else max(-high, FIELDS[field].minimum)
     high = 0.0 if field == "gravity" and term.value < 0.0 else high  # it points downwards

@@ -1,6 +1,6 @@
 """What a search computes before and after a step, in the same form for known and unknown initial states."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -76,6 +76,14 @@ class Outcome:
     followed: Float[np.ndarray, "trials unknown"]
     failures: int
     simulations: int
+
+    def with_no_step(self) -> "Outcome":
+        """The same with the cost of staying where the plan is, as the last step."""
+        return replace(
+            self,
+            totals=np.append(self.totals, self.before),
+            followed=np.concatenate([self.followed, np.zeros_like(self.followed[:1])]),
+        )
 
     def saved(self, trial: int) -> float:
         """Share of the cost that a step saves."""
