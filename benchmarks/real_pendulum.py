@@ -93,8 +93,10 @@ def published(folder: Path) -> dict[str, dict[str, float]]:
     inertia is given that is not mass · length², it is that of the point mass with the same inertia and weight.
     """
     found = {}
+    reader = YAML(typ="safe")
+    reader.allow_duplicate_keys = True  # the makers' files set dt twice, which is not read here
     for file in sorted(folder.glob("*.yaml")):
-        given = YAML(typ="safe").load(file)
+        given = reader.load(file)
         mass, length, inertia = given["mass"], given["length"], given.get("inertia")
         if isinstance(inertia, float):
             mass, length = (mass * length) ** 2 / inertia, inertia / (mass * length)
