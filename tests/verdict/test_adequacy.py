@@ -131,3 +131,11 @@ def test_a_coarse_integration_step_that_explains_more_is_told_first():
     assert coarse_step(held(step, friction), term(explained=0.2)) is None
     assert coarse_step(held(replace(step, t=4.0), friction), friction) is None
     assert coarse_step(held(replace(step, value=3.5), friction), friction) is None
+
+
+def test_a_force_of_two_shapes_is_no_rival_of_itself():
+    sine, cosine = (
+        term("a drive whose gain depends on where the joint is (hip)", t=t, parameter="") for t in (9.0, 8.0)
+    )
+    assert as_likely(held(sine, cosine), sine) == []
+    assert as_likely(held(sine, term()), sine) == [term()]

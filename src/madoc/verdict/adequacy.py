@@ -85,7 +85,7 @@ def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
     return [
         term
         for term in holdout.missing_terms
-        if term != named
+        if (term.cause, term.parameter) != (named.cause, named.parameter)
         and is_certain(term)
         and term.cause not in DRIFTS
         and term.explained >= NEARLY * named.explained

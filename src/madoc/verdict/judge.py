@@ -158,7 +158,7 @@ def _named(term: MissingTerm) -> str:
 
 def _others(holdout: HoldOut, term: MissingTerm) -> str:
     """Which other terms are as likely as the one named."""
-    others = [_named(other) for other in as_likely(holdout, term)][:_MOST_NAMED]
+    others = list(dict.fromkeys(map(_named, as_likely(holdout, term))))[:_MOST_NAMED]
     return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
 
 
