@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.linalg import orth
 from scipy.signal import correlate
 
 from madoc.data import Dataset
@@ -26,6 +27,8 @@ FAR = 3.0
 """Ratio of the logged response to the nearest that the model has; a ratio above this, or below its inverse, is told."""
 _TAPS = 2
 """Number of rows on either side of the correlation's peak over which the response is resolved."""
+_EARLIER = 2
+"""Number of rows by which the state that stands for a row's own is earlier: the fewest of which no reading is shared."""
 _BLOCKS = 12
 """Number of parts of the log that are left out, one at a time, for standard errors."""
 _FEWEST = 8
@@ -173,6 +176,10 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     The change of velocity is regressed on the state and on the action of some rows before. Which rows is found by the
     cross-correlation of the two, both cleared of what the state explains. Only actions at or before a row are taken, as
     those after it depend on the motion where a controller chose them.
+
+    A noisy state takes part of what earlier actions did for their own effect, and its noise is in the change too. So
+    the regression is by instrumental variables (two-stage least squares): the state enters as predicted from the state
+    two rows before, with whose noise it has none in common even where speeds are differences of positions.
     """
     joints, motion = _motion(dataset, simulator)
     if not joints:
@@ -181,12 +188,14 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     peaks = _peaks(motion, action[motion.rows][:, [joint.action for joint in joints]], simulator.control_step)
     windows = [np.arange(max(0, peak - _TAPS), peak + _TAPS + 1) for peak in peaks]
     age = motion.rows - dataset.episode_starts[dataset.episode_of(motion.rows)]
-    kept = np.flatnonzero(age >= max(window[-1] for window in windows))
+    kept = np.flatnonzero(age >= max(_EARLIER + 1, *(window[-1] for window in windows)))
     rows = motion.rows[kept]
     taps = [action[rows[:, None] - window, joint.action] for window, joint in zip(windows, joints, strict=True)]
-    design = np.concatenate([motion.state[kept], *taps], axis=1)
-    if len(rows) < _FEWEST * design.shape[1]:
+    if len(rows) < _FEWEST * (motion.state.shape[1] + sum(len(window) for window in windows)):
         return ()
+    earlier = motion.state[np.searchsorted(motion.rows, rows - _EARLIER)]
+    instruments = _basis(np.concatenate([earlier, *taps], axis=1))
+    design = np.concatenate([instruments @ (instruments.T @ motion.state[kept]), *taps], axis=1)
     ends = motion.state.shape[1] + np.cumsum([len(window) for window in windows])
     own = [np.arange(end - len(window), end) for end, window in zip(ends, windows, strict=True)]
     found = []
@@ -240,7 +249,7 @@ def _motion(dataset: Dataset, simulator: Simulator) -> tuple[tuple[DrivenJoint, 
 
 def _peaks(motion: _Motion, action: Float[np.ndarray, "rows joints"], control_step: float) -> list[int]:
     """The lags in rows at which each joint's acceleration correlates most with its action, in absolute value."""
-    basis = np.linalg.qr(motion.state / np.maximum(np.abs(motion.state).max(0), np.finfo(float).tiny))[0]
+    basis = _basis(motion.state)
     changes, actions = (columns - basis @ (basis.T @ columns) for columns in (motion.change, action))
     longest = int(np.ceil(LONGEST / control_step))
     cuts = np.flatnonzero(np.diff(motion.rows) > 1) + 1
@@ -252,6 +261,11 @@ def _peaks(motion: _Motion, action: Float[np.ndarray, "rows joints"], control_st
             total[: len(lagged)] += lagged
         peaks.append(int(np.argmax(np.abs(total))))
     return peaks
+
+
+def _basis(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows rank"]:
+    """An orthonormal basis of what the columns span."""
+    return orth(columns / np.maximum(np.abs(columns).max(0), np.finfo(float).tiny))
 
 
 def _regressed(

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.stats import median_abs_deviation
 
 from madoc.data import Dataset
 from madoc.data.findings import Finding
@@ -36,6 +37,11 @@ _EXPLAINED = 0.99
 the floor between two rows, small differences are not judged."""
 _NEAR = (0.8, 1.25)
 """Ratios that are no mistake of a unit."""
+JUMP = 8.0
+"""Standard deviations, by the median absolute deviation, of a change of speed in a row that is taken for an impact; in
+such a row the mean of two speeds is not that between them."""
+_FEW_JUMPS = 0.1
+"""Share in [0, 1] of the rows that impacts are below."""
 _BLOCKS = 12
 """Number of parts of the log that are left out, one at a time, for standard errors."""
 _FEWEST = 36
@@ -53,6 +59,7 @@ class _Pair:
         expected: That change by the speed: the mean of its two readings times the control step.
         places: The place of each row in its episode, from -0.5 to 0.5.
         starts: Rows at which an episode begins.
+        hit: Whether the speed jumps between two rows, as where something hits the floor.
     """
 
     position: str
@@ -61,6 +68,7 @@ class _Pair:
     expected: Float[np.ndarray, " rows"]
     places: Float[np.ndarray, " rows"]
     starts: Int[np.ndarray, " episodes"]
+    hit: Bool[np.ndarray, " rows"]
 
 
 def speed_findings(dataset: Dataset, simulator: Simulator) -> tuple[list[Finding], bool]:
@@ -107,9 +115,17 @@ def _pairs(dataset: Dataset, simulator: Simulator) -> list[_Pair]:
         if position is None or speed is None:
             continue
         change = after[:, dof] - before[:, dof]
-        expected = 0.5 * (before[:, model.nv + dof] + after[:, model.nv + dof]) * simulator.control_step
-        pairs.append(_Pair(position, speed, change, expected, places - 0.5, starts))
+        first, last = before[:, model.nv + dof], after[:, model.nv + dof]
+        expected = 0.5 * (first + last) * simulator.control_step
+        pairs.append(_Pair(position, speed, change, expected, places - 0.5, starts, _jumps(last - first)))
     return pairs
+
+
+def _jumps(change: Float[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+    """Rows whose change of speed stands out, nowhere if that is more than a few: then it is how the joint moves."""
+    apart = np.abs(change - np.median(change))
+    out = apart > JUMP * median_abs_deviation(change, scale="normal")
+    return out if out.mean() < _FEW_JUMPS else np.zeros(len(change), bool)
 
 
 def _ratio(change: Float[np.ndarray, " rows"], expected: Float[np.ndarray, " rows"]) -> float | None:
@@ -233,7 +249,8 @@ def _stretches(pair: _Pair, rows: int) -> Float[np.ndarray, "stretches 5"]:
         place, change = pair.places[start:end][inner], pair.change[start:end][inner]
         differences = (part[: count * rows] for part in (slope, bend))
         columns = (expected[inner], place * expected[inner], *differences, change)
-        found.append(np.stack([column.reshape(count, rows).sum(1) for column in columns], axis=-1))
+        smooth = ~pair.hit[start:end][inner].reshape(count, rows).any(1)
+        found.append(np.stack([column.reshape(count, rows).sum(1)[smooth] for column in columns], axis=-1))
     return np.concatenate(found) if found else np.zeros((0, 5))
 
 
