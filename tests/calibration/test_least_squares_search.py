@@ -127,7 +127,7 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     assert epoch.control_steps == 40 * 5 * (1 + 2 + 2)
     np.testing.assert_array_equal(state.point, point)
     state, epoch = search.step(problem, state)
-    derivatives, tried = 1 + 2 * len(truth) + 2, 3  # the first step helps, so no other is tried
+    derivatives, tried = 1 + len(truth) + 2, 3  # the first step helps, so no other is tried
     assert epoch.control_steps == 40 * 5 * (derivatives + tried)
     assert (state.point != point).all()
     assert state.damping[0] == FIRST_DAMPING * TRIALS[0]

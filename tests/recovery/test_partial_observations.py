@@ -96,7 +96,7 @@ def test_noise_at_contacts_misleads_neither_estimates_nor_intervals(bouncer):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
+@pytest.mark.timeout(3600)
 def test_intervals_cover_at_contacts(bouncer):
     assert 0.9 < np.mean([covered(bouncer, seed) for seed in range(100, 140)]) < 0.995
 

@@ -1,4 +1,4 @@
-"""Derivatives of residuals by central differences, whose points are simulated in one batch by `replay`."""
+"""Derivatives of residuals by differences, whose points are simulated in one batch by `replay`."""
 
 from dataclasses import dataclass, replace
 
@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 DIFFERENCE = 1e-4
-"""Half width of a central difference in [-1, 1]. Its truncation error is 1e-8 of the third derivative; rounding of next
-states (1e-16, and the solver's 1e-10 at contacts) divided by it is below 1e-6 of a typical derivative."""
+"""Half width of a central difference in [-1, 1], whole width of a one-sided one. Truncation errors are 1e-8 of the third
+derivative and 5e-5 of the second; rounding of next states (1e-16, and the solver's 1e-10 at contacts) divided by it is
+below 1e-6 of a typical derivative."""
 TORN = 0.5
 """Difference of the one-sided derivatives relative to the larger one, above which a value jumps or bends there."""
 
@@ -88,13 +89,18 @@ def difference_points(point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "poin
     return np.clip(np.concatenate([point[None], point + shift, point - shift]), -1.0, 1.0)
 
 
+def one_sided_points(point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "points d"]:
+    """The point itself, then each parameter in turn a little nearer the middle of its range."""
+    return np.concatenate([point[None], point - DIFFERENCE * np.diag(np.where(point > 0.0, 1.0, -1.0))])
+
+
 def linearise(
     points: Float[np.ndarray, "points d"], residuals: Float[np.ndarray, "points windows values"]
 ) -> Linearisation:
-    """Central differences between `difference_points`; one-sided where the box ends."""
+    """Differences between `difference_points`, one-sided where the box ends, or `one_sided_points`."""
     whole: Bool[np.ndarray, " windows"] = np.isfinite(residuals).all((0, 2))
     seen = residuals[:, whole]
-    return Linearisation(seen[0], np.moveaxis(_central(points, seen), 0, -1))
+    return Linearisation(seen[0], np.moveaxis(_differences(points, seen), 0, -1))
 
 
 def slopes_of_windows(
@@ -105,25 +111,27 @@ def slopes_of_windows(
 ) -> WindowSlopes:
     """Derivatives by parameters and by initial states; the latter are one-sided.
 
-    `by_points` are residuals at a point alone or at its `difference_points`, `by_shifts` those at the first point with
-    each value of the initial states in turn moved by its width.
+    `by_points` are residuals at a point alone, or at its `difference_points` or `one_sided_points`, `by_shifts` those at
+    the first point with each value of the initial states in turn moved by its width.
     """
     whole = np.isfinite(by_points).all((0, 2)) & np.isfinite(by_shifts).all((0, 2))
     with np.errstate(invalid="ignore"):
         by_states = (by_shifts - by_points[0]) / widths[: len(by_shifts), None, None]
-        parts = (by_points[0], _central(points, by_points), by_states)
+        parts = (by_points[0], _differences(points, by_points), by_states)
     residuals, by_parameters, by_states = (np.where(whole[:, None], part, 0.0) for part in parts)
     return WindowSlopes(residuals, np.moveaxis(by_parameters, 0, -1), np.moveaxis(by_states, 0, -1), whole)
 
 
-def _central(
+def _differences(
     points: Float[np.ndarray, "points d"], residuals: Float[np.ndarray, "points windows values"]
 ) -> Float[np.ndarray, "derivatives windows values"]:
     """Differences of residuals divided by those of the points: d of them, or none for a point without neighbours.
 
-    Where a contact begins between a point and its neighbour, a difference across it says nothing of the slope, and one
+    With a neighbour on either side they are central. Where a contact begins between a point and its neighbour, a difference across it says nothing of the slope, and one
     window's would outweigh all others: of central and one-sided derivatives the smallest is taken there.
     """
+    if len(points) == 1 + points.shape[1]:
+        return (residuals[1:] - residuals[0]) / np.diagonal(points[1:] - points[0])[:, None, None]
     count = len(points) // 2
     here, above, below = residuals[0], residuals[1 : count + 1], residuals[count + 1 :]
     to_above = np.diagonal(points[1 : count + 1] - points[0])[:, None, None]

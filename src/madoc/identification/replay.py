@@ -7,7 +7,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.data.dataset import Dataset, spread_of
-from madoc.identification.linearisation import DIFFERENCE, WindowSlopes, difference_points, slopes_of_windows
+from madoc.identification.linearisation import (
+    DIFFERENCE,
+    WindowSlopes,
+    difference_points,
+    one_sided_points,
+    slopes_of_windows,
+)
 from madoc.identification.states import LoggedStates
 from madoc.identification.windows import Windows, readings_at
 from madoc.simulation.base import Simulator, System
@@ -150,17 +156,20 @@ def slopes_at(
     *,
     parameters: bool = True,
     initial_states: bool = True,
+    central: bool = True,
     width: Float[np.ndarray, " physical"] | None = None,
 ) -> list[WindowSlopes]:
     """Residuals and their derivatives around every point's parameters and initial states, in two batches.
 
-    Differences by parameters are central, because confidence intervals are computed from them; those by the many state
-    values are one-sided. Without `parameters` there are only the latter, and d is 0; without `initial_states` only the
-    former, and n is 0. Differences are `DIFFERENCE` wide, those by initial states `width` where that is larger, in
-    standard deviations of each value over the log. It takes points · windows · (1 + 2 d + n) · steps control steps.
+    Differences by parameters are central, which contacts need, or one-sided, which serves where motion is smooth; those
+    by the many state values are one-sided. Without `parameters` there are only the latter, and d is 0; without
+    `initial_states` only the former, and n is 0. Differences are `DIFFERENCE` wide, those by initial states `width`
+    where that is larger, in standard deviations of each value over the log. It takes points · windows · (1 + 2 d + n) ·
+    steps control steps, or (1 + d + n) of one-sided differences.
     """
     count, windows, size = states.shape
-    around = np.stack([difference_points(point) if parameters else point[None] for point in points])
+    neighbours = difference_points if central else one_sided_points
+    around = np.stack([neighbours(point) if parameters else point[None] for point in points])
     each = around.shape[1]
     by_points = readings.residuals(simulator, around.reshape(-1, points.shape[1]), np.repeat(states, each, axis=0))
     by_points = by_points.reshape(count, each, windows, -1)

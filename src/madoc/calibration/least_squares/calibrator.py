@@ -91,16 +91,17 @@ class LeastSquares:
     Residuals are in typical changes of a channel in one step. With `logged` initial states, which are assumed to be
     exact, noise in them biases the estimate. With `estimated` ones each window's initial state is a further unknown,
     its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
-    has settled, windows become three times as long, and again, while that narrows the intervals and residuals remain
-    noise: where motion is smooth, long windows hold more information, and they show model errors. Where contacts forbid
-    longer windows, there are ten times as many of them in the end. By default states are estimated where they cannot be
+    has settled, windows become nine times as long, or three times where that fails, if it narrows the intervals and
+    residuals remain noise: where motion is smooth, long windows hold more information, and they show model errors. With
+    contacts they become three times as long first; where contacts forbid longer windows, there are ten times as many of
+    them in the end. By default states are estimated where they cannot be
     rebuilt, where the data is declared noisy, and where residuals of consecutive rows alternate as noise makes them: a
     reading that is too high makes the step to it look too long and the step from it too short.
 
     Attributes:
         initial_states: `logged`, `estimated`, or None to choose by the data.
         horizon: Length of a window in control steps; the observation after each of them counts. None is 1 from logged
-            states, and with estimated ones `horizon_of` the data, then 3 and 9 times as many.
+            states, and with estimated ones `horizon_of` the data, then 9 or 3 times as many.
         loss: `linear`, or a robust one (`huber`, `soft-l1`, `cauchy`) whose scale follows the residuals.
         windows: Largest number of windows. None is 1000 from logged states, 100 with estimated ones, or
             1000 where contacts forbid longer windows.
@@ -278,6 +279,9 @@ class LeastSquares:
     def _after_unknown(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
         """Go on to longer windows once a search has settled, while they narrow the intervals.
 
+        Where the log shows no contact, the longest come first: motion is smooth, and they serve mostly. Where they do
+        not, shorter ones have their turn, and then the longest again unless they have settled.
+
         If longer windows show model errors, the estimate of the shortest is kept: model errors bias the estimate by
         about as much for all lengths, and only wide intervals may cover that. At contacts longer windows may leave
         residuals because their initial states were not found: there the estimate of the longest that were explained is
@@ -289,20 +293,28 @@ class LeastSquares:
             return state
         if not self._unknown(problem).settled(search):
             lost = hopeless(search, searches[0], searches[state.best]) or search.epochs >= self.search_epochs
-            return _ended(state, state.best) if length >= LONGER and lost and not search.waiting else state
+            return self._failed(problem, state) if length >= LONGER and lost and not search.waiting else state
         if length == WIDER:
             return _finished(state, WIDER)
         if length and not self._noise_alone(problem, state, length):
-            return _ended(state, state.best if search.rough else 0)
+            return self._failed(problem, state if search.rough else replace(state, best=0))
         if length and not tells_more(search, searches[state.best]):
-            return _ended(state, state.best)
+            return self._failed(problem, state)
         if float(search.deviation.max()) < sentences.EXACT:
             return _finished(state, length)
         following = max(length + 1, LONGER)
-        if following == len(searches) or not enough(searches[following], search):
+        if not length and len(searches) > LONGER and enough(searches[-1], search):
+            following = following if searches[-1].touching.any() else len(searches) - 1
+        if following == len(searches) or self._unknown(problem).settled(searches[following]):
             return _ended(state, length)
-        longer = _with(state, following, continued(searches[following], search))
-        return replace(longer, stage="lengthening", best=length, length=following)
+        return _lengthening(replace(state, best=length), following)
+
+    def _failed(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
+        """Go on to the next shorter windows than those that have failed, unless they had their turn."""
+        shorter = state.length - 1
+        if shorter < LONGER or state.unknown[shorter].epochs:
+            return _ended(state, state.best)
+        return _lengthening(state, shorter)
 
     def _noise_alone(self, problem: CalibrationProblem, state: LeastSquaresState, length: int) -> bool:
         """Whether residuals of windows of this length are the noise that those of the shortest windows are."""
@@ -346,6 +358,14 @@ def _begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
     """The stage of unknown initial states, begun at the best point of the search from logged ones."""
     first = replace(state.unknown[0], point=known.point[:1].copy())
     return replace(_with(state, 0, first), stage="estimated")
+
+
+def _lengthening(state: LeastSquaresState, length: int) -> LeastSquaresState:
+    """The search on windows of this length, begun where the best one is; the end where too few have an initial state."""
+    best, longer = state.unknown[state.best], state.unknown[length]
+    if not enough(longer, best):
+        return _ended(state, state.best)
+    return replace(_with(state, length, continued(longer, best)), stage="lengthening", length=length)
 
 
 def _ended(state: LeastSquaresState, best: int) -> LeastSquaresState:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.least_squares.plan import FIRST_DAMPING
 from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Dataset
@@ -79,13 +80,16 @@ def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, 
 
 
 def continued(longer: SearchState, shorter: SearchState) -> SearchState:
-    """The longer search with the parameters and initial states of the shorter one."""
+    """The longer search, begun anew with the parameters and initial states of the shorter one."""
     return replace(
         longer,
         point=shorter.point[:1].copy(),
         states=_states_at(shorter, longer.rows),
         state_errors=shorter.state_errors,
+        damping=np.full_like(longer.damping, FIRST_DAMPING),
+        state_damping=np.full_like(longer.state_damping, FIRST_DAMPING),
         waiting=UnknownStarts.waiting,
+        epochs=0,
     )
 
 

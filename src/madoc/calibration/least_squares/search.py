@@ -220,7 +220,7 @@ class Search:
             settled_at=state.point[0].copy(),
             missed=before,
             rough=max(state.rough, int(found)),
-            waiting=0 if smooth and state.waiting < self.starts.waiting else waiting,
+            waiting=0 if smooth else waiting,
             failures=state.failures + after.failures,
         )
         metrics = {"residual": missed[1], "noise": float(np.median(after.deviation))}
@@ -300,9 +300,13 @@ class Search:
 
     def _derivative_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
         """Control steps of an epoch's derivatives, and at contacts of counting these."""
-        columns = self.starts.settling_columns(problem) if state.waiting else self.starts.columns(problem)
+        columns = self.starts.settling_columns(problem) if state.waiting else self._columns(problem, state)
         counted = self.starts.unknown and state.refining and not state.waiting and state.touching.any()
         return self._window_steps(state) * (columns + int(counted))
+
+    def _columns(self, problem: CalibrationProblem, state: SearchState) -> int:
+        """Number of systems simulated for the derivatives of an epoch in which parameters move."""
+        return self.starts.columns(problem, smooth=not state.touching[: self.window_count(state)].any())
 
     def _window_steps(self, state: SearchState) -> int:
         """Control steps of all windows of all searches under one system each."""

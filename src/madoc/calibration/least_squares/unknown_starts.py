@@ -123,9 +123,9 @@ class UnknownStarts:
         return rows
 
     @staticmethod
-    def columns(problem: CalibrationProblem) -> int:
+    def columns(problem: CalibrationProblem, *, smooth: bool) -> int:
         """Number of systems simulated for the derivatives of an epoch: differences by parameters and states."""
-        return 1 + 2 * len(problem.simulator.parameters) + problem.states.physical_size
+        return 1 + (1 if smooth else 2) * len(problem.simulator.parameters) + problem.states.physical_size
 
     @staticmethod
     def trial_columns(*, smooth: bool) -> int:
@@ -203,7 +203,7 @@ class UnknownStarts:
         refining: bool,
     ) -> list[Plan]:
         """Differences around every search's point and initial states, in one batch each."""
-        slopes = slopes_at(self.simulator, self.readings, points, states)
+        slopes = slopes_at(self.simulator, self.readings, points, states, central=bool(self.touching.any()))
         searches = zip(slopes, points, damping.tolist(), state_damping, strict=True)
         return [
             self._plan(*each, contacts=self._contacts(each[1], state) if refining else None)
