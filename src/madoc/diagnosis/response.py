@@ -28,7 +28,7 @@ FAR = 3.0
 _TAPS = 2
 """Number of rows on either side of the correlation's peak over which the response is resolved."""
 _EARLIER = 2
-"""Number of rows by which the state that stands for a row's own is earlier: the fewest of which no reading is shared."""
+"""Number of rows by which the state that stands for a row's own is earlier: the fewest that share no reading."""
 _BLOCKS = 12
 """Number of parts of the log that are left out, one at a time, for standard errors."""
 _FEWEST = 8

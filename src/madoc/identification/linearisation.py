@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 DIFFERENCE = 1e-4
-"""Half width of a central difference in [-1, 1], whole width of a one-sided one. Truncation errors are 1e-8 of the third
+"""Half width of a central difference in [-1, 1], and width of a one-sided one. Truncation errors are 1e-8 of the third
 derivative and 5e-5 of the second; rounding of next states (1e-16, and the solver's 1e-10 at contacts) divided by it is
 below 1e-6 of a typical derivative."""
 TORN = 0.5
@@ -111,8 +111,8 @@ def slopes_of_windows(
 ) -> WindowSlopes:
     """Derivatives by parameters and by initial states; the latter are one-sided.
 
-    `by_points` are residuals at a point alone, or at its `difference_points` or `one_sided_points`, `by_shifts` those at
-    the first point with each value of the initial states in turn moved by its width.
+    `by_points` are residuals at a point alone, or at its `difference_points` or `one_sided_points`. `by_shifts` are those
+    at the first point with each value of the initial states in turn moved by its width.
     """
     whole = np.isfinite(by_points).all((0, 2)) & np.isfinite(by_shifts).all((0, 2))
     with np.errstate(invalid="ignore"):
@@ -127,8 +127,9 @@ def _differences(
 ) -> Float[np.ndarray, "derivatives windows values"]:
     """Differences of residuals divided by those of the points: d of them, or none for a point without neighbours.
 
-    With a neighbour on either side they are central. Where a contact begins between a point and its neighbour, a difference across it says nothing of the slope, and one
-    window's would outweigh all others: of central and one-sided derivatives the smallest is taken there.
+    With a neighbour on either side they are central. Where a contact begins between a point and its neighbour, a
+    difference across it says nothing of the slope, and one window's would outweigh all others: of central and one-sided
+    derivatives the smallest is taken there.
     """
     if len(points) == 1 + points.shape[1]:
         return (residuals[1:] - residuals[0]) / np.diagonal(points[1:] - points[0])[:, None, None]

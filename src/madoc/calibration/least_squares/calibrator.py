@@ -361,7 +361,7 @@ def _begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
 
 
 def _lengthening(state: LeastSquaresState, length: int) -> LeastSquaresState:
-    """The search on windows of this length, begun where the best one is; the end where too few have an initial state."""
+    """The search on windows of this length, begun where the best one is; the end if too few have an initial state."""
     best, longer = state.unknown[state.best], state.unknown[length]
     if not enough(longer, best):
         return _ended(state, state.best)
