@@ -18,12 +18,14 @@ CONSTANT = "a constant force, as friction that differs by direction"
 LOADED = "friction that grows with the load"
 SLOW = "friction that is larger at low speed"
 WEAKENING = "a drive that weakens with speed"
+DEAD_ZONE = "a drive that gives less at small commands, as with a dead zone"
+BENT = "a drive whose force is not in proportion to its command"
 RIPPLE = "a drive whose gain depends on where the joint is"
 UNEVEN = "friction that depends on where the joint is"
 PLACED = "a force that depends on where the joint is"
-FORCES = (CONSTANT, LOADED, SLOW, WEAKENING, RIPPLE, UNEVEN, PLACED)
+FORCES = (CONSTANT, LOADED, SLOW, WEAKENING, DEAD_ZONE, BENT, RIPPLE, UNEVEN, PLACED)
 """What each stands for, in words, the most usual first; the joint's name follows in brackets."""
-USUAL = 4
+USUAL = 5
 """Number of `FORCES` that are tried at every joint; the others only at robots of few joints."""
 FEW_JOINTS = 4
 """Largest number of joints of such a robot."""
@@ -31,6 +33,8 @@ TURNING = 0.1
 """Speed relative to the joint's root mean square, at which friction has turned to the direction of motion."""
 LOW_SPEED = 0.3
 """The same, below which friction at low speed acts (Stribeck)."""
+SMALL_COMMAND = 0.1
+"""Force of a drive relative to its root mean square, beyond which it is out of a dead zone."""
 _SMALLEST = 1e-9
 """Root mean square of a speed or a force below which a joint or its drive does nothing."""
 
@@ -47,7 +51,7 @@ def joint_forces(
     *,
     turns: bool,
 ) -> dict[str, list[Float[np.ndarray, "windows steps"]]]:
-    """Each of `FORCES` along the motion of a joint, of about 1 in size, as one or two functions of time.
+    """Each of `FORCES` along the motion of a joint, of about 1 in size, as one function of time or more.
 
     Values that are not finite are those of windows that do not count.
 
@@ -61,15 +65,18 @@ def joint_forces(
     moves, drives = fast > _SMALLEST, strong > _SMALLEST
     direction, drive = np.tanh(speed / (TURNING * max(fast, _SMALLEST))), exerted / max(strong, _SMALLEST)
     places = [np.sin(position), np.cos(position)]
+    finer = [np.sin(2.0 * position), np.cos(2.0 * position)]
     if not turns:
         along = (position - np.nanmean(position)) / max(float(np.nanstd(position)), _SMALLEST)
-        places = [along, along**2]
+        places, finer = [along, along**2], [along**3]
     found = {CONSTANT: [np.ones_like(speed)]}
+    if drives:
+        found |= {DEAD_ZONE: [-np.tanh(drive / SMALL_COMMAND)], BENT: [-drive * np.abs(drive)]}
     if moves and drives:
         found |= {LOADED: [-direction * np.abs(drive)], WEAKENING: [-drive * np.abs(speed) / fast]}
     if moves:
         found |= {SLOW: [-direction * np.exp(-((speed / (LOW_SPEED * fast)) ** 2))]}
-        found |= {UNEVEN: [-direction * place for place in places], PLACED: places}
+        found |= {UNEVEN: [-direction * place for place in places], PLACED: [*places, *finer]}
     if moves and drives:
         found |= {RIPPLE: [drive * place for place in places]}
     return found
