@@ -54,6 +54,15 @@ def test_honest_logs_raise_nothing(told, spec):
         assert told(columns, spec)[0] == []
 
 
+def test_noise_of_the_state_biases_no_gain(told):
+    """Earlier actions tell of the true state, and would be taken for the cause of what the noise of a reading hides."""
+    _, exact = told(recorded(), POSITIONS)
+    _, noisy = told(recorded(noise=0.004), POSITIONS)
+    for one, other in zip(noisy, exact, strict=True):
+        assert abs(one.gain / other.gain - 1.0) < 0.06
+        assert abs(one.lag) < 3.0 * one.lag_error
+
+
 def test_an_action_that_pushes_the_other_way_is_told_without_velocities(told):
     columns = recorded()
     columns |= {"shoulder_torque": -columns["shoulder_torque"]}

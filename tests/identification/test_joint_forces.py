@@ -7,7 +7,10 @@ from test_missing_terms import MODEL, NOISE, SPEC, scores
 from madoc import robots, simulation
 from madoc.data import logs
 from madoc.identification.joint_forces import (
+    BENT,
     CONSTANT,
+    COUPLED,
+    DEAD_ZONE,
     LOADED,
     PLACED,
     RIPPLE,
@@ -32,9 +35,20 @@ def test_forces_along_a_motion():
     for cause, sign in ((PLACED, 1.0), (UNEVEN, -1.0), (RIPPLE, 1.0)):
         assert found[cause][0] == pytest.approx(sign * np.array([[0.0, 1.0]]), abs=1e-8)
         assert found[cause][1] == pytest.approx(sign * np.array([[1.0, 0.0]]), abs=1e-8)
-    along, squared = joint_forces(position, speed, exerted, turns=False)[PLACED]
+    assert found[PLACED][2] == pytest.approx(np.zeros((1, 2)), abs=1e-8)  # the sine of twice the angle
+    assert found[PLACED][3] == pytest.approx(np.array([[1.0, -1.0]]))
+    assert found[DEAD_ZONE][0] == pytest.approx(-ones)
+    assert found[BENT][0] == pytest.approx(-ones)
+    along, squared, cubed = joint_forces(position, speed, exerted, turns=False)[PLACED]
     assert along == pytest.approx(np.array([[-1.0, 1.0]]))
     assert squared == pytest.approx(ones)
+    assert cubed == pytest.approx(along)
+
+
+def test_forces_by_another_joint():
+    one, still = np.array([[1.0, 3.0]]), np.zeros((1, 2))
+    (coupled,) = joint_forces(still, still, still, [(one, still)], turns=True)[COUPLED]
+    assert coupled == pytest.approx(np.array([[-1.0, 1.0]]))
 
 
 def test_what_neither_moves_nor_drives_has_a_constant_force_alone():
@@ -55,8 +69,9 @@ def test_causes_are_known_by_their_begin():
         (lambda q, v, u: -0.08 * abs(u) * np.tanh(v / 0.05), LOADED),
         (lambda q, v, u: -0.06 * np.tanh(v / 0.05) * np.exp(-((v / 0.4) ** 2)), SLOW),
         (lambda q, v, u: 0.1 * u * np.sin(q), RIPPLE),
+        (lambda q, v, u: -np.clip(u, -0.03, 0.03), DEAD_ZONE),
     ],
-    ids=["constant", "loaded", "slow", "ripple"],
+    ids=["constant", "loaded", "slow", "ripple", "dead zone"],
 )
 def test_a_force_at_the_joint_is_certain_and_named(tmp_path, force, cause):
     (tmp_path / "model.xml").write_text(MODEL.format(damping=0.1, friction=0.03, drag=""))

@@ -1,9 +1,11 @@
 """Forces at a joint that no parameter of a spec adds: what each stands for, and its effect on simulated windows.
 
-Each is a function of the joint's position, its speed and what its drive exerts. To first order the motion under a small
+Each is a function of the joint's position, its speed and what its drive exerts, or of another joint's motion. To first order the motion under a small
 force is that under its values along the motion without it, so one simulation of each window gives its effect. During a
 control step a force has its value at the begin of that.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,7 +25,8 @@ BENT = "a drive whose force is not in proportion to its command"
 RIPPLE = "a drive whose gain depends on where the joint is"
 UNEVEN = "friction that depends on where the joint is"
 PLACED = "a force that depends on where the joint is"
-FORCES = (CONSTANT, LOADED, SLOW, WEAKENING, DEAD_ZONE, BENT, RIPPLE, UNEVEN, PLACED)
+COUPLED = "a force that another joint's motion exerts"
+FORCES = (CONSTANT, LOADED, SLOW, WEAKENING, DEAD_ZONE, BENT, RIPPLE, UNEVEN, PLACED, COUPLED)
 """What each stands for, in words, the most usual first; the joint's name follows in brackets."""
 USUAL = 5
 """Number of `FORCES` that are tried at every joint; the others only at robots of few joints."""
@@ -48,6 +51,7 @@ def joint_forces(
     position: Float[np.ndarray, "windows steps"],
     speed: Float[np.ndarray, "windows steps"],
     exerted: Float[np.ndarray, "windows steps"],
+    others: Sequence[tuple[Float[np.ndarray, "windows steps"], Float[np.ndarray, "windows steps"]]] = (),
     *,
     turns: bool,
 ) -> dict[str, list[Float[np.ndarray, "windows steps"]]]:
@@ -59,6 +63,7 @@ def joint_forces(
         position: Of the joint, in rad or m.
         speed: Of the joint.
         exerted: What its drive exerts.
+        others: Positions and speeds of other joints.
         turns: Whether it is a hinge: what depends on its position then repeats with every turn.
     """
     fast, strong = (float(np.sqrt(np.nanmean(values**2))) for values in (speed, exerted))
@@ -67,7 +72,7 @@ def joint_forces(
     places = [np.sin(position), np.cos(position)]
     finer = [np.sin(2.0 * position), np.cos(2.0 * position)]
     if not turns:
-        along = (position - np.nanmean(position)) / max(float(np.nanstd(position)), _SMALLEST)
+        along = _standardised(position)
         places, finer = [along, along**2], [along**3]
     found = {CONSTANT: [np.ones_like(speed)]}
     if drives:
@@ -79,7 +84,13 @@ def joint_forces(
         found |= {UNEVEN: [-direction * place for place in places], PLACED: [*places, *finer]}
     if moves and drives:
         found |= {RIPPLE: [drive * place for place in places]}
-    return found
+    coupled = [_standardised(each) for other in others for each in other if np.nanstd(each) > _SMALLEST]
+    return found | ({COUPLED: coupled} if coupled else {})
+
+
+def _standardised(values: Float[np.ndarray, "windows steps"]) -> Float[np.ndarray, "windows steps"]:
+    """The values less their mean, over their standard deviation."""
+    return (values - np.nanmean(values)) / max(float(np.nanstd(values)), _SMALLEST)
 
 
 def force_effects(
@@ -101,11 +112,13 @@ def force_effects(
         return tried, np.zeros((len(readings), readings.observed[0].size, 0))
     motion, exerted = readings.trajectories(simulator, point, states)
     motion, exerted = (np.where(whole[:, None, None], each, np.nan) for each in (motion, exerted))
-    for joint, turns in joints:
+    few = model.njnt <= FEW_JOINTS
+    causes = FORCES if few else FORCES[:USUAL]
+    along = [(motion[..., int(each.qposadr[0])], motion[..., model.nq + int(each.dofadr[0])]) for each, _ in joints]
+    for place, (joint, turns) in enumerate(joints):
         dof, torque = int(joint.dofadr[0]), references_of(logged, simulator, joint)["dof_frictionloss"]
-        along = motion[..., int(joint.qposadr[0])], motion[..., model.nq + dof], exerted[..., dof]
-        found = joint_forces(*along, turns=turns)
-        causes = FORCES if model.njnt <= FEW_JOINTS else FORCES[:USUAL]
+        others = [*along[:place], *along[place + 1 :]] if few else []
+        found = joint_forces(*along[place], exerted[..., dof], others, turns=turns)
         for cause, shape in [(each, shape) for each in causes for shape in found.get(each, [])]:
             unit = "N·m" if turns else "N"
             tried.append(Candidate(f"{cause} ({joint.name})", "", unit, 0.0, torque, -np.inf, known_before=True))
