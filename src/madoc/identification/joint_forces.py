@@ -1,8 +1,8 @@
 """Forces at a joint that no parameter of a spec adds: what each stands for, and its effect on simulated windows.
 
-Each is a function of the joint's position, its speed and what its drive exerts, or of another joint's motion. To first order the motion under a small
-force is that under its values along the motion without it, so one simulation of each window gives its effect. During a
-control step a force has its value at the begin of that.
+Each is a function of the joint's position, its speed and what its drive exerts, or of another joint's motion. To first
+order the motion under a small force is that under its values along the motion without it, so one simulation of each
+window gives its effect. During a control step a force has its value at the begin of that.
 """
 
 from collections.abc import Sequence
