@@ -112,6 +112,9 @@ class Plant:
         uneven: Friction on every joint, N or N·m, times the sine of its position.
         ripple: Share of what its motor exerts on every joint that goes with the sine of its position.
         sag: Share of what the motors exert that they lose within seconds of each run.
+        dead_zone: Command that the motors do not follow, a share of the largest: they follow what is beyond it.
+        coarse: Step of the commands as motors follow them, cut towards zero, a share of the largest.
+        coupled: Damping of each of the first two joints by the other's speed, N·m·s/rad.
         sway: Amplitude (m/s²) of a sideways acceleration of the base at 0.7 Hz.
         wind: Constant force on the first joint, N or N·m.
         process: Random force on every joint, one draw a row, as a share of the largest command.
@@ -134,6 +137,9 @@ class Plant:
     uneven: float = 0.0
     ripple: float = 0.0
     sag: float = 0.0
+    dead_zone: float = 0.0
+    coarse: float = 0.0
+    coupled: float = 0.0
     sway: float = 0.0
     wind: float = 0.0
     process: float = 0.0

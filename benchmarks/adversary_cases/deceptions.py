@@ -21,6 +21,8 @@ RANGE = "outside|ends? of (its|their|the) range|beyond"
 LOOSE = r"elastic|flexib|backlash|\bplay\b|second mass|spring"
 LIMIT = "saturat|limit|clip"
 DRIFT = r"drift|runs differ|between runs|\bthirds\b|change over"
+SMALL = "small commands|in proportion"
+COUPLED = "another joint"
 PLACE = "where the joint is"
 CLOCK = r"clock|drift|spacing|\brates?\b"
 FORCE = r"constant|wind|external|offset|\bbias"
@@ -133,6 +135,8 @@ _PENDULUM = (
     Case(PENDULUM, "uneven", Plant(uneven=0.08), spec=Spec(free=FRICTIONAL), cause=PLACE),
     Case(PENDULUM, "ripple", Plant(ripple=0.15), cause=PLACE),
     Case(PENDULUM, "sag", Plant(sag=0.1), spec=Spec(free=THREE), cause=DRIFT),
+    Case(PENDULUM, "dead-zone", Plant(dead_zone=0.03), spec=Spec(free=THREE), cause=SMALL),
+    Case(PENDULUM, "coarse", Plant(coarse=0.1), spec=Spec(free=THREE), cause=SMALL),
 )
 
 _ARM = (
@@ -177,6 +181,10 @@ _ARM = (
     Case(ARM, "loaded", Plant(loaded=0.06), cause=FRICTION),
     Case(ARM, "warming", Plant(warming=0.1), cause=DRIFT + "|" + FRICTION),
     Case(ARM, "sag", Plant(sag=0.1), cause=DRIFT),
+    Case(ARM, "dead-zone", Plant(dead_zone=0.03), cause=SMALL),
+    Case(ARM, "coarse-closed-loop", Plant(coarse=0.1, closed_loop=True), cause=SMALL),
+    Case(ARM, "coupled", Plant(coupled=0.04), cause=COUPLED),
+    Case(ARM, "coupled-positions", Plant(coupled=0.04), POSITIONS, cause=COUPLED),
 )
 
 _BOX = (
@@ -235,6 +243,8 @@ _CART = (
     Case(CART, "drag", Plant(drag=1.0), cause=DRAG),
     Case(CART, "delay-0.5", Plant(delay=0.5), cause=LATE),
     Case(CART, "wind", Plant(wind=0.8), cause=FORCE),
+    Case(CART, "dead-zone", Plant(dead_zone=0.03), cause=SMALL),
+    Case(CART, "dead-zone-closed-loop", Plant(dead_zone=0.03, closed_loop=True), cause=SMALL),
     Case(CART, "gear-invisible", Plant({"gain": 1.25}), cause=GEAR, invisible=True),
     Case(
         CART, "unit-invisible", log=Log(scale={"slide": 1.1, "slide_speed": 1.1}), cause="unit|" + GEAR, invisible=True

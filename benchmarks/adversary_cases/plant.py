@@ -105,9 +105,12 @@ def move(
         wanted = late(commands, plant.delay - step / steps)
         motor = wanted if motor is None else wanted + keep * (motor - wanted)
         cold = np.exp(-data.time / WARM_AFTER)
-        data.ctrl[:] = np.clip(motor, middle - reach, middle + reach) * (1.0 - plant.sag * (1.0 - cold))
+        followed = middle + (high - low) / 2 * driven(plant, 2 * (motor - middle) / (high - low))
+        data.ctrl[:] = np.clip(followed, middle - reach, middle + reach) * (1.0 - plant.sag * (1.0 - cold))
         data.qfrc_applied[:] = push + resistance(plant, data.qvel) + of_gear(plant, data, cold)
         data.qfrc_applied[0] += plant.wind
+        if plant.coupled:
+            data.qfrc_applied[:2] -= plant.coupled * data.qvel[1::-1]
         if plant.sway:
             model.opt.gravity[0] = plant.sway * np.sin(2 * np.pi * SWAY_HZ * data.time)
         mujoco.mj_step(model, data)
@@ -128,6 +131,13 @@ def limits_of(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 def late(commands: list[np.ndarray], rows: float) -> np.ndarray:
     """The command of so many rows ago; that of the first row before it."""
     return commands[max(0, len(commands) - 1 - max(0, int(np.ceil(rows))))]
+
+
+def driven(plant: Plant, command: np.ndarray) -> np.ndarray:
+    """What motors follow of commands in [-1, 1]."""
+    if plant.coarse:
+        command = plant.coarse * np.trunc(command / plant.coarse)
+    return np.sign(command) * np.maximum(np.abs(command) - plant.dead_zone, 0.0)
 
 
 def resistance(plant: Plant, speed: np.ndarray) -> np.ndarray:
