@@ -25,7 +25,7 @@ from madoc.identification.candidate_terms import (
 from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import Fit, fit_windows, negligible, products_of, windows_of
 from madoc.identification.information import NORMAL_95
-from madoc.identification.joint_forces import force_effects
+from madoc.identification.joint_forces import force_effects, is_joint_force
 from madoc.identification.replay import Readings
 from madoc.identification.score_tests import deviate, joint_shift, parameter_shift, score
 from madoc.identification.states import LoggedStates
@@ -53,6 +53,9 @@ _AT_MINIMUM = 1e-3
 """Distance in [-1, 1] from the end of a range, up to which a parameter is at its minimum."""
 LIKELY_FRICTION = 1.0
 """t from which Coulomb friction counts though it is not significant; 16 % of joints without any reach it by chance."""
+LIKELY_FORCE = 3.5
+"""|t| from which a force at a joint counts though it is not certain; of a hundred that are tested, one in twenty logs has
+such a one by chance."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
 
 
@@ -133,7 +136,7 @@ def suspicions(
             others.append(together)
         further = [*_rivals(tests, chosen), *_further(tests, chosen)]
         others += [replace(_with_terms(tests, rivals), terms=False) for rivals in further]
-    others += _of_friction(tests, chosen)
+    others += [*_of_friction(tests, chosen), *_of_forces(tests, chosen)]
     return Suspicions(tuple(sorted(terms, key=lambda term: -abs(term.t))), tuple(others), spent)
 
 
@@ -315,6 +318,17 @@ def _of_friction(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
         shift, error = 0.5 * (low + high) * by_friction, 0.5 * (high - low) * np.abs(by_friction)
         if np.max((np.abs(shift) + error) / tests.half_widths) >= WORTH_FITTING:
             yield Alternative((_name(candidate),), False, tests.by_name(shift), tests.by_name(error), bounded=True)
+
+
+def _of_forces(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
+    """The estimates with a force at a joint that is likely beside the chosen terms.
+
+    Such forces are too many for all that cannot be excluded to be covered.
+    """
+    for index, candidate in enumerate(tests.tried):
+        found = tests.score(index, chosen) if is_joint_force(candidate.cause) else None
+        if found is not None and abs(found.t) >= LIKELY_FORCE:
+            yield replace(_with_terms(tests, [index, *chosen]), terms=False)
 
 
 def _of_other_windows(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[Alternative]:
