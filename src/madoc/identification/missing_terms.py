@@ -54,8 +54,8 @@ _AT_MINIMUM = 1e-3
 LIKELY_FRICTION = 1.0
 """t from which Coulomb friction counts though it is not significant; 16 % of joints without any reach it by chance."""
 LIKELY_FORCE = 3.5
-"""|t| from which a force at a joint counts though it is not certain; of a hundred that are tested, one in twenty logs has
-such a one by chance."""
+"""|t| from which a force at a joint counts though it is not certain; of a hundred that are tested, one log in twenty
+has such a one by chance."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
 
 
