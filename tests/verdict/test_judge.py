@@ -84,7 +84,12 @@ def test_a_good_estimate_is_calibrated_and_the_sentence_has_its_numbers(good):
         ("NOT_IDENTIFIABLE", {}, {"interval_shares": {"mass": 0.1, "damping": 0.7}}, "leaves damping open"),
         ("NO_IMPROVEMENT", {"relative": 1.1, "relative_interval": (0.9, 1.3)}, {}, "not at its end"),
         ("NO_IMPROVEMENT", {"relative": 0.5, "relative_interval": (0.4, 0.6)}, {}, "parameters nearby leave 9 %"),
-        ("NO_IMPROVEMENT", {"nearby_relative": 0.99, "relative": 1.0}, {}, "mid-range is as good"),
+        (
+            "NO_IMPROVEMENT",
+            {"nearby_relative": 0.99, "relative": 1.0, "relative_interval": (0.98, 1.02)},
+            {},
+            "mid-range is as good",
+        ),
     ],
 )
 def test_one_thing_wrong_changes_the_word(good, word, of_errors, change, told):
@@ -206,6 +211,21 @@ def test_a_right_guess_is_confirmed_where_intervals_hold_it(good):
     assert judge(changed(good, loud, estimate=near)).word == "NO_IMPROVEMENT"
     stuck = no_gain | {"nearby_relative": 0.5}
     assert judge(changed(good, stuck, estimate={"mass": 0.0, "damping": 0.0})).word == "NO_IMPROVEMENT"
+
+
+@EITHER
+def test_a_small_gain_counts_where_it_is_significant_and_the_rest_is_noise(good):
+    gain = {
+        "mid_range": errors(0.1, 0.41),
+        "relative": 0.97,
+        "nearby_relative": 0.97,
+        "relative_interval": (0.95, 0.99),
+    }
+    assert judge(changed(good, gain)).word == "CALIBRATED"
+    assert judge(changed(good, gain | {"relative_interval": (0.94, 1.01)})).word == "NO_IMPROVEMENT"
+    left = errors(0.3, 1.2)
+    loud = gain | {"estimate": left, "nearby_best": left, "mid_range": errors(0.3, 1.23)}
+    assert judge(changed(good, loud)).word == "NO_IMPROVEMENT"
 
 
 @EITHER

@@ -314,7 +314,7 @@ def _no_improvement(holdout: HoldOut) -> Verdict | None:
     if isinstance(holdout, ToldApart):
         sentence = _no_better_areas(holdout.area_at_mid_range, holdout.area_at_estimate)
     else:
-        sentence = "" if _mid_range_was_right(holdout) else _no_better_errors(holdout.errors)
+        sentence = "" if _mid_range_was_right(holdout) else _no_better_errors(holdout)
     return Verdict("NO_IMPROVEMENT", sentence) if sentence else None
 
 
@@ -328,9 +328,13 @@ def _mid_range_was_right(holdout: Predicted | Fitted) -> bool:
     return inside and as_good and not other_windows and not beyond
 
 
-def _no_better_errors(errors: PredictionErrors) -> str:
-    """Why an estimate is no improvement by its prediction errors; empty if it is one."""
-    if errors.nearby_relative > 1.0 - WORTH_GAINING:
+def _no_better_errors(holdout: Predicted | Fitted) -> str:
+    """Why an estimate is no improvement by its prediction errors; empty if it is one.
+
+    A small gain is one as well if it is significant and leaves noise alone, which then is most of any error.
+    """
+    errors, only_noise = holdout.errors, beats_mid_range(holdout) and explains_all(holdout)
+    if errors.nearby_relative > 1.0 - WORTH_GAINING and not only_noise:
         return (
             f"mid-range is as good: parameters nearby leave {100 * errors.nearby_relative:.0f} % of its error on the "
             f"hold-out ({_change(errors)} at the estimate)"
