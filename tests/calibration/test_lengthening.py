@@ -125,7 +125,7 @@ def test_longer_windows_say_more_if_intervals_are_narrower_and_as_many_are_expla
 
 
 def test_where_motion_is_smooth_they_make_noise_matter_less(pendulum):
-    problem, space = problem_of(pendulum), pendulum.parameters
+    problem, space = problem_of(pendulum, rows=4000), pendulum.parameters
     truth = space.vector(dict(zip(space.names, TRUTH, strict=True)))
     widths = []
     for horizon in (horizon_of(problem.dataset, 26), None):
@@ -134,8 +134,44 @@ def test_where_motion_is_smooth_they_make_noise_matter_less(pendulum):
         interval = method.estimate(problem, state).interval
         assert ((interval[:, 0] <= truth) & (truth <= interval[:, 1])).all()
         widths.append(interval[:, 1] - interval[:, 0])
-    assert state.best == len(state.unknown) - 1 > 0
+    assert [search.epochs > 0 for search in state.unknown] == [True, False, False, True]  # the longest come first
+    assert state.best == 3
     assert (widths[1] < 0.5 * widths[0]).all()
+
+
+def test_what_follows_windows_that_fail(pendulum):
+    """By hand: of four searches the last, on windows nine times as long as the first, has taken three steps."""
+    problem, method = problem_of(pendulum, rows=4000), LeastSquares()
+    state = method.init(problem, jax.random.key(0))
+    count = len(problem.simulator.parameters)
+
+    def search(length, **changed):
+        each = state.unknown[length]
+        done = {"moved": np.full(len(each.moved), 0.5), "cost": np.full(len(each.cost), 0.8)}
+        done |= {"bread": 4.0**length * np.eye(count), "meat": 4.0**length * np.eye(count)}
+        done |= {"explained": len(each.rows), "refining": 1, "epochs": 3}
+        return replace(each, **{**done, **changed})
+
+    def after(length, best=0, **searches):
+        unknown = tuple(searches.get(f"of_{index}", each) for index, each in enumerate(state.unknown))
+        at = replace(state, unknown=unknown, stage="lengthening", length=length, best=best)
+        found = method._after_unknown(problem, at)
+        return found.length, found.best, found.finished, found.unknown[found.length].epochs
+
+    first, three, nine = search(0), search(2), search(3)
+    assert after(0, of_0=first)[:3] == (3, 0, 0)
+    assert after(3, of_0=first, of_3=nine)[1:3] == (3, 1)
+    # It tells no more than the first, or is not at its end by far: the shorter ones have their turn.
+    assert after(3, of_0=first, of_3=search(3, meat=1e6 * np.eye(count)))[:3] == (2, 0, 0)
+    loud = search(3, deviation=2.5 * first.deviation, moved=np.array([9.0]))
+    assert after(3, of_0=first, of_3=loud)[:3] == (2, 0, 0)
+    # These serve, so the longest begin again from there, which ends if they fail once more.
+    assert after(2, of_0=first, of_2=three, of_3=loud) == (3, 2, 0, 0)
+    assert after(3, best=2, of_0=first, of_2=three, of_3=loud)[1:3] == (2, 1)
+    # At their end, but with more than noise: the shortest, whose intervals are wide, are the estimate.
+    errors = search(3, deviation=1.5 * first.deviation)
+    assert after(3, of_0=first, of_3=errors)[1:3] == (0, 1)
+    assert after(3, best=2, of_0=first, of_2=three, of_3=errors)[1:3] == (0, 1)
 
 
 def test_a_run_killed_on_longer_windows_goes_on_with_the_same_bits(pendulum, tmp_path):

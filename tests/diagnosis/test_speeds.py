@@ -37,6 +37,21 @@ def test_rows_farther_apart_than_their_times_say(told, spacing, ratio):
     assert not late
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_a_joint_that_moves_now_and_then(told, noise):
+    """It goes to and fro smoothly in one second of ten, speeds 6 % too low: no change of them is an impact."""
+    time, random = 0.02 * np.arange(6000), np.random.default_rng(0)
+    columns = {"time": time, "shoulder_torque": np.zeros(6000), "elbow_torque": np.zeros(6000)}
+    share, sign = np.clip(time % 10.0, 0.0, 1.0), (-1.0) ** (time // 10.0)
+    angle = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    speed = 30.0 * (share * (1.0 - share)) ** 2
+    for name in ("shoulder", "elbow"):
+        columns[name] = np.where(sign > 0, angle, 1.0 - angle) + noise * random.standard_normal(6000)
+        columns[f"{name}_speed"] = 0.94 * sign * speed + noise * random.standard_normal(6000)
+    (finding,), _ = told(columns)
+    assert finding[1].startswith("it changes 1.06")
+
+
 def test_speeds_that_are_two_rows_late(told):
     columns = recorded()
     columns |= {name: np.roll(columns[name], 2) for name in ("shoulder_speed", "elbow_speed")}

@@ -10,6 +10,7 @@ from madoc.data import logs, typical_change
 from madoc.identification import missing_terms as terms
 from madoc.identification.candidate_terms import CAUSES, EARLY, Candidate, _cut_off
 from madoc.identification.drifts import DRIFT, WITHIN_RUNS, _between_runs, _drifts
+from madoc.identification.joint_forces import LOADED
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
 from madoc.identification.term_tests import TermTests
@@ -183,6 +184,27 @@ def test_runs_that_repeat_one_motion_agree_and_are_no_sign_of_a_change():
     tests = TermTests(products, (), space, np.array([0.01]), np.repeat(np.arange(12), 8))
     (term,), others = _between_runs(tests)
     assert (term.t, others) == (0.0, [])
+
+
+@pytest.mark.parametrize(
+    ("cause", "size", "counts"), [(LOADED, 0.15, True), (LOADED, 0.06, False), ("drag", 0.15, False)]
+)
+def test_a_force_at_a_joint_counts_where_it_is_likely(cause, size, counts):
+    """Its effect is half that of the parameter, so that without it the estimate is off by half of its size."""
+    random = np.random.default_rng(0)
+    noise, slope, other = random.standard_normal((3, 200, 6))
+    force = 0.5 * slope + other
+    products = Products.of(noise - size * force, slope[..., None], force[..., None])
+    space = ParameterSpace((Parameter("gravity", "", -11, -9),))
+    tried = Candidate(f"{cause} (hinge)", "", "N·m", 0.0, 1.0, -np.inf, known_before=True)
+    tests = TermTests(products, (tried,), space, np.array([0.01]), np.zeros(200, int))
+    found = list(terms._of_forces(tests, []))
+    assert len(found) == counts
+    for each in found:
+        value = tests.score(0).change
+        assert 3.5 < tests.score(0).t < 6.5
+        assert each.shifts["gravity"] == pytest.approx(-0.5 * value / 0.01, rel=0.2)
+        assert not each.terms
 
 
 def test_a_term_that_explains_the_same_is_a_rival():

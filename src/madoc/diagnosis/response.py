@@ -177,9 +177,10 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     cross-correlation of the two, both cleared of what the state explains. Only actions at or before a row are taken, as
     those after it depend on the motion where a controller chose them.
 
-    A noisy state takes part of what earlier actions did for their own effect, and its noise is in the change too. So
+    A noisy state leaves part of what earlier actions did to their own effect, and its noise is in the change too. So
     the regression is by instrumental variables (two-stage least squares): the state enters as predicted from the state
-    two rows before, with whose noise it has none in common even where speeds are differences of positions.
+    two rows before, with whose noise it has none in common even where speeds are differences of positions. Actions
+    count as free of that noise: where a controller computes them from noisy readings, lags come out too early.
     """
     joints, motion = _motion(dataset, simulator)
     if not joints:
@@ -194,13 +195,12 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     if len(rows) < _FEWEST * (motion.state.shape[1] + sum(len(window) for window in windows)):
         return ()
     earlier = motion.state[np.searchsorted(motion.rows, rows - _EARLIER)]
-    instruments = _basis(np.concatenate([earlier, *taps], axis=1))
-    design = np.concatenate([instruments @ (instruments.T @ motion.state[kept]), *taps], axis=1)
+    design, instruments = (np.concatenate([state, *taps], axis=1) for state in (motion.state[kept], earlier))
     ends = motion.state.shape[1] + np.cumsum([len(window) for window in windows])
     own = [np.arange(end - len(window), end) for end, window in zip(ends, windows, strict=True)]
     found = []
     for at, joint in enumerate(joints):
-        estimates, share = _regressed(design, motion.change[kept, at], own[at])
+        estimates, share = _regressed(design, instruments, motion.change[kept, at], own[at])
         gains = estimates.sum(-1)
         taken = np.full(len(gains), motion.ahead[at])
         taken = np.divide(estimates @ windows[at], gains, out=taken, where=gains != 0.0)
@@ -249,7 +249,7 @@ def _motion(dataset: Dataset, simulator: Simulator) -> tuple[tuple[DrivenJoint, 
 
 def _peaks(motion: _Motion, action: Float[np.ndarray, "rows joints"], control_step: float) -> list[int]:
     """The lags in rows at which each joint's acceleration correlates most with its action, in absolute value."""
-    basis = _basis(motion.state)
+    basis = orth(motion.state / np.maximum(np.abs(motion.state).max(0), np.finfo(float).tiny))
     changes, actions = (columns - basis @ (basis.T @ columns) for columns in (motion.change, action))
     longest = int(np.ceil(LONGEST / control_step))
     cuts = np.flatnonzero(np.diff(motion.rows) > 1) + 1
@@ -263,29 +263,41 @@ def _peaks(motion: _Motion, action: Float[np.ndarray, "rows joints"], control_st
     return peaks
 
 
-def _basis(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows rank"]:
-    """An orthonormal basis of what the columns span."""
-    return orth(columns / np.maximum(np.abs(columns).max(0), np.finfo(float).tiny))
-
-
 def _regressed(
-    design: Float[np.ndarray, "rows columns"], change: Float[np.ndarray, " rows"], own: Int[np.ndarray, " taps"]
+    design: Float[np.ndarray, "rows columns"],
+    instruments: Float[np.ndarray, "rows columns"],
+    change: Float[np.ndarray, " rows"],
+    own: Int[np.ndarray, " taps"],
 ) -> tuple[Float[np.ndarray, "estimates taps"], float]:
-    """The coefficients of a joint's own action, of the whole log and without each of its parts; and its share."""
-    scale = np.maximum(np.sqrt((design**2).mean(0)), np.finfo(float).tiny)
-    table = np.column_stack([design / scale, change])
-    parts = np.stack([part.T @ part for part in np.array_split(table, _BLOCKS)])
-    whole = parts.sum(0)
-    count = design.shape[1]
+    """The coefficients of a joint's own action, of the whole log and without each of its parts; and its share.
 
-    def solved(products: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        ridge = _RIDGE * len(table) * np.eye(len(columns))
-        return np.linalg.solve(products[np.ix_(columns, columns)] + ridge, products[columns, count])
+    Both stages of the least squares leave a part out: the design's columns as the instruments predict them, and the
+    change as those predict it.
+    """
+    count, rows = design.shape[1], len(design)
+    table = np.column_stack([instruments, design, change])
+    scale = np.maximum(np.sqrt((table**2).mean(0)), np.finfo(float).tiny)
+    scale[-1] = 1.0
+    parts = np.stack([part.T @ part for part in np.array_split(table / scale, _BLOCKS)])
+    whole = parts.sum(0)
+
+    def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+        return np.linalg.solve(matrix + _RIDGE * rows * np.eye(len(matrix)), right)
+
+    def second(products: np.ndarray) -> np.ndarray:
+        """Products of the predicted columns, the change behind them."""
+        mixed = products[:count, count:]
+        return np.asarray(mixed.T @ solved(products[:count, :count], mixed))
 
     everything, others = np.arange(count), np.setdiff1d(np.arange(count), own)
-    estimates = np.stack([solved(each, everything)[own] for each in (whole, *(whole - parts))]) / scale[own]
-    left = [whole[count, count] - whole[count, some] @ solved(whole, some) for some in (others, everything)]
-    return estimates, float(1.0 - left[1] / max(left[0], np.finfo(float).tiny))
+
+    def coefficients(predicted: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        return solved(predicted[np.ix_(columns, columns)], predicted[columns, count])
+
+    predicted = second(whole)
+    estimates = np.stack([coefficients(each, everything)[own] for each in (predicted, *map(second, whole - parts))])
+    left = [whole[-1, -1] - predicted[count, some] @ coefficients(predicted, some) for some in (others, everything)]
+    return estimates / scale[count + own], float(1.0 - left[1] / max(left[0], np.finfo(float).tiny))
 
 
 def _jackknife(values: Float[np.ndarray, " estimates"]) -> float:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import median_filter
 from scipy.stats import median_abs_deviation
 
 from madoc.data import Dataset
@@ -38,10 +39,10 @@ the floor between two rows, small differences are not judged."""
 _NEAR = (0.8, 1.25)
 """Ratios that are no mistake of a unit."""
 JUMP = 8.0
-"""Standard deviations, by the median absolute deviation, of a change of speed in a row that is taken for an impact; in
-such a row the mean of two speeds is not that between them."""
-_FEW_JUMPS = 0.1
-"""Share in [0, 1] of the rows that impacts are below."""
+"""Distance of a change of speed from its neighbours', in standard deviations of that by the median absolute deviation,
+from which it is taken for an impact: in such a row the mean of two speeds is not that between them."""
+_NEIGHBOURS = 5
+"""Number of rows, the row itself among them, that are neighbours."""
 _BLOCKS = 12
 """Number of parts of the log that are left out, one at a time, for standard errors."""
 _FEWEST = 36
@@ -122,10 +123,10 @@ def _pairs(dataset: Dataset, simulator: Simulator) -> list[_Pair]:
 
 
 def _jumps(change: Float[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
-    """Rows whose change of speed stands out, nowhere if that is more than a few: then it is how the joint moves."""
-    apart = np.abs(change - np.median(change))
-    out = apart > JUMP * median_abs_deviation(change, scale="normal")
-    return out if out.mean() < _FEW_JUMPS else np.zeros(len(change), bool)
+    """Rows whose change of speed is unlike that of their neighbours, whose median a smooth change follows."""
+    apart = change - median_filter(change, _NEIGHBOURS)
+    usual = median_filter(np.abs(change), _NEIGHBOURS)
+    return (np.abs(apart) > JUMP * median_abs_deviation(apart, scale="normal")) & (np.abs(apart) > 2.0 * usual)
 
 
 def _ratio(change: Float[np.ndarray, " rows"], expected: Float[np.ndarray, " rows"]) -> float | None:

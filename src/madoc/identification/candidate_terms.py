@@ -64,7 +64,7 @@ class Candidate:
         least: Its smallest physical value.
         elements: Elements of the model that share the value; empty for a term of the whole robot.
         known_before: Whether users know the value well without the log, as by scales or a level, or no parameter of
-            a spec adds the term: only a certain sign of it counts then.
+            a spec adds the term: it is not taken together with others that cannot be excluded then.
     """
 
     cause: str

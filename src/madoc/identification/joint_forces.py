@@ -107,11 +107,12 @@ def force_effects(
     of every window for each force, and two besides.
     """
     model, joints = simulator.task.model, single_joints(simulator.task.model)
-    tried, forces = list[Candidate](), list[Float[np.ndarray, "windows steps dof"]]()
+    tried, effects = list[Candidate](), [np.zeros((len(readings), readings.observed[0].size, 0))]
     if not joints or not whole.any():
-        return tried, np.zeros((len(readings), readings.observed[0].size, 0))
+        return tried, effects[0]
     motion, exerted = readings.trajectories(simulator, point, states)
     motion, exerted = (np.where(whole[:, None, None], each, np.nan) for each in (motion, exerted))
+    base = readings.residuals(simulator, point[None], states[None])[0, 0]
     few = model.njnt <= FEW_JOINTS
     causes = FORCES if few else FORCES[:USUAL]
     along = [(motion[..., int(each.qposadr[0])], motion[..., model.nq + int(each.dofadr[0])]) for each, _ in joints]
@@ -119,14 +120,16 @@ def force_effects(
         dof, torque = int(joint.dofadr[0]), references_of(logged, simulator, joint)["dof_frictionloss"]
         others = [*along[:place], *along[place + 1 :]] if few else []
         found = joint_forces(*along[place], exerted[..., dof], others, turns=turns)
-        for cause, shape in [(each, shape) for each in causes for shape in found.get(each, [])]:
+        shapes = [(each, shape) for each in causes for shape in found.get(each, [])]
+        forces = np.zeros((len(shapes), *exerted.shape))
+        for index, (cause, shape) in enumerate(shapes):
+            least = 0.0 if cause == DEAD_ZONE else -np.inf
             unit = "N·m" if turns else "N"
-            tried.append(Candidate(f"{cause} ({joint.name})", "", unit, 0.0, torque, -np.inf, known_before=True))
-            forces.append(np.zeros((*shape.shape, model.nv)))
-            forces[-1][..., dof] = CHANGE * torque * np.nan_to_num(shape)
-    base = readings.residuals(simulator, point[None], states[None])[0, 0]
-    points, starts = (np.repeat(each[None], len(tried), axis=0) for each in (point, states))
-    moved = readings.residuals(simulator, points, starts, np.stack(forces))[:, 0]
-    effects = np.moveaxis((moved - base) / CHANGE, 0, -1)
-    effects[..., ~np.isfinite(effects[whole]).all((0, 1))] = 0.0
-    return tried, effects
+            tried.append(Candidate(f"{cause} ({joint.name})", "", unit, 0.0, torque, least, known_before=True))
+            forces[index, ..., dof] = CHANGE * torque * np.nan_to_num(shape)
+        points, starts = (np.repeat(each[None], len(shapes), axis=0) for each in (point, states))
+        moved = readings.residuals(simulator, points, starts, forces)[:, 0]
+        effects.append(np.moveaxis((moved - base) / CHANGE, 0, -1))
+    every = np.concatenate(effects, axis=-1)
+    every[..., ~np.isfinite(every[whole]).all((0, 1))] = 0.0
+    return tried, every

@@ -91,12 +91,12 @@ class LeastSquares:
     Residuals are in typical changes of a channel in one step. With `logged` initial states, which are assumed to be
     exact, noise in them biases the estimate. With `estimated` ones each window's initial state is a further unknown,
     its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
-    has settled, windows become nine times as long, or three times where that fails, if it narrows the intervals and
-    residuals remain noise: where motion is smooth, long windows hold more information, and they show model errors. With
-    contacts they become three times as long first; where contacts forbid longer windows, there are ten times as many of
-    them in the end. By default states are estimated where they cannot be
-    rebuilt, where the data is declared noisy, and where residuals of consecutive rows alternate as noise makes them: a
-    reading that is too high makes the step to it look too long and the step from it too short.
+    has settled, windows become nine times as long, by way of three times where the longest show contacts or fail, while
+    that narrows the intervals and residuals remain noise: where motion is smooth, long windows hold more information,
+    and they show model errors. Where contacts forbid longer windows, there are ten times as many of them in the end. By
+    default states are estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of
+    consecutive rows alternate as noise makes them: a reading that is too high makes the step to it look too long and
+    the step from it too short.
 
     Attributes:
         initial_states: `logged`, `estimated`, or None to choose by the data.
@@ -208,7 +208,8 @@ class LeastSquares:
             steps += self._known(problem).whole_run(problem, state.known, epochs)
         if state.stage != "undecided":
             for length, search in enumerate(state.unknown):
-                if length == WIDER and state.stage != "widening":
+                skipped = LONGER <= length < len(state.unknown) - 1 and _longest_first(state.unknown)
+                if (skipped and not search.epochs) or (length == WIDER and state.stage != "widening"):
                     continue
                 steps += self._unknown(problem, length).whole_run(problem, search, refining_epochs)
         return steps
@@ -279,8 +280,8 @@ class LeastSquares:
     def _after_unknown(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
         """Go on to longer windows once a search has settled, while they narrow the intervals.
 
-        Where the log shows no contact, the longest come first: motion is smooth, and they serve mostly. Where they do
-        not, shorter ones have their turn, and then the longest again unless they have settled.
+        Where the log shows no contact in the longest, these come first: motion is smooth, and they mostly serve. Where
+        they do not, shorter ones have their turn, and then the longest again unless they have settled.
 
         If longer windows show model errors, the estimate of the shortest is kept: model errors bias the estimate by
         about as much for all lengths, and only wide intervals may cover that. At contacts longer windows may leave
@@ -293,28 +294,21 @@ class LeastSquares:
             return state
         if not self._unknown(problem).settled(search):
             lost = hopeless(search, searches[0], searches[state.best]) or search.epochs >= self.search_epochs
-            return self._failed(problem, state) if length >= LONGER and lost and not search.waiting else state
+            return _failed(state) if length >= LONGER and lost and not search.waiting else state
         if length == WIDER:
             return _finished(state, WIDER)
         if length and not self._noise_alone(problem, state, length):
-            return self._failed(problem, state if search.rough else replace(state, best=0))
+            return _ended(state, state.best if search.rough else 0)
         if length and not tells_more(search, searches[state.best]):
-            return self._failed(problem, state)
+            return _failed(state)
         if float(search.deviation.max()) < sentences.EXACT:
             return _finished(state, length)
         following = max(length + 1, LONGER)
-        if not length and len(searches) > LONGER and enough(searches[-1], search):
-            following = following if searches[-1].touching.any() else len(searches) - 1
+        if not length and _longest_first(searches) and enough(searches[-1], search):
+            following = len(searches) - 1
         if following == len(searches) or self._unknown(problem).settled(searches[following]):
             return _ended(state, length)
         return _lengthening(replace(state, best=length), following)
-
-    def _failed(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
-        """Go on to the next shorter windows than those that have failed, unless they had their turn."""
-        shorter = state.length - 1
-        if shorter < LONGER or state.unknown[shorter].epochs:
-            return _ended(state, state.best)
-        return _lengthening(state, shorter)
 
     def _noise_alone(self, problem: CalibrationProblem, state: LeastSquaresState, length: int) -> bool:
         """Whether residuals of windows of this length are the noise that those of the shortest windows are."""
@@ -360,8 +354,21 @@ def _begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
     return replace(_with(state, 0, first), stage="estimated")
 
 
+def _longest_first(searches: tuple[SearchState, ...]) -> bool:
+    """Whether there are longer windows, and the log shows no contact in the longest."""
+    return len(searches) > LONGER and not searches[-1].touching.any()
+
+
+def _failed(state: LeastSquaresState) -> LeastSquaresState:
+    """The state after a search on longer windows in vain: the next shorter ones begin, unless they had their turn."""
+    shorter = state.length - 1
+    if shorter < LONGER or state.unknown[shorter].epochs:
+        return _ended(state, state.best)
+    return _lengthening(state, shorter)
+
+
 def _lengthening(state: LeastSquaresState, length: int) -> LeastSquaresState:
-    """The search on windows of this length, begun where the best one is; the end if too few have an initial state."""
+    """The state in which windows of this length begin where the best search is, or the end if too few are explained."""
     best, longer = state.unknown[state.best], state.unknown[length]
     if not enough(longer, best):
         return _ended(state, state.best)

@@ -29,7 +29,7 @@ FOUND = (0.5, 0.9)
 """Shares in [0, 1]. If narrowing differences and restarts leave at most this share of the unexplained windows, or of
 the size of all residuals, those windows lacked an initial state, not a better model."""
 FIRST_STEPS = 2
-"""Number of steps of initial states, after which those of smooth motion are explained, as it is nearly linear."""
+"""Number of steps of initial states at contacts with whose result those of the following steps are compared."""
 FAR = 3.0
 """Distance in standard errors; once parameters have moved farther, initial states are looked for anew."""
 _SMALLEST = 1e-100
