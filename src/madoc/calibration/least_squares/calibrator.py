@@ -109,7 +109,8 @@ class LeastSquares:
         search_windows: Largest number of windows while searching. None is 64 from logged states, else 24.
         search_epochs: Largest number of epochs of searching, which ends once the best search has settled.
         tolerance: Share of each range; the search ends with a step that moves no parameter by more than this, nor by a
-            tenth of its standard error (half of it at contacts).
+            tenth of its standard error (half of it at contacts, and where states are estimated from the step on that
+            is the last of `search_epochs`).
     """
 
     initial_states: InitialStates | None = None

@@ -173,7 +173,8 @@ class Search:
             new["state_damping"][index, :count] = np.clip(state_damping[index] * state_factor, *settling.DAMPING_RANGE)
             cost = float(outcome.totals[trial])
             new["cost"][index] = cost if state.refining else plan.comparable(cost)
-            new["moved"][index] = self._moved(plan, outcome, trial, damping=float(damping[index]))
+            relaxed = ROUGHLY_SETTLED / SETTLED if self._impatient(state) else 1.0
+            new["moved"][index] = self._moved(plan, outcome, trial, damping=float(damping[index])) / relaxed
         leader = int(np.argmin(new["cost"][:running]))
         best = plans[leader]
         following = replace(
@@ -181,7 +182,7 @@ class Search:
             **new,
             deviation=best.deviation,
             bread=best.bread,
-            meat=best.meat,
+            meat=best.meat + (_of_last_step(best) if self._impatient(state) else 0.0),
             explained=int(best.kept.sum()),
             steady_cost=best.steady_cost,
             autocorrelation=best.autocorrelation,
@@ -247,13 +248,12 @@ class Search:
         new["cost"][0], new["moved"][0] = cost, self._relative_step(plan, step, ROUGHLY_SETTLED)
         if not better and state.damping[0] <= self.starts.stuck:
             new["moved"][0] = max(new["moved"][0], 1.0)  # a damped step may be small far from the minimum too
-        pull = plan.bread @ step
         following = replace(
             state,
             **new,
             deviation=plan.deviation,
             bread=plan.bread,
-            meat=plan.meat + (np.outer(pull, pull) if new["moved"][0] < 1.0 else 0.0),
+            meat=plan.meat + (_of_last_step(plan) if new["moved"][0] < 1.0 else 0.0),
             explained=int(plan.kept.sum()),
             steady_cost=plan.steady_cost,
             autocorrelation=plan.autocorrelation,
@@ -312,6 +312,14 @@ class Search:
         """Control steps of all windows of all searches under one system each."""
         return self._running(state) * self.window_count(state) * self.horizon
 
+    def _impatient(self, state: SearchState) -> bool:
+        """Whether a step is the last that a search on all windows with unknown initial states needs to settle in.
+
+        Windows may be trusted after one step and not after the next, and parameters then go to and fro. From that step
+        on they settle as at contacts: at half a standard error, and the covariance counts the last step as an error.
+        """
+        return self.starts.unknown and bool(state.refining) and state.epochs + 1 >= self.search_epochs
+
     @staticmethod
     def _smooth(state: SearchState) -> bool:
         """Whether a search refines on windows without contacts."""
@@ -340,6 +348,12 @@ class Search:
             searches["damping"] = np.full(self.searches, FIRST_DAMPING)
             searches["state_damping"] = np.full_like(state.state_damping, FIRST_DAMPING)
         return replace(state, **searches, refining=1, waiting=self.starts.waiting, epochs=0)
+
+
+def _of_last_step(plan: Plan) -> Float[np.ndarray, "d d"]:
+    """What the least damped step adds to the scatter of the cost's gradient, where it counts as an error."""
+    pull = plan.bread @ plan.steps[0]
+    return np.outer(pull, pull)
 
 
 def chosen(outcome: Outcome) -> tuple[int, float]:
