@@ -6,6 +6,7 @@ import pytest
 from madoc.identification.score_tests import (
     Products,
     deviate,
+    imitators,
     joint_shift,
     parameter_shift,
     score,
@@ -30,7 +31,10 @@ def test_a_change_and_its_error():
 
 
 def test_a_column_that_parameters_imitate_is_none():
-    assert score(Products.of(NOISE, ONES, 3.0 * ONES), 2) is None
+    products = Products.of(NOISE, ONES, 3.0 * ONES)
+    assert score(products, 2) is None
+    assert imitators(products, 2) == pytest.approx([-3.0])
+    assert imitators(Products.of(NOISE, ONES, EFFECT[..., None]), 2) is None
 
 
 def test_the_parameter_makes_room_for_the_term():

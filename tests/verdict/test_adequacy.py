@@ -10,10 +10,11 @@ from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.identification.candidate_terms import INTEGRATION, TILTS
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
-from madoc.identification.term_tests import Alternative, MissingTerm
+from madoc.identification.term_tests import Alternative, ImitatedTerm, MissingTerm
 from madoc.verdict import judge
 from madoc.verdict.adequacy import (
     SURER,
+    about_imitated,
     as_likely,
     coarse_step,
     in_full,
@@ -63,6 +64,13 @@ def test_intervals_and_combinations_cover_the_alternatives():
     # The sum moves by 0.1 · 3 - 2 · 0.1 · 0.5 = 0.2, known to 2 · 0.1 · 2.4 = 0.48.
     assert wide.combinations[0].interval[1] == pytest.approx(2.2 + np.hypot(0.1, 0.48))
     assert wide.warnings == ["intervals were widened to cover what the data does not exclude: a spring"]
+
+
+def test_terms_that_parameters_imitate_are_told():
+    imitated = (ImitatedTerm("a spring", "jnt_stiffness.hinge", ("mass", "damping")),)
+    assert about_imitated(held()) == ()
+    (told,) = about_imitated(replace(held(), imitated=imitated))
+    assert told.startswith("the log cannot tell a spring (jnt_stiffness.hinge) from mass and damping: estimates assume")
 
 
 def test_other_estimates_by_a_coarse_step_are_taken_in_full():

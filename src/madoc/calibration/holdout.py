@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
-from madoc.identification.term_tests import Alternative, MissingTerm
+from madoc.identification.term_tests import Alternative, ImitatedTerm, MissingTerm
 
 Word = Literal["CALIBRATED", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
 
@@ -135,6 +135,7 @@ class Judged:
         control_steps: Control steps that were simulated for this record.
         missing_terms: Terms that the model may lack, the most significant first.
         alternatives: Other estimates that the log does not exclude, which the intervals cover.
+        imitated: Terms that the model has none of and parameters imitate, which the intervals do not cover.
         tested: False where the log should tell whether the model lacks a term, but is too short for that.
         at_end: Parameters estimated at an end of their range that is no physical bound.
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
@@ -154,6 +155,7 @@ class Judged:
     control_steps: int
     missing_terms: tuple[MissingTerm, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
+    imitated: tuple[ImitatedTerm, ...] = ()
     tested: bool = True
     at_end: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()

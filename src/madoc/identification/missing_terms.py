@@ -27,13 +27,14 @@ from madoc.identification.fitted_windows import Fit, fit_windows, negligible, pr
 from madoc.identification.information import NORMAL_95
 from madoc.identification.joint_forces import force_effects, is_joint_force
 from madoc.identification.replay import Readings
-from madoc.identification.score_tests import deviate, joint_shift, parameter_shift, score
+from madoc.identification.score_tests import deviate, imitators, joint_shift, parameter_shift, score
 from madoc.identification.states import LoggedStates
 from madoc.identification.term_tests import (
     DISAGREEING,
     FEWEST,
     SUSPICIOUS,
     Alternative,
+    ImitatedTerm,
     MissingTerm,
     TermTests,
     term_of,
@@ -56,6 +57,9 @@ LIKELY_FRICTION = 1.0
 LIKELY_FORCE = 3.5
 """|t| from which a force at a joint counts though it is not certain; of a hundred that are tested, one log in twenty
 has such a one by chance."""
+MOVES_TOO = 0.1
+"""Shift of a parameter in its half-widths over the largest shift of any, from which it counts among the imitators of a
+term."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
 
 
@@ -66,12 +70,14 @@ class Suspicions:
     Attributes:
         terms: Candidates with a physical sign, such as friction that takes energy out, the most significant first.
         alternatives: Other estimates that it does not exclude.
+        imitated: Terms that the model has none of and of which the log cannot tell whether they are missing.
         control_steps: Control steps that were simulated to find that out.
         tested: Whether there were enough windows to find anything.
     """
 
     terms: tuple[MissingTerm, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
+    imitated: tuple[ImitatedTerm, ...] = ()
     control_steps: int = 0
     tested: bool = True
 
@@ -137,7 +143,8 @@ def suspicions(
         further = [*_rivals(tests, chosen), *_further(tests, chosen)]
         others += [replace(_with_terms(tests, rivals), terms=False) for rivals in further]
     others += [*_of_friction(tests, chosen), *_of_forces(tests, chosen)]
-    return Suspicions(tuple(sorted(terms, key=lambda term: -abs(term.t))), tuple(others), spent)
+    most_significant_first = sorted(terms, key=lambda term: -abs(term.t))
+    return Suspicions(tuple(most_significant_first), tuple(others), tuple(_imitated(tests)), spent)
 
 
 @dataclass(frozen=True)
@@ -329,6 +336,21 @@ def _of_forces(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
         found = tests.score(index, chosen) if is_joint_force(candidate.cause) else None
         if found is not None and abs(found.t) >= LIKELY_FORCE:
             yield replace(_with_terms(tests, [index, *chosen]), terms=False)
+
+
+def _imitated(tests: TermTests) -> Iterator[ImitatedTerm]:
+    """Terms that the model has none of and parameters imitate, as a mass does a spring where a joint moves little."""
+    for index, candidate in enumerate(tests.tried):
+        if candidate.known_before or not candidate.parameter or candidate.nominal > candidate.least:
+            continue
+        moved = imitators(tests.products, 1 + tests.products.count + index)
+        if moved is not None:
+            shifts = {name: abs(shift) for name, shift in tests.by_name(moved).items()}
+            most = max(shifts.values())
+            names = [name for name, shift in shifts.items() if shift >= MOVES_TOO * most]
+            yield ImitatedTerm(
+                candidate.cause, candidate.parameter, tuple(sorted(names, key=lambda name: -shifts[name]))
+            )
 
 
 def _of_other_windows(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[Alternative]:

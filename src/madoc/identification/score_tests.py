@@ -150,6 +150,18 @@ def score(
     return Score(change, error, change**2 * power / float(squares), -response * change, freedom)
 
 
+def imitators(products: Products, index: int) -> Float[np.ndarray, " d"] | None:
+    """How the parameters move for a change of one in a column that they imitate; None of one that they do not.
+
+    Then `score` finds nothing: whatever the column's coefficient is, the residuals are the same at other parameters.
+    """
+    included = products.parameters
+    total = products.bounded([*included, index]).sum(0)
+    imitation = _solved(total[np.ix_(included, included)], total[included, index])
+    alone = total[index, index] - imitation @ total[included, index]
+    return -imitation if total[index, index] > 0.0 and alone <= _DISTINCT * total[index, index] else None
+
+
 def joint_shift(
     products: Products, terms: Sequence[int]
 ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:

@@ -67,6 +67,21 @@ class Alternative:
 
 
 @dataclass(frozen=True)
+class ImitatedTerm:
+    """A term whose effect the parameters imitate in all of the logged motion: no test can tell whether it is missing.
+
+    Attributes:
+        cause: What the term stands for, in words.
+        parameter: The parameter of the spec that adds it.
+        imitators: The calibrated parameters that would be wrong in its place, the one that moves most first.
+    """
+
+    cause: str
+    parameter: str
+    imitators: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class TermTests:
     """What score tests need: products of residuals and derivatives, the candidates, and the scale of shifts.
 

@@ -216,6 +216,19 @@ def with_widened_intervals(result: CalibrationResult, holdout: HoldOut) -> Calib
     return replace(result.with_intervals(grown, _sentence(holdout.alternatives)), combinations=told)
 
 
+def about_imitated(holdout: HoldOut) -> tuple[str, ...]:
+    """A sentence on the terms that calibrated parameters imitate, which no verdict and no interval covers."""
+    if not holdout.imitated:
+        return ()
+    which = "; ".join(
+        f"{each.cause} ({each.parameter}) from {' and '.join(each.imitators)}" for each in holdout.imitated
+    )
+    return (
+        f"the log cannot tell {which}: estimates assume that the machine has no more of it than the model; if it may, "
+        "add it to the spec, or log motions that tell them apart",
+    )
+
+
 def _covering(
     combination: Combination, result: CalibrationResult, alternatives: tuple[Alternative, ...]
 ) -> Combination:

@@ -13,7 +13,7 @@ from madoc.data import Dataset
 from madoc.errors import MadocError
 from madoc.identification.noise import difference_noise
 from madoc.simulation.base import Simulator
-from madoc.verdict.adequacy import with_widened_intervals
+from madoc.verdict.adequacy import about_imitated, with_widened_intervals
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.fitted import fitted
 from madoc.verdict.judge import judge
@@ -72,7 +72,8 @@ def assess(
     holdout = measured(bench, result.mean, result.interval)
     widened = with_widened_intervals(result, holdout)
     verdict = judge(holdout, settled=result.settled, long_tails=result.long_tails, combinations=widened.combinations)
-    widened = replace(widened, verdict=verdict, holdout=holdout)
+    warnings = [*widened.warnings, *about_imitated(holdout)]
+    widened = replace(widened, verdict=verdict, holdout=holdout, warnings=warnings)
     return Assessment(verdict, holdout, widened)
 
 

@@ -242,6 +242,7 @@ def judged(
             if place < _MOST_TERMS or term.cause == INTEGRATION or is_certain(term)
         ),
         alternatives=alternatives,
+        imitated=doubts.imitated,
         tested=doubts.tested,
         contradictions=tuple(each.sentence for each in found if each.contradicts),
         coarseness=coarse,
