@@ -2,10 +2,10 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from madoc.identification.candidate_terms import Candidate
 from madoc.identification.fitted_windows import Fit, fit_windows, products_of
@@ -27,23 +27,33 @@ DRIFT = "a value that changes over the log"
 WITHIN_RUNS = "a value that changes within each run"
 DRIFTS = (DRIFT, WITHIN_RUNS)
 """Causes of a missing term that is a parameter itself, as it changes."""
+FEWEST_OF_A_RUN = 3
+"""Fewest windows of a run beyond the number of parameters, of which its values are estimated: their errors count only
+together with those of other runs."""
 FEWEST_RUNS = 3
 """Fewest degrees of freedom of a variance between runs; with fewer, runs of their own motions would seem to differ."""
 
 
 def drifts_of(
-    tests: TermTests, simulator: Simulator, readings: Readings, fit: Fit, point: Float[np.ndarray, " d"]
+    tests: TermTests,
+    simulator: Simulator,
+    readings: Readings,
+    runs: Int[np.ndarray, " windows"],
+    fit: Fit,
+    point: Float[np.ndarray, " d"],
 ) -> tuple[list[MissingTerm], list[Alternative], int]:
     """The most significant change of each parameter, and estimates of parts of the log that disagree.
 
     A parameter may change over the log, within each run, as where a drive warms up, or from run to run.
 
-    Thirds of the log are fitted by themselves only where a score test says that a parameter changes.
+    Thirds of the log, and single runs, are fitted by themselves only where a test says that a parameter changes: score
+    tests underestimate a change that leaves residuals far from noise, which count little.
 
     Args:
         tests: Score tests of the log.
         simulator: The model with its calibrated parameters.
         readings: The windows that the tests are of.
+        runs: The episode that each of them is from.
         fit: What they were fitted by.
         point: The estimate in [-1, 1], from which shifts count.
 
@@ -52,12 +62,21 @@ def drifts_of(
     """
     drifts, spent = list(_drifts(tests)), 0
     others = list(_of_parts(drifts))
-    between, of_runs = _between_runs(tests)
-    others += of_runs
-    if any(term.cause == DRIFT and abs(term.t) >= DISAGREEING for term in drifts):
-        thirds, spent = _fitted_thirds(simulator, readings, fit)
-        drifts += list(_changes(tests, thirds, drifts))
-        others += _of_thirds(tests, thirds, drifts, point)
+    between, covering = _between_runs(tests)
+    others += covering
+    disagreeing = dict.fromkeys(term.parameter for term in drifts if term.cause == DRIFT and abs(term.t) >= DISAGREEING)
+    if disagreeing:
+        time = np.linspace(-1.0, 1.0, len(readings))
+        thirds, spent = _fitted_parts(simulator, readings, fit, [time < -1.0 / 3.0, time > 1.0 / 3.0])
+        if len(thirds) == 2:
+            drifts += list(_changes(tests, thirds, drifts))
+            others += _of_fitted_parts(tests, thirds, disagreeing, point, "over the log")
+    differing = [term.parameter for term in between if term.t >= SUSPICIOUS]
+    if differing:
+        single = [runs == run for run in np.unique(runs)]
+        fitted, of_runs = _fitted_parts(simulator, readings, fit, single, fewest=FEWEST_OF_A_RUN)
+        others += _of_fitted_runs(tests, fitted, differing, point)
+        spent += of_runs
     return list(_most_certain([*drifts, *between])), others, spent
 
 
@@ -115,40 +134,40 @@ def _between_runs(tests: TermTests) -> tuple[list[MissingTerm], list[Alternative
 
 
 @dataclass(frozen=True)
-class _Third:
-    """The estimate of a third of the log: its point in [-1, 1], the variance of that, and its degrees of freedom."""
+class _Part:
+    """The estimate of a part of the log: its point in [-1, 1], the variance of that, and its degrees of freedom."""
 
     point: Float[np.ndarray, " d"]
     variance: Float[np.ndarray, " d"]
     freedom: int
 
 
-def _fitted_thirds(simulator: Simulator, readings: Readings, fit: Fit) -> tuple[list[_Third], int]:
-    """Estimates of the first and of the last third of the log, and the control steps simulated.
-
-    There are none where a third has too few windows.
-
-    A score test underestimates a change that leaves residuals far from noise, which count little.
-    """
-    time, found, spent = np.linspace(-1.0, 1.0, len(readings)), list[_Third](), 0
-    for third in (time < -1.0 / 3.0, time > 1.0 / 3.0):
-        if third.sum() < FEWEST + len(fit.point):
-            return [], spent
-        part = replace(readings, actions=readings.actions[third], observed=readings.observed[third])
-        own = fit_windows(simulator, part, fit.states[third], fit.point)
-        products, spent = products_of(own.slopes, part, len(own.point)), spent + own.control_steps
-        if products is None or len(products) < FEWEST + len(own.point):
-            return [], spent
+def _fitted_parts(
+    simulator: Simulator,
+    readings: Readings,
+    fit: Fit,
+    parts: Iterable[Bool[np.ndarray, " windows"]],
+    *,
+    fewest: int = FEWEST,
+) -> tuple[list[_Part], int]:
+    """Estimates of the parts of the log with `fewest` windows more than parameters, and the control steps simulated."""
+    found, spent = list[_Part](), 0
+    for part in parts:
+        if part.sum() < fewest + len(fit.point):
+            continue
+        own_readings = readings.of(np.flatnonzero(part))
+        own = fit_windows(simulator, own_readings, fit.states[part], fit.point)
+        products, spent = products_of(own.slopes, own_readings, len(own.point)), spent + own.control_steps
+        if products is None or len(products) < fewest + len(own.point):
+            continue
         step, covariance = parameter_shift(products)
         point, variance = np.clip(own.point + step, -1.0, 1.0), np.maximum(np.diag(covariance), 0.0)
-        found.append(_Third(point, variance, len(products) - 1))
+        found.append(_Part(point, variance, len(products) - 1))
     return found, spent
 
 
-def _changes(tests: TermTests, thirds: list[_Third], drifts: Iterable[MissingTerm]) -> Iterator[MissingTerm]:
+def _changes(tests: TermTests, thirds: list[_Part], drifts: Iterable[MissingTerm]) -> Iterator[MissingTerm]:
     """The change of each parameter from the first third to the last; `explained` is that of its score tests."""
-    if not thirds:
-        return
     first, last = thirds
     explained: dict[str, float] = defaultdict(float)
     for drift in drifts:
@@ -170,17 +189,33 @@ def _changes(tests: TermTests, thirds: list[_Third], drifts: Iterable[MissingTer
             )
 
 
-def _of_thirds(
-    tests: TermTests, thirds: list[_Third], drifts: Iterable[MissingTerm], point: Float[np.ndarray, " d"]
+def _of_fitted_parts(
+    tests: TermTests, parts: list[_Part], names: Iterable[str], point: Float[np.ndarray, " d"], changing: str
 ) -> Iterator[Alternative]:
-    """The estimates of both thirds for each parameter that certainly differs between parts of the log."""
-    disagreeing = dict.fromkeys(term.parameter for term in drifts if term.cause == DRIFT and abs(term.t) >= DISAGREEING)
-    for third in thirds:
-        shifts = tests.by_name(third.point - point)
-        errors = tests.by_name(NORMAL_95 * np.sqrt(third.variance))
-        for name in disagreeing:
-            causes = (f"{name} changing over the log",)
+    """The estimates of all parts for each parameter that differs between them."""
+    for part in parts:
+        shifts = tests.by_name(part.point - point)
+        errors = tests.by_name(NORMAL_95 * np.sqrt(part.variance))
+        for name in names:
+            causes = (f"{name} changing {changing}",)
             yield Alternative(causes, False, {name: shifts[name]}, {name: errors[name]}, parts=True)
+
+
+def _of_fitted_runs(
+    tests: TermTests, runs: list[_Part], names: Iterable[str], point: Float[np.ndarray, " d"]
+) -> Iterator[Alternative]:
+    """For each parameter that differs from run to run the mean of its estimates, and an interval for any of them.
+
+    Their standard deviation is that of the estimates beyond their own errors (DerSimonian and Laird 1986).
+    """
+    if len(runs) <= FEWEST_RUNS:
+        return
+    points, variances = np.stack([run.point for run in runs]), np.stack([run.variance for run in runs])
+    between = np.sqrt(np.maximum(points.var(0, ddof=1) - variances.mean(0), 0.0))
+    shifts, errors = tests.by_name(points.mean(0) - point), tests.by_name(NORMAL_95 * between)
+    for name in names:
+        cause = f"{name} changing from run to run"
+        yield Alternative((cause,), False, {name: shifts[name]}, {name: errors[name]}, parts=True)
 
 
 def _most_certain(drifts: Iterable[MissingTerm]) -> Iterable[MissingTerm]:

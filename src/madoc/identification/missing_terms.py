@@ -122,8 +122,8 @@ def suspicions(
     if products is None or len(products) < FEWEST + len(led):
         return Suspicions(control_steps=spent, tested=negligible(both))
     tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
-    drifts, others, of_thirds = drifts_of(tests, simulator, readings, fit, point)
-    spent += of_thirds
+    drifts, others, of_parts = drifts_of(tests, simulator, readings, runs, fit, point)
+    spent += of_parts
     terms, others = (
         [*_terms(tests), *_below_minimum(tests, led), *drifts],
         [*others, *_of_other_windows(tests, led - point)],
