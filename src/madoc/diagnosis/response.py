@@ -178,9 +178,10 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     those after it depend on the motion where a controller chose them.
 
     A noisy state leaves part of what earlier actions did to their own effect, and its noise is in the change too. So
-    the regression is by instrumental variables (two-stage least squares): the state enters as predicted from the state
-    two rows before, with whose noise it has none in common even where speeds are differences of positions. Actions
-    count as free of that noise: where a controller computes them from noisy readings, lags come out too early.
+    there is a second regression by instrumental variables (two-stage least squares): the state enters as predicted from
+    the state two rows before, with whose noise it has none in common even where speeds are differences of positions.
+    Its lags come out too early where a controller computes actions from noisy readings, and wrong where contacts make
+    the prediction poor. So what both regressions tell counts: the smaller gain and lag, and the larger errors.
     """
     joints, motion = _motion(dataset, simulator)
     if not joints:
@@ -200,13 +201,23 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     own = [np.arange(end - len(window), end) for end, window in zip(ends, windows, strict=True)]
     found = []
     for at, joint in enumerate(joints):
-        estimates, share = _regressed(design, instruments, motion.change[kept, at], own[at])
-        gains = estimates.sum(-1)
-        taken = np.full(len(gains), motion.ahead[at])
-        taken = np.divide(estimates @ windows[at], gains, out=taken, where=gains != 0.0)
-        lags = simulator.control_step * (taken - motion.ahead[at])
-        found.append(Response(joint, float(gains[0]), _jackknife(gains), float(lags[0]), _jackknife(lags), share))
+        both = []
+        for predicting in (design, instruments):  # ordinary least squares, and in two stages
+            estimates, share = _regressed(design, predicting, motion.change[kept, at], own[at])
+            gains = estimates.sum(-1)
+            taken = np.full(len(gains), motion.ahead[at])
+            taken = np.divide(estimates @ windows[at], gains, out=taken, where=gains != 0.0)
+            lags = simulator.control_step * (taken - motion.ahead[at])
+            both.append((gains[0], _jackknife(gains), lags[0], _jackknife(lags), share))
+        gain, gain_error, lag, lag_error, shares = zip(*both, strict=True)
+        common = _common(*gain), max(gain_error), _common(*lag), max(lag_error), min(shares)
+        found.append(Response(joint, *map(float, common)))
     return tuple(found)
+
+
+def _common(one: float, other: float) -> float:
+    """The number nearer to 0 of two, 0 if their signs differ."""
+    return min(one, other, key=abs) if one * other > 0.0 else 0.0
 
 
 def _motion(dataset: Dataset, simulator: Simulator) -> tuple[tuple[DrivenJoint, ...], _Motion]:
