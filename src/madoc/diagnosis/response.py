@@ -196,14 +196,22 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     if len(rows) < _FEWEST * (motion.state.shape[1] + sum(len(window) for window in windows)):
         return ()
     earlier = motion.state[np.searchsorted(motion.rows, rows - _EARLIER)]
-    design, instruments = (np.concatenate([state, *taps], axis=1) for state in (motion.state[kept], earlier))
-    ends = motion.state.shape[1] + np.cumsum([len(window) for window in windows])
+    table = np.concatenate([earlier, *taps, motion.state[kept], motion.change[kept]], axis=1)
+    scale = np.maximum(np.sqrt((table**2).mean(0)), np.finfo(float).tiny)
+    scale[-len(joints) :] = 1.0
+    parts = np.stack([part.T @ part for part in np.array_split(table / scale, _BLOCKS)])
+    states, acted = motion.state.shape[1], sum(len(window) for window in windows)
+    actions = np.arange(states, states + acted)
+    instruments, design = (np.append(first + np.arange(states), actions) for first in (0, states + acted))
+    ends = states + np.cumsum([len(window) for window in windows])
     own = [np.arange(end - len(window), end) for end, window in zip(ends, windows, strict=True)]
     found = []
     for at, joint in enumerate(joints):
         both = []
         for predicting in (design, instruments):  # ordinary least squares, and in two stages
-            estimates, share = _regressed(design, predicting, motion.change[kept, at], own[at])
+            change = table.shape[1] - len(joints) + at
+            estimates, share = _regressed(parts, len(rows), predicting, design, change, own[at])
+            estimates /= scale[design[own[at]]]
             gains = estimates.sum(-1)
             taken = np.full(len(gains), motion.ahead[at])
             taken = np.divide(estimates @ windows[at], gains, out=taken, where=gains != 0.0)
@@ -275,30 +283,27 @@ def _peaks(motion: _Motion, action: Float[np.ndarray, "rows joints"], control_st
 
 
 def _regressed(
-    design: Float[np.ndarray, "rows columns"],
-    instruments: Float[np.ndarray, "rows columns"],
-    change: Float[np.ndarray, " rows"],
+    parts: Float[np.ndarray, "parts columns columns"],
+    rows: int,
+    instruments: Int[np.ndarray, " terms"],
+    design: Int[np.ndarray, " terms"],
+    change: int,
     own: Int[np.ndarray, " taps"],
 ) -> tuple[Float[np.ndarray, "estimates taps"], float]:
     """The coefficients of a joint's own action, of the whole log and without each of its parts; and its share.
 
     Both stages of the least squares leave a part out: the design's columns as the instruments predict them, and the
-    change as those predict it.
+    change as those predict it. `parts` are products of all columns in each part of the log, `own` places in the design.
     """
-    count, rows = design.shape[1], len(design)
-    table = np.column_stack([instruments, design, change])
-    scale = np.maximum(np.sqrt((table**2).mean(0)), np.finfo(float).tiny)
-    scale[-1] = 1.0
-    parts = np.stack([part.T @ part for part in np.array_split(table / scale, _BLOCKS)])
-    whole = parts.sum(0)
+    whole, count = parts.sum(0), len(design)
 
     def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
         return np.linalg.solve(matrix + _RIDGE * rows * np.eye(len(matrix)), right)
 
     def second(products: np.ndarray) -> np.ndarray:
         """Products of the predicted columns, the change behind them."""
-        mixed = products[:count, count:]
-        return np.asarray(mixed.T @ solved(products[:count, :count], mixed))
+        mixed = products[np.ix_(instruments, np.append(design, change))]
+        return np.asarray(mixed.T @ solved(products[np.ix_(instruments, instruments)], mixed))
 
     everything, others = np.arange(count), np.setdiff1d(np.arange(count), own)
 
@@ -307,8 +312,10 @@ def _regressed(
 
     predicted = second(whole)
     estimates = np.stack([coefficients(each, everything)[own] for each in (predicted, *map(second, whole - parts))])
-    left = [whole[-1, -1] - predicted[count, some] @ coefficients(predicted, some) for some in (others, everything)]
-    return estimates / scale[count + own], float(1.0 - left[1] / max(left[0], np.finfo(float).tiny))
+    left = [
+        whole[change, change] - predicted[count, some] @ coefficients(predicted, some) for some in (others, everything)
+    ]
+    return estimates, float(1.0 - left[1] / max(left[0], np.finfo(float).tiny))
 
 
 def _jackknife(values: Float[np.ndarray, " estimates"]) -> float:

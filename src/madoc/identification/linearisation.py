@@ -111,8 +111,8 @@ def slopes_of_windows(
 ) -> WindowSlopes:
     """Derivatives by parameters and by initial states; the latter are one-sided.
 
-    `by_points` are residuals at a point alone, at its `difference_points`, or at its `one_sided_points`; `by_shifts` at
-    the first point with each value of the initial states in turn moved by its width.
+    `by_points` are residuals at a point alone, at its `difference_points`, or at its `one_sided_points`.
+    `by_shifts` are those at the first point, with each value of the initial states in turn moved by its width.
     """
     whole = np.isfinite(by_points).all((0, 2)) & np.isfinite(by_shifts).all((0, 2))
     with np.errstate(invalid="ignore"):
