@@ -106,7 +106,7 @@ def chromium() -> Iterator[Page]:
     """A page in a fresh Chromium, which ends with the block."""
     assert CHROMIUM is not None
     to_it, from_it = os.pipe(), os.pipe()
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:  # its helpers may still write there
         redirected = f'exec "$@" 3<&{to_it[0]} 4>&{from_it[1]}'
         process = subprocess.Popen(
             ["bash", "-c", redirected, "chromium", CHROMIUM, *FLAGS, f"--user-data-dir={profile}", "about:blank"],

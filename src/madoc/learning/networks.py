@@ -59,7 +59,8 @@ class Network(eqx.Module):
                 # the slopes, on a CPU.
                 weight = jax.lax.optimization_barrier(weight)
             rows = rows @ weight
-            rows = rows + jnp.broadcast_to(layer.bias, rows.shape)
+            # A product, so that the bias's gradient is one too: XLA shares a long sum among cores, which decide its bits.
+            rows = rows + jnp.ones((*rows.shape[:-1], 1)) @ layer.bias[None]
             if index + 1 < len(self.layers):
                 rows = self.activation(rows)
                 if self.dropout and key is not None:
