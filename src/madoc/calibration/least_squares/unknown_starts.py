@@ -130,7 +130,7 @@ class UnknownStarts:
     @staticmethod
     def trial_columns(*, smooth: bool) -> int:
         """Number of systems simulated for the steps tried in an epoch; for smooth motion the first mostly serves."""
-        return len(FOLLOWED) * (1 if smooth else len(TRIALS) + 1)
+        return 1 if smooth else len(FOLLOWED) * (len(TRIALS) + 1)
 
     @staticmethod
     def settling_columns(problem: CalibrationProblem) -> int:
@@ -215,16 +215,17 @@ class UnknownStarts:
     ) -> list[Outcome]:
         """Costs after every step of every search, with the share of its state's step that fits each window best.
 
-        Where a search refines on windows without contacts, the least damped step is tried first, and the others only if
-        that does not help: motion is smooth there, and the whole step mostly leads to the minimum.
+        Where a search refines on windows without contacts, the least damped step is tried first, with the whole steps
+        of the states, and the others only if that does not help: motion is smooth there, and the whole step mostly
+        leads to the minimum.
         """
         spent = 0
         if refining and not self.touching.any():
-            alone = self._tried(plans, states, trials=1)
+            alone = self._tried(plans, states, trials=1, shares=FOLLOWED[:1])
             if all(self._helps(plan, outcome) for plan, outcome in zip(plans, alone, strict=True)):
                 return [outcome.with_no_step() for outcome in alone]
-            spent = len(FOLLOWED) * len(self.readings)
-        every = self._tried(plans, states, trials=len(TRIALS) + 1)
+            spent = len(self.readings)
+        every = self._tried(plans, states, trials=len(TRIALS) + 1, shares=FOLLOWED)
         return [replace(outcome, simulations=outcome.simulations + spent) for outcome in every]
 
     @staticmethod
@@ -238,25 +239,28 @@ class UnknownStarts:
         states: Float[np.ndarray, "searches windows state"],
         *,
         trials: int,
+        shares: tuple[float, ...],
     ) -> list[Outcome]:
-        """Costs after the first steps of every search, each with all shares of the initial states' steps."""
-        shares, readings, size = np.array(FOLLOWED)[:, None, None], self.readings, states.shape[2]
+        """Costs after the first steps of every search, each with these shares of the initial states' steps."""
+        ways, readings, size = np.array(shares)[:, None, None], self.readings, states.shape[2]
         starts = [
-            state + shares * readings.in_state_units(plan.state_steps[:trials], size)[:, None]
+            state + ways * readings.in_state_units(plan.state_steps[:trials], size)[:, None]
             for plan, state in zip(plans, states, strict=True)
         ]
-        flat = np.concatenate(starts).reshape(-1, len(FOLLOWED) * len(readings), size)
+        flat = np.concatenate(starts).reshape(-1, len(shares) * len(readings), size)
         points = np.concatenate([plan.point + plan.steps[:trials] for plan in plans])
         residuals = readings.residuals(self.simulator, points, flat)
         residuals = residuals.reshape(len(plans), trials, *residuals.shape[1:])
         return [
-            self._outcome(plan, part / np.tile(plan.deviation, readings.steps + 1))
+            self._outcome(plan, part / np.tile(plan.deviation, readings.steps + 1), shares)
             for part, plan in zip(residuals, plans, strict=True)
         ]
 
-    def _outcome(self, plan: Plan, residuals: Float[np.ndarray, "trials ways windows values"]) -> Outcome:
+    def _outcome(
+        self, plan: Plan, residuals: Float[np.ndarray, "trials ways windows values"], shares: tuple[float, ...]
+    ) -> Outcome:
         costs, simulations = window_costs(residuals, self.loss), int(np.prod(residuals.shape[:-1]))
-        followed = np.array(FOLLOWED)[costs.argmin(1)]
+        followed = np.array(shares)[costs.argmin(1)]
         if not plan.kept.any():
             return Outcome(FAILED_WINDOW, costs.min(1).mean(-1), followed, 0, simulations)
         before, after = window_costs(plan.residuals, self.loss)[plan.kept], costs.min(1)[:, plan.kept]
