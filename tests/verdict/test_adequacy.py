@@ -63,7 +63,14 @@ def test_intervals_and_combinations_cover_the_alternatives():
     assert wide.parameters["damping"].interval == pytest.approx([0.19, 0.71])
     # The sum moves by 0.1 · 3 - 2 · 0.1 · 0.5 = 0.2, known to 2 · 0.1 · 2.4 = 0.48.
     assert wide.combinations[0].interval[1] == pytest.approx(2.2 + np.hypot(0.1, 0.48))
-    assert wide.warnings == ["intervals were widened to cover what the data does not exclude: a spring"]
+    told = "intervals were widened to cover what the data does not exclude: "
+    assert wide.warnings == [told + "a spring"]
+    names = ("drag", "friction", "lag", "a load", "no move")
+    shifts = (0.5, 3.0, 2.0, 2.5, 0.0)
+    lesser = [replace(BEYOND, causes=(name,), shifts={"mass": shift}) for name, shift in zip(names, shifts, strict=True)]
+    lesser[-1] = replace(lesser[-1], errors={"mass": 0.0})
+    wide = with_widened_intervals(result, held(alternatives=tuple(lesser)))
+    assert wide.warnings == [told + "friction, a load, lag and, less, 1 more"]
 
 
 def test_terms_that_parameters_imitate_are_told():

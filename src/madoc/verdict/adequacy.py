@@ -39,6 +39,8 @@ NEARLY = 0.8
 """Share explained by a term over that of the one named; terms above it are as likely."""
 SURER = 1.314
 """Half of a 99 % interval over half of a 95 % interval: an alternative is covered unless one in a hundred is worse."""
+NAMED = 3
+"""Number of causes named for which intervals are widened."""
 EARTH = 0.03
 """m/s², by which gravity on the ground differs from the standard 9.80665 (poles, equator, mountains)."""
 
@@ -213,7 +215,7 @@ def with_widened_intervals(result: CalibrationResult, holdout: HoldOut) -> Calib
     if not grown:
         return result
     told = [_covering(combination, result, holdout.alternatives) for combination in result.combinations]
-    return replace(result.with_intervals(grown, _sentence(holdout.alternatives)), combinations=told)
+    return replace(result.with_intervals(grown, _sentence(holdout.alternatives, tuple(grown))), combinations=told)
 
 
 def about_imitated(holdout: HoldOut) -> tuple[str, ...]:
@@ -248,6 +250,10 @@ def _covering(
     return replace(combination, interval=(low, high))
 
 
-def _sentence(alternatives: tuple[Alternative, ...]) -> str:
-    causes = dict.fromkeys(cause for each in alternatives for cause in each.causes)
-    return f"intervals were widened to cover what the data does not exclude: {', '.join(causes)}"
+def _sentence(alternatives: tuple[Alternative, ...], names: tuple[str, ...]) -> str:
+    """The causes whose estimates move an end of these parameters' intervals, those that move one furthest first."""
+    moved = np.array([widening((each,), names).max() for each in alternatives])
+    furthest = [alternatives[index] for index in np.argsort(-moved, kind="stable") if moved[index] > 0.0]
+    causes = [*dict.fromkeys(cause for each in furthest for cause in each.causes)]
+    others = f" and, less, {len(causes) - NAMED} more" if len(causes) > NAMED else ""
+    return f"intervals were widened to cover what the data does not exclude: {', '.join(causes[:NAMED])}{others}"
