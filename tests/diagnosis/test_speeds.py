@@ -7,7 +7,7 @@ from mujoco_log import recorded
 
 from madoc import simulation
 from madoc.data import logs
-from madoc.diagnosis.speeds import speed_findings
+from madoc.diagnosis.speeds import impacts, speed_findings
 
 
 @pytest.fixture
@@ -71,3 +71,20 @@ def test_joints_that_move_in_one_part_of_the_log_alone(told, trembling):
         columns[name] = 0.1 * (1.0 - np.cos(phase)) + trembling * np.sin(time)
         columns[f"{name}_speed"] = 0.2 * np.pi * np.sin(phase) + trembling * np.cos(time)
     assert told(columns) == ([], False)
+
+
+def test_impacts_are_left_out_and_steps_of_an_encoder_are_not():
+    random, step, height, speed = np.random.default_rng(0), 0.002, 1.0, 0.0
+    logged, bounced = [], []
+    for _ in range(2000):
+        speed -= 9.81 * step
+        height += step * speed
+        bounced.append(height < 0.0)
+        if bounced[-1]:
+            height, speed = -height, -0.8 * speed
+        logged.append(speed + 0.01 * random.standard_normal())
+    np.testing.assert_array_equal(impacts(np.diff(logged)), bounced[1:])
+    angle = np.sin(3.0 * np.arange(5000) / 1000.0)
+    speeds = 1000.0 * np.diff(np.round(angle / 0.0015) * 0.0015)
+    assert not impacts(np.diff(speeds)).any()
+    assert not impacts(np.zeros(5)).any()

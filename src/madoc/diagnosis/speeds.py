@@ -41,6 +41,8 @@ _NEAR = (0.8, 1.25)
 JUMP = 8.0
 """Distance of a change of speed from its neighbours', in standard deviations of that by the median absolute deviation,
 from which it is taken for an impact: in such a row the mean of two speeds is not that between them."""
+_STEPS = 3.0
+"""Smallest distance from its neighbours of a change of speed that counts as an impact, in median changes of the log."""
 _NEIGHBOURS = 5
 """Number of rows, the row itself among them, that are neighbours."""
 _BLOCKS = 12
@@ -118,15 +120,21 @@ def _pairs(dataset: Dataset, simulator: Simulator) -> list[_Pair]:
         change = after[:, dof] - before[:, dof]
         first, last = before[:, model.nv + dof], after[:, model.nv + dof]
         expected = 0.5 * (first + last) * simulator.control_step
-        pairs.append(_Pair(position, speed, change, expected, places - 0.5, starts, _jumps(last - first)))
+        pairs.append(_Pair(position, speed, change, expected, places - 0.5, starts, impacts(last - first)))
     return pairs
 
 
-def _jumps(change: Float[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
-    """Rows whose change of speed is unlike that of their neighbours, whose median a smooth change follows."""
+def impacts(change: Float[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+    """Rows whose change of speed is unlike that of their neighbours, whose median a smooth change follows.
+
+    It is also larger than the usual change of the whole log, which in speeds of an encoder is one of its steps.
+    """
+    moving = np.abs(change[change != 0.0])
+    if not len(moving):
+        return np.zeros(len(change), bool)
     apart = change - median_filter(change, _NEIGHBOURS)
-    usual = median_filter(np.abs(change), _NEIGHBOURS)
-    return (np.abs(apart) > JUMP * median_abs_deviation(apart, scale="normal")) & (np.abs(apart) > 2.0 * usual)
+    usual = np.maximum(2.0 * median_filter(np.abs(change), _NEIGHBOURS), _STEPS * np.median(moving))
+    return np.abs(apart) > np.maximum(JUMP * median_abs_deviation(apart, scale="normal"), usual)
 
 
 def _ratio(change: Float[np.ndarray, " rows"], expected: Float[np.ndarray, " rows"]) -> float | None:

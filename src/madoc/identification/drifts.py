@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from madoc.identification.candidate_terms import Candidate
 from madoc.identification.fitted_windows import Fit, fit_windows, products_of
 from madoc.identification.information import NORMAL_95
+from madoc.identification.random_effects import common
 from madoc.identification.replay import Readings
 from madoc.identification.score_tests import deviate, parameter_shift, score, variances_by_group
 from madoc.identification.term_tests import (
@@ -70,7 +71,7 @@ def drifts_of(
         thirds, spent = _fitted_parts(simulator, readings, fit, [time < -1.0 / 3.0, time > 1.0 / 3.0])
         if len(thirds) == 2:
             drifts += list(_changes(tests, thirds, drifts))
-            others += _of_fitted_parts(tests, thirds, disagreeing, point, "over the log")
+            others += _of_fitted_parts(tests, thirds, disagreeing, point)
     differing = [term.parameter for term in between if term.t >= SUSPICIOUS]
     if differing:
         single = [runs == run for run in np.unique(runs)]
@@ -190,15 +191,15 @@ def _changes(tests: TermTests, thirds: list[_Part], drifts: Iterable[MissingTerm
 
 
 def _of_fitted_parts(
-    tests: TermTests, parts: list[_Part], names: Iterable[str], point: Float[np.ndarray, " d"], changing: str
+    tests: TermTests, parts: list[_Part], names: Iterable[str], point: Float[np.ndarray, " d"]
 ) -> Iterator[Alternative]:
-    """The estimates of all parts for each parameter that differs between them."""
+    """The estimates of all parts of the log for each parameter that changes over it."""
     for part in parts:
         shifts = tests.by_name(part.point - point)
         errors = tests.by_name(NORMAL_95 * np.sqrt(part.variance))
         for name in names:
-            causes = (f"{name} changing {changing}",)
-            yield Alternative(causes, False, {name: shifts[name]}, {name: errors[name]}, parts=True)
+            cause = f"{name} changing over the log"
+            yield Alternative((cause,), False, {name: shifts[name]}, {name: errors[name]}, parts=True)
 
 
 def _of_fitted_runs(
@@ -206,16 +207,17 @@ def _of_fitted_runs(
 ) -> Iterator[Alternative]:
     """For each parameter that differs from run to run the mean of its estimates, and an interval for any of them.
 
-    Their standard deviation is that of the estimates beyond their own errors (DerSimonian and Laird 1986).
+    Mean and standard deviation are those of the random-effects model, in which a run that tells little counts little.
     """
     if len(runs) <= FEWEST_RUNS:
         return
-    points, variances = np.stack([run.point for run in runs]), np.stack([run.variance for run in runs])
-    between = np.sqrt(np.maximum(points.var(0, ddof=1) - variances.mean(0), 0.0))
-    shifts, errors = tests.by_name(points.mean(0) - point), tests.by_name(NORMAL_95 * between)
+    points, errors = np.stack([run.point for run in runs]), np.sqrt(np.stack([run.variance for run in runs]))
+    kinds = [common(*column) for column in zip(points.T, np.maximum(errors, np.finfo(float).tiny).T, strict=True)]
+    shifts = tests.by_name(np.array([kind.mean for kind in kinds]) - point)
+    reaches = tests.by_name(NORMAL_95 * np.array([kind.spread for kind in kinds]))
     for name in names:
         cause = f"{name} changing from run to run"
-        yield Alternative((cause,), False, {name: shifts[name]}, {name: errors[name]}, parts=True)
+        yield Alternative((cause,), False, {name: shifts[name]}, {name: reaches[name]}, parts=True)
 
 
 def _most_certain(drifts: Iterable[MissingTerm]) -> Iterable[MissingTerm]:

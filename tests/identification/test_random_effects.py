@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from madoc.suites.random_effects import between, common, outliers
+from madoc.identification.random_effects import between, common, outliers
 
 
 def test_equal_errors_by_hand():
