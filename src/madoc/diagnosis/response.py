@@ -54,20 +54,28 @@ _UNIT_ERRORS = {
 class Response:
     """The response of a joint's acceleration to its action, with standard errors from leaving out parts of the log.
 
+    Two regressions estimate it: see `measured_responses`.
+
     Attributes:
         joint: The joint and its action.
-        gain: Change of the joint's velocity in a control step over that of the action, in [-1, 1].
-        gain_error: Standard error of the gain.
+        gain: Change of the joint's velocity in a control step over that of the action, in [-1, 1]: that of the two
+            estimates which is nearer to 0, or 0 if their signs differ.
+        larger_gain: The other estimate.
+        gain_error: The larger standard error of the two.
         lag: Time from an action to the acceleration it causes, beyond that of a command held for a control step, s; 0
-            where the gain is 0.
-        lag_error: Standard error of the lag, s.
-        share: Share in [0, 1] of the acceleration's variance, beyond what the state explains, that the action explains.
+            where the gain is 0. Of two estimates as for the gain.
+        larger_lag: The other estimate, s.
+        lag_error: The larger standard error of the two, s.
+        share: Share in [0, 1] of the acceleration's variance, beyond what the state explains, that the action explains;
+            the smaller one.
     """
 
     joint: DrivenJoint
     gain: float
+    larger_gain: float
     gain_error: float
     lag: float
+    larger_lag: float
     lag_error: float
     share: float
 
@@ -119,7 +127,8 @@ def _lag_findings(response: Response, action: str, simulator: Simulator) -> list
     """A warning where a lag is certain, and no calibrated delay can stand for it."""
     step, lag, error = simulator.control_step, response.lag, response.lag_error
     delays = [row for row in simulator.parameters.parameters if row.field == "action_delay"]
-    if lag < max(LATE * step, CERTAIN * error) or any(row.low <= lag <= row.high for row in delays):
+    covered = (row.low <= each <= row.high for row in delays for each in (lag, response.larger_lag))
+    if lag < max(LATE * step, CERTAIN * error) or any(covered):
         return []
     what = (
         f"the acceleration of {response.joint.joint} follows it {lag:.3g} ± {2.0 * error:.1g} s late ({lag / step:.2g} "
@@ -143,11 +152,12 @@ def _gain_findings(response: Response, action: str, modelled: Float[np.ndarray, 
             Finding("warning", what, action, f"reverse its sign, or that of {joint}, in the spec or in the log", True)
         ]
     least, most = np.abs(modelled).min(), np.abs(modelled).max()
-    ratio = abs(measured) / (most if abs(measured) > most else least)
-    if least <= abs(measured) <= most or 1.0 / FAR < ratio < FAR:
+    size, larger = abs(measured), abs(response.larger_gain)
+    ratio = size / most if size > most else larger / least
+    if not (size >= FAR * most or larger <= least / FAR):
         return []
     factors = ((each, text) for factor, text in _UNIT_ERRORS.items() for each in (factor, 1.0 / factor))
-    mistake = next((text for each, text in factors if least / 1.5 < abs(measured) / each < 1.5 * most), "")
+    mistake = next((text for each, text in factors if least / 1.5 < size / each < 1.5 * most), "")
     what = f"it accelerates {joint} {ratio:.2g} times as much as anywhere in the ranges of the parameters"
     what += f": {mistake}?" if mistake else ""
     return [Finding("warning", what, action, "look at the units of the spec and of the log, and at the ranges", True)]
@@ -179,9 +189,9 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
 
     A noisy state leaves part of what earlier actions did to their own effect, and its noise is in the change too. So
     there is a second regression by instrumental variables (two-stage least squares): the state enters as predicted from
-    the state two rows before, with whose noise it has none in common even where speeds are differences of positions.
-    Its lags come out too early where a controller computes actions from noisy readings, and wrong where contacts make
-    the prediction poor. So what both regressions tell counts: the smaller gain and lag, and the larger errors.
+    the state two rows before, with whose noise it has none in common even where speeds are differences of the last two
+    positions. Its lags come out too early where a controller computes actions from noisy readings, and wrong where
+    contacts make the prediction poor. So only what both regressions tell counts.
     """
     joints, motion = _motion(dataset, simulator)
     if not joints:
@@ -191,41 +201,30 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     windows = [np.arange(max(0, peak - _TAPS), peak + _TAPS + 1) for peak in peaks]
     age = motion.rows - dataset.episode_starts[dataset.episode_of(motion.rows)]
     kept = np.flatnonzero(age >= max(_EARLIER + 1, *(window[-1] for window in windows)))
-    rows = motion.rows[kept]
-    taps = [action[rows[:, None] - window, joint.action] for window, joint in zip(windows, joints, strict=True)]
-    if len(rows) < _FEWEST * (motion.state.shape[1] + sum(len(window) for window in windows)):
+    if len(kept) < _FEWEST * (motion.state.shape[1] + sum(len(window) for window in windows)):
         return ()
-    earlier = motion.state[np.searchsorted(motion.rows, rows - _EARLIER)]
-    table = np.concatenate([earlier, *taps, motion.state[kept], motion.change[kept]], axis=1)
-    scale = np.maximum(np.sqrt((table**2).mean(0)), np.finfo(float).tiny)
-    scale[-len(joints) :] = 1.0
-    parts = np.stack([part.T @ part for part in np.array_split(table / scale, _BLOCKS)])
-    states, acted = motion.state.shape[1], sum(len(window) for window in windows)
-    actions = np.arange(states, states + acted)
-    instruments, design = (np.append(first + np.arange(states), actions) for first in (0, states + acted))
-    ends = states + np.cumsum([len(window) for window in windows])
-    own = [np.arange(end - len(window), end) for end, window in zip(ends, windows, strict=True)]
+    products = _products(motion, kept, action, windows, joints)
+    regressions = [_regressed(products, staged=staged) for staged in (False, True)]
     found = []
-    for at, joint in enumerate(joints):
+    for at, (joint, own) in enumerate(zip(joints, products.own, strict=True)):
         both = []
-        for predicting in (design, instruments):  # ordinary least squares, and in two stages
-            change = table.shape[1] - len(joints) + at
-            estimates, share = _regressed(parts, len(rows), predicting, design, change, own[at])
-            estimates /= scale[design[own[at]]]
-            gains = estimates.sum(-1)
+        for estimates, shares in regressions:
+            taps = estimates[:, own, at]
+            gains = taps.sum(-1)
             taken = np.full(len(gains), motion.ahead[at])
-            taken = np.divide(estimates @ windows[at], gains, out=taken, where=gains != 0.0)
+            taken = np.divide(taps @ windows[at], gains, out=taken, where=gains != 0.0)
             lags = simulator.control_step * (taken - motion.ahead[at])
-            both.append((gains[0], _jackknife(gains), lags[0], _jackknife(lags), share))
-        gain, gain_error, lag, lag_error, shares = zip(*both, strict=True)
-        common = _common(*gain), max(gain_error), _common(*lag), max(lag_error), min(shares)
-        found.append(Response(joint, *map(float, common)))
+            both.append((gains[0], _jackknife(gains), lags[0], _jackknife(lags), shares[at]))
+        gain, gain_error, lag, lag_error, share = zip(*both, strict=True)
+        told = *_smaller_first(*gain), max(gain_error), *_smaller_first(*lag), max(lag_error), min(share)
+        found.append(Response(joint, *map(float, told)))
     return tuple(found)
 
 
-def _common(one: float, other: float) -> float:
-    """The number nearer to 0 of two, 0 if their signs differ."""
-    return min(one, other, key=abs) if one * other > 0.0 else 0.0
+def _smaller_first(one: float, other: float) -> tuple[float, float]:
+    """Two numbers, the one nearer to 0 first; 0 comes in its place if their signs differ."""
+    near, far = sorted((one, other), key=abs)
+    return (near if one * other > 0.0 else 0.0), far
 
 
 def _motion(dataset: Dataset, simulator: Simulator) -> tuple[tuple[DrivenJoint, ...], _Motion]:
@@ -282,40 +281,91 @@ def _peaks(motion: _Motion, action: Float[np.ndarray, "rows joints"], control_st
     return peaks
 
 
-def _regressed(
-    parts: Float[np.ndarray, "parts columns columns"],
-    rows: int,
-    instruments: Int[np.ndarray, " terms"],
-    design: Int[np.ndarray, " terms"],
-    change: int,
-    own: Int[np.ndarray, " taps"],
-) -> tuple[Float[np.ndarray, "estimates taps"], float]:
-    """The coefficients of a joint's own action, of the whole log and without each of its parts; and its share.
+@dataclass(frozen=True)
+class _Products:
+    """Products of the regression's columns in parts of the log, each column over its root mean square.
 
-    Both stages of the least squares leave a part out: the design's columns as the instruments predict them, and the
-    change as those predict it. `parts` are products of all columns in each part of the log, `own` places in the design.
+    Attributes:
+        parts: Products of all columns in each part of the log.
+        rows: Number of rows of the log.
+        instruments: Columns of the state two rows before and of the actions.
+        design: Columns of the state and of the actions.
+        changes: Columns of the joints' changes of velocity, in their own unit.
+        own: For each joint, places of its action's rows in the design.
+        scale: Root mean square of each column of the design.
     """
-    whole, count = parts.sum(0), len(design)
+
+    parts: Float[np.ndarray, "parts columns columns"]
+    rows: int
+    instruments: Int[np.ndarray, " terms"]
+    design: Int[np.ndarray, " terms"]
+    changes: Int[np.ndarray, " joints"]
+    own: list[Int[np.ndarray, " _"]]
+    scale: Float[np.ndarray, " terms"]
+
+
+def _products(
+    motion: _Motion,
+    kept: Int[np.ndarray, " some"],
+    action: Float[np.ndarray, "all action"],
+    windows: list[Int[np.ndarray, " _"]],
+    joints: tuple[DrivenJoint, ...],
+) -> _Products:
+    """Products of earlier state, actions, state and changes over these rows of the motion, one part after the other."""
+
+    def columns(part: np.ndarray) -> np.ndarray:
+        rows = motion.rows[part]
+        earlier = motion.state[np.searchsorted(motion.rows, rows - _EARLIER)]
+        taps = [action[rows[:, None] - window, joint.action] for window, joint in zip(windows, joints, strict=True)]
+        return np.concatenate([earlier, *taps, motion.state[part], motion.change[part]], axis=1)
+
+    parts = np.stack([block.T @ block for block in map(columns, np.array_split(kept, _BLOCKS))])
+    scale = np.sqrt(np.diagonal(parts.sum(0)) / len(kept))
+    scale[scale == 0.0] = scale[-len(joints) :] = 1.0
+    parts /= scale[:, None] * scale
+    sizes, states = [len(window) for window in windows], motion.state.shape[1]
+    actions = np.arange(states, states + sum(sizes))
+    instruments, design = (np.append(first + np.arange(states), actions) for first in (0, states + sum(sizes)))
+    own = np.split(states + np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+    changes = np.arange(len(scale) - len(joints), len(scale))
+    return _Products(parts, len(kept), instruments, design, changes, own, scale[design])
+
+
+def _regressed(
+    products: _Products, *, staged: bool
+) -> tuple[Float[np.ndarray, "estimates terms joints"], Float[np.ndarray, " joints"]]:
+    """The coefficients of every joint's change, of the whole log and without each of its parts; and actions' shares.
+
+    It is ordinary least squares or, if `staged`, that in two stages, of which both leave the part out: the design's
+    columns as the instruments predict them, and the changes as those predict them.
+    """
+    whole, count, changes = products.parts.sum(0), len(products.design), products.changes
+    targets = np.append(products.design, changes)
 
     def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-        return np.linalg.solve(matrix + _RIDGE * rows * np.eye(len(matrix)), right)
+        return np.linalg.solve(matrix + _RIDGE * products.rows * np.eye(len(matrix)), right)
 
-    def second(products: np.ndarray) -> np.ndarray:
-        """Products of the predicted columns, the change behind them."""
-        mixed = products[np.ix_(instruments, np.append(design, change))]
-        return np.asarray(mixed.T @ solved(products[np.ix_(instruments, instruments)], mixed))
+    def predicted(of: np.ndarray) -> np.ndarray:
+        """Products of the design's columns, as the instruments predict them, with each other and with the changes."""
+        if not staged:
+            return of[np.ix_(products.design, targets)]
+        mixed = of[np.ix_(products.instruments, targets)]
+        return np.asarray(mixed[:, :count].T @ solved(of[np.ix_(products.instruments, products.instruments)], mixed))
 
-    everything, others = np.arange(count), np.setdiff1d(np.arange(count), own)
-
-    def coefficients(predicted: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        return solved(predicted[np.ix_(columns, columns)], predicted[columns, count])
-
-    predicted = second(whole)
-    estimates = np.stack([coefficients(each, everything)[own] for each in (predicted, *map(second, whole - parts))])
-    left = [
-        whole[change, change] - predicted[count, some] @ coefficients(predicted, some) for some in (others, everything)
-    ]
-    return estimates, float(1.0 - left[1] / max(left[0], np.finfo(float).tiny))
+    everything = predicted(whole)
+    estimates = np.stack(
+        [
+            solved(each[:, :count], each[:, count:])
+            for each in (everything, *(predicted(whole - part) for part in products.parts))
+        ]
+    )
+    shares = []
+    for at, own in enumerate(products.own):
+        others, right = np.setdiff1d(np.arange(count), own), everything[:, count + at]
+        without = solved(everything[np.ix_(others, others)], right[others])
+        left = whole[changes[at], changes[at]] - np.array([right[others] @ without, right @ estimates[0, :, at]])
+        shares.append(float(1.0 - left[1] / max(left[0], np.finfo(float).tiny)))
+    return estimates / products.scale[:, None], np.array(shares)
 
 
 def _jackknife(values: Float[np.ndarray, " estimates"]) -> float:

@@ -49,8 +49,11 @@ STARTING_STRIDES = 1
 """Length in strides of the rows of windows from logged states where these are noisy and only a start is wanted."""
 NOISY_STRIDE = 1e-3
 """Noise of a channel in its typical changes in a stride; above it logged states are noisy where rows are close."""
-NOISY = 0.25
-"""Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5."""
+NOISY = 0.15
+"""Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5, and where none is the
+estimate of it is below 0.1 from a hundred windows on."""
+MORE = 2
+"""Smallest ratio of the numbers of windows for which more of the shortest ones are worth a search of their own."""
 
 
 @jax.tree_util.register_dataclass
@@ -379,7 +382,7 @@ def _lengthening(state: LeastSquaresState, length: int) -> LeastSquaresState:
 def _ended(state: LeastSquaresState, best: int) -> LeastSquaresState:
     """The end of lengthening; if only the shortest windows are explained, as at contacts, more of them follow."""
     first, wider = state.unknown[:LONGER]
-    if best or not first.rough or len(wider.rows) == len(first.rows):
+    if best or not first.rough or len(wider.rows) < MORE * len(first.rows):
         return _finished(state, best)
     return replace(_with(state, WIDER, widened(wider, first)), stage="widening", best=0, length=WIDER)
 

@@ -32,6 +32,8 @@ FIRST_STEPS = 2
 """Number of steps of initial states at contacts with whose result those of the following steps are compared."""
 FAR = 3.0
 """Distance in standard errors; once parameters have moved farther, initial states are looked for anew."""
+SHORTER = 1.0
+"""Smallest damping after a step that did not help at contacts: with less, the next would hardly be shorter."""
 _SMALLEST = 1e-100
 """Smallest tolerance, so that the ratio of a step to a tolerance of 0 is finite."""
 
@@ -239,12 +241,12 @@ class Search:
         undamped = np.full(states.shape[:2], settling.DAMPING_RANGE[0])
         (plan,) = windows.plans(state.point[:1], states, state.damping[:1], undamped, refining=True)
         after, better, cost = windows.profiled(plan, states[0], state.state_errors)
-        factor = TRIALS[0] if better else 1e3
+        damping = TRIALS[0] * state.damping[0] if better else max(1e3 * state.damping[0], SHORTER)
         new, step = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}, plan.steps[0]
         if better:
             new["point"][0] = np.clip(plan.point + step, -1.0, 1.0)
             new["states"][0], new["state_damping"][0] = after.states, after.damping
-        new["damping"][0] = np.clip(state.damping[0] * factor, *DAMPING_RANGE)
+        new["damping"][0] = np.clip(damping, *DAMPING_RANGE)
         new["cost"][0], new["moved"][0] = cost, self._relative_step(plan, step, ROUGHLY_SETTLED)
         if not better and state.damping[0] <= self.starts.stuck:
             new["moved"][0] = max(new["moved"][0], 1.0)  # a damped step may be small far from the minimum too
@@ -264,7 +266,7 @@ class Search:
         metrics = {"residual": float(np.sqrt(cost)) * noise, "moved": float(following.moved[0]), "noise": noise}
         if following.moved[0] < 1.0 and self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0:
             moved = np.maximum(following.moved, 1.0)
-            following = replace(following, waiting=self.starts.waiting, moved=moved)
+            following = replace(following, waiting=settling.RESTARTS, moved=moved)
         columns = 2 + 2 * len(step) + len(plan.spread)  # the last for the contacts
         spent = len(state.rows) * columns + after.simulations
         return following, Epoch(metrics, spent * self.horizon, stage="calibrating")
