@@ -126,11 +126,7 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     assert (state.waiting, state.rough) == (0, 0)
     assert epoch.control_steps == 40 * 5 * (1 + 2 + 2)
     np.testing.assert_array_equal(state.point, point)
-    patient, _ = replace(search, search_epochs=2).step(problem, state)
     state, epoch = search.step(problem, state)
-    # The last step that it has to settle in may be five times as long, and counts as an error.
-    assert patient.moved[0] == pytest.approx(5.0 * state.moved[0])
-    assert (np.diag(state.meat) > np.diag(patient.meat)).all()
     derivatives, tried = 1 + len(truth) + 2, 1  # the first step helps, so no other is tried
     assert epoch.control_steps == 40 * 5 * (derivatives + tried)
     assert (state.point != point).all()
@@ -141,6 +137,12 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     (outcome,) = windows.outcomes([astray], state.states, refining=True)
     assert outcome.simulations == 40 * (tried + 4 * 3)  # it does not help: every step with every share of the states'
     assert chosen(outcome)[0] != 0
+    # After many steps one of half a standard error settles, five times as long as before, and counts as an error.
+    while not search.settled(state):
+        before, state = state, search.step(problem, state)[0]
+    patient, _ = replace(search, search_epochs=99).step(problem, before)
+    assert state.moved[0] < patient.moved[0] <= 5.0 * state.moved[0]
+    assert (np.diag(state.meat) > np.diag(patient.meat)).all()
 
 
 def test_at_contacts_states_settle_anew_after_each_step_of_the_parameters(monkeypatch):

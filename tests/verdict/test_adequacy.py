@@ -67,7 +67,9 @@ def test_intervals_and_combinations_cover_the_alternatives():
     assert wide.warnings == [told + "a spring"]
     names = ("drag", "friction", "lag", "a load", "no move")
     shifts = (0.5, 3.0, 2.0, 2.5, 0.0)
-    lesser = [replace(BEYOND, causes=(name,), shifts={"mass": shift}) for name, shift in zip(names, shifts, strict=True)]
+    lesser = [
+        replace(BEYOND, causes=(name,), shifts={"mass": shift}) for name, shift in zip(names, shifts, strict=True)
+    ]
     lesser[-1] = replace(lesser[-1], errors={"mass": 0.0})
     wide = with_widened_intervals(result, held(alternatives=tuple(lesser)))
     assert wide.warnings == [told + "friction, a load, lag and, less, 1 more"]

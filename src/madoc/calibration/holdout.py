@@ -141,6 +141,8 @@ class Judged:
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
         coarseness: By how many typical changes predictions one stride ahead change where the model is integrated in
             steps of a quarter of the length, the median over signals; 0 for a robot without a spec.
+        finer: Whether other terms than the error of the integration step were tested with steps of a quarter of the
+            length, as that error explains much and would hide them.
         candidates: The methods that were compared on this hold-out; None where only one was run.
         chosen: The name of the method among them whose estimate was kept.
     """
@@ -160,6 +162,7 @@ class Judged:
     at_end: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
     coarseness: float = 0.0
+    finer: bool = False
     candidates: tuple[Tried | NotRun, ...] | None = None
     chosen: str | None = None
 

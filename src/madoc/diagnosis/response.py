@@ -62,8 +62,9 @@ class Response:
             estimates which is nearer to 0, or 0 if their signs differ.
         larger_gain: The other estimate.
         gain_error: The larger standard error of the two.
-        lag: Time from an action to the acceleration it causes, beyond that of a command held for a control step, s; 0
-            where the gain is 0. Of two estimates as for the gain.
+        lag: Time from an action to the acceleration it causes, beyond that of a command held for a control step, s. Of
+            two estimates as for the gain. It is 0 where the gain is 0, and where actions of different rows act in
+            different directions, so that their mean is no delay.
         larger_lag: The other estimate, s.
         lag_error: The larger standard error of the two, s.
         share: Share in [0, 1] of the acceleration's variance, beyond what the state explains, that the action explains;
@@ -214,7 +215,8 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
             taken = np.full(len(gains), motion.ahead[at])
             taken = np.divide(taps @ windows[at], gains, out=taken, where=gains != 0.0)
             lags = simulator.control_step * (taken - motion.ahead[at])
-            both.append((gains[0], _jackknife(gains), lags[0], _jackknife(lags), shares[at]))
+            delayed = windows[at][0] <= taken[0] <= windows[at][-1]
+            both.append((gains[0], _jackknife(gains), lags[0] * delayed, _jackknife(lags), shares[at]))
         gain, gain_error, lag, lag_error, share = zip(*both, strict=True)
         told = *_smaller_first(*gain), max(gain_error), *_smaller_first(*lag), max(lag_error), min(share)
         found.append(Response(joint, *map(float, told)))

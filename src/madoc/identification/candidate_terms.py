@@ -38,6 +38,8 @@ SATURATION = "a drive that saturates below the limit of its actions"
 SPACING = "rows that are farther apart in time than the spec says, by another rate or a clock that drifts"
 TILTS = ("a base or a floor that is tilted towards x", "a base or a floor that is tilted towards y")
 INTEGRATION = "the error of the model's integration step"
+LATE_DRIVE = "a drive that acts later than the others"
+LATE_SENSOR = "a sensor that reads late, as behind a filter"
 _KNOWN_BEFORE = ("body_mass", "body_com")
 _STILL = 1e-9
 """Standard deviation of a joint's position below which it does not move, so that nothing tells of a spring."""
@@ -49,6 +51,11 @@ _RANGE = 10.0
 """Half of the range in which a term is fitted, in its change or standard error by the score test."""
 _LATER = 0.1
 """Delay in control steps with which the effect of a delay is computed."""
+
+
+def is_late(cause: str) -> bool:
+    """Whether the cause of a term is that a single drive or sensor is late."""
+    return cause.startswith((LATE_DRIVE, LATE_SENSOR))
 
 
 @dataclass(frozen=True)
@@ -206,7 +213,35 @@ def effects(
             moved = inputs.residuals(other, point[None], states[None])[0, 0]
             tried.append(candidate)
             found.append((moved - base) / change)
+    for place, channel in enumerate(simulator.task.actions if len(simulator.task.actions) > 1 else ()):
+        actions = readings.actions.copy()
+        actions[..., place] = late.actions[..., place]
+        moved = replace(readings, actions=actions).residuals(simulator, point[None], states[None])[0, 0]
+        tried.append(_late(f"{LATE_DRIVE} ({channel.name})", step))
+        found.append((moved - base) / _LATER)
+    for signal, column in _late_sensors(simulator, readings, base):
+        tried.append(_late(f"{LATE_SENSOR} ({signal})", step))
+        found.append(column)
     return tried, np.stack(found, axis=-1)
+
+
+def _late(cause: str, step: float) -> Candidate:
+    """A lag of a single drive or sensor, s."""
+    return Candidate(cause, "", "s", 0.0, step, 0.0, known_before=True)
+
+
+def _late_sensors(
+    simulator: Simulator, readings: Readings, residuals: Float[np.ndarray, "windows values"]
+) -> Iterator[tuple[str, Float[np.ndarray, "windows values"]]]:
+    """Each signal that a user's robot logs, and what it reads less by if it is a control step late: to first order."""
+    if simulator.task.source is None:
+        return
+    predicted = residuals.reshape(readings.observed.shape) + readings.observed / readings.scale
+    less = -np.gradient(predicted, axis=1)
+    for place, signal in enumerate(simulator.task.signals[: predicted.shape[-1]]):
+        column = np.where(np.isnan(less), np.nan, 0.0)
+        column[..., place] = less[..., place]
+        yield signal, column.reshape(residuals.shape)
 
 
 def _cut_off(

@@ -21,6 +21,7 @@ from madoc.identification.candidate_terms import (
     Candidate,
     candidates,
     effects,
+    is_late,
 )
 from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import Fit, fit_windows, negligible, products_of, windows_of
@@ -328,12 +329,13 @@ def _of_friction(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
 
 
 def _of_forces(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
-    """The estimates with a force at a joint that is likely beside the chosen terms.
+    """The estimates with a force at a joint, or a late drive or sensor, that is likely beside the chosen terms.
 
-    Such forces are too many for all that cannot be excluded to be covered.
+    These are too many for all that cannot be excluded to be covered.
     """
     for index, candidate in enumerate(tests.tried):
-        found = tests.score(index, chosen) if is_joint_force(candidate.cause) else None
+        tried = is_joint_force(candidate.cause) or is_late(candidate.cause)
+        found = tests.score(index, chosen) if tried else None
         if found is not None and abs(found.t) >= LIKELY_FORCE:
             yield replace(_with_terms(tests, [index, *chosen]), terms=False)
 

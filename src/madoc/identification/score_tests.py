@@ -57,12 +57,16 @@ class Products:
         order = [*first, *range(len(first), self.each.shape[1])]
         return Products(self.each[:, order][:, :, order], len(kept))
 
-    def bounded(self, columns: Sequence[int]) -> Float[np.ndarray, "windows columns columns"]:
-        """The products, of which no window has more than `REACH` times the usual length of any of these columns."""
+    def bounded(self, columns: Sequence[int]) -> Float[np.ndarray, "windows some some"]:
+        """The products of the residuals and these columns, in this order.
+
+        No window has more than `REACH` times the usual length of any of the columns.
+        """
         lengths = np.sqrt(np.maximum(self.each[:, columns, columns], 0.0))
         usual = np.array([np.median(column[column > 0.0]) if column.any() else 0.0 for column in lengths.T])
         longest = (lengths / np.where(usual > 0.0, REACH * usual, np.inf)).max(1)
-        return self.each / np.maximum(longest, 1.0)[:, None, None] ** 2
+        chosen = np.array([0, *columns])
+        return self.each[:, chosen[:, None], chosen] / np.maximum(longest, 1.0)[:, None, None] ** 2
 
 
 @dataclass(frozen=True)
@@ -123,17 +127,16 @@ def score(
     included = [*products.parameters, *already]
     each = products.bounded([*included, index])
     shape = np.ones(len(products)) if shape is None else shape
-    total, mixed = each.sum(0), (shape[:, None] * each[:, included, index])
-    imitation = _solved(total[np.ix_(included, included)], mixed.sum(0))
-    fitted = _solved(total[np.ix_(included, included)], total[included, 0])
-    inner = each[:, included][:, :, included]
-    own = shape**2 * each[:, index, index]
+    inner, with_residuals, mixed = each[:, 1:-1, 1:-1], each[:, 1:-1, 0], shape[:, None] * each[:, 1:-1, -1]
+    total, right = inner.sum(0), with_residuals.sum(0)
+    imitation, fitted = _solved(total, mixed.sum(0)), _solved(total, right)
+    own = shape**2 * each[:, -1, -1]
     alone = own - 2.0 * mixed @ imitation + np.einsum("wij,i,j->w", inner, imitation, imitation)
     power = float(alone.sum())
     if power <= _DISTINCT * own.sum():
         return None
-    left = shape * each[:, index, 0] - mixed @ fitted
-    left -= each[:, included, 0] @ imitation - np.einsum("wij,i,j->w", inner, imitation, fitted)
+    left = shape * each[:, -1, 0] - mixed @ fitted
+    left -= with_residuals @ imitation - np.einsum("wij,i,j->w", inner, imitation, fitted)
     change = -float(left.sum()) / power
     without = power - alone
     if (without <= _DISTINCT * power).any():
@@ -141,9 +144,9 @@ def score(
     error = float(_jackknife(((left + change * alone) / without)[:, None])[0, 0]) ** 0.5
     # Windows are left out at the same coefficients of the columns included, which have been fitted to all of them.
     error *= np.sqrt(len(each) / max(1, len(each) - len(included)))
-    squares = total[0, 0] - 2.0 * fitted @ total[included, 0] + fitted @ total[np.ix_(included, included)] @ fitted
-    own_columns = products.parameters
-    response = _solved(total[np.ix_(own_columns, own_columns)], mixed.sum(0)[: products.count])
+    squares = each[:, 0, 0].sum() - 2.0 * fitted @ right + fitted @ total @ fitted
+    own_columns = slice(products.count)
+    response = _solved(total[own_columns, own_columns], mixed.sum(0)[own_columns])
     if not error > 0.0:
         return None
     freedom = max(1.0, power**2 / float((alone**2).sum()) - 1.0 - len(included))
@@ -155,29 +158,26 @@ def imitators(products: Products, index: int) -> Float[np.ndarray, " d"] | None:
 
     Then `score` finds nothing: whatever the column's coefficient is, the residuals are the same at other parameters.
     """
-    included = products.parameters
-    total = products.bounded([*included, index]).sum(0)
-    imitation = _solved(total[np.ix_(included, included)], total[included, index])
-    alone = total[index, index] - imitation @ total[included, index]
-    return -imitation if total[index, index] > 0.0 and alone <= _DISTINCT * total[index, index] else None
+    total = products.bounded([*products.parameters, index]).sum(0)
+    imitation, own = _solved(total[1:-1, 1:-1], total[1:-1, -1]), total[-1, -1]
+    alone = own - imitation @ total[1:-1, -1]
+    return -imitation if own > 0.0 and alone <= _DISTINCT * own else None
 
 
 def joint_shift(
     products: Products, terms: Sequence[int]
 ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
     """The changes of several terms together, how they move the parameters, in [-1, 1], and the covariance of that."""
-    parameters, terms = products.parameters, list(terms)
-    each = products.bounded([*parameters, *terms])
-    changes, covariance = _regression(each, [*parameters, *terms])
-    total = each.sum(0)
-    response = -_solved(total[np.ix_(parameters, parameters)], total[np.ix_(parameters, terms)])
-    of_terms = slice(products.count, None)
+    each = products.bounded([*products.parameters, *terms])
+    changes, covariance = _regression(each)
+    total, parameters, of_terms = each[:, 1:, 1:].sum(0), slice(products.count), slice(products.count, None)
+    response = -_solved(total[parameters, parameters], total[parameters, of_terms])
     return changes[of_terms], response @ changes[of_terms], response @ covariance[of_terms, of_terms] @ response.T
 
 
 def parameter_shift(products: Products) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
     """The step to the parameters that explain the windows best, in [-1, 1], and its covariance."""
-    return _regression(products.bounded(products.parameters), products.parameters)
+    return _regression(products.bounded(products.parameters))
 
 
 def variances_by_group(
@@ -187,24 +187,26 @@ def variances_by_group(
 
     These are the number of groups that tell of the parameter, less one.
     """
-    columns = products.parameters
-    each = products.bounded(columns)
+    each = products.bounded(products.parameters)
     summed = np.stack([each[groups == group].sum(0) for group in np.unique(groups)])
-    _, covariance = _regression(summed, columns)
-    inner = summed[:, columns][:, :, columns]
-    directions = _solved(inner.sum(0), np.eye(len(columns)))
+    _, covariance = _regression(summed)
+    inner = summed[:, 1:, 1:]
+    directions = _solved(inner.sum(0), np.eye(products.count))
     alone = np.einsum("jd,gjk,kd->gd", directions, inner, directions)
     effective = alone.sum(0) ** 2 / np.maximum((alone**2).sum(0), np.finfo(float).tiny)
     return np.maximum(np.diag(covariance), 0.0), effective - 1.0
 
 
 def _regression(
-    each: Float[np.ndarray, "windows columns columns"], columns: list[int]
+    each: Float[np.ndarray, "windows columns columns"],
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    """Coefficients of columns that make residuals smallest, and their covariance by leaving out windows."""
-    lengths = np.sqrt(np.maximum(np.diag(each.sum(0))[columns], np.finfo(float).tiny))
-    inner = each[:, columns][:, :, columns] / lengths[:, None] / lengths
-    with_residuals = each[:, columns, 0] / lengths
+    """Coefficients of columns that make residuals smallest, and their covariance by leaving out windows.
+
+    The residuals are the first column of the products.
+    """
+    lengths = np.sqrt(np.maximum(np.diag(each.sum(0))[1:], np.finfo(float).tiny))
+    inner = each[:, 1:, 1:] / lengths[:, None] / lengths
+    with_residuals = each[:, 1:, 0] / lengths
     total = inner.sum(0)
     change = -_solved(total, with_residuals.sum(0))
     scores = with_residuals + inner @ change

@@ -59,7 +59,7 @@ class Network(eqx.Module):
                 # the slopes, on a CPU.
                 weight = jax.lax.optimization_barrier(weight)
             rows = rows @ weight
-            # A product, so that the bias's gradient is one too: XLA shares a long sum among cores, which decide its bits.
+            # A product, whose gradient is one too: XLA shares long sums among cores, whose number decides the bits.
             rows = rows + jnp.ones((*rows.shape[:-1], 1)) @ layer.bias[None]
             if index + 1 < len(self.layers):
                 rows = self.activation(rows)

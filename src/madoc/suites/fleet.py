@@ -9,9 +9,9 @@ import numpy as np
 
 from madoc.calibration.result import ParameterEstimate
 from madoc.identification.information import NORMAL_95
+from madoc.identification.random_effects import Common, common, outliers
 from madoc.suites.cells import KINDS
 from madoc.suites.options import flat
-from madoc.identification.random_effects import Common, common, outliers
 from madoc.suites.results import Result
 
 _FEWEST = 2

@@ -9,7 +9,7 @@ from scipy.constants import g as standard_gravity
 
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult
-from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS
+from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS, is_late
 from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
@@ -33,6 +33,8 @@ SMALLEST = 0.3
 """Smallest value of the error of the integration step in proportion to which its effects are taken larger."""
 NUMERICAL = 0.3
 """Share of squared residuals explained by the integration step; above it they are no mismatch of the model."""
+FELT = 0.1
+"""Share of squared residuals explained by the integration step, above which other terms are tested with a finer one."""
 AS_SIGNIFICANT = 0.6
 """|t| over that of the most significant term; among terms above it the one that explains most is named."""
 NEARLY = 0.8
@@ -48,16 +50,18 @@ EARTH = 0.03
 def missing_term(holdout: HoldOut) -> MissingTerm | None:
     """The likeliest term that the model certainly lacks, if such terms move the estimate by themselves or together.
 
-    None where the integration step explains much of the residuals: beside its error no lesser one can be told.
+    None where the error of the integration step explains much of the residuals and lesser ones were not tested without.
     """
-    if numerical(holdout) is not None:
+    if numerical(holdout) is not None and not holdout.finer:
         return None
     certain = [term for term in holdout.missing_terms if is_certain(term)]
     moving = [term for term in certain if moves_certainly(term)]
     if certain and not moving and _moved_together(holdout):
         uncertain = (*DRIFTS, INTEGRATION)  # by themselves, as are forces that no parameter adds
         others = (term for term in holdout.missing_terms if term.cause not in uncertain)
-        moving = [term for term in others if is_certain(term) or not is_joint_force(term.cause)]
+        moving = [
+            term for term in others if is_certain(term) or not (is_joint_force(term.cause) or is_late(term.cause))
+        ]
     return likeliest(moving)
 
 
@@ -79,7 +83,7 @@ def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
 def _unusual(term: MissingTerm) -> bool:
     if term.parameter == "gravity":
         return abs(abs(term.value) - standard_gravity) > EARTH + 2.0 * term.standard_error
-    return term.cause in (EARLY, WITHIN_RUNS, *TILTS) or is_joint_force(term.cause)
+    return term.cause in (EARLY, WITHIN_RUNS, *TILTS) or is_joint_force(term.cause) or is_late(term.cause)
 
 
 def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
@@ -140,7 +144,14 @@ def _moved_together(holdout: HoldOut) -> bool:
 
 def numerical(holdout: HoldOut) -> MissingTerm | None:
     """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
-    return _numerical(holdout.missing_terms)
+    step = felt(holdout.missing_terms) if holdout.finer else _numerical(holdout.missing_terms)
+    return step if step is not None and step.explained >= NUMERICAL else None
+
+
+def felt(terms: Sequence[MissingTerm]) -> MissingTerm | None:
+    """The error of the integration step, where it explains so much of the residuals that it may hide other terms."""
+    step = integration(terms)
+    return step if step is not None and step.t >= CERTAIN_STEP and step.explained >= FELT else None
 
 
 def _numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:

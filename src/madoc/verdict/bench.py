@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from sklearn.neighbors import NearestNeighbors
 
+from madoc import simulation
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.holdout import AgainstChance, Area, Judged
 from madoc.data import Dataset, stride
@@ -16,7 +17,7 @@ from madoc.diagnosis.channels import signal_names
 from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.errors import MadocError
 from madoc.identification.candidate_terms import INTEGRATION
-from madoc.identification.coarseness import coarseness
+from madoc.identification.coarseness import FINER, coarseness
 from madoc.identification.excitation import expected_half_widths
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
 from madoc.identification.noise import difference_noise
@@ -27,7 +28,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
 from madoc.types import named_key
-from madoc.verdict.adequacy import in_full, is_certain, widening
+from madoc.verdict.adequacy import NUMERICAL, felt, in_full, is_certain, widening
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
@@ -174,6 +175,38 @@ class Bench:
         return classify(self.view.sample(held), self.view.sample(simulated), overlap=True)
 
 
+def _doubts(
+    bench: Bench, point: Float[np.ndarray, " d"], half_widths: Float[np.ndarray, " d"]
+) -> tuple[Suspicions, bool]:
+    """What the log says against the model, and whether that was tested with a finer integration step.
+
+    Where the error of the integration step explains much, it hides other terms or looks like them. These are then
+    tested with steps of a quarter of the length, unless their error explains much there too.
+    """
+    problem, task = bench.problem, bench.problem.simulator.task
+    ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
+    if bench.states.kind == "unknown" or problem.dataset.disturbance.shuffled != "none" or not ordered:
+        return Suspicions(), False
+    given = problem.dataset, bench.states
+    doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change)
+    doubts = replace(doubts, alternatives=in_full(doubts.alternatives, doubts.terms))
+    step = felt(doubts.terms)
+    if step is None or task.source is None:
+        return doubts, False
+    finer = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
+    fine = suspicions(*given, finer, point, half_widths, bench.change)
+    spent = doubts.control_steps + FINER * fine.control_steps
+    left = felt(fine.terms)
+    if not fine.tested or (left is not None and left.explained >= NUMERICAL):
+        return replace(doubts, control_steps=spent), False
+    others = [replace(each, terms=False) for each in doubts.alternatives]
+    others += [
+        replace(each, causes=(INTEGRATION,)) if each.causes == (OTHER_WINDOWS,) else each for each in fine.alternatives
+    ]
+    terms = step, *(term for term in fine.terms if term.cause != INTEGRATION)
+    return replace(fine, terms=terms, alternatives=tuple(others), control_steps=spent), True
+
+
 def judged(
     record: Callable[..., Measure],
     bench: Bench,
@@ -205,10 +238,7 @@ def judged(
     own = half
     if interval is not None:  # to the farther end, as the other may be cut off at an end of the range
         own = np.maximum(np.abs(space.to_unit(interval.T) - point).max(0), 1e-9)
-    doubts = Suspicions()
-    ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
-    if bench.states.kind != "unknown" and problem.dataset.disturbance.shuffled == "none" and ordered:
-        doubts = suspicions(problem.dataset, bench.states, problem.simulator, point, own, bench.change)
+    doubts, finer = _doubts(bench, point, own)
     found = problem.dataset.findings
     if bench.simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none":
         points = np.stack([np.zeros(len(point)), point, at])
@@ -216,12 +246,11 @@ def judged(
             bench.held_out, bench.simulator, points, horizons(problem.dataset)[1], bench.change, contradicts=True
         )
         found, spent = (*exchanged, *found), spent + steps
-    alternatives = in_full(doubts.alternatives, doubts.terms)
     coarse, steps = 0.0, 0
     if bench.simulator.task.source is not None:  # else no timestep can be given
         coarse, steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
     # Another estimate of other windows says that the search is not at its end, not that a parameter is open.
-    open_by = tuple(each for each in alternatives if each.causes != (OTHER_WINDOWS,))
+    open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
     best, own_ends = (point[:, None] + np.outer(each, (-1.0, 1.0)) for each in (half, own))
     ends = own_ends if interval is None else space.to_unit(interval.T).T
     ends = ends + own[:, None] * widening(open_by, space.names) * (-1.0, 1.0)
@@ -241,11 +270,12 @@ def judged(
             for place, term in enumerate(doubts.terms)
             if place < _MOST_TERMS or term.cause == INTEGRATION or is_certain(term)
         ),
-        alternatives=alternatives,
+        alternatives=doubts.alternatives,
         imitated=doubts.imitated,
         tested=doubts.tested,
         contradictions=tuple(each.sentence for each in found if each.contradicts),
         coarseness=coarse,
+        finer=finer,
         at_end=tuple(
             row.name
             for row, value in zip(space.parameters, point, strict=True)

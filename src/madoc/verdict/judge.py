@@ -15,7 +15,15 @@ from madoc.calibration.holdout import (
     Verdict,
     Word,
 )
-from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, SATURATION, SPACING, TILTS
+from madoc.identification.candidate_terms import (
+    BELOW_MINIMUM,
+    EARLY,
+    LATE_SENSOR,
+    SATURATION,
+    SPACING,
+    TILTS,
+    is_late,
+)
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
 from madoc.identification.information import OPEN
@@ -40,6 +48,9 @@ WARM_UP = "let the machine warm up before it is logged, or leave the begin of ea
 """The same for a parameter that changes within each run."""
 CHANGE_MACHINE = "no parameter of a spec adds it: take it out of the machine, or log motions in which it is small"
 """The same for a force at a joint."""
+CHANGE_LOG = "log it without its filter, or shift its column by that time"
+CHANGE_DRIVE = "give its actuator that lag in the model, by MuJoCo's dyntype filter"
+"""The same for a sensor and for a drive that are late."""
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
 
 WORDS: dict[Word, str] = {
@@ -175,7 +186,8 @@ def _disagreeing(holdout: HoldOut) -> str:
 
 
 def _value(term: MissingTerm) -> str:
-    return f"{term.value:.3g} ± {term.standard_error:.1g} {term.unit}".rstrip()
+    unit = "" if term.unit == "1" else term.unit
+    return f"{term.value:.3g} ± {term.standard_error:.1g} {unit}".rstrip()
 
 
 def _remedy(term: MissingTerm) -> str:
@@ -183,6 +195,8 @@ def _remedy(term: MissingTerm) -> str:
     field, _, element = term.parameter.partition(".")
     if term.cause in REMEDIES:
         return REMEDIES[term.cause]
+    if is_late(term.cause):
+        return CHANGE_LOG if term.cause.startswith(LATE_SENSOR) else CHANGE_DRIVE
     if is_joint_force(term.cause):
         return CHANGE_MACHINE
     high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)

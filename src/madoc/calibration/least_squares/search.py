@@ -23,8 +23,8 @@ DAMPING_RANGE = (1e-10, 1e10)
 LITTLE = 5e-3
 """Share in [0, 1] of the cost; after a step that saves less, unknown initial states count as settled too."""
 ROUGHLY_SETTLED = 0.5
-"""Ratio in [0, 1] of a step to the standard error where initial states settle anew after each step: some windows end in
-another minimum each time, which moves the parameters by about as much."""
+"""Ratio in [0, 1] of a step to the standard error at contacts, where some windows end in another minimum after each
+step, which moves the parameters by about as much."""
 FOUND = (0.5, 0.9)
 """Shares in [0, 1]. If narrowing differences and restarts leave at most this share of the unexplained windows, or of
 the size of all residuals, those windows lacked an initial state, not a better model."""
@@ -56,13 +56,13 @@ class SearchState:
         touching: Whether a contact was seen in each window, as far as its states are known.
         deviation: Noise of each channel in its typical changes; 1 where initial states are known.
         bread: Curvature of the best search's cost where it last linearised.
-        meat: Scatter of the cost's gradient there; at contacts also the last step's, once settled.
+        meat: Scatter of the cost's gradient there, and the last step's where steps of half a standard error settle.
         explained: Number of windows from which these two were computed.
         steady_cost: Mean loss of a residual in those in which no contact begins or ends, each kind in its own noise.
         autocorrelation: Correlation of these windows' residuals with the next reading's; 0 for known initial states.
         refining: 0 while searching on few windows, 1 on all of them.
         settled_at: The point at which initial states last settled alone.
-        missed: Share of the windows that initial states did not explain after the first two steps of that, and the size
+        missed: Share of the windows that initial states did not explain after the first steps of that, and the size
             of all windows' residuals in typical changes.
         rough: 1 where wide differences and restarts have found initial states, as at contacts: each step of the
             parameters is then followed by several of the states; else 0.
@@ -164,6 +164,7 @@ class Search:
         plans = windows.plans(points, states, damping, state_damping, refining=bool(state.refining))
         outcomes = windows.outcomes(plans, states, refining=bool(state.refining))
         new = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}
+        roughly = self._settles_roughly(state)
         for index, (plan, outcome) in enumerate(zip(plans, outcomes, strict=True)):
             trial, factor = chosen(outcome)
             followed = outcome.followed[trial]
@@ -175,8 +176,8 @@ class Search:
             new["state_damping"][index, :count] = np.clip(state_damping[index] * state_factor, *settling.DAMPING_RANGE)
             cost = float(outcome.totals[trial])
             new["cost"][index] = cost if state.refining else plan.comparable(cost)
-            relaxed = ROUGHLY_SETTLED / SETTLED if self._impatient(state) else 1.0
-            new["moved"][index] = self._moved(plan, outcome, trial, damping=float(damping[index])) / relaxed
+            share = ROUGHLY_SETTLED if roughly else SETTLED
+            new["moved"][index] = self._moved(plan, outcome, trial, damping=float(damping[index]), share=share)
         leader = int(np.argmin(new["cost"][:running]))
         best = plans[leader]
         following = replace(
@@ -184,7 +185,7 @@ class Search:
             **new,
             deviation=best.deviation,
             bread=best.bread,
-            meat=best.meat + (_of_last_step(best) if self._impatient(state) else 0.0),
+            meat=best.meat + (_of_last_step(best) if roughly and new["moved"][leader] < 1.0 else 0.0),
             explained=int(best.kept.sum()),
             steady_cost=best.steady_cost,
             autocorrelation=best.autocorrelation,
@@ -209,7 +210,7 @@ class Search:
         after, waiting = windows.settle(state.point[0], states, damping, state.state_errors, state.waiting)
         new_states, new_damping = state.states.copy(), state.state_damping.copy()
         new_states[0], new_damping[0] = after.states, after.damping
-        first = state.waiting > self.starts.waiting - FIRST_STEPS
+        first = state.waiting > self.starts.waiting - FIRST_STEPS or state.missed == (0.0, 0.0)
         missed = windows.share_unexplained(after), float(np.sqrt(after.costs.mean()) * np.median(after.deviation))
         before = missed if first else state.missed
         smooth = not state.touching.any()
@@ -314,27 +315,28 @@ class Search:
         """Control steps of all windows of all searches under one system each."""
         return self._running(state) * self.window_count(state) * self.horizon
 
-    def _impatient(self, state: SearchState) -> bool:
-        """Whether a step is the last that a search on all windows with unknown initial states needs to settle in.
+    def _settles_roughly(self, state: SearchState) -> bool:
+        """Whether steps of half a standard error are small enough: at contacts, and after many steps that were larger.
 
-        Windows may be trusted after one step and not after the next, and parameters then go to and fro. From that step
-        on they settle as at contacts: at half a standard error, and the covariance counts the last step as an error.
+        Windows may be trusted after one step and not after the next, and parameters then go to and fro. The covariance
+        counts the last step as an error.
         """
-        return self.starts.unknown and bool(state.refining) and state.epochs + 1 >= self.search_epochs
+        many = state.touching.any() or state.epochs + 1 >= self.search_epochs
+        return self.starts.unknown and bool(state.refining) and bool(many)
 
     @staticmethod
     def _smooth(state: SearchState) -> bool:
         """Whether a search refines on windows without contacts."""
         return bool(state.refining) and not state.touching.any()
 
-    def _moved(self, plan: Plan, outcome: Outcome, trial: int, *, damping: float) -> float:
-        """The largest component of a step relative to one that matters: a tenth of a standard error, or the tolerance.
+    def _moved(self, plan: Plan, outcome: Outcome, trial: int, *, damping: float, share: float) -> float:
+        """The largest component of a step relative to one that matters: a share of a standard error, or the tolerance.
 
         While the damping is at most `starts.stuck` the least damped step counts, whether it helped or not: a damped one
         may be small far from the minimum too.
         """
         tried = plan.steps[0 if damping <= self.starts.stuck else min(trial, len(TRIALS) - 1)]
-        relative = self._relative_step(plan, tried, SETTLED)
+        relative = self._relative_step(plan, tried, share)
         return max(relative, 0.0 if plan.exact else outcome.saved(trial) / LITTLE)
 
     def _relative_step(self, plan: Plan, step: Float[np.ndarray, " d"], share: float) -> float:
