@@ -139,7 +139,7 @@ def _lag_findings(response: Response, action: str, simulator: Simulator) -> list
     remedy = f"{{field: action_delay, low: {0.0 if low < step else low:.2g}, high: {high:.2g}}}"
     verb = "widen the range of the delay to" if delays else "add the parameter"
     do = f"{verb} {remedy}; a lag of the motor, a filter on the logged speed and an elastic transmission look alike"
-    return [Finding("warning", what, action, do, contradicts=lag >= CONTRADICTING * step)]
+    return [Finding("warning", what, action, do, contradicts=lag >= CONTRADICTING * step, late=True)]
 
 
 def _gain_findings(response: Response, action: str, modelled: Float[np.ndarray, " points"]) -> list[Finding]:

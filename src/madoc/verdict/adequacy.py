@@ -9,13 +9,13 @@ from scipy.constants import g as standard_gravity
 
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult
-from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS, is_late
+from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, is_late
 from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
 from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
-from madoc.identification.term_tests import Alternative, MissingTerm
+from madoc.identification.term_tests import SUSPICIOUS, Alternative, MissingTerm
 
 CERTAIN = 5.0
 """|t| from which a term is missing; by chance one in two million is larger where residuals are normal."""
@@ -35,6 +35,10 @@ NUMERICAL = 0.3
 """Share of squared residuals explained by the integration step; above it they are no mismatch of the model."""
 FELT = 0.1
 """Share of squared residuals explained by the integration step, above which other terms are tested with a finer one."""
+IN_TIME = 0.25
+"""Delay of actions in control steps; a shorter one is none."""
+SURELY = 3.0
+"""Standard errors of a delay's value that exclude a longer one."""
 AS_SIGNIFICANT = 0.6
 """|t| over that of the most significant term; among terms above it the one that explains most is named."""
 NEARLY = 0.8
@@ -146,6 +150,16 @@ def numerical(holdout: HoldOut) -> MissingTerm | None:
     """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
     step = felt(holdout.missing_terms) if holdout.finer else _numerical(holdout.missing_terms)
     return step if step is not None and step.explained >= NUMERICAL else None
+
+
+def actions_in_time(terms: Sequence[MissingTerm], control_step: float) -> bool:
+    """Whether tests at the estimate exclude that actions take effect late by `IN_TIME` control steps or more.
+
+    A log alone may seem to tell that where joints stick, as under Coulomb friction, and a controller pushes on.
+    """
+    delays = [term.value + SURELY * term.standard_error for term in terms if term.cause in (DELAY, EARLY)]
+    late = any(is_late(term.cause) and term.t >= SUSPICIOUS and term.value >= IN_TIME * control_step for term in terms)
+    return bool(delays) and max(delays) < IN_TIME * control_step and not late
 
 
 def felt(terms: Sequence[MissingTerm]) -> MissingTerm | None:

@@ -28,7 +28,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
 from madoc.types import named_key
-from madoc.verdict.adequacy import NUMERICAL, felt, in_full, is_certain, widening
+from madoc.verdict.adequacy import NUMERICAL, actions_in_time, felt, in_full, is_certain, widening
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
@@ -246,6 +246,7 @@ def judged(
             bench.held_out, bench.simulator, points, horizons(problem.dataset)[1], bench.change, contradicts=True
         )
         found, spent = (*exchanged, *found), spent + steps
+    in_time = actions_in_time(doubts.terms, bench.simulator.control_step)
     coarse, steps = 0.0, 0
     if bench.simulator.task.source is not None:  # else no timestep can be given
         coarse, steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
@@ -273,7 +274,7 @@ def judged(
         alternatives=doubts.alternatives,
         imitated=doubts.imitated,
         tested=doubts.tested,
-        contradictions=tuple(each.sentence for each in found if each.contradicts),
+        contradictions=tuple(each.sentence for each in found if each.contradicts and not (each.late and in_time)),
         coarseness=coarse,
         finer=finer,
         at_end=tuple(
