@@ -8,7 +8,7 @@ import pytest
 from madoc import robots, simulation
 from madoc.data import logs, typical_change
 from madoc.identification import missing_terms as terms
-from madoc.identification.candidate_terms import CAUSES, EARLY, Candidate, _cut_off
+from madoc.identification.candidate_terms import CAUSES, EARLY, LATE_DRIVE, LATE_SENSOR, Candidate, _cut_off, is_late
 from madoc.identification.drifts import DRIFT, WITHIN_RUNS, _between_runs, _drifts, _of_fitted_runs, _Part
 from madoc.identification.joint_forces import LOADED
 from madoc.identification.score_tests import Products
@@ -44,10 +44,19 @@ parameters:
 NOISE = 0.002
 
 
-def plant(folder: Path, *, friction: float = 0.0, drag: float = 0.0, late: int = 0, damping: float = 0.1):
+def plant(
+    folder: Path,
+    *,
+    friction: float = 0.0,
+    drag: float = 0.0,
+    late: int = 0,
+    damping: float = 0.1,
+    filtered: float = 0.0,
+):
     """A log of the pendulum with a term that the model of its spec lacks, and what the tests need of it.
 
-    Its damping is 0.1 N·m·s/rad in the first half of the log, and `damping` in the second.
+    Its damping is 0.1 N·m·s/rad in the first half of the log, and `damping` in the second. Its speed is logged behind a
+    filter that mixes this share of the row before with each row.
     """
     folder.mkdir(exist_ok=True)
     (folder / "real.xml").write_text(MODEL.format(damping=0.1, friction=friction, drag=f" {drag} 0" if drag else ""))
@@ -62,7 +71,9 @@ def plant(folder: Path, *, friction: float = 0.0, drag: float = 0.0, late: int =
         system = systems[2 * row // len(torque)]
         angles.append(np.asarray(system.observe(state))[0, 0])
         state = system.step(state, torque[None, None, min(max(0, row - late), len(torque) - 1)][..., None])
-    seen = np.array(angles) + NOISE * random.standard_normal((len(torque), 2))
+    motion = np.array(angles)
+    motion[1:, 1] += filtered * (motion[:-1, 1] - motion[1:, 1])
+    seen = motion + NOISE * random.standard_normal((len(torque), 2))
     columns = np.column_stack([0.02 * np.arange(len(torque)), seen, torque])
     np.savetxt(folder / "log.csv", columns, "%.9g", ",", header="time,angle,speed,torque", comments="")
     robot = robots.load(folder / "pendulum.yaml")
@@ -73,6 +84,16 @@ def scores(dataset, simulator, half_width: float = 0.01):
     point = simulator.parameters.to_unit(np.array([0.1]))
     states = states_of(dataset, simulator)
     return terms.suspicions(dataset, states, simulator, point, np.array([half_width]), typical_change(dataset)).terms
+
+
+def test_a_sensor_that_reads_late(tmp_path):
+    found = scores(*plant(tmp_path, filtered=0.3))
+    late = {term.cause: term for term in found if is_late(term.cause)}
+    term = late[f"{LATE_SENSOR} (speed)"]
+    assert term.t > 5.0
+    assert term.value == pytest.approx(0.3 * 0.02, rel=0.1)
+    assert abs(term.shifts["dof_damping.hinge"]) > 1.0
+    assert not any(cause.startswith(LATE_DRIVE) for cause in late)  # a single drive is what all drives are
 
 
 @pytest.mark.parametrize(

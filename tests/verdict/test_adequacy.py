@@ -7,7 +7,7 @@ import pytest
 
 from madoc.calibration.holdout import AgainstChance, Area, ToldApart
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
-from madoc.identification.candidate_terms import INTEGRATION, TILTS
+from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, LATE_DRIVE, TILTS
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
 from madoc.identification.term_tests import Alternative, ImitatedTerm, MissingTerm
@@ -15,6 +15,7 @@ from madoc.verdict import judge
 from madoc.verdict.adequacy import (
     SURER,
     about_imitated,
+    actions_in_time,
     as_likely,
     coarse_step,
     in_full,
@@ -156,3 +157,32 @@ def test_a_force_of_two_shapes_is_no_rival_of_itself():
     )
     assert as_likely(held(sine, cosine), sine) == []
     assert as_likely(held(sine, term()), sine) == [term()]
+
+
+def test_terms_tested_with_a_finer_step_are_told_beside_the_error_of_the_models_own():
+    step = replace(term(INTEGRATION, t=20.0, explained=0.6, parameter=""), value=1.2)
+    friction = term(t=8.0, explained=0.2)
+    hidden = held(step, friction)
+    assert numerical(hidden) == step
+    assert missing_term(hidden) is None
+    assert missing_term(replace(hidden, finer=True)) == friction
+    # What the error explains is explained, whatever else is missing with a finer step.
+    assert numerical(replace(held(step, term(explained=0.9)), finer=True)) == step
+    assert numerical(held(step, term(explained=0.9))) is None
+    assert numerical(replace(held(replace(step, explained=0.2)), finer=True)) is None
+
+
+@pytest.mark.parametrize(
+    ("cause", "value", "error", "other", "expected"),
+    [
+        (DELAY, 0.0001, 0.0005, 0.0, True),
+        (EARLY, -0.004, 0.0005, 0.0, True),
+        (DELAY, 0.0001, 0.001, 0.0, False),  # up to 0.0031 s late, and a quarter of a control step is 0.0025 s
+        (DELAY, 0.0001, 0.0005, 0.004, False),  # one of the drives is late
+    ],
+)
+def test_tests_at_the_estimate_exclude_late_actions(cause, value, error, other, expected):
+    terms = [replace(term(cause, t=0.2), value=value, standard_error=error)]
+    terms.append(replace(term(f"{LATE_DRIVE} (hip)", t=4.0), value=other))
+    assert actions_in_time(terms, 0.01) == expected
+    assert not actions_in_time(terms[1:], 0.01)  # nothing is excluded where no delay was tested
