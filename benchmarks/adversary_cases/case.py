@@ -103,6 +103,7 @@ class Plant:
         spacing: Time between two rows, in control steps of the spec.
         drift: By how much the spacing grows over a run, as a share.
         lag: Time constant of the motors, s.
+        last_lag: Time constant of the last motor alone, s.
         delay: Of the command, in rows.
         limit: Largest command that the motors follow, as a share of the logged limit.
         drag: Quadratic drag on every joint, N·s²/m² or N·m·s²/rad².
@@ -128,6 +129,7 @@ class Plant:
     spacing: float = 1.0
     drift: float = 0.0
     lag: float = 0.0
+    last_lag: float = 0.0
     delay: float = 0.0
     limit: float = 1.0
     drag: float = 0.0

@@ -100,7 +100,9 @@ def move(
     middle, reach = (low + high) / 2, plant.limit * (high - low) / 2
     steps = max(1, round(spacing / case.robot.timestep)) * plant.fine
     model.opt.timestep = spacing / steps
-    keep = np.exp(-model.opt.timestep / plant.lag) if plant.lag else 0.0
+    lags = np.full(len(low), plant.lag)
+    lags[-1] = plant.last_lag or plant.lag
+    keep = np.where(lags > 0.0, np.exp(-model.opt.timestep / np.maximum(lags, np.finfo(float).tiny)), 0.0)
     for step in range(steps):
         wanted = late(commands, plant.delay - step / steps)
         motor = wanted if motor is None else wanted + keep * (motor - wanted)
