@@ -81,6 +81,9 @@ def test_terms_that_parameters_imitate_are_told():
     assert about_imitated(held()) == ()
     (told,) = about_imitated(replace(held(), imitated=imitated))
     assert told.startswith("the log cannot tell a spring (jnt_stiffness.hinge) from mass and damping: estimates assume")
+    (told,) = about_imitated(replace(held(), imitated=5 * imitated))
+    assert told.count("a spring") == 3
+    assert "mass and damping; 2 more terms: estimates assume" in told
 
 
 def test_other_estimates_by_a_coarse_step_are_taken_in_full():

@@ -46,7 +46,7 @@ NEARLY = 0.8
 SURER = 1.314
 """Half of a 99 % interval over half of a 95 % interval: an alternative is covered unless one in a hundred is worse."""
 NAMED = 3
-"""Number of causes named for which intervals are widened."""
+"""Number of causes named for which intervals are widened, and of terms that the log cannot tell."""
 EARTH = 0.03
 """m/s², by which gravity on the ground differs from the standard 9.80665 (poles, equator, mountains)."""
 
@@ -247,11 +247,10 @@ def about_imitated(holdout: HoldOut) -> tuple[str, ...]:
     """A sentence on the terms that calibrated parameters imitate, which no verdict and no interval covers."""
     if not holdout.imitated:
         return ()
-    which = "; ".join(
-        f"{each.cause} ({each.parameter}) from {' and '.join(each.imitators)}" for each in holdout.imitated
-    )
+    which = [f"{each.cause} ({each.parameter}) from {' and '.join(each.imitators)}" for each in holdout.imitated]
+    which = [*which[:NAMED], *([f"{len(which) - NAMED} more terms"] if len(which) > NAMED else [])]
     return (
-        f"the log cannot tell {which}: estimates assume that the machine has no more of it than the model; if it may, "
+        f"the log cannot tell {'; '.join(which)}: estimates assume that the machine has no more of it than the model; if it may, "
         "add it to the spec, or log motions that tell them apart",
     )
 
