@@ -251,8 +251,8 @@ def about_imitated(holdout: HoldOut) -> tuple[str, ...]:
     if len(which) > NAMED:
         which = [*which[:NAMED], f"{len(which) - NAMED} more terms"]
     return (
-        f"the log cannot tell {'; '.join(which)}: estimates assume that the machine has no more of it than the model; if it may, "
-        "add it to the spec, or log motions that tell them apart",
+        f"the log cannot tell {'; '.join(which)}: estimates assume that the machine has no more of it than the model; "
+        "if it may, add it to the spec, or log motions that tell them apart",
     )
 
 
