@@ -49,9 +49,9 @@ STARTING_STRIDES = 1
 """Length in strides of the rows of windows from logged states where these are noisy and only a start is wanted."""
 NOISY_STRIDE = 1e-3
 """Noise of a channel in its typical changes in a stride; above it logged states are noisy where rows are close."""
-NOISY = 0.15
-"""Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5, and where there is
-none the estimate is below 0.1 from a hundred windows on."""
+NOISY = 0.2
+"""Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5, and random forces
+as large as it half of that."""
 MORE = 2
 """Smallest ratio of the numbers of windows for which more of the shortest ones are worth a search of their own."""
 
