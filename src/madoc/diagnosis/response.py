@@ -128,8 +128,8 @@ def _lag_findings(response: Response, action: str, simulator: Simulator) -> list
     """A warning where a lag is certain, and no calibrated delay can stand for it."""
     step, lag, error = simulator.control_step, response.lag, response.lag_error
     delays = [row for row in simulator.parameters.parameters if row.field == "action_delay"]
-    covered = (row.low <= each <= row.high for row in delays for each in (lag, response.larger_lag))
-    if lag < max(LATE * step, CERTAIN * error) or any(covered):
+    covered = any(row.low <= max(lag, response.larger_lag) and lag <= row.high for row in delays)
+    if lag < max(LATE * step, CERTAIN * error) or covered:
         return []
     what = (
         f"the acceleration of {response.joint.joint} follows it {lag:.3g} ± {2.0 * error:.1g} s late ({lag / step:.2g} "

@@ -209,15 +209,16 @@ def _of_fitted_runs(
 
     Mean and standard deviation are those of the random-effects model, in which a run that tells little counts little.
     """
-    if len(runs) <= FEWEST_RUNS:
-        return
-    points, errors = np.stack([run.point for run in runs]), np.sqrt(np.stack([run.variance for run in runs]))
-    kinds = [common(*column) for column in zip(points.T, np.maximum(errors, np.finfo(float).tiny).T, strict=True)]
-    shifts = tests.by_name(np.array([kind.mean for kind in kinds]) - point)
-    reaches = tests.by_name(NORMAL_95 * np.array([kind.spread for kind in kinds]))
     for name in names:
+        index = tests.space.names.index(name)
+        telling = [run for run in runs if run.variance[index] > 0.0]  # a run in which it has no effect tells nothing
+        if len(telling) <= FEWEST_RUNS:
+            continue
+        values, variances = np.array([(run.point[index], run.variance[index]) for run in telling]).T
+        kind, half_width = common(values, np.sqrt(variances)), float(tests.half_widths[index])
+        shift, reach = (kind.mean - float(point[index])) / half_width, NORMAL_95 * kind.spread / half_width
         cause = f"{name} changing from run to run"
-        yield Alternative((cause,), False, {name: shifts[name]}, {name: reaches[name]}, parts=True)
+        yield Alternative((cause,), False, {name: shift}, {name: reach}, parts=True)
 
 
 def _most_certain(drifts: Iterable[MissingTerm]) -> Iterable[MissingTerm]:

@@ -153,13 +153,13 @@ def numerical(holdout: HoldOut) -> MissingTerm | None:
 
 
 def actions_in_time(terms: Sequence[MissingTerm], control_step: float) -> bool:
-    """Whether tests at the estimate exclude that actions take effect late by `IN_TIME` control steps or more.
+    """Whether tests at the estimate exclude that actions take effect late or early by `IN_TIME` control steps or more.
 
     A log alone may seem to tell that where joints stick, as under Coulomb friction, and a controller pushes on.
     """
-    delays = [term.value + SURELY * term.standard_error for term in terms if term.cause in (DELAY, EARLY)]
+    delays = [abs(term.value) + SURELY * term.standard_error for term in terms if term.cause in (DELAY, EARLY)]
     late = any(is_late(term.cause) and term.t >= SUSPICIOUS and term.value >= IN_TIME * control_step for term in terms)
-    return bool(delays) and max(delays) < IN_TIME * control_step and not late
+    return bool(delays) and bool(max(delays) < IN_TIME * control_step) and not late
 
 
 def felt(terms: Sequence[MissingTerm]) -> MissingTerm | None:
@@ -280,5 +280,5 @@ def _sentence(alternatives: tuple[Alternative, ...], names: tuple[str, ...]) -> 
     moved = np.array([widening((each,), names).max() for each in alternatives])
     furthest = [alternatives[index] for index in np.argsort(-moved, kind="stable") if moved[index] > 0.0]
     causes = [*dict.fromkeys(cause for each in furthest for cause in each.causes)]
-    others = f" and, less, {len(causes) - NAMED} more" if len(causes) > NAMED else ""
+    others = f" and {len(causes) - NAMED} more" if len(causes) > NAMED else ""
     return f"intervals were widened to cover what the data does not exclude: {', '.join(causes[:NAMED])}{others}"

@@ -93,6 +93,7 @@ def continued(longer: SearchState, shorter: SearchState) -> SearchState:
         damping=np.full_like(longer.damping, FIRST_DAMPING),
         state_damping=np.full_like(longer.state_damping, FIRST_DAMPING),
         waiting=RESTARTS + NARROWEST,
+        missed=(0.0, 0.0),
         epochs=0,
     )
 

@@ -32,8 +32,9 @@ FIRST_STEPS = 2
 """Number of steps of initial states at contacts with whose result those of the following steps are compared."""
 FAR = 3.0
 """Distance in standard errors; once parameters have moved farther, initial states are looked for anew."""
-SHORTER = 1.0
-"""Smallest damping after a step that did not help at contacts: with less, the next would hardly be shorter."""
+SHORTER = 1.0 / TRIALS[0]
+"""Smallest damping after a step that did not help at contacts: with less, the next would hardly be shorter. It is that
+of the least damped step, by which it is multiplied, of 1."""
 _SMALLEST = 1e-100
 """Smallest tolerance, so that the ratio of a step to a tolerance of 0 is finite."""
 

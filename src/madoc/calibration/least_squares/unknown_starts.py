@@ -261,6 +261,9 @@ class UnknownStarts:
     ) -> Outcome:
         costs, simulations = window_costs(residuals, self.loss), int(np.prod(residuals.shape[:-1]))
         followed = np.array(shares)[costs.argmin(1)]
+        if len(shares) == 1:  # a state whose step makes its window worse stays where it is
+            worse = costs[:, 0] > np.maximum(window_costs(plan.residuals, self.loss), LIKE_NOISE)
+            followed = np.where(worse, 0.0, followed)
         if not plan.kept.any():
             return Outcome(FAILED_WINDOW, costs.min(1).mean(-1), followed, 0, simulations)
         before, after = window_costs(plan.residuals, self.loss)[plan.kept], costs.min(1)[:, plan.kept]
