@@ -15,7 +15,6 @@ from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Dataset
 from madoc.identification.information import half_width, sandwich
-from madoc.identification.settling import RESTARTS
 from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
 LENGTHS = (1, 1, 3, 9)
@@ -40,9 +39,6 @@ LEFT_OUT = 0.1
 """Share in [0, 1] of windows; longer windows are refused if more than this share of them is newly unexplained."""
 CHANCE = 3.0
 """Autocorrelation in its standard errors under white noise; above it residuals are not white."""
-NARROWEST = 2
-"""Number of steps of initial states with the narrowest differences, before those that do not serve begin anew: states
-are near their best on longer windows already, and wide differences are of no use."""
 _SMALLEST = 1e-100
 
 
@@ -92,8 +88,7 @@ def continued(longer: SearchState, shorter: SearchState) -> SearchState:
         state_errors=shorter.state_errors,
         damping=np.full_like(longer.damping, FIRST_DAMPING),
         state_damping=np.full_like(longer.state_damping, FIRST_DAMPING),
-        waiting=RESTARTS + NARROWEST,
-        missed=(0.0, 0.0),
+        waiting=UnknownStarts.waiting,
         epochs=0,
     )
 

@@ -211,7 +211,7 @@ class Search:
         after, waiting = windows.settle(state.point[0], states, damping, state.state_errors, state.waiting)
         new_states, new_damping = state.states.copy(), state.state_damping.copy()
         new_states[0], new_damping[0] = after.states, after.damping
-        first = state.waiting > self.starts.waiting - FIRST_STEPS or state.missed == (0.0, 0.0)
+        first = state.waiting > self.starts.waiting - FIRST_STEPS
         missed = windows.share_unexplained(after), float(np.sqrt(after.costs.mean()) * np.median(after.deviation))
         before = missed if first else state.missed
         smooth = not state.touching.any()
@@ -268,7 +268,7 @@ class Search:
         metrics = {"residual": float(np.sqrt(cost)) * noise, "moved": float(following.moved[0]), "noise": noise}
         if following.moved[0] < 1.0 and self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0:
             moved = np.maximum(following.moved, 1.0)
-            following = replace(following, waiting=settling.RESTARTS, moved=moved)
+            following = replace(following, waiting=self.starts.waiting, moved=moved)
         columns = 2 + 2 * len(step) + len(plan.spread)  # the last for the contacts
         spent = len(state.rows) * columns + after.simulations
         return following, Epoch(metrics, spent * self.horizon, stage="calibrating")
@@ -317,13 +317,12 @@ class Search:
         return self._running(state) * self.window_count(state) * self.horizon
 
     def _settles_roughly(self, state: SearchState) -> bool:
-        """Whether steps of half a standard error are small enough: at contacts, and after many steps that were larger.
+        """Whether steps of half a standard error are small enough: after many steps that were larger.
 
         Windows may be trusted after one step and not after the next, and parameters then go to and fro. The covariance
         counts the last step as an error.
         """
-        many = state.touching.any() or state.epochs + 1 >= self.search_epochs
-        return self.starts.unknown and bool(state.refining) and bool(many)
+        return self.starts.unknown and bool(state.refining) and state.epochs + 1 >= self.search_epochs
 
     @staticmethod
     def _smooth(state: SearchState) -> bool:
