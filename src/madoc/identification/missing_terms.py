@@ -90,6 +90,8 @@ def suspicions(
     point: Float[np.ndarray, " d"],
     half_widths: Float[np.ndarray, " d"],
     scale: Float[np.ndarray, " observation"],
+    *,
+    of_other_model: bool = False,
 ) -> Suspicions:
     """Terms that the model may lack, and what including them would do to the estimate.
 
@@ -101,6 +103,8 @@ def suspicions(
             parameters would pass for missing terms.
         half_widths: Half of each parameter's 95 % interval in [-1, 1].
         scale: Typical change of each signal in a step.
+        of_other_model: Whether the estimate is another model's, so that other windows may move it for a reason:
+            alternatives then move by that as well.
     """
     readings, states, before, runs = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)))
     if len(readings) < FEWEST + len(point):
@@ -125,10 +129,12 @@ def suspicions(
     tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
     drifts, others, of_parts = drifts_of(tests, simulator, readings, runs, fit, point)
     spent += of_parts
-    terms, others = (
-        [*_terms(tests), *_below_minimum(tests, led), *drifts],
-        [*others, *_of_other_windows(tests, led - point)],
-    )
+    terms = [*_terms(tests), *_below_minimum(tests, led), *drifts]
+    for other in _of_other_windows(tests, led - point):
+        others.append(other)
+        if of_other_model:
+            shifts = np.array([other.shifts.get(name, 0.0) for name in tests.space.names])
+            tests = replace(tests, moved=shifts * half_widths)
     chosen = _chosen(tests)
     if chosen:
         together = _with_terms(tests, chosen)
@@ -257,7 +263,7 @@ def _with_terms(tests: TermTests, chosen: list[int]) -> Alternative:
             alone = tests.score(index)
             error = np.hypot(error, 0.0 if alone is None else alone.shifts)
     causes = tuple(dict.fromkeys(_name(tests.tried[index]) for index in chosen))
-    return Alternative(causes, True, tests.by_name(shift), tests.by_name(error))
+    return tests.alternative(causes, shift, error, terms=True)
 
 
 def _fitted(
@@ -325,7 +331,7 @@ def _of_friction(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
         by_friction = found.shifts / found.change
         shift, error = 0.5 * (low + high) * by_friction, 0.5 * (high - low) * np.abs(by_friction)
         if np.max((np.abs(shift) + error) / tests.half_widths) >= WORTH_FITTING:
-            yield Alternative((_name(candidate),), False, tests.by_name(shift), tests.by_name(error), bounded=True)
+            yield tests.alternative((_name(candidate),), shift, error, bounded=True)
 
 
 def _of_forces(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:

@@ -85,7 +85,13 @@ class ImitatedTerm:
 class TermTests:
     """What score tests need: products of residuals and derivatives, the candidates, and the scale of shifts.
 
-    `runs` are the episodes that the windows are from.
+    Attributes:
+        products: Products of residuals and derivatives, those of the parameters first, then those of the candidates.
+        tried: The candidates.
+        space: The calibrated parameters.
+        half_widths: Half of each parameter's 95 % interval in [-1, 1].
+        runs: The episodes that the windows are from.
+        moved: By how much these windows without any candidate move the estimate in [-1, 1]; a number for all, or each.
     """
 
     products: Products
@@ -93,6 +99,7 @@ class TermTests:
     space: ParameterSpace
     half_widths: Float[np.ndarray, " d"]
     runs: Int[np.ndarray, " windows"]
+    moved: Float[np.ndarray, " d"] | float = 0.0
 
     def score(self, index: int, beside: Sequence[int] = ()) -> Score | None:
         """The score of a candidate beside others; None if there is none, or if its value would not be physical."""
@@ -104,6 +111,18 @@ class TermTests:
     def by_name(self, values: Float[np.ndarray, " d"]) -> dict[str, float]:
         """Values in [-1, 1] of each parameter, by name and in half-widths."""
         return dict(zip(self.space.names, (values / self.half_widths).tolist(), strict=True))
+
+    def alternative(
+        self,
+        causes: tuple[str, ...],
+        shift: Float[np.ndarray, " d"],
+        error: Float[np.ndarray, " d"],
+        *,
+        terms: bool = False,
+        bounded: bool = False,
+    ) -> Alternative:
+        """The estimate with candidates that shift it by this much in [-1, 1], from the given one."""
+        return Alternative(causes, terms, self.by_name(self.moved + shift), self.by_name(error), bounded=bounded)
 
 
 def term_of(candidate: Candidate, found: Score, shifts: dict[str, float]) -> MissingTerm:

@@ -148,8 +148,10 @@ def _moved_together(holdout: HoldOut) -> bool:
 
 def numerical(holdout: HoldOut) -> MissingTerm | None:
     """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
-    step = felt(holdout.missing_terms) if holdout.finer else _numerical(holdout.missing_terms)
-    return step if step is not None and step.explained >= NUMERICAL else None
+    step = integration(holdout.missing_terms)
+    # What terms explain with a finer step is a share of what the error of the model's own leaves.
+    left = 1.0 - step.explained if holdout.finer and step is not None else 1.0
+    return _numerical(holdout.missing_terms, left)
 
 
 def actions_in_time(terms: Sequence[MissingTerm], control_step: float) -> bool:
@@ -168,11 +170,12 @@ def felt(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     return step if step is not None and step.t >= CERTAIN_STEP and step.explained >= FELT else None
 
 
-def _numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:
+def _numerical(terms: Sequence[MissingTerm], left: float = 1.0) -> MissingTerm | None:
+    """`numerical`, where other terms explain shares of what is `left` of the squared residuals, in [0, 1]."""
     step = integration(terms)
     if step is None or step.t < CERTAIN_STEP or step.explained < NUMERICAL:
         return None
-    others = (each.explained for each in terms if is_certain(each) and each.cause not in DRIFTS)
+    others = (left * each.explained for each in terms if is_certain(each) and each.cause not in DRIFTS)
     return step if max(others, default=0.0) <= step.explained else None
 
 

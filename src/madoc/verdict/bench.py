@@ -194,7 +194,7 @@ def _doubts(
     if step is None or task.source is None:
         return doubts, False
     finer = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
-    fine = suspicions(*given, finer, point, half_widths, bench.change)
+    fine = suspicions(*given, finer, point, half_widths, bench.change, of_other_model=True)
     spent = doubts.control_steps + FINER * fine.control_steps
     left = felt(fine.terms)
     if not fine.tested or (left is not None and left.explained >= NUMERICAL):
