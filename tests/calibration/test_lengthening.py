@@ -16,6 +16,7 @@ from madoc.calibration.least_squares.lengthening import (
     horizon_of,
     lengthened,
     noise_alone,
+    precise,
     tells_more,
     widened,
 )
@@ -122,6 +123,30 @@ def test_longer_windows_say_more_if_intervals_are_narrower_and_as_many_are_expla
     assert tells_more(longer, shorter)
     assert not tells_more(replace(longer, bread=np.eye(3), meat=4.0 * np.eye(3)), shorter)
     assert not tells_more(replace(longer, explained=12), replace(shorter, explained=0))
+
+
+def test_none_follow_a_precise_search_at_contacts(pendulum):
+    """A standard error of 0.4 % of half of the range, times 2.03 for 37 degrees of freedom, is 0.41 % of the range."""
+    problem = problem_of(pendulum)
+    search, _ = searches_of(problem)
+    search = replace(search, bread=np.eye(3), meat=0.004**2 * np.eye(3), explained=40)
+    assert precise(search)
+    assert not precise(replace(search, meat=np.diag([0.004, 0.004, 0.006]) ** 2))
+    state = replace(LeastSquares().init(problem, jax.random.key(0)), stage="estimated")
+    first = state.unknown[0]
+    settled = replace(
+        first,
+        bread=search.bread,
+        meat=search.meat,
+        refining=1,
+        epochs=1,
+        moved=0.0 * first.moved,
+        cost=0.0 * first.cost,
+    )
+    for rough in (0, 1):
+        searches = (replace(settled, rough=rough, explained=len(first.rows)), *state.unknown[1:])
+        after = LeastSquares()._after_unknown(problem, replace(state, unknown=searches))
+        assert after.finished == rough
 
 
 def test_where_motion_is_smooth_they_make_noise_matter_less(pendulum):

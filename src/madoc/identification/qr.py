@@ -1,7 +1,7 @@
-"""QR decomposition of tall matrices in blocks of rows (Demmel et al. 2012, Communication-optimal QR, TSQR).
+"""QR decompositions of tall, narrow matrices, as Jacobians of residuals are, faster than LAPACK's.
 
-LAPACK's own works on whole columns; of residuals' tall, narrow Jacobians these do not fit the processor's cache, and
-the blocked form takes a tenth to a twentieth of the time.
+That works on whole columns, which do not fit the processor's cache. R alone is computed in blocks of rows (Demmel et
+al. 2012, Communication-optimal QR, TSQR), in a tenth to a twentieth of the time.
 """
 
 import numpy as np
@@ -26,17 +26,22 @@ def triangle(matrix: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "co
 def thin_qr(
     matrices: Float[np.ndarray, "stack rows columns"],
 ) -> tuple[Float[np.ndarray, "stack rows columns"], Float[np.ndarray, "stack columns columns"]]:
-    """Q and R of each matrix of a stack, Q with as many columns as the matrix, which must have as many rows or more."""
-    stack, count, columns = matrices.shape
-    rows = max(BLOCK, 2 * columns)
-    if count <= 2 * rows:
-        return np.linalg.qr(matrices)
-    filled = np.zeros((stack, -(-count // rows) * rows, columns))
-    filled[:, :count] = matrices
-    first, parts = np.linalg.qr(filled.reshape(-1, rows, columns))
-    second, factor = thin_qr(parts.reshape(stack, -1, columns))
-    basis = first @ second.reshape(-1, columns, columns)
-    return basis.reshape(stack, -1, columns)[:, :count], factor
+    """Q and R of each matrix of a stack by two Cholesky decompositions (Yamamoto et al. 2015, CholeskyQR2).
+
+    The columns of each matrix, taken to the same length, must have a condition number of at most 10^7, as those of a
+    damped problem have. Q is then orthonormal to rounding, and two products of matrices take less than half of the time
+    of Householder's reflections.
+
+    Raises:
+        numpy.linalg.LinAlgError: The columns of a matrix are nearer to linear dependence, or not finite.
+    """
+    lengths = np.linalg.norm(matrices, axis=1, keepdims=True)
+    lengths[lengths == 0.0] = 1.0
+    basis, factor = matrices / lengths, np.eye(matrices.shape[2])
+    for _ in range(2):
+        part = np.linalg.cholesky(np.swapaxes(basis, 1, 2) @ basis, upper=True)
+        basis, factor = basis @ np.linalg.inv(part), part @ factor
+    return basis, factor * lengths
 
 
 def _padded(matrix: Float[np.ndarray, "rows columns"], multiple: int) -> Float[np.ndarray, "more columns"]:

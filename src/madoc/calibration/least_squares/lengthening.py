@@ -37,6 +37,8 @@ FIRST_STEPS = 3
 inexact."""
 LEFT_OUT = 0.1
 """Share in [0, 1] of windows; longer windows are refused if more than this share of them is newly unexplained."""
+PRECISE = 5e-3
+"""Half of a 95 % interval as a share of the parameter's range, up to which an estimate is precise."""
 CHANCE = 3.0
 """Autocorrelation in its standard errors under white noise; above it residuals are not white."""
 _SMALLEST = 1e-100
@@ -136,6 +138,12 @@ def noise_alone(longer: SearchState, first: SearchState, readings: int) -> bool:
     """
     quiet = bool((longer.deviation <= AS_WELL * first.deviation).all())
     return quiet and longer.autocorrelation <= CHANCE / math.sqrt(max(1, longer.explained * readings))
+
+
+def precise(search: SearchState) -> bool:
+    """Whether the interval of every parameter is so narrow that more windows are not worth their time."""
+    width = half_width(sandwich(search.bread, search.meat).covariance, search.explained)
+    return bool((0.5 * width <= PRECISE).all())
 
 
 def tells_more(longer: SearchState, shorter: SearchState) -> bool:

@@ -172,7 +172,9 @@ class Search:
             new["point"][index] = np.clip(points[index] + plan.steps[trial], -1.0, 1.0)
             change = followed[:, None] * plan.state_steps[trial] * plan.spread
             new["states"][index, :count, : len(plan.spread)] += change
-            new["damping"][index] = np.clip(damping[index] * factor, *DAMPING_RANGE)
+            rejected = trial == len(TRIALS) and self.starts.unknown and windows.touching.any()
+            least = SHORTER if rejected else DAMPING_RANGE[0]
+            new["damping"][index] = np.clip(max(damping[index] * factor, least), *DAMPING_RANGE)
             state_factor = np.select([followed == 1.0, followed > 0.0], [0.1, 1.0], 10.0)
             new["state_damping"][index, :count] = np.clip(state_damping[index] * state_factor, *settling.DAMPING_RANGE)
             cost = float(outcome.totals[trial])
@@ -268,7 +270,7 @@ class Search:
         metrics = {"residual": float(np.sqrt(cost)) * noise, "moved": float(following.moved[0]), "noise": noise}
         if following.moved[0] < 1.0 and self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0:
             moved = np.maximum(following.moved, 1.0)
-            following = replace(following, waiting=self.starts.waiting, moved=moved)
+            following = replace(following, waiting=settling.RESTARTS, moved=moved)
         columns = 2 + 2 * len(step) + len(plan.spread)  # the last for the contacts
         spent = len(state.rows) * columns + after.simulations
         return following, Epoch(metrics, spent * self.horizon, stage="calibrating")
