@@ -111,24 +111,14 @@ def suspicions(
         return Suspicions(tested=False)
     fit = fit_windows(simulator, readings, states, point)
     led = fit.point
-    added = list(candidates(logged, simulator, led, scale))
-    space = ParameterSpace((*simulator.parameters.parameters, *(parameter for _, parameter in added)))
-    wide = simulation.make(replace(simulator.task, parameters=space))
-    at_nominal = np.concatenate([led, -np.ones(len(added))])
-    tried, by_terms = effects(simulator, wide, readings, before, at_nominal, fit.states, added)
-    forces, by_forces = force_effects(simulator, readings, logged, led, fit.states, fit.slopes.whole)
-    tried, by_terms = [*tried, *forces], np.concatenate([by_terms, by_forces], axis=-1)
+    tried, by_terms = _effects(logged, simulator, readings, before, fit, scale)
     spent = fit.control_steps + (3 + len(tried)) * len(readings) * readings.steps
-    if fit.slopes.whole.any():
-        diverges = (~np.isfinite(by_terms).all(1)[fit.slopes.whole]).mean(0) > DIVERGING
-        by_terms[..., diverges] = 0.0  # so that a term which most windows cannot bear is not tested, but others are
     both = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, by_terms], axis=-1))
     products, counted = products_of(both, readings, len(led)), both.finite
     if products is None or len(products) < FEWEST + len(led):
         return Suspicions(control_steps=spent, tested=negligible(both))
     tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
     drifts, others, of_parts = drifts_of(tests, simulator, readings, runs, fit, point)
-    spent += of_parts
     terms = [*_terms(tests), *_below_minimum(tests, led), *drifts]
     for other in _of_other_windows(tests, led - point):
         others.append(other)
@@ -136,22 +126,60 @@ def suspicions(
             shifts = np.array([other.shifts.get(name, 0.0) for name in tests.space.names])
             tests = replace(tests, moved=shifts * half_widths)
     chosen = _chosen(tests)
-    if chosen:
-        together = _with_terms(tests, chosen)
-        richer = None
-        if max(map(abs, together.shifts.values())) >= WORTH_FITTING:
-            richer = _fitted(tests, chosen, simulator, readings, fit, point)
-        if richer is not None:
-            spent += richer.control_steps
-            terms = [richer.terms.get(term.parameter, term) for term in terms]
-            others.append(richer.alternative)
-        if richer is None or len(richer.terms) < len(chosen):
-            others.append(together)
-        further = [*_rivals(tests, chosen), *_further(tests, chosen)]
-        others += [replace(_with_terms(tests, rivals), terms=False) for rivals in further]
-    others += [*_of_friction(tests, chosen), *_of_forces(tests, chosen)]
+    fitted, with_chosen, of_fit = _of_chosen(tests, chosen, simulator, readings, fit, point)
+    terms = [fitted.get(term.parameter, term) for term in terms]
+    others += [*with_chosen, *_of_friction(tests, chosen), *_of_forces(tests, chosen)]
     most_significant_first = sorted(terms, key=lambda term: -abs(term.t))
-    return Suspicions(tuple(most_significant_first), tuple(others), tuple(_imitated(tests)), spent)
+    imitated = tuple(_imitated(tests))
+    return Suspicions(tuple(most_significant_first), tuple(others), imitated, spent + of_parts + of_fit)
+
+
+def _effects(
+    logged: LoggedStates,
+    simulator: Simulator,
+    readings: Readings,
+    before: Float[np.ndarray, "windows action"],
+    fit: Fit,
+    scale: Float[np.ndarray, " observation"],
+) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"]]:
+    """Every candidate and the derivative of the residuals by it, 0 for one that most windows cannot bear."""
+    added = list(candidates(logged, simulator, fit.point, scale))
+    space = ParameterSpace((*simulator.parameters.parameters, *(parameter for _, parameter in added)))
+    wide = simulation.make(replace(simulator.task, parameters=space))
+    at_nominal = np.concatenate([fit.point, -np.ones(len(added))])
+    tried, by_terms = effects(simulator, wide, readings, before, at_nominal, fit.states, added)
+    forces, by_forces = force_effects(simulator, readings, logged, fit.point, fit.states, fit.slopes.whole)
+    by_terms = np.concatenate([by_terms, by_forces], axis=-1)
+    if fit.slopes.whole.any():
+        diverges = (~np.isfinite(by_terms).all(1)[fit.slopes.whole]).mean(0) > DIVERGING
+        by_terms[..., diverges] = 0.0  # so that others are tested
+    return [*tried, *forces], by_terms
+
+
+def _of_chosen(
+    tests: TermTests,
+    chosen: list[int],
+    simulator: Simulator,
+    readings: Readings,
+    fit: Fit,
+    point: Float[np.ndarray, " d"],
+) -> tuple[dict[str, MissingTerm], list[Alternative], int]:
+    """The estimates with the chosen terms, with their rivals, and with one more; also the control steps simulated.
+
+    The terms are fitted together with the parameters where they move these by much: the fitted ones come first, by the
+    name of their parameter.
+    """
+    if not chosen:
+        return {}, [], 0
+    together, richer = _with_terms(tests, chosen), None
+    if max(map(abs, together.shifts.values())) >= WORTH_FITTING:
+        richer = _fitted(tests, chosen, simulator, readings, fit, point)
+    others = [] if richer is None else [richer.alternative]
+    if richer is None or len(richer.terms) < len(chosen):
+        others.append(together)
+    further = [*_rivals(tests, chosen), *_further(tests, chosen)]
+    others += [replace(_with_terms(tests, rivals), terms=False) for rivals in further]
+    return ({}, others, 0) if richer is None else (richer.terms, others, richer.control_steps)
 
 
 @dataclass(frozen=True)

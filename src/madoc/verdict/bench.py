@@ -25,7 +25,7 @@ from madoc.identification.states import LoggedStates, logged_states
 from madoc.identification.windows import consecutive_rows, evenly, horizons
 from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
-from madoc.parameters import FIELDS
+from madoc.parameters import FIELDS, ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.types import named_key
 from madoc.verdict.adequacy import NUMERICAL, actions_in_time, felt, in_full, is_certain, widening
@@ -227,35 +227,17 @@ def judged(
     in typical changes of a stride.
     """
     space, problem = bench.simulator.parameters, bench.problem
-    residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
-    half, spent = expected_half_widths(problem.states, problem.dataset, problem.simulator, at, residual, exact=exact)
-    if exact and noise.any():  # then windows with fitted initial states may tell more than single noisy steps do
-        sensors = np.maximum(noise, NEGLIGIBLE) * bench.change
-        fitted, more = expected_half_widths(
-            problem.states, problem.dataset, problem.simulator, at, sensors, exact=False
-        )
-        half, spent = np.minimum(half, fitted), spent + more
-    own = half
+    best, of_widths = _best_half_widths(bench, at, residual, noise if exact and noise.any() else None, exact=exact)
+    own = best
     if interval is not None:  # to the farther end, as the other may be cut off at an end of the range
         own = np.maximum(np.abs(space.to_unit(interval.T) - point).max(0), 1e-9)
     doubts, finer = _doubts(bench, point, own)
-    found = problem.dataset.findings
-    if bench.simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none":
-        points = np.stack([np.zeros(len(point)), point, at])
-        exchanged, steps = exchanged_columns(
-            bench.held_out, bench.simulator, points, horizons(problem.dataset)[1], bench.change, contradicts=True
-        )
-        found, spent = (*exchanged, *found), spent + steps
-    in_time = actions_in_time(doubts.terms, bench.simulator.control_step)
-    coarse, steps = 0.0, 0
+    contradictions, of_columns = _contradictions(bench, point, at, doubts)
+    coarse, of_steps = 0.0, 0
     if bench.simulator.task.source is not None:  # else no timestep can be given
-        coarse, steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
-    # Another estimate of other windows says that the search is not at its end, not that a parameter is open.
-    open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
-    best, own_ends = (point[:, None] + np.outer(each, (-1.0, 1.0)) for each in (half, own))
-    ends = own_ends if interval is None else space.to_unit(interval.T).T
-    ends = ends + own[:, None] * widening(open_by, space.names) * (-1.0, 1.0)
-    shares = np.maximum(*(np.ptp(np.clip(each, -1.0, 1.0), axis=1) / 2.0 for each in (best, ends)))
+        coarse, of_steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
+    ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
+    shares = _shares(space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own, doubts)
     signals = signal_names(bench.simulator.task)[: len(noise)]
     return record(
         split=bench.split,
@@ -265,7 +247,7 @@ def judged(
         interval_shares=dict(zip(space.names, shares.tolist(), strict=True)),
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
-        control_steps=control_steps + spent + steps + doubts.control_steps,
+        control_steps=control_steps + of_widths + of_columns + of_steps + doubts.control_steps,
         missing_terms=tuple(
             term
             for place, term in enumerate(doubts.terms)
@@ -274,7 +256,7 @@ def judged(
         alternatives=doubts.alternatives,
         imitated=doubts.imitated,
         tested=doubts.tested,
-        contradictions=tuple(each.sentence for each in found if each.contradicts and not (each.late and in_time)),
+        contradictions=contradictions,
         coarseness=coarse,
         finer=finer,
         at_end=tuple(
@@ -283,3 +265,60 @@ def judged(
             if abs(value) > AT_END and not (value < 0.0 and row.low <= FIELDS[row.field].minimum)
         ),
     )
+
+
+def _best_half_widths(
+    bench: Bench,
+    at: Float[np.ndarray, " d"],
+    residual: Float[np.ndarray, " channels"],
+    sensors: Float[np.ndarray, " channels"] | None,
+    *,
+    exact: bool,
+) -> tuple[Float[np.ndarray, " d"], int]:
+    """Half of the narrowest 95 % intervals that the log allows, in [-1, 1], and the control steps simulated.
+
+    Where states are exact but for the noise of `sensors`, windows with fitted initial states may tell more than single
+    noisy steps do.
+    """
+    given = bench.problem.states, bench.problem.dataset, bench.problem.simulator, at
+    residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
+    half, spent = expected_half_widths(*given, residual, exact=exact)
+    if sensors is None:
+        return half, spent
+    fitted, more = expected_half_widths(*given, np.maximum(sensors, NEGLIGIBLE) * bench.change, exact=False)
+    return np.minimum(half, fitted), spent + more
+
+
+def _contradictions(
+    bench: Bench, point: Float[np.ndarray, " d"], at: Float[np.ndarray, " d"], doubts: Suspicions
+) -> tuple[tuple[str, ...], int]:
+    """Findings of the log that contradict the spec, in a sentence each, and the control steps simulated.
+
+    Actions that seem late are none where tests at the estimate exclude it.
+    """
+    simulator, dataset = bench.simulator, bench.problem.dataset
+    found, spent = dataset.findings, 0
+    if simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none":
+        points = np.stack([np.zeros(len(point)), point, at])
+        exchanged, spent = exchanged_columns(
+            bench.held_out, simulator, points, horizons(dataset)[1], bench.change, contradicts=True
+        )
+        found = (*exchanged, *found)
+    in_time = actions_in_time(doubts.terms, simulator.control_step)
+    return tuple(each.sentence for each in found if each.contradicts and not (each.late and in_time)), spent
+
+
+def _shares(
+    space: ParameterSpace,
+    best: Float[np.ndarray, "d 2"],
+    ends: Float[np.ndarray, "d 2"],
+    half_widths: Float[np.ndarray, " d"],
+    doubts: Suspicions,
+) -> Float[np.ndarray, " d"]:
+    """Shares in [0, 1] of each range that intervals cover: the best possible, or the given ones widened, if wider.
+
+    Another estimate of other windows says that the search is not at its end, not that a parameter is open.
+    """
+    open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
+    ends = ends + half_widths[:, None] * widening(open_by, space.names) * (-1.0, 1.0)
+    return np.maximum(*(np.ptp(np.clip(each, -1.0, 1.0), axis=1) / 2.0 for each in (best, ends)))
