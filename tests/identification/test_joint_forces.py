@@ -8,6 +8,7 @@ from madoc import robots, simulation
 from madoc.data import logs
 from madoc.identification.joint_forces import (
     BENT,
+    BUILT_UP,
     CONSTANT,
     COUPLED,
     DEAD_ZONE,
@@ -45,6 +46,27 @@ def test_forces_along_a_motion():
     assert cubed == pytest.approx(along)
 
 
+def test_friction_builds_up_after_a_reversal():
+    """The joint moves to and fro between 0 and 1, so that the variance of its position is 3/5 · 2/5."""
+    position, speed = np.array([[0.0, 1.0, 1.0, 0.0, 1.0]]), np.array([[1.0, 1.0, -1.0, -1.0, 1.0]])
+    deviation = np.sqrt(0.24)
+    near, far = joint_forces(position, speed, speed, turns=False)[BUILT_UP]
+    expected = np.array([[0.0, 0.0, -1.0, -np.exp(-1.0 / (0.3 * deviation)), 1.0]])
+    assert far == pytest.approx(expected, abs=1e-8)
+    assert near == pytest.approx(np.sign(expected) * np.abs(expected) ** 10, abs=1e-8)
+
+
+def dahl(friction, rate):
+    """What friction that builds up over 1 / `rate` rad (Dahl 1968) lacks of Coulomb friction of that size."""
+    state = [0.0]
+
+    def force(q, v, u):
+        state[0] = np.clip(state[0] + 0.02 * rate * (v - abs(v) * state[0]), -1.0, 1.0)
+        return friction * (np.tanh(v / 0.02) - state[0])
+
+    return force
+
+
 def test_forces_by_another_joint():
     one, still = np.array([[1.0, 3.0]]), np.zeros((1, 2))
     (coupled,) = joint_forces(still, still, still, [(one, still)], turns=True)[COUPLED]
@@ -70,8 +92,9 @@ def test_causes_are_known_by_their_begin():
         (lambda q, v, u: -0.06 * np.tanh(v / 0.05) * np.exp(-((v / 0.4) ** 2)), SLOW),
         (lambda q, v, u: 0.1 * u * np.sin(q), RIPPLE),
         (lambda q, v, u: -np.clip(u, -0.03, 0.03), DEAD_ZONE),
+        (dahl(0.08, rate=10.0), BUILT_UP),
     ],
-    ids=["constant", "loaded", "slow", "ripple", "dead zone"],
+    ids=["constant", "loaded", "slow", "ripple", "dead zone", "built up"],
 )
 def test_a_force_at_the_joint_is_certain_and_named(tmp_path, force, cause):
     (tmp_path / "model.xml").write_text(MODEL.format(damping=0.1, friction=0.03, drag=""))

@@ -26,7 +26,8 @@ RIPPLE = "a drive whose gain depends on where the joint is"
 UNEVEN = "friction that depends on where the joint is"
 PLACED = "a force that depends on where the joint is"
 COUPLED = "a force that another joint's motion exerts"
-FORCES = (CONSTANT, LOADED, SLOW, WEAKENING, DEAD_ZONE, BENT, RIPPLE, UNEVEN, PLACED, COUPLED)
+BUILT_UP = "friction that builds up over a distance after each reversal, as of belts and seals"
+FORCES = (CONSTANT, LOADED, SLOW, WEAKENING, DEAD_ZONE, BENT, RIPPLE, UNEVEN, PLACED, COUPLED, BUILT_UP)
 """What each stands for, in words, the most usual first; the joint's name follows in brackets."""
 USUAL = 5
 """Number of `FORCES` that are tried at every joint; the others only at robots of few joints."""
@@ -36,6 +37,8 @@ TURNING = 0.1
 """Speed relative to the joint's root mean square, at which friction has turned to the direction of motion."""
 LOW_SPEED = 0.3
 """The same, below which friction at low speed acts (Stribeck)."""
+BUILD_UP = (0.03, 0.3)
+"""Distances relative to the standard deviation of the joint's position, over which friction builds up (Dahl)."""
 SMALL_COMMAND = 0.1
 """Force of a drive relative to its root mean square, beyond which it is out of a dead zone."""
 _SMALLEST = 1e-9
@@ -82,10 +85,22 @@ def joint_forces(
     if moves:
         found |= {SLOW: [-direction * np.exp(-((speed / (LOW_SPEED * fast)) ** 2))]}
         found |= {UNEVEN: [-direction * place for place in places], PLACED: [*places, *finer]}
+        away = _since_reversal(position, speed) / max(float(np.nanstd(position)), _SMALLEST)
+        found |= {BUILT_UP: [direction * np.exp(-away / distance) for distance in BUILD_UP]}
     if moves and drives:
         found |= {RIPPLE: [drive * place for place in places]}
     coupled = [_standardised(each) for other in others for each in other if np.nanstd(each) > _SMALLEST]
     return found | ({COUPLED: coupled} if coupled else {})
+
+
+def _since_reversal(
+    position: Float[np.ndarray, "windows steps"], speed: Float[np.ndarray, "windows steps"]
+) -> Float[np.ndarray, "windows steps"]:
+    """Distance that a joint has moved since its direction was another; infinite before the first such time."""
+    moved = np.abs(np.diff(position, axis=1, prepend=position[:, :1]))
+    path = np.cumsum(moved, axis=1)
+    reversed_ = np.sign(speed) != np.sign(np.concatenate([speed[:, :1], speed[:, :-1]], axis=1))
+    return path - np.maximum.accumulate(np.where(reversed_, path, -np.inf), axis=1)
 
 
 def _standardised(values: Float[np.ndarray, "windows steps"]) -> Float[np.ndarray, "windows steps"]:
