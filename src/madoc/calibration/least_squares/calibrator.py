@@ -285,7 +285,7 @@ class LeastSquares:
     def _after_unknown(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
         """Go on to longer windows once a search has settled, while they narrow the intervals.
 
-        At contacts, where a search takes longest, none follows one that is precise.
+        At contacts, where a search takes longest, none follows the first if that is precise.
 
         Where the log shows no contact in the longest, these come first: motion is smooth, and they mostly serve. Where
         they do not, shorter ones have their turn, and then the longest again unless they have settled.
@@ -308,7 +308,7 @@ class LeastSquares:
             return _ended(state, state.best if search.rough else 0)
         if length and not tells_more(search, searches[state.best]):
             return _failed(state)
-        if float(search.deviation.max()) < sentences.EXACT or (search.rough and precise(search)):
+        if float(search.deviation.max()) < sentences.EXACT or (not length and search.rough and precise(search)):
             return _finished(state, length)
         following = max(length + 1, LONGER)
         if not length and _longest_first(searches) and enough(searches[-1], search):

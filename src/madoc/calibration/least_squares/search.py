@@ -172,9 +172,7 @@ class Search:
             new["point"][index] = np.clip(points[index] + plan.steps[trial], -1.0, 1.0)
             change = followed[:, None] * plan.state_steps[trial] * plan.spread
             new["states"][index, :count, : len(plan.spread)] += change
-            rejected = trial == len(TRIALS) and self.starts.unknown and windows.touching.any()
-            least = SHORTER if rejected else DAMPING_RANGE[0]
-            new["damping"][index] = np.clip(max(damping[index] * factor, least), *DAMPING_RANGE)
+            new["damping"][index] = np.clip(damping[index] * factor, *DAMPING_RANGE)
             state_factor = np.select([followed == 1.0, followed > 0.0], [0.1, 1.0], 10.0)
             new["state_damping"][index, :count] = np.clip(state_damping[index] * state_factor, *settling.DAMPING_RANGE)
             cost = float(outcome.totals[trial])
