@@ -154,13 +154,12 @@ def _gain_findings(response: Response, action: str, modelled: Float[np.ndarray, 
         ]
     least, most = np.abs(modelled).min(), np.abs(modelled).max()
     size, larger = abs(measured), abs(response.larger_gain)
-    told = size if size > most else larger  # the estimate that is nearer to the model's
+    told, bound = (size, most) if size > most else (larger, least)  # the estimate nearer to the model's, and that
     if not (size >= FAR * most or larger <= least / FAR):
         return []
-    ratio = size / most if size > most else larger / least
     factors = ((each, text) for factor, text in _UNIT_ERRORS.items() for each in (factor, 1.0 / factor))
     mistake = next((text for each, text in factors if least / 1.5 < told / each < 1.5 * most), "")
-    what = f"it accelerates {joint} {ratio:.2g} times as much as anywhere in the ranges of the parameters"
+    what = f"it accelerates {joint} {told / bound:.2g} times as much as anywhere in the ranges of the parameters"
     what += f": {mistake}?" if mistake else ""
     return [Finding("warning", what, action, "look at the units of the spec and of the log, and at the ranges", True)]
 

@@ -28,7 +28,7 @@ from madoc.identification.fitted_windows import Fit, fit_windows, negligible, pr
 from madoc.identification.information import NORMAL_95
 from madoc.identification.joint_forces import force_effects, is_joint_force
 from madoc.identification.replay import Readings
-from madoc.identification.score_tests import deviate, imitators, joint_shift, parameter_shift, score
+from madoc.identification.score_tests import deviate, joint_shift, parameter_shift, score
 from madoc.identification.states import LoggedStates
 from madoc.identification.term_tests import (
     DISAGREEING,
@@ -38,6 +38,7 @@ from madoc.identification.term_tests import (
     ImitatedTerm,
     MissingTerm,
     TermTests,
+    imitated_terms,
     term_of,
 )
 from madoc.parameters import FIELDS, ParameterSpace
@@ -58,9 +59,6 @@ LIKELY_FRICTION = 1.0
 LIKELY_FORCE = 3.5
 """|t| from which a force at a joint counts though it is not certain; of a hundred that are tested, one log in twenty
 has such a one by chance."""
-MOVES_TOO = 0.1
-"""Shift of a parameter in its half-widths over the largest shift of any, from which it counts among the imitators of a
-term."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
 
 
@@ -130,7 +128,7 @@ def suspicions(
     terms = [fitted.get(term.parameter, term) for term in terms]
     others += [*with_chosen, *_of_friction(tests, chosen), *_of_forces(tests, chosen)]
     most_significant_first = sorted(terms, key=lambda term: -abs(term.t))
-    imitated = tuple(_imitated(tests))
+    imitated = tuple(imitated_terms(tests))
     return Suspicions(tuple(most_significant_first), tuple(others), imitated, spent + of_parts + of_fit)
 
 
@@ -372,21 +370,6 @@ def _of_forces(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
         found = tests.score(index, chosen) if tried else None
         if found is not None and abs(found.t) >= LIKELY_FORCE:
             yield replace(_with_terms(tests, [index, *chosen]), terms=False)
-
-
-def _imitated(tests: TermTests) -> Iterator[ImitatedTerm]:
-    """Terms that the model has none of and parameters imitate, as a mass does a spring where a joint moves little."""
-    for index, candidate in enumerate(tests.tried):
-        if candidate.known_before or not candidate.parameter or candidate.nominal > candidate.least:
-            continue
-        moved = imitators(tests.products, 1 + tests.products.count + index)
-        if moved is not None:
-            shifts = {name: abs(shift) for name, shift in tests.by_name(moved).items()}
-            most = max(shifts.values())
-            names = [name for name, shift in shifts.items() if shift >= MOVES_TOO * most]
-            yield ImitatedTerm(
-                candidate.cause, candidate.parameter, tuple(sorted(names, key=lambda name: -shifts[name]))
-            )
 
 
 def _of_other_windows(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[Alternative]:

@@ -1,13 +1,13 @@
 """What score tests of a log say of single terms: the tests, the terms they find, and other estimates they allow."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.identification.candidate_terms import DELAY, EARLY, Candidate
-from madoc.identification.score_tests import Products, Score, score
+from madoc.identification.score_tests import Products, Score, imitators, score
 from madoc.parameters import ParameterSpace
 
 SUSPICIOUS = 2.0
@@ -16,6 +16,9 @@ DISAGREEING = 3.0
 """|t| from which parts of the log, or windows of another length, give another estimate: one in 370 does by chance."""
 FEWEST = 12
 """Fewest windows beyond the number of parameters for which a standard error is worth anything."""
+MOVES_TOO = 0.1
+"""Shift of a parameter in its half-widths over the largest shift of any, from which it counts among the imitators of a
+term."""
 
 
 @dataclass(frozen=True)
@@ -138,3 +141,18 @@ def term_of(candidate: Candidate, found: Score, shifts: dict[str, float]) -> Mis
         t=found.t,
         shifts=shifts,
     )
+
+
+def imitated_terms(tests: TermTests) -> Iterator[ImitatedTerm]:
+    """Terms that the model has none of and parameters imitate, as a mass does a spring where a joint moves little."""
+    for index, candidate in enumerate(tests.tried):
+        if candidate.known_before or not candidate.parameter or candidate.nominal > candidate.least:
+            continue
+        moved = imitators(tests.products, 1 + tests.products.count + index)
+        if moved is not None:
+            shifts = {name: abs(shift) for name, shift in tests.by_name(moved).items()}
+            most = max(shifts.values())
+            names = [name for name, shift in shifts.items() if shift >= MOVES_TOO * most]
+            yield ImitatedTerm(
+                candidate.cause, candidate.parameter, tuple(sorted(names, key=lambda name: -shifts[name]))
+            )
