@@ -167,7 +167,7 @@ def recorded(task: Task, truth: dict[str, float], rows: int, key):
 
 
 class CountingSimulator:
-    """A simulator that counts the rows its systems step."""
+    """A simulator that counts the control steps of its systems."""
 
     def __init__(self, simulator):
         self._simulator = simulator
@@ -178,11 +178,11 @@ class CountingSimulator:
 
     def bind(self, parameters):
         system = self._simulator.bind(parameters)
-        step = system.step
+        roll_out = system.roll_out
 
-        def counted(state, action, force=None):
-            self.rows += state.shape[0] * state.shape[1]
-            return step(state, action, force)
+        def counted(state, actions, force=None):
+            self.rows += actions[..., 0].size
+            return roll_out(state, actions, force)
 
-        system.step = counted
+        system.roll_out = counted
         return system

@@ -246,14 +246,14 @@ class Fragile(CountingSimulator):
 
     def bind(self, parameters):
         system = super().bind(parameters)
-        step = system.step
+        roll_out = system.roll_out
 
-        def exploding(state, action, force=None):
-            following = step(state, action, force)
+        def exploding(state, actions, force=None):
+            following = roll_out(state, actions, force)
             following[parameters[:, 2] < 0.5] = np.nan
             return following
 
-        system.step = exploding
+        system.roll_out = exploding
         return system
 
 

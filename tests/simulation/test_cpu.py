@@ -44,6 +44,43 @@ def test_threads_give_the_same_bits(name, make_batch):
     np.testing.assert_array_equal(ends[0], ends[2])
 
 
+def test_a_rollout_is_its_steps_bit_for_bit_where_nothing_is_solved(monkeypatch):
+    late = replace(spring(Parameter("action_delay", "", 0.0, 0.1)), pending=5)
+    simulator = CpuSimulator(late, threads=1)
+    system = simulator.bind(np.array([[0.0], [0.033], [0.1]]))
+    random = np.random.default_rng(0)
+    state = random.normal(size=(3, 4, len(simulator.initial_state)))
+    actions, force = random.uniform(-1, 1, (3, 4, 7, 1)), random.normal(size=(3, 4, 7, 1))
+    state[1, 2, 0] = np.nan
+    together, now = system.roll_out(state, actions, force), state
+    for step in range(7):
+        now = system.step(now, actions[:, :, step], force[:, :, step])
+        np.testing.assert_array_equal(together[:, :, step], now)
+    assert np.isnan(together[1, 2]).all() and np.isfinite(together[[0, 2]]).all()
+    monkeypatch.setattr("madoc.simulation.cpu._VALUES_AT_ONCE", 1)
+    np.testing.assert_array_equal(system.roll_out(state, actions, force), together)
+
+
+def test_a_rollout_through_contacts_is_its_steps_within_the_tolerance_of_the_solver(make_batch):
+    batches = []
+    for threads in (1, 2):
+        simulator = CpuSimulator(madoc.tasks.make("hopper"), threads=threads)
+        parameters, state, action = make_batch(simulator, 3, 6)
+        system, actions = simulator.bind(parameters), np.repeat(action[:, :, None], 10, axis=2)
+        actions[0, 2, 4, 1] = np.nan
+        batches.append(system.roll_out(state, actions))
+    np.testing.assert_array_equal(*batches)
+    steps, now = [], state
+    for step in range(10):
+        now = system.step(now, actions[:, :, step])
+        steps.append(now)
+    stepped, failed = np.stack(steps, axis=2), np.isnan(batches[0]).any(-1)
+    assert failed[0, 2, 4:].all() and failed.sum() == 6
+    assert simulator.contacts(batches[0][~failed]).any()
+    np.testing.assert_array_equal(failed, np.isnan(stepped).any(-1))
+    np.testing.assert_allclose(batches[0], stepped, rtol=0, atol=1e-9)
+
+
 def test_a_step_does_not_depend_on_the_steps_before(hopper, make_batch):
     parameters, state, action = make_batch(hopper, 2, 6)
     system = hopper.bind(parameters)

@@ -38,6 +38,9 @@ class Script:
         self._step += 1
         return end
 
+    def roll_out(self, state, actions, force=None):
+        raise NotImplementedError
+
     def observe(self, state):
         return state
 

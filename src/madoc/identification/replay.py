@@ -1,6 +1,5 @@
 """Windows of a log simulated under many parameter vectors, and their residuals."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,9 +32,8 @@ def window_residuals(
     states = system.unbiased(
         np.ascontiguousarray(np.broadcast_to(windows.states, (len(points), *windows.states.shape)))
     )
-    simulated = _observations(system, states, windows.actions)
-    columns = [(then - windows.following[:, step]) / scale for step, then in enumerate(simulated)]
-    return np.concatenate(columns, axis=-1)
+    residuals = (_observations(system, states, windows.actions) - windows.following) / scale
+    return residuals.reshape(len(points), len(windows.states), -1)
 
 
 @dataclass(frozen=True)
@@ -104,12 +102,8 @@ class Readings:
         Spends windows · steps control steps.
         """
         system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
-        state = np.ascontiguousarray(states[None])
-        counts = [simulator.contacts(state[0])]
-        for action in np.moveaxis(self.actions, 1, 0):
-            state = system.step(state, np.ascontiguousarray(action[None]))
-            counts.append(simulator.contacts(state[0]))
-        return np.stack(counts, axis=1)
+        visited = np.concatenate([states[:, None], system.roll_out(states[None], self.actions[None])[0]], axis=1)
+        return simulator.contacts(visited.reshape(-1, visited.shape[-1])).reshape(visited.shape[:2])
 
     def trajectories(
         self, simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
@@ -119,13 +113,11 @@ class Readings:
         Spends windows · steps control steps.
         """
         system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
-        state, visited, exerted = np.ascontiguousarray(states[None]), [], []
-        for action in np.moveaxis(self.actions, 1, 0):
-            given = np.ascontiguousarray(action[None])
-            visited.append(state[0])
-            exerted.append(system.actuator_forces(state, given)[0])
-            state = system.step(state, given)
-        return np.stack(visited, axis=1), np.stack(exerted, axis=1)
+        after = system.roll_out(states[None], self.actions[None])[0]
+        visited = np.concatenate([states[:, None], after[:, :-1]], axis=1)
+        flat = (each.reshape(1, -1, each.shape[-1]) for each in (visited, self.actions))
+        exerted = system.actuator_forces(*flat)
+        return visited, exerted.reshape(*visited.shape[:2], -1)
 
     def residuals(
         self,
@@ -143,7 +135,7 @@ class Readings:
         system = simulator.bind(simulator.parameters.to_physical(np.clip(points, -1.0, 1.0)))
         start = np.ascontiguousarray(states)
         following = _observations(system, start, np.tile(self.actions, (times, 1, 1)), force)
-        simulated = np.stack([system.observe(start), *following], axis=2)[..., : len(self.scale)]
+        simulated = np.concatenate([system.observe(start)[:, :, None], following], axis=2)[..., : len(self.scale)]
         residuals = (simulated.reshape(len(points), times, *self.observed.shape) - self.observed) / self.scale
         return residuals.reshape(len(points), times, len(self), -1)
 
@@ -187,9 +179,8 @@ def _observations(
     state: Float[np.ndarray, "systems rows state"],
     actions: Float[np.ndarray, "rows steps action"],
     force: Float[np.ndarray, "systems rows steps dof"] | None = None,
-) -> Iterator[Float[np.ndarray, "systems rows observation"]]:
+) -> Float[np.ndarray, "systems rows steps observation"]:
     """The observation after each of the actions."""
-    for step, action in enumerate(np.moveaxis(actions, 1, 0)):
-        same = np.ascontiguousarray(np.broadcast_to(action, (system.count, *action.shape)))
-        state = system.step(state, same, None if force is None else force[:, :, step])
-        yield system.observe(state)
+    after = system.roll_out(state, np.broadcast_to(actions, (system.count, *actions.shape)), force)
+    seen = system.observe(after.reshape(len(after), -1, after.shape[-1]))
+    return seen.reshape(*after.shape[:3], seen.shape[-1])

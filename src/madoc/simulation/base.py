@@ -29,6 +29,19 @@ class System(Protocol):
         """
         ...
 
+    def roll_out(
+        self,
+        state: Float[np.ndarray, "systems rows state"],
+        actions: Float[np.ndarray, "systems rows steps action"],
+        force: Float[np.ndarray, "systems rows steps dof"] | None = None,
+    ) -> Float[np.ndarray, "systems rows steps state"]:
+        """The state after each of several actions; NaN from where a simulation failed. `force` is that of each step.
+
+        It is quicker than a step at a time. Where there are constraints, the two agree within the tolerance of the
+        solver, which starts each step of a rollout from the solution of the step before.
+        """
+        ...
+
     def observe(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows observation"]:
         """Observations of these states with the bias of each system's sensors; NaN where a state is NaN."""
         ...

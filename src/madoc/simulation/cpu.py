@@ -24,6 +24,8 @@ _ROWS_FOR_ALL_THREADS = 8
 """Number of rows from which all threads step them; with fewer, waking a second thread costs more than it saves."""
 _CHUNKS = 2
 """Number of parts of a batch that each thread steps; with ten, the default, 200 rows take a tenth longer."""
+_VALUES_AT_ONCE = 4_000_000
+"""Number of values of states and controls that are in memory at once; larger batches are simulated in parts."""
 
 
 class CpuSimulator:
@@ -137,8 +139,8 @@ class CpuSimulator:
 class CpuSystem:
     """Systems at fixed parameters; states are (qpos, qvel, pending actions, goals).
 
-    The solver's warm start is always 0, so a step depends on state, action and parameters alone, whatever the number
-    of threads.
+    The solver's warm start is 0 where a step or a rollout begins, so what follows depends on the state, the actions and
+    the parameters alone, whatever the number of threads.
     """
 
     def __init__(
@@ -182,11 +184,42 @@ class CpuSystem:
         (systems, rows, values) are refused.
         """
         self._check_shapes(state.shape, action.shape)
-        history = self._history(state, action)
-        control = self._simulator._controls(blend(self._weights, history))
-        moved, _ = self._roll_out(state[..., : self._physical], control, force)
-        pending = history[..., :-1, :].reshape(*state.shape[:2], self._goals - self._physical)
-        kept = np.concatenate([pending, state[..., self._goals :]], axis=-1)
+        return self.roll_out(state, action[:, :, None], None if force is None else force[:, :, None])[:, :, 0]
+
+    def roll_out(
+        self,
+        state: Float[np.ndarray, "systems rows state"],
+        actions: Float[np.ndarray, "systems rows steps action"],
+        force: Float[np.ndarray, "systems rows steps dof"] | None = None,
+    ) -> Float[np.ndarray, "systems rows steps state"]:
+        """The state after each of several actions; NaN from where a simulation diverges."""
+        steps, physics_steps = actions.shape[2], self._simulator.task.frame_skip
+        values = self.count * max(1, steps) * physics_steps * (1 + self._physical + self.models[0].nu)
+        rows = max(1, _VALUES_AT_ONCE // values)
+        parts = [slice(first, first + rows) for first in range(0, max(1, state.shape[1]), rows)]
+        return np.concatenate(
+            [
+                self._roll_out_part(state[:, part], actions[:, part], None if force is None else force[:, part])
+                for part in parts
+            ],
+            axis=1,
+        )
+
+    def _roll_out_part(
+        self,
+        state: Float[np.ndarray, "systems rows state"],
+        actions: Float[np.ndarray, "systems rows steps action"],
+        force: Float[np.ndarray, "systems rows steps dof"] | None,
+    ) -> Float[np.ndarray, "systems rows steps state"]:
+        (count, rows, steps, _), physics_steps = actions.shape, self._simulator.task.frame_skip
+        history = self._histories(state, actions)
+        given = blend(self._weights, history.reshape(count, rows * steps, *history.shape[3:]))
+        control = self._simulator._controls(given.reshape(count, rows, steps * physics_steps, given.shape[-1]))
+        held = None if force is None else np.repeat(force, physics_steps, axis=2)
+        moved, _ = self._simulated(state[..., : self._physical], control, held)
+        pending = history[..., :-1, :].reshape(count, rows, steps, self._goals - self._physical)
+        goals = np.broadcast_to(state[:, :, None, self._goals :], (count, rows, steps, state.shape[-1] - self._goals))
+        kept = np.concatenate([pending, goals], axis=-1)
         return np.concatenate([moved, np.where(np.isnan(moved[..., :1]), np.nan, kept)], axis=-1)
 
     def observe(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows observation"]:
@@ -207,7 +240,8 @@ class CpuSystem:
         Late actions count as late. It is 0 where an actuator has another transmission than a joint, another gain than a
         constant, or another bias than a linear one.
         """
-        control = self._simulator._controls(blend(self._weights, self._history(state, action)))[:, :, 0]
+        history = self._histories(state, action[:, :, None])[:, :, 0]
+        control = self._simulator._controls(blend(self._weights, history))[:, :, 0]
         return np.stack([joint_drives(*each) for each in zip(self.models, state, control, strict=True)])
 
     def unbiased(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows state"]:
@@ -224,15 +258,17 @@ class CpuSystem:
         if self._simulator.task.pending:
             newest = in_effect(self._delay, self._simulator.control_step)
             last = self._pending(state)[np.arange(self.count), :, newest]
-            control[..., 0, :] = self._simulator._controls(last)
-        moved, sensors = self._roll_out(state[..., : self._physical], control)
-        return np.where(np.isnan(moved).any(-1, keepdims=True), np.nan, sensors)
+            control[:, :, 0] = self._simulator._controls(last)
+        moved, sensors = self._simulated(state[..., : self._physical], control)
+        return np.where(np.isnan(moved[:, :, 0]).any(-1, keepdims=True), np.nan, sensors)
 
-    def _history(
-        self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
-    ) -> Float[np.ndarray, "systems rows actions action"]:
-        """An action and those before it that are pending, newest first."""
-        return np.concatenate([action[..., None, :], self._pending(state)], axis=-2)
+    def _histories(
+        self, state: Float[np.ndarray, "systems rows state"], actions: Float[np.ndarray, "systems rows steps action"]
+    ) -> Float[np.ndarray, "systems rows steps actions action"]:
+        """Each of the actions with those before it that are pending, newest first."""
+        pending, steps = self._simulator.task.pending, actions.shape[2]
+        taken = np.concatenate([self._pending(state)[:, :, ::-1], actions], axis=2)
+        return taken[:, :, pending + np.arange(steps)[:, None] - np.arange(pending + 1)]
 
     def _pending(
         self, state: Float[np.ndarray, "systems rows state"]
@@ -241,49 +277,54 @@ class CpuSystem:
         sizes = self._simulator.task.pending, self._simulator.action_size
         return state[..., self._physical : self._goals].reshape(*state.shape[:2], *sizes)
 
-    def _roll_out(
+    def _simulated(
         self,
         state: Float[np.ndarray, "systems rows physical"],
-        control: Float[np.ndarray, "systems rows steps control"],
-        force: Float[np.ndarray, "systems rows dof"] | None = None,
-    ) -> tuple[Float[np.ndarray, "systems rows physical"], Float[np.ndarray, "systems rows sensor"]]:
-        """States after the physics steps, NaN where they diverge, and what the sensors read in the first of them."""
-        simulator, (_, rows, steps, _) = self._simulator, control.shape
+        control: Float[np.ndarray, "systems rows physics_steps control"],
+        force: Float[np.ndarray, "systems rows physics_steps dof"] | None = None,
+    ) -> tuple[Float[np.ndarray, "systems rows steps physical"], Float[np.ndarray, "systems rows sensor"]]:
+        """States after each control step, NaN from where they diverge, and what sensors read in the first physics step.
+
+        Where there are fewer physics steps than a control step has, the state after them is the only one.
+        """
+        simulator, (_, rows, physics_steps, _) = self._simulator, control.shape
         inputs = mujoco.mjtState.mjSTATE_CTRL
         if force is not None:
             inputs |= mujoco.mjtState.mjSTATE_QFRC_APPLIED
-            control = np.concatenate([control, np.repeat(force[:, :, None], steps, axis=2)], axis=-1)
-        total = self.count * rows
+            control = np.concatenate([control, force], axis=-1)
+        total, each = self.count * rows, min(simulator.task.frame_skip, physics_steps)
+        ends, nsensor = np.arange(each - 1, physics_steps, each), self.models[0].nsensordata
         if not total:
-            return state, np.zeros((*state.shape[:2], self.models[0].nsensordata))
+            return np.zeros((self.count, rows, len(ends), self._physical)), np.zeros((self.count, rows, nsensor))
         start = np.full((total, 1 + self._physical), _CLOCK)
         start[:, 1:] = state.reshape(total, -1)
-        bad = ~np.isfinite(start).all(1)
+        bad = np.asarray(~np.isfinite(start).all(1))
         if bad.any():
             start[bad, 1:] = simulator.initial_state[: self._physical]
         many = total >= _ROWS_FOR_ALL_THREADS
         pool = simulator._pool if many else simulator._alone
         chunk = -(-total // (_CHUNKS * simulator.threads))
-        trajectory = np.zeros((total, steps, 1 + self._physical))
-        sensors = np.zeros((total, steps, self.models[0].nsensordata))
+        trajectory = np.zeros((total, physics_steps, 1 + self._physical))
+        sensors = np.zeros((total, physics_steps, nsensor))
         with without_warnings():
             pool.rollout(
                 [model for model in self.models for _ in range(rows)],
                 simulator._data if many else simulator._data[:1],
                 start,
-                control.reshape(total, steps, -1),
+                control.reshape(total, physics_steps, -1),
                 control_spec=inputs,
                 skip_checks=True,
-                nstep=steps,
+                nstep=physics_steps,
                 chunk_size=chunk,
                 state=trajectory,
                 sensordata=sensors,
             )
-        end = trajectory[:, -1]
-        ended = _CLOCK + steps * self.models[0].opt.timestep
-        failed = bad | (abs(end[:, 0] - ended) > 1e-9) | ~(abs(end) <= mujoco.mjMAXVAL).all(1)
-        next_state = np.where(failed[:, None], np.nan, end[:, 1:])
-        return next_state.reshape(state.shape), sensors[:, 0].reshape(*state.shape[:2], -1)
+        reached = trajectory[:, ends]
+        clock = _CLOCK + (ends + 1) * self.models[0].opt.timestep
+        succeeded = (abs(reached[..., 0] - clock) < 1e-9) & (abs(reached) <= mujoco.mjMAXVAL).all(-1) & ~bad[:, None]
+        succeeded = np.logical_and.accumulate(succeeded, axis=1)
+        after = np.where(succeeded[..., None], reached[..., 1:], np.nan).reshape(self.count, rows, len(ends), -1)
+        return after, sensors[:, 0].reshape(self.count, rows, nsensor)
 
     def _check_shapes(self, state: tuple[int, ...], action: tuple[int, ...]) -> None:
         simulator, rows = self._simulator, state[1] if len(state) == 3 else 0
