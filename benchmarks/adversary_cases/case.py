@@ -108,6 +108,7 @@ class Plant:
         limit: Largest command that the motors follow, as a share of the logged limit.
         drag: Quadratic drag on every joint, N·s²/m² or N·m·s²/rad².
         stribeck: Stribeck friction on every joint, N or N·m; it falls to half of that with speed.
+        presliding: Friction on every joint, N or N·m, that builds up over 0.1 rad or m after each reversal (Dahl).
         loaded: Friction on every joint, as a share of what its motor exerts.
         warming: Friction on every joint at the begin of each run, N or N·m; it falls off within seconds.
         uneven: Friction on every joint, N or N·m, times the sine of its position.
@@ -134,6 +135,7 @@ class Plant:
     limit: float = 1.0
     drag: float = 0.0
     stribeck: float = 0.0
+    presliding: float = 0.0
     loaded: float = 0.0
     warming: float = 0.0
     uneven: float = 0.0
@@ -159,7 +161,8 @@ class Log:
         action_noise: Of each logged command, as a share of its limit, as where torque is computed from current.
         quantum: Step of the position encoders, rad or m; 0 for none.
         velocities: Measured; differences of logged positions; passed through a filter; or not logged at all.
-        filter: Time constant of that filter, s.
+        positions: Measured, or passed through a filter, as from the estimator of a motor driver.
+        filter: Time constant of these filters, s.
         scale: Factor on columns.
         offset: Added to columns.
         clip: Largest magnitude of columns.
@@ -176,6 +179,7 @@ class Log:
     action_noise: float = 0.0
     quantum: float = 0.0
     velocities: Literal["measured", "differenced", "filtered", "none"] = "measured"
+    positions: Literal["measured", "filtered"] = "measured"
     filter: float = 0.03
     scale: Mapping[str, float] = field(default_factory=dict)
     offset: Mapping[str, float] = field(default_factory=dict)

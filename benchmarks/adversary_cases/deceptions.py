@@ -121,6 +121,9 @@ _PENDULUM = (
         for size in (0.05, 0.1)
     ),
     Case(PENDULUM, "filtered-speed", log=Log(velocities="filtered"), cause=LATE),
+    Case(PENDULUM, "filtered-positions", log=Log(positions="filtered", velocities="none"), cause=LATE),
+    Case(PENDULUM, "presliding-0.05", Plant(presliding=0.05), cause=FRICTION),
+    Case(PENDULUM, "presliding-0.1", Plant(presliding=0.1), spec=Spec(free=FRICTIONAL), cause=FRICTION),
     Case(PENDULUM, "clock-drift", Plant(drift=0.08), Log(nominal_time=True), cause=CLOCK),
     Case(
         PENDULUM, "dropped-rows", log=Log(nominal_time=True, dropped=0.03), cause="dropped|missing rows|lost|" + CLOCK
@@ -186,6 +189,8 @@ _ARM = (
     Case(ARM, "sag", Plant(sag=0.1), cause=DRIFT),
     Case(ARM, "dead-zone", Plant(dead_zone=0.03), cause=SMALL),
     Case(ARM, "coarse-closed-loop", Plant(coarse=0.1, closed_loop=True), cause=SMALL),
+    Case(ARM, "presliding", Plant(presliding=0.08), cause=FRICTION),
+    Case(ARM, "filtered-positions", log=Log(positions="filtered", velocities="none"), cause=LATE),
     Case(ARM, "coupled", Plant(coupled=0.04), cause=COUPLED),
     Case(ARM, "coupled-positions", Plant(coupled=0.04), POSITIONS, cause=COUPLED),
 )
@@ -246,6 +251,7 @@ _CART = (
     Case(CART, "drag", Plant(drag=1.0), cause=DRAG),
     Case(CART, "delay-0.5", Plant(delay=0.5), cause=LATE),
     Case(CART, "wind", Plant(wind=0.8), cause=FORCE),
+    Case(CART, "presliding", Plant(presliding=0.3), cause=FRICTION),
     Case(CART, "dead-zone", Plant(dead_zone=0.03), cause=SMALL),
     Case(CART, "dead-zone-closed-loop", Plant(dead_zone=0.03, closed_loop=True), cause=SMALL),
     Case(CART, "gear-invisible", Plant({"gain": 1.25}), cause=GEAR, invisible=True),

@@ -14,8 +14,23 @@ STRIBECK_SPEED = 0.3
 """rad/s or m/s, at which Stribeck friction has fallen by 63 % of its fall."""
 REVERSAL_SPEED = 0.01
 """rad/s or m/s, below which such friction rises linearly with speed, so that it has no step."""
+BUILD_UP = 0.1
+"""rad or m, over which friction with presliding has built up by 63 % after a reversal (Dahl 1968)."""
 WARM_AFTER = 3.0
 """s, in which a machine has warmed up by 63 %, so that its friction or what its motors exert has changed as much."""
+
+
+@dataclass
+class Inside:
+    """What a machine carries from one physics step to the next that is not in its positions and velocities.
+
+    Attributes:
+        motor: What the motors follow; nothing before the first command.
+        friction: Share of its friction that has built up on each degree of freedom, in [-1, 1], against the motion.
+    """
+
+    motor: np.ndarray | None
+    friction: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -60,13 +75,13 @@ def record_run(case: Case, values: Mapping[str, float], noise: np.ndarray | floa
     places = addresses(robot, model)
     signals: list[np.ndarray] = []
     commands: list[np.ndarray] = []
-    motor: np.ndarray | None = None
+    inside = Inside(None, np.zeros(model.nv))
     for row, spacing in enumerate(spacings):
         state = np.concatenate([data.qpos, data.qvel])
         reading = state[places] + noise * random.standard_normal(len(robot.signals))
         signals.append(quantised(case, reading))
         commands.append(middle + half * steered(case, targets[row], signals[-1]))
-        motor = move(case, model, data, commands, motor, push[row], spacing)
+        move(case, model, data, commands, inside, push[row], spacing)
     times = np.concatenate([[0.0], np.cumsum(spacings)[:-1]])
     return Run(times, np.stack(signals), np.stack(commands))
 
@@ -90,11 +105,11 @@ def move(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     commands: list[np.ndarray],
-    motor: np.ndarray | None,
+    inside: Inside,
     push: np.ndarray,
     spacing: float,
-) -> np.ndarray:
-    """Step the machine in place from one row to the next; what the motors follow then, for the next row."""
+) -> None:
+    """Step the machine, with what it carries inside, in place from one row to the next."""
     plant = case.plant
     low, high = limits_of(case.robot)
     middle, reach = (low + high) / 2, plant.limit * (high - low) / 2
@@ -105,19 +120,19 @@ def move(
     keep = np.where(lags > 0.0, np.exp(-model.opt.timestep / np.maximum(lags, np.finfo(float).tiny)), 0.0)
     for step in range(steps):
         wanted = late(commands, plant.delay - step / steps)
-        motor = wanted if motor is None else wanted + keep * (motor - wanted)
+        inside.motor = motor = wanted if inside.motor is None else wanted + keep * (inside.motor - wanted)
         cold = np.exp(-data.time / WARM_AFTER)
         followed = middle + (high - low) / 2 * driven(plant, 2 * (motor - middle) / (high - low))
         data.ctrl[:] = np.clip(followed, middle - reach, middle + reach) * (1.0 - plant.sag * (1.0 - cold))
         data.qfrc_applied[:] = push + resistance(plant, data.qvel) + of_gear(plant, data, cold)
         data.qfrc_applied[0] += plant.wind
+        inside.friction = built_up(inside.friction, model.opt.timestep * data.qvel)
+        data.qfrc_applied -= plant.presliding * inside.friction
         if plant.coupled:
             data.qfrc_applied[:2] -= plant.coupled * data.qvel[1::-1]
         if plant.sway:
             model.opt.gravity[0] = plant.sway * np.sin(2 * np.pi * SWAY_HZ * data.time)
         mujoco.mj_step(model, data)
-    assert motor is not None
-    return motor
 
 
 def control_step(case: Case) -> float:
@@ -155,6 +170,12 @@ def of_gear(plant: Plant, data: mujoco.MjData, cold: float) -> np.ndarray:
     turn = np.sin(data.qpos)
     friction = plant.loaded * np.abs(data.qfrc_actuator) + plant.warming * cold + plant.uneven * turn
     return plant.ripple * data.qfrc_actuator * turn - friction * np.tanh(data.qvel / REVERSAL_SPEED)
+
+
+def built_up(share: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Share of friction with presliding after a small motion: Dahl's dF/dx = (1 - F sign(v)) / distance, solved."""
+    end = np.sign(moved)
+    return end + (share - end) * np.exp(-np.abs(moved) / BUILD_UP)
 
 
 def excitation(case: Case, rows: int, random: np.random.Generator) -> np.ndarray:

@@ -106,6 +106,8 @@ def columns_of(case: Case, run: Run, random: np.random.Generator) -> dict[str, n
     positions = np.array([signal.kind == "position" for signal in robot.signals])
     signals = run.signals.copy()
     signals[:, ~positions] = velocities(case, run.time, signals)
+    if log.positions == "filtered":
+        signals[:, positions] = filtered(signals[:, positions], run.time, log.filter)
     low, high = limits_of(robot)
     commands = run.commands + log.action_noise * (high - low) / 2 * random.standard_normal(run.commands.shape)
     table = {
@@ -128,12 +130,17 @@ def velocities(case: Case, time: np.ndarray, signals: np.ndarray) -> np.ndarray:
     if case.log.velocities == "differenced":
         return np.diff(signals[:, positions], axis=0, prepend=signals[:1, positions]) / np.median(np.diff(time))
     if case.log.velocities == "filtered":
-        keep = np.exp(-np.median(np.diff(time)) / case.log.filter)
-        filtered = measured.copy()
-        for row in range(1, len(filtered)):
-            filtered[row] = keep * filtered[row - 1] + (1.0 - keep) * measured[row]
-        return filtered
+        return filtered(measured, time, case.log.filter)
     return measured
+
+
+def filtered(columns: np.ndarray, time: np.ndarray, constant: float) -> np.ndarray:
+    """Columns behind a filter of first order with this time constant in s, which begins at the first row."""
+    keep = np.exp(-np.median(np.diff(time)) / constant)
+    behind = columns.copy()
+    for row in range(1, len(behind)):
+        behind[row] = keep * behind[row - 1] + (1.0 - keep) * columns[row]
+    return behind
 
 
 def altered(case: Case, name: str, column: np.ndarray) -> np.ndarray:

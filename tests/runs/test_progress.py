@@ -55,6 +55,24 @@ def test_a_bar_of_known_size(capsys, total):
     assert f"recording [hopper]: 100%, {total} rows" in capsys.readouterr().err.splitlines()[-1]
 
 
+def test_work_of_unknown_length_shows_the_time_it_has_taken_and_no_share_that_is_done(monkeypatch, capsys):
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    with progress.waiting("judging [arm]"):
+        assert capsys.readouterr().err == "judging [arm]: begun\n"
+        now = 75.0
+    assert capsys.readouterr().err == "judging [arm]: done, 1:15 elapsed\n"
+    with progress.waiting("judging [arm]", quiet=True):
+        pass
+    assert capsys.readouterr().err == ""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with progress.waiting("judging [arm]"):
+        pass
+    assert "judging [arm]" in terminal.getvalue() and "%" not in terminal.getvalue()
+
+
 def test_time_left_follows_the_recent_pace(monkeypatch, capsys):
     now = 0.0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)

@@ -16,7 +16,7 @@ from madoc.pipeline.priors import prior_for
 from madoc.pipeline.refusals import check_order, method_of
 from madoc.runs.budget import Budget, Seconds
 from madoc.runs.files import read_json
-from madoc.runs.progress import bar
+from madoc.runs.progress import waiting
 from madoc.verdict import Assessment, assess
 from madoc.verdict.evidence import evidence, save_evidence
 from madoc.verdict.judge import explains_all
@@ -82,10 +82,8 @@ def _calibrate_by(
         )
         if prepared.holdout is None or result.status not in ENDED:
             return result, None
-        with bar("judging the estimate on the rows held out", total=1, unit="verdicts", quiet=quiet) as advance:
-            advance(0)  # shown while it is under way, as it may take a minute
+        with waiting("judging the estimate on the rows held out", quiet=quiet):
             assessment = assess(result, prepared.bench)
-            advance(1)
         result = assessment.result
         _leave_evidence(out, prepared, result)
         folder.write_json("result.json", result.to_json())

@@ -68,6 +68,30 @@ def bar(description: str, *, total: int, unit: str, quiet: bool = False) -> Iter
         yield advance
 
 
+@contextmanager
+def waiting(description: str, *, quiet: bool = False) -> Iterator[None]:
+    """Show work whose length nobody knows, with the time that it has taken.
+
+    It is a moving bar in a terminal, and a line at its begin and one at its end anywhere else.
+    """
+    started = time.monotonic()
+    if quiet:
+        yield
+    elif sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
+        with Progress(*columns, console=Console(stderr=True)) as progress:
+            task = progress.add_task(description, total=None)
+            yield
+            progress.update(task, total=1.0, completed=1.0)
+    else:
+        print(f"{description}: begun", file=sys.stderr, flush=True)
+        yield
+        print(f"{description}: done, {_clock(time.monotonic() - started)} elapsed", file=sys.stderr, flush=True)
+
+
 class _Pace:
     """The rate of the work and the time left, from the moments of the last `_WINDOW_SECONDS`.
 
