@@ -146,11 +146,10 @@ def replay_error(robot: robots.Robot, values: Mapping[str, float], log: Path) ->
     rows = np.arange(SLOPE, len(seen) - WINDOW - 1, APART)
     speed = (seen[rows + SLOPE] - seen[rows - SLOPE]) / (2 * SLOPE * simulator.control_step)
     state = np.concatenate([seen[rows], speed], axis=-1)[None]
-    system, squares = simulator.bind(dict(values)), []
-    for step in range(WINDOW):
-        state = system.step(np.ascontiguousarray(state), np.ascontiguousarray(action[rows + step][None]))
-        squares.append((system.observe(state)[0] - seen[rows + step + 1]) ** 2)
-    return float(np.sqrt(np.mean(squares)))
+    system, following = simulator.bind(dict(values)), rows[:, None] + np.arange(WINDOW)
+    states = system.roll_out(state, action[following][None])[0]
+    replayed = system.observe(states.reshape(1, -1, states.shape[-1]))[0].reshape(*following.shape, -1)
+    return float(np.sqrt(np.mean((replayed - seen[following + 1]) ** 2)))
 
 
 def disagreeing(thirds: list[dict]) -> list[str]:

@@ -15,7 +15,7 @@ STRIBECK_SPEED = 0.3
 REVERSAL_SPEED = 0.01
 """rad/s or m/s, below which such friction rises linearly with speed, so that it has no step."""
 BUILD_UP = 0.1
-"""rad or m, over which friction with presliding has built up by 63 % after a reversal (Dahl 1968)."""
+"""rad or m, over which friction with presliding comes 63 % nearer to its full size after a reversal (Dahl 1968)."""
 WARM_AFTER = 3.0
 """s, in which a machine has warmed up by 63 %, so that its friction or what its motors exert has changed as much."""
 

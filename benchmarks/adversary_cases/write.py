@@ -105,9 +105,9 @@ def columns_of(case: Case, run: Run, random: np.random.Generator) -> dict[str, n
     log, robot = case.log, case.robot
     positions = np.array([signal.kind == "position" for signal in robot.signals])
     signals = run.signals.copy()
-    signals[:, ~positions] = velocities(case, run.time, signals)
     if log.positions == "filtered":
         signals[:, positions] = filtered(signals[:, positions], run.time, log.filter)
+    signals[:, ~positions] = velocities(case, run.time, signals)
     low, high = limits_of(robot)
     commands = run.commands + log.action_noise * (high - low) / 2 * random.standard_normal(run.commands.shape)
     table = {

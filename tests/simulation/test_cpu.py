@@ -61,6 +61,16 @@ def test_a_rollout_is_its_steps_bit_for_bit_where_nothing_is_solved(monkeypatch)
     np.testing.assert_array_equal(system.roll_out(state, actions, force), together)
 
 
+def test_a_rollout_fails_at_an_action_that_is_no_number():
+    task = replace(spring(), frame_skip=1)
+    simulator = CpuSimulator(task, threads=1)
+    actions = np.array([0.1, 0.2, np.nan, 0.3]).reshape(1, 1, 4, 1)
+    end = simulator.bind(simulator.parameters.middle).roll_out(simulator.initial_state[None, None], actions)
+    np.testing.assert_array_equal(np.isnan(end[0, 0]).any(-1), [False, False, True, True])
+    with pytest.raises(MadocError, match=r"got \(1, 1, 2\) and \(1, 1, 2\)"):
+        simulator.bind(simulator.parameters.middle).roll_out(np.zeros((1, 1, 2)), np.zeros((1, 1, 4, 2)))
+
+
 def test_a_rollout_through_contacts_is_its_steps_within_the_tolerance_of_the_solver(make_batch):
     batches = []
     for threads in (1, 2):

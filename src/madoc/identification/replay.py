@@ -115,8 +115,8 @@ class Readings:
         system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
         after = system.roll_out(states[None], self.actions[None])[0]
         visited = np.concatenate([states[:, None], after[:, :-1]], axis=1)
-        flat = (each.reshape(1, -1, each.shape[-1]) for each in (visited, self.actions))
-        exerted = system.actuator_forces(*flat)
+        flat_states, flat_actions = (each.reshape(1, -1, each.shape[-1]) for each in (visited, self.actions))
+        exerted = system.actuator_forces(flat_states, flat_actions)
         return visited, exerted.reshape(*visited.shape[:2], -1)
 
     def residuals(

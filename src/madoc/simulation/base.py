@@ -35,10 +35,11 @@ class System(Protocol):
         actions: Float[np.ndarray, "systems rows steps action"],
         force: Float[np.ndarray, "systems rows steps dof"] | None = None,
     ) -> Float[np.ndarray, "systems rows steps state"]:
-        """The state after each of several actions; NaN from where a simulation failed. `force` is that of each step.
+        """The state after each of several actions; NaN from where a simulation failed.
 
         It is quicker than a step at a time. Where there are constraints, the two agree within the tolerance of the
-        solver, which starts each step of a rollout from the solution of the step before.
+        solver, which starts each step of a rollout from the solution of the step before. `force` is what acts on each
+        degree of freedom from outside during each of the steps, in N or N·m.
         """
         ...
 

@@ -20,12 +20,12 @@ from madoc.tasks.base import Task
 _CLOCK = 1.0
 """Time in s at which every row starts its step; MuJoCo resets a simulation that diverges, which its clock shows."""
 
-_ROWS_FOR_ALL_THREADS = 8
-"""Number of rows from which all threads step them; with fewer, waking a second thread costs more than it saves."""
+_STEPS_FOR_ALL_THREADS = 8
+"""Number of control steps from which all threads simulate; with fewer, waking a second costs more than it saves."""
 _CHUNKS = 2
 """Number of parts of a batch that each thread steps; with ten, the default, 200 rows take a tenth longer."""
 _VALUES_AT_ONCE = 4_000_000
-"""Number of values of states and controls that are in memory at once; larger batches are simulated in parts."""
+"""Number of values, beside the states returned, that a rollout may keep in memory; larger ones are done in parts."""
 
 
 class CpuSimulator:
@@ -183,27 +183,30 @@ class CpuSystem:
         `force` acts on each degree of freedom from outside all the while. States and actions that are not of shape
         (systems, rows, values) are refused.
         """
-        self._check_shapes(state.shape, action.shape)
         return self.roll_out(state, action[:, :, None], None if force is None else force[:, :, None])[:, :, 0]
 
     def roll_out(
         self,
-        state: Float[np.ndarray, "systems rows state"],
-        actions: Float[np.ndarray, "systems rows steps action"],
+        state: Float[np.ndarray, "..."],
+        actions: Float[np.ndarray, "..."],
         force: Float[np.ndarray, "systems rows steps dof"] | None = None,
     ) -> Float[np.ndarray, "systems rows steps state"]:
-        """The state after each of several actions; NaN from where a simulation diverges."""
-        steps, physics_steps = actions.shape[2], self._simulator.task.frame_skip
-        values = self.count * max(1, steps) * physics_steps * (1 + self._physical + self.models[0].nu)
-        rows = max(1, _VALUES_AT_ONCE // values)
-        parts = [slice(first, first + rows) for first in range(0, max(1, state.shape[1]), rows)]
-        return np.concatenate(
-            [
-                self._roll_out_part(state[:, part], actions[:, part], None if force is None else force[:, part])
-                for part in parts
-            ],
-            axis=1,
-        )
+        """The state after each of the actions of shape (systems, rows, steps, action); NaN from where it diverges.
+
+        `force` is what acts on each degree of freedom from outside during each of the steps.
+        """
+        self._check_shapes(state.shape, (*actions.shape[:2], *actions.shape[3:]))
+        (count, rows, steps, _), pending = actions.shape, self._simulator.task.pending
+        values = 1 + self._physical + self.models[0].nu + self.models[0].nv + (2 + pending) * actions.shape[-1]
+        most = _VALUES_AT_ONCE // max(1, count * steps * self._simulator.task.frame_skip * values)
+        if most >= rows:
+            return self._roll_out_part(state, actions, force)
+        after = np.empty((count, rows, steps, state.shape[-1]))
+        for part in np.array_split(np.arange(rows), -(-rows // max(1, most))):
+            after[:, part] = self._roll_out_part(
+                state[:, part], actions[:, part], None if force is None else force[:, part]
+            )
+        return after
 
     def _roll_out_part(
         self,
@@ -216,9 +219,11 @@ class CpuSystem:
         given = blend(self._weights, history.reshape(count, rows * steps, *history.shape[3:]))
         control = self._simulator._controls(given.reshape(count, rows, steps * physics_steps, given.shape[-1]))
         held = None if force is None else np.repeat(force, physics_steps, axis=2)
-        moved, _ = self._simulated(state[..., : self._physical], control, held)
+        moved = self._simulated(state[..., : self._physical], control, held)[:, :, physics_steps - 1 :: physics_steps]
+        if state.shape[-1] == self._physical:
+            return moved
         pending = history[..., :-1, :].reshape(count, rows, steps, self._goals - self._physical)
-        goals = np.broadcast_to(state[:, :, None, self._goals :], (count, rows, steps, state.shape[-1] - self._goals))
+        goals = np.repeat(state[:, :, None, self._goals :], steps, axis=2)
         kept = np.concatenate([pending, goals], axis=-1)
         return np.concatenate([moved, np.where(np.isnan(moved[..., :1]), np.nan, kept)], axis=-1)
 
@@ -259,14 +264,17 @@ class CpuSystem:
             newest = in_effect(self._delay, self._simulator.control_step)
             last = self._pending(state)[np.arange(self.count), :, newest]
             control[:, :, 0] = self._simulator._controls(last)
-        moved, sensors = self._simulated(state[..., : self._physical], control)
-        return np.where(np.isnan(moved[:, :, 0]).any(-1, keepdims=True), np.nan, sensors)
+        sensors = np.zeros((control.shape[0] * control.shape[1], 1, self.models[0].nsensordata))
+        moved = self._simulated(state[..., : self._physical], control, sensors=sensors)
+        return np.where(np.isnan(moved[:, :, 0, :1]), np.nan, sensors.reshape(*control.shape[:2], -1))
 
     def _histories(
         self, state: Float[np.ndarray, "systems rows state"], actions: Float[np.ndarray, "systems rows steps action"]
     ) -> Float[np.ndarray, "systems rows steps actions action"]:
         """Each of the actions with those before it that are pending, newest first."""
         pending, steps = self._simulator.task.pending, actions.shape[2]
+        if not pending:
+            return actions[:, :, :, None]
         taken = np.concatenate([self._pending(state)[:, :, ::-1], actions], axis=2)
         return taken[:, :, pending + np.arange(steps)[:, None] - np.arange(pending + 1)]
 
@@ -282,49 +290,43 @@ class CpuSystem:
         state: Float[np.ndarray, "systems rows physical"],
         control: Float[np.ndarray, "systems rows physics_steps control"],
         force: Float[np.ndarray, "systems rows physics_steps dof"] | None = None,
-    ) -> tuple[Float[np.ndarray, "systems rows steps physical"], Float[np.ndarray, "systems rows sensor"]]:
-        """States after each control step, NaN from where they diverge, and what sensors read in the first physics step.
-
-        Where there are fewer physics steps than a control step has, the state after them is the only one.
-        """
-        simulator, (_, rows, physics_steps, _) = self._simulator, control.shape
-        inputs = mujoco.mjtState.mjSTATE_CTRL
+        sensors: Float[np.ndarray, "all_rows physics_steps sensor"] | None = None,
+    ) -> Float[np.ndarray, "systems rows physics_steps physical"]:
+        """States after each physics step, NaN from where they diverge; `sensors` are filled with what sensors read."""
+        simulator, (count, rows, physics_steps, _) = self._simulator, control.shape
+        total, inputs = count * rows, mujoco.mjtState.mjSTATE_CTRL
         if force is not None:
             inputs |= mujoco.mjtState.mjSTATE_QFRC_APPLIED
             control = np.concatenate([control, force], axis=-1)
-        total, each = self.count * rows, min(simulator.task.frame_skip, physics_steps)
-        ends, nsensor = np.arange(each - 1, physics_steps, each), self.models[0].nsensordata
-        if not total:
-            return np.zeros((self.count, rows, len(ends), self._physical)), np.zeros((self.count, rows, nsensor))
+        if not control.size:
+            return np.zeros((count, rows, physics_steps, self._physical))
+        control = control.reshape(total, physics_steps, -1)
         start = np.full((total, 1 + self._physical), _CLOCK)
         start[:, 1:] = state.reshape(total, -1)
-        bad = np.asarray(~np.isfinite(start).all(1))
-        if bad.any():
-            start[bad, 1:] = simulator.initial_state[: self._physical]
-        many = total >= _ROWS_FOR_ALL_THREADS
-        pool = simulator._pool if many else simulator._alone
-        chunk = -(-total // (_CHUNKS * simulator.threads))
+        good = np.logical_and.reduce(np.isfinite(start), axis=1)
+        if not good.all():
+            start[~good, 1:] = simulator.initial_state[: self._physical]
+        many = total > 1 and total * physics_steps >= _STEPS_FOR_ALL_THREADS * simulator.task.frame_skip
         trajectory = np.zeros((total, physics_steps, 1 + self._physical))
-        sensors = np.zeros((total, physics_steps, nsensor))
         with without_warnings():
-            pool.rollout(
+            (simulator._pool if many else simulator._alone).rollout(
                 [model for model in self.models for _ in range(rows)],
                 simulator._data if many else simulator._data[:1],
                 start,
-                control.reshape(total, physics_steps, -1),
+                control,
                 control_spec=inputs,
                 skip_checks=True,
                 nstep=physics_steps,
-                chunk_size=chunk,
+                chunk_size=-(-total // (_CHUNKS * simulator.threads)),
                 state=trajectory,
                 sensordata=sensors,
             )
-        reached = trajectory[:, ends]
-        clock = _CLOCK + (ends + 1) * self.models[0].opt.timestep
-        succeeded = (abs(reached[..., 0] - clock) < 1e-9) & (abs(reached) <= mujoco.mjMAXVAL).all(-1) & ~bad[:, None]
-        succeeded = np.logical_and.accumulate(succeeded, axis=1)
-        after = np.where(succeeded[..., None], reached[..., 1:], np.nan).reshape(self.count, rows, len(ends), -1)
-        return after, sensors[:, 0].reshape(self.count, rows, nsensor)
+        timestep = self.models[0].opt.timestep
+        on_time = abs(trajectory[..., 0] - _CLOCK - timestep * np.arange(1, physics_steps + 1)) < timestep / 2
+        succeeded = on_time & (abs(trajectory) <= mujoco.mjMAXVAL).all(-1) & np.isfinite(control).all(-1)
+        succeeded = np.logical_and.accumulate(succeeded & good[:, None], axis=1)
+        after = np.where(succeeded[..., None], trajectory[..., 1:], np.nan)
+        return after.reshape(count, rows, physics_steps, self._physical)
 
     def _check_shapes(self, state: tuple[int, ...], action: tuple[int, ...]) -> None:
         simulator, rows = self._simulator, state[1] if len(state) == 3 else 0
