@@ -50,10 +50,15 @@ def test_friction_builds_up_after_a_reversal():
     """The joint moves to and fro between 0 and 1, so that the variance of its position is 3/5 · 2/5."""
     position, speed = np.array([[0.0, 1.0, 1.0, 0.0, 1.0]]), np.array([[1.0, 1.0, -1.0, -1.0, 1.0]])
     deviation = np.sqrt(0.24)
-    near, far = joint_forces(position, speed, speed, turns=False)[BUILT_UP]
-    expected = np.array([[0.0, 0.0, -1.0, -np.exp(-1.0 / (0.3 * deviation)), 1.0]])
-    assert far == pytest.approx(expected, abs=1e-8)
-    assert near == pytest.approx(np.sign(expected) * np.abs(expected) ** 10, abs=1e-8)
+    near, *far = joint_forces(position, speed, speed, turns=False)[BUILT_UP]
+    expected = np.array([[0.0, 0.0, -1.0, -np.exp(-1.0 / (0.03 * deviation)), 1.0]])
+    assert near == pytest.approx(expected, abs=1e-8)
+    for shape, distance in zip(far, (0.2, 0.5, 1.2), strict=True):
+        kept = np.exp(-1.0 / (distance * deviation))
+        first = 1.0 - kept
+        back = -1.0 + (first + 1.0) * kept
+        again = 1.0 + (back - 1.0) * kept
+        assert shape == pytest.approx(-np.array([[0.0, first, first, back, again]]), abs=1e-8)
 
 
 def dahl(friction, rate):

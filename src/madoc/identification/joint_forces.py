@@ -37,8 +37,12 @@ TURNING = 0.1
 """Speed relative to the joint's root mean square, at which friction has turned to the direction of motion."""
 LOW_SPEED = 0.3
 """The same, below which friction at low speed acts (Stribeck)."""
-BUILD_UP = (0.03, 0.3)
-"""Distances relative to the standard deviation of the joint's position, over which friction builds up (Dahl)."""
+BUILD_UP = (0.03, 0.2, 0.5, 1.2)
+"""Distances relative to the standard deviation of the joint's position, over which friction builds up (Dahl).
+
+Over the first it is nearly Coulomb friction, and what it lacks of that is the shape. A model without Coulomb friction
+imitates friction over the others by damping and a spring: these are the shape as a whole.
+"""
 SMALL_COMMAND = 0.1
 """Force of a drive relative to its root mean square, beyond which it is out of a dead zone."""
 _SMALLEST = 1e-9
@@ -85,8 +89,9 @@ def joint_forces(
     if moves:
         found |= {SLOW: [-direction * np.exp(-((speed / (LOW_SPEED * fast)) ** 2))]}
         found |= {UNEVEN: [-direction * place for place in places], PLACED: [*places, *finer]}
-        away = _since_reversal(position, speed) / max(float(np.nanstd(position)), _SMALLEST)
-        found |= {BUILT_UP: [direction * np.exp(-away / distance) for distance in BUILD_UP]}
+        way = position / max(float(np.nanstd(position)), _SMALLEST)
+        lacking = direction * np.exp(-_since_reversal(way, speed) / BUILD_UP[0])
+        found |= {BUILT_UP: [lacking, *(-_built_up(way / distance) for distance in BUILD_UP[1:])]}
     if moves and drives:
         found |= {RIPPLE: [drive * place for place in places]}
     coupled = [_standardised(each) for other in others for each in other if np.nanstd(each) > _SMALLEST]
@@ -101,6 +106,18 @@ def _since_reversal(
     path = np.cumsum(moved, axis=1)
     reversed_ = np.sign(speed) != np.sign(np.concatenate([speed[:, :1], speed[:, :-1]], axis=1))
     return path - np.maximum.accumulate(np.where(reversed_, path, -np.inf), axis=1)
+
+
+def _built_up(way: Float[np.ndarray, "windows steps"]) -> Float[np.ndarray, "windows steps"]:
+    """Share of its full size to which friction has built up along positions in units of its distance, from 0 on.
+
+    It is the solution of Dahl's (1968) dF/dx = 1 - F sign(dx/dt) for motion of one direction between two steps.
+    """
+    moved = np.diff(way, axis=1)
+    share = np.zeros_like(way)
+    for step, (end, kept) in enumerate(zip(np.sign(moved.T), np.exp(-np.abs(moved.T)), strict=True)):
+        share[:, step + 1] = end + (share[:, step] - end) * kept
+    return share
 
 
 def _standardised(values: Float[np.ndarray, "windows steps"]) -> Float[np.ndarray, "windows steps"]:
