@@ -3,7 +3,9 @@
 Windows' initial states are known (`known_starts`) or further unknowns (`unknown_starts`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -164,21 +166,8 @@ class Search:
         damping, state_damping = state.damping[:running], state.state_damping[:running, :count]
         plans = windows.plans(points, states, damping, state_damping, refining=bool(state.refining))
         outcomes = windows.outcomes(plans, states, refining=bool(state.refining))
-        new = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}
         roughly = self._settles_roughly(state)
-        for index, (plan, outcome) in enumerate(zip(plans, outcomes, strict=True)):
-            trial, factor = chosen(outcome)
-            followed = outcome.followed[trial]
-            new["point"][index] = np.clip(points[index] + plan.steps[trial], -1.0, 1.0)
-            change = followed[:, None] * plan.state_steps[trial] * plan.spread
-            new["states"][index, :count, : len(plan.spread)] += change
-            new["damping"][index] = np.clip(damping[index] * factor, *DAMPING_RANGE)
-            state_factor = np.select([followed == 1.0, followed > 0.0], [0.1, 1.0], 10.0)
-            new["state_damping"][index, :count] = np.clip(state_damping[index] * state_factor, *settling.DAMPING_RANGE)
-            cost = float(outcome.totals[trial])
-            new["cost"][index] = cost if state.refining else plan.comparable(cost)
-            share = ROUGHLY_SETTLED if roughly else SETTLED
-            new["moved"][index] = self._moved(plan, outcome, trial, damping=float(damping[index]), share=share)
+        new = self._advanced(state, plans, outcomes, share=ROUGHLY_SETTLED if roughly else SETTLED)
         leader = int(np.argmin(new["cost"][:running]))
         best = plans[leader]
         following = replace(
@@ -204,6 +193,27 @@ class Search:
         stage = "calibrating" if state.refining else "searching"
         spent = self._derivative_steps(problem, state) + self.horizon * sum(each.simulations for each in outcomes)
         return following, Epoch(metrics, spent, stage=stage)
+
+    def _advanced(
+        self, state: SearchState, plans: Sequence[Plan], outcomes: Sequence[Outcome], *, share: float
+    ) -> dict[str, Any]:
+        """What each search has of its own, after the best of the steps that it tried."""
+        count = self.window_count(state)
+        new = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}
+        for index, (plan, outcome) in enumerate(zip(plans, outcomes, strict=True)):
+            trial, factor = chosen(outcome)
+            followed, damping = outcome.followed[trial], float(state.damping[index])
+            new["point"][index] = np.clip(state.point[index] + plan.steps[trial], -1.0, 1.0)
+            change = followed[:, None] * plan.state_steps[trial] * plan.spread
+            new["states"][index, :count, : len(plan.spread)] += change
+            new["damping"][index] = np.clip(damping * factor, *DAMPING_RANGE)
+            state_factor = np.select([followed == 1.0, followed > 0.0], [0.1, 1.0], 10.0)
+            state_damping = state.state_damping[index, :count] * state_factor
+            new["state_damping"][index, :count] = np.clip(state_damping, *settling.DAMPING_RANGE)
+            cost = float(outcome.totals[trial])
+            new["cost"][index] = cost if state.refining else plan.comparable(cost)
+            new["moved"][index] = self._moved(plan, outcome, trial, damping=damping, share=share)
+        return new
 
     def _settled_states(self, windows: UnknownStarts, state: SearchState) -> tuple[SearchState, Epoch]:
         """One step of initial states alone, which every search on new windows begins with."""

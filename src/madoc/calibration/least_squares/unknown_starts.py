@@ -286,17 +286,10 @@ class UnknownStarts:
 
         Channels are weighted by noise then, and untrusted windows left out.
         """
-        channels, readings = len(self.readings.scale), self.readings.steps + 1
         least = np.full(len(state_damping), LEAST_DAMPING)
-        alike = eliminate(slopes, np.ones_like(slopes.residuals), least)
-        kept = slopes.whole
-        deviation = self._deviation(slopes, alike.spare, kept)
-        if contacts is not None:
-            kept = self._trusted(slopes.over(np.tile(deviation, readings)))
-            deviation = self._deviation(slopes, alike.spare, kept)
-        else:
-            deviation = np.full(channels, np.median(deviation))
-        slopes = slopes.over(np.tile(deviation, readings))
+        spare = eliminate(slopes, np.ones_like(slopes.residuals), least).spare
+        kept, deviation = self._weighted(slopes, spare, refining=contacts is not None)
+        slopes = slopes.over(np.tile(deviation, self.readings.steps + 1))
         z = (slopes.residuals / TUNING[self.loss]) ** 2
         weights = loss_slope(z, self.loss) * slopes.whole[:, None]
         share = curvature_share(z[kept], self.loss)
@@ -307,7 +300,7 @@ class UnknownStarts:
         steps = [*(damped_step(*factors, point, damping * trial) for trial in TRIALS), np.zeros_like(point)]
         exact = eliminate(slopes, weights, least).reduced.of(kept)
         curved = share * bread(exact, 1.0, "linear")
-        freedom = float(alike.spare[kept].sum()) - len(point)
+        freedom = float(spare[kept].sum()) - len(point)
         ratio = noise_ratio(slopes.residuals[kept], weights[kept], share, freedom)
         return Plan(
             point=point,
@@ -321,12 +314,22 @@ class UnknownStarts:
             deviation=deviation,
             bread=curved,
             meat=at_least_noise(jackknife_meat(exact, share, curved), curved, ratio),
-            autocorrelation=autocorrelation(slopes.residuals.reshape(len(kept), -1, channels)[kept]),
+            autocorrelation=autocorrelation(slopes.residuals.reshape(len(kept), -1, len(deviation))[kept]),
             exact=float(deviation.max()) < ROUNDING,
             left_out=1.0 - float(kept.mean()),
             failures=int((~slopes.whole).sum()),
-            steady_cost=0.0 if contacts is None else self._steady_cost(slopes, alike.spare, contacts, kept),
+            steady_cost=0.0 if contacts is None else self._steady_cost(slopes, spare, contacts, kept),
         )
+
+    def _weighted(
+        self, slopes: WindowSlopes, spare: Float[np.ndarray, "windows values"], *, refining: bool
+    ) -> tuple[Bool[np.ndarray, " windows"], Float[np.ndarray, " channels"]]:
+        """The windows that count, and the noise of each channel, which divides residuals; one for all at first."""
+        deviation = self._deviation(slopes, spare, slopes.whole)
+        if not refining:
+            return slopes.whole, np.full(len(deviation), np.median(deviation))
+        kept = self._trusted(slopes.over(np.tile(deviation, self.readings.steps + 1)))
+        return kept, self._deviation(slopes, spare, kept)
 
     def _contacts(
         self, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
