@@ -3,14 +3,18 @@
 import json
 
 import jax
+import numpy as np
 import pytest
 from planted import ROBOTS, log_of
 
 import madoc
-from madoc import simulation
+from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, CalibrationResult, LeastSquares
 from madoc.data.split import hold_out
 from madoc.errors import MadocError
+from madoc.identification.candidate_terms import INTEGRATION
+from own_robots import SPRING_SPEC, write_robot
+from robots import SPRING_TRUTH, recorded
 
 TASK, _ = ROBOTS["spring"]
 
@@ -32,6 +36,22 @@ def test_a_result_and_rows_held_out_are_all_it_needs(result, split):
     assert str(found).startswith("CALIBRATED: the prediction error on the hold-out is")
     assert (found.holdout.rows, found.holdout.measure) == (len(split.held), "predicted")
     assert found.holdout.split == "100 rows in 1 episode were held out"
+
+
+def test_a_log_of_a_finer_simulation_is_judged_with_a_finer_step_and_its_truth_is_covered(tmp_path):
+    task = robots.load(write_robot(tmp_path, SPRING_SPEC)).task
+    log = recorded(task.with_time_step(0.25, substeps=4), SPRING_TRUTH, 500, jax.random.key(0))
+    parts = hold_out(log, 0.2, jax.random.key(0))
+    problem = CalibrationProblem(parts.kept, simulation.make(task, threads=1))
+    estimate = madoc.calibrate(LeastSquares(), problem, key=jax.random.key(0), budget=100_000)
+    found = madoc.assess(estimate, parts.held)
+    assert found.verdict.word == "CALIBRATED" and found.holdout.finer
+    (error,) = (term for term in found.holdout.missing_terms if term.cause == INTEGRATION)
+    assert error.value == pytest.approx(1.0, abs=0.01) and error.explained > 0.99
+    space = problem.simulator.parameters
+    truth = space.vector(SPRING_TRUTH)
+    low, high = np.asarray(found.result.interval).T
+    assert (np.maximum(low - truth, truth - high) < 1e-4 * (space.high - space.low)).all()
 
 
 def test_a_result_from_a_file_needs_to_be_told_what_was_calibrated(result, split):
