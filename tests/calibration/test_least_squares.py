@@ -13,6 +13,7 @@ from madoc.errors import MadocError
 from madoc.identification import losses
 from madoc.identification.gauss_newton import damped_step, triangular_factors
 from madoc.identification.information import (
+    BOX_VARIANCE,
     at_least_noise,
     bread,
     correlated_pairs,
@@ -165,6 +166,14 @@ def test_all_slopes_come_from_one_batch():
     assert residuals.shape == (7, 4, 6)
     assert simulator.rows == 7 * 4 * 3
     np.testing.assert_allclose(residuals[0], 0.0, atol=1e-12)
+
+
+def test_a_scatter_below_rounding_is_not_told_and_no_variance_is_negative():
+    found = sandwich(np.diag([1.0, 1e-9]), np.diag([0.1, -1e-17]))
+    np.testing.assert_allclose(np.diag(found.covariance), [0.1, BOX_VARIANCE])
+    np.testing.assert_allclose(np.abs(found.unidentified), [[0.0, 1.0]])
+    nothing = sandwich(np.diag([1.0, 1e-9]), np.zeros((2, 2)))
+    np.testing.assert_array_equal(nothing.covariance, np.zeros((2, 2)))
 
 
 def test_the_sandwich_of_a_mean_is_its_standard_error():

@@ -118,7 +118,9 @@ def sandwich(bread: Float[np.ndarray, "d d"], meat: Float[np.ndarray, "d d"]) ->
     values, vectors = np.linalg.eigh(bread)
     identified: Bool[np.ndarray, " d"] = values > _BLIND * max(float(values[-1]), np.finfo(float).tiny)
     inverse = (vectors[:, identified] / values[identified]) @ vectors[:, identified].T
-    covariance = inverse @ meat @ inverse
+    scatter, along = np.linalg.eigh(meat)  # below rounding it is not known, and could come out negative
+    root = inverse @ along * np.sqrt(np.maximum(scatter, np.finfo(float).eps * max(float(scatter[-1]), 0.0)))
+    covariance = root @ root.T
     identified &= np.einsum("id,ij,jd->d", vectors, covariance, vectors) < BOX_VARIANCE
     kept, lost = vectors[:, identified] @ vectors[:, identified].T, vectors[:, ~identified]
     deviation = np.sqrt(np.maximum(np.diag(inverse), np.finfo(float).tiny))
