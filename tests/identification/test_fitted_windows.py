@@ -21,7 +21,8 @@ def windows():
     """Windows of an exact log of the spring, logged initial states, and its simulator."""
     task = spring(max_episode_steps=100)
     simulator, dataset = simulation.make(task, threads=1), recorded(task, SPRING_TRUTH, 2000, jax.random.key(0))
-    readings, states, _, _ = windows_of(dataset, states_of(dataset, simulator), typical_change(dataset), fewest=30)
+    windows = windows_of(dataset, states_of(dataset, simulator), typical_change(dataset), fewest=30)
+    readings, states = windows.readings, windows.states
     return simulator, readings, states
 
 
@@ -78,5 +79,9 @@ def test_slopes_at_another_point_leave_out_windows_that_fail_there():
 def test_episodes_of_ten_rows_have_windows_behind_their_first_row():
     task = spring(max_episode_steps=10)
     dataset, simulator = recorded(task, SPRING_TRUTH, 2000, jax.random.key(0)), simulation.make(task, threads=1)
-    readings, _, _, _ = windows_of(dataset, states_of(dataset, simulator), typical_change(dataset), fewest=30)
-    assert readings.steps == 9
+    logged = states_of(dataset, simulator)
+    windows = windows_of(dataset, logged, typical_change(dataset), fewest=30)
+    assert windows.readings.steps == 9
+    # Each begins at the second row of its episode, so that what came before is its first row, again and again.
+    firsts = logged.states[dataset.episode_starts[windows.runs]]
+    np.testing.assert_array_equal(windows.earlier, np.repeat(firsts[:, None], 9, axis=1))

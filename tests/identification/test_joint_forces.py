@@ -61,6 +61,13 @@ def test_friction_builds_up_after_a_reversal():
         assert shape == pytest.approx(-np.array([[0.0, first, first, back, again]]), abs=1e-8)
 
 
+def test_friction_that_had_built_up_before_a_window_is_there_when_it_begins():
+    position, earlier = np.array([[1.0, 2.0]]), np.array([[0.0, 0.5]])
+    shape = joint_forces(position, position, position, turns=False, earlier=earlier)[BUILT_UP][2]
+    kept = np.exp(-1.0 / (0.5 * 0.5))  # per unit of position: 0.5 of a standard deviation, which is 0.5
+    assert shape == pytest.approx(-np.array([[1.0 - kept, 1.0 - kept**2]]))
+
+
 def dahl(friction, rate):
     """What friction that builds up over 1 / `rate` rad (Dahl 1968) lacks of Coulomb friction of that size."""
     state = [0.0]

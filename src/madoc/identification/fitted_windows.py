@@ -39,12 +39,29 @@ _DAMPING = 1e-6
 """Relative damping of a step of the parameters."""
 
 
+@dataclass(frozen=True)
+class LoggedWindows:
+    """Windows of a log that share no observation.
+
+    Attributes:
+        readings: What was observed and done in them.
+        states: Guesses of their initial states.
+        before: The action before each.
+        earlier: Logged states before each, of as many rows as it has; the first of its episode where that begins later.
+        runs: The episode of each.
+    """
+
+    readings: Readings
+    states: Float[np.ndarray, "windows state"]
+    before: Float[np.ndarray, "windows action"]
+    earlier: Float[np.ndarray, "windows steps state"]
+    runs: Int[np.ndarray, " windows"]
+
+
 def windows_of(
     dataset: Dataset, logged: LoggedStates, scale: Float[np.ndarray, " observation"], *, fewest: int
-) -> tuple[
-    Readings, Float[np.ndarray, "windows state"], Float[np.ndarray, "windows action"], Int[np.ndarray, " windows"]
-]:
-    """Windows that share no observation, guesses of their initial states, the actions before them, and their episodes.
+) -> LoggedWindows:
+    """Windows to test a model by, evenly spread over the log.
 
     They are shorter than `STRIDES` where the log has not enough rows for `fewest` of that length, or where the episode
     of its median row is shorter.
@@ -63,7 +80,10 @@ def windows_of(
         chosen = evenly(disjoint_windows(dataset, rows, steps), max(WINDOWS, fewest))
     readings = Readings.at(dataset, logged, rows[chosen], steps, scale)
     before = np.asarray(dataset.transitions.action, np.float64)[rows[chosen] - 1]
-    return readings, states[chosen], before, dataset.episode_of(rows[chosen])
+    runs = dataset.episode_of(rows[chosen])
+    wanted = np.maximum(rows[chosen, None] - np.arange(steps, 0, -1), dataset.episode_starts[runs, None])
+    earlier = logged.states[np.searchsorted(logged.rows, wanted).clip(max=len(logged.rows) - 1)]
+    return LoggedWindows(readings, states[chosen], before, earlier, runs)
 
 
 @dataclass(frozen=True)

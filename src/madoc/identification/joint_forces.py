@@ -61,6 +61,7 @@ def joint_forces(
     others: Sequence[tuple[Float[np.ndarray, "windows steps"], Float[np.ndarray, "windows steps"]]] = (),
     *,
     turns: bool,
+    earlier: Float[np.ndarray, "windows earlier"] | None = None,
 ) -> dict[str, list[Float[np.ndarray, "windows steps"]]]:
     """Each of `FORCES` along the motion of a joint, of about 1 in size, as one function of time or more.
 
@@ -72,6 +73,7 @@ def joint_forces(
         exerted: What its drive exerts.
         others: Positions and speeds of other joints.
         turns: Whether it is a hinge: what depends on its position then repeats with every turn.
+        earlier: Logged positions before each window, which say how far friction has built up when it begins.
     """
     fast, strong = (float(np.sqrt(np.nanmean(values**2))) for values in (speed, exerted))
     moves, drives = fast > _SMALLEST, strong > _SMALLEST
@@ -89,9 +91,11 @@ def joint_forces(
     if moves:
         found |= {SLOW: [-direction * np.exp(-((speed / (LOW_SPEED * fast)) ** 2))]}
         found |= {UNEVEN: [-direction * place for place in places], PLACED: [*places, *finer]}
-        way = position / max(float(np.nanstd(position)), _SMALLEST)
-        lacking = direction * np.exp(-_since_reversal(way, speed) / BUILD_UP[0])
-        found |= {BUILT_UP: [lacking, *(-_built_up(way / distance) for distance in BUILD_UP[1:])]}
+        spread = max(float(np.nanstd(position)), _SMALLEST)
+        lacking = direction * np.exp(-_since_reversal(position / spread, speed) / BUILD_UP[0])
+        way = position if earlier is None else np.concatenate([earlier, position], axis=1)
+        shares = (_built_up(way / (spread * distance))[:, -position.shape[1] :] for distance in BUILD_UP[1:])
+        found |= {BUILT_UP: [lacking, *(-share for share in shares)]}
     if moves and drives:
         found |= {RIPPLE: [drive * place for place in places]}
     coupled = [_standardised(each) for other in others for each in other if np.nanstd(each) > _SMALLEST]
@@ -132,11 +136,12 @@ def force_effects(
     point: Float[np.ndarray, " d"],
     states: Float[np.ndarray, "windows state"],
     whole: Bool[np.ndarray, " windows"],
+    earlier: Float[np.ndarray, "windows earlier state"],
 ) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"]]:
     """Every force at a joint of one degree of freedom, and the derivative of the residuals by it, in its reference.
 
-    `whole` are the windows that count; a force with which one of these diverges has no effect. It takes one simulation
-    of every window for each force, and two besides.
+    `whole` are the windows that count; a force with which one of these diverges has no effect. `earlier` are logged
+    states before each window. It takes one simulation of every window for each force, and two besides.
     """
     model, joints = simulator.task.model, single_joints(simulator.task.model)
     tried, effects = list[Candidate](), [np.zeros((len(readings), readings.observed[0].size, 0))]
@@ -151,7 +156,8 @@ def force_effects(
     for place, (joint, turns) in enumerate(joints):
         dof, torque = int(joint.dofadr[0]), references_of(logged, simulator, joint)["dof_frictionloss"]
         others = [*along[:place], *along[place + 1 :]] if few else []
-        found = joint_forces(*along[place], exerted[..., dof], others, turns=turns)
+        came_from = earlier[..., int(joint.qposadr[0])]
+        found = joint_forces(*along[place], exerted[..., dof], others, turns=turns, earlier=came_from)
         shapes = [(each, shape) for each in causes for shape in found.get(each, [])]
         forces = np.zeros((len(shapes), *exerted.shape))
         for index, (cause, shape) in enumerate(shapes):

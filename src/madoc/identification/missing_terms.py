@@ -24,7 +24,7 @@ from madoc.identification.candidate_terms import (
     is_late,
 )
 from madoc.identification.drifts import drifts_of
-from madoc.identification.fitted_windows import Fit, fit_windows, negligible, products_of, windows_of
+from madoc.identification.fitted_windows import Fit, LoggedWindows, fit_windows, negligible, products_of, windows_of
 from madoc.identification.information import NORMAL_95
 from madoc.identification.joint_forces import force_effects, is_joint_force
 from madoc.identification.replay import Readings
@@ -104,12 +104,13 @@ def suspicions(
         of_other_model: Whether the estimate is another model's, so that other windows may move it for a reason:
             alternatives then move by that as well.
     """
-    readings, states, before, runs = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)))
+    windows = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)))
+    readings, runs = windows.readings, windows.runs
     if len(readings) < FEWEST + len(point):
         return Suspicions(tested=False)
-    fit = fit_windows(simulator, readings, states, point)
+    fit = fit_windows(simulator, readings, windows.states, point)
     led = fit.point
-    tried, by_terms = _effects(logged, simulator, readings, before, fit, scale)
+    tried, by_terms = _effects(logged, simulator, windows, fit, scale)
     spent = fit.control_steps + (3 + len(tried)) * len(readings) * readings.steps
     both = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, by_terms], axis=-1))
     products, counted = products_of(both, readings, len(led)), both.finite
@@ -135,21 +136,21 @@ def suspicions(
 def _effects(
     logged: LoggedStates,
     simulator: Simulator,
-    readings: Readings,
-    before: Float[np.ndarray, "windows action"],
+    windows: LoggedWindows,
     fit: Fit,
     scale: Float[np.ndarray, " observation"],
 ) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"]]:
     """Every candidate and the derivative of the residuals by it, 0 for one that most windows cannot bear."""
-    added = list(candidates(logged, simulator, fit.point, scale))
+    readings, added = windows.readings, list(candidates(logged, simulator, fit.point, scale))
     space = ParameterSpace((*simulator.parameters.parameters, *(parameter for _, parameter in added)))
     wide = simulation.make(replace(simulator.task, parameters=space))
     at_nominal = np.concatenate([fit.point, -np.ones(len(added))])
-    tried, by_terms = effects(simulator, wide, readings, before, at_nominal, fit.states, added)
-    forces, by_forces = force_effects(simulator, readings, logged, fit.point, fit.states, fit.slopes.whole)
+    tried, by_terms = effects(simulator, wide, readings, windows.before, at_nominal, fit.states, added)
+    whole, earlier = fit.slopes.whole, windows.earlier
+    forces, by_forces = force_effects(simulator, readings, logged, fit.point, fit.states, whole, earlier)
     by_terms = np.concatenate([by_terms, by_forces], axis=-1)
-    if fit.slopes.whole.any():
-        diverges = (~np.isfinite(by_terms).all(1)[fit.slopes.whole]).mean(0) > DIVERGING
+    if whole.any():
+        diverges = (~np.isfinite(by_terms).all(1)[whole]).mean(0) > DIVERGING
         by_terms[..., diverges] = 0.0  # so that others are tested
     return [*tried, *forces], by_terms
 
