@@ -10,7 +10,7 @@ import madoc.tasks
 from madoc.errors import MadocError
 from madoc.parameters import Parameter
 from madoc.robots import load
-from madoc.simulation.cpu import CpuSimulator
+from madoc.simulation.cpu import CpuSimulator, CpuSystem
 from madoc.simulation.drives import joint_drives
 from own_robots import CART_SPEC, write_robot
 from robots import spring
@@ -59,6 +59,14 @@ def test_a_rollout_is_its_steps_bit_for_bit_where_nothing_is_solved(monkeypatch)
     assert np.isnan(together[1, 2]).all() and np.isfinite(together[[0, 2]]).all()
     monkeypatch.setattr("madoc.simulation.cpu._VALUES_AT_ONCE", 1)
     np.testing.assert_array_equal(system.roll_out(state, actions, force), together)
+
+
+def test_a_machine_without_actuators_falls():
+    xml = '<mujoco><worldbody><body name="cart"><joint name="slide" type="slide"/><geom size="1"/></body></worldbody></mujoco>'
+    simulator = CpuSimulator(replace(spring(), spec=lambda: mujoco.MjSpec.from_string(xml)), threads=1)
+    system = CpuSystem(simulator, [simulator.task.model], np.zeros(1), np.zeros((1, 1)))
+    fallen = system._simulated(np.zeros((1, 2, 2)), np.zeros((1, 2, 5, 0)))
+    np.testing.assert_allclose(fallen[0, :, :, 1], 2 * [-9.81 * 0.002 * np.arange(1, 6)])
 
 
 def test_a_rollout_fails_at_an_action_that_is_no_number():

@@ -298,7 +298,7 @@ class CpuSystem:
         if force is not None:
             inputs |= mujoco.mjtState.mjSTATE_QFRC_APPLIED
             control = np.concatenate([control, force], axis=-1)
-        if not control.size:
+        if not total:
             return np.zeros((count, rows, physics_steps, self._physical))
         control = control.reshape(total, physics_steps, -1)
         start = np.full((total, 1 + self._physical), _CLOCK)
