@@ -62,8 +62,9 @@ def test_a_rollout_is_its_steps_bit_for_bit_where_nothing_is_solved(monkeypatch)
 
 
 def test_a_machine_without_actuators_falls():
-    xml = '<mujoco><worldbody><body name="cart"><joint name="slide" type="slide"/><geom size="1"/></body></worldbody></mujoco>'
-    simulator = CpuSimulator(replace(spring(), spec=lambda: mujoco.MjSpec.from_string(xml)), threads=1)
+    cart = '<body name="cart"><joint name="slide" type="slide"/><geom size="1"/></body>'
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{cart}</worldbody></mujoco>")
+    simulator = CpuSimulator(replace(spring(), spec=lambda: spec), threads=1)
     system = CpuSystem(simulator, [simulator.task.model], np.zeros(1), np.zeros((1, 1)))
     fallen = system._simulated(np.zeros((1, 2, 2)), np.zeros((1, 2, 5, 0)))
     np.testing.assert_allclose(fallen[0, :, :, 1], 2 * [-9.81 * 0.002 * np.arange(1, 6)])
