@@ -116,7 +116,8 @@ def disturbed() -> str:
     return (
         "## Under disturbances\n\n`python benchmarks/calibration.py --data-is ...`. Median of the mean absolute error "
         "over seeds, and in brackets in % of the range. *refuses*: with a sentence, kept in the result. Empty: not "
-        "run.\n\n" + "\n".join(_disturbed(rows) for rows in (timed, counted) if rows)
+        "run. What the data tells: the median over parameters of half the width of least squares' 95 % intervals, in % "
+        "of the range.\n\n" + "\n".join(_disturbed(rows) for rows in (timed, counted) if rows)
     )
 
 
@@ -127,13 +128,28 @@ def _disturbed(rows: list[dict]) -> str:
         if row["data"] != "clean":
             methods[label(row)] = None
             robots.add(row["robot"])
-    lines = [f"| robot | data | budget | {' | '.join(methods)} |", "|---" * (3 + len(methods)) + "|"]
+    head = ("robot", "data", "budget", "seeds", "what the data tells, %", *methods)
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for robot, data, budget in sorted({cell[:3] for cell in cells}):
         columns = [cells.get((robot, data, budget, method), []) for method in methods]
         if robot in robots and any(columns):
             of_all = budget if is_time(budget) else f"{budget:,}"
-            lines.append(f"| {robot} | {data} | {of_all} | {' | '.join(map(_cell, columns))} |")
+            seeds = sorted({len(column) for column in columns if column})
+            told = _half_width(cells.get((robot, data, budget, "least-squares"), []))
+            words = (robot, data, of_all, " to ".join(map(str, seeds[:: max(1, len(seeds) - 1)])), told)
+            lines.append(f"| {' | '.join((*words, *map(_cell, columns)))} |")
     return "\n".join(lines) + "\n"
+
+
+def _half_width(rows: list[dict]) -> str:
+    """Half the width of intervals in % of the range, the median over parameters and seeds; empty without intervals."""
+    found = [
+        50.0 * (part["interval"][1] - part["interval"][0]) / (part["high"] - part["low"])
+        for row in rows
+        for part in row.get("parameters", {}).values()
+        if part.get("interval")
+    ]
+    return f"{np.median(found):.2g}" if found else ""
 
 
 def _cell(rows: list[dict]) -> str:

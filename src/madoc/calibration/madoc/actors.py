@@ -55,8 +55,27 @@ def prior_weight(updates: Int[Array, ""], *, time_constant: float, largest: floa
     return jnp.minimum(largest, jnp.exp(updates / time_constant))
 
 
+def value_weight(parameters: int, shared_by: float) -> float:
+    """The weight w of values in Eq. (13): d / `shared_by`, at least the 1 of the paper.
+
+    The blur holds the mean |reward| of a row at a set value, whatever the number d of parameters, so that the share of
+    each is about 1/d of it. Its entropy and its KL are not shared: with many parameters they outweigh its value, and
+    hold it wide and near the middle of its range.
+    """
+    return max(1.0, parameters / shared_by)
+
+
 def actor_loss(
-    value: PerRow, log_density: PerRow, kl: Scalar, *, entropy_weight: float, prior_weight: Scalar | float
+    value: PerRow,
+    log_density: PerRow,
+    kl: Scalar,
+    *,
+    entropy_weight: float,
+    prior_weight: Scalar | float,
+    value_weight: float = 1.0,
 ) -> Scalar:
-    """Eq. (13): α log q - v + λ KL(q || p), averaged over draws; values, densities and KL are sums over groups."""
-    return (entropy_weight * log_density - value).mean() + prior_weight * kl
+    """Eq. (13): α log q - w v + λ KL(q || p), averaged over draws; values, densities and KL are sums over groups.
+
+    w is 1 in the paper.
+    """
+    return (entropy_weight * log_density - value_weight * value).mean() + prior_weight * kl

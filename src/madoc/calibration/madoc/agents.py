@@ -1,5 +1,6 @@
 """The networks and distributions that Madoc trains, and the updates that train them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -8,9 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_parameters, prior_weight
+from madoc.calibration.madoc.actors import (
+    Actors,
+    actor_loss,
+    divergence,
+    draw_parameters,
+    prior_weight,
+    value_weight,
+)
 from madoc.calibration.madoc.slopes import Slopes, redrawn
-from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
+from madoc.calibration.madoc.value_decomposition import (
+    GroupCritics,
+    Mixing,
+    counterfactual_loss,
+    set_back,
+    value_loss,
+)
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
 from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend, moving_average, scan_updates
@@ -32,6 +46,8 @@ class Resolution:
             the reward is too blunt to move it; where the reward is sharp, less of it will do.
         prior_rate: Rate of the prior's moving average. The actors move as fast as the prior follows them, so it is
             slow where their steps are noisy.
+        shared_by: Number of parameters that may share the reward before values weigh more in Eq. (13); with a prior
+            that stays they never do.
     """
 
     blur: float
@@ -39,11 +55,14 @@ class Resolution:
     largest: float
     entropy_weight: float
     prior_rate: float
+    shared_by: float
 
 
-OF_CHANGES = Resolution(blur=0.3, smallest=0.01, largest=0.3, entropy_weight=0.05, prior_rate=0.1)
+OF_CHANGES = Resolution(
+    blur=0.3, smallest=0.01, largest=0.3, entropy_weight=0.05, prior_rate=0.1, shared_by=float("inf")
+)
 """Where s' is described by its change or as it is; the entropy's weight is the paper's."""
-OF_INNOVATIONS = Resolution(blur=2.0, smallest=0.01, largest=10.0, entropy_weight=0.01, prior_rate=0.3)
+OF_INNOVATIONS = Resolution(blur=2.0, smallest=0.01, largest=10.0, entropy_weight=0.01, prior_rate=0.3, shared_by=4.0)
 """Where s' is described by its innovation in multiples of the spread that the actors leave."""
 
 
@@ -100,7 +119,7 @@ class AgentSettings:
         prior_rate: Rate of the prior's moving average; None takes that of the `Resolution`.
         prior_every: Updates between two moves of the prior.
         average_rate: Rate of the moving average from which the estimate is read.
-        baseline: Whether b of Eq. (11) depends on (s, a), where credit has one (`dop`); in the paper it does not.
+        baseline: Whether b of Eq. (11) depends on (s, a), where credit has one; in the paper it does not.
         reward_size: Mean |reward| to which the blur is steered; 0 for no blur, as in the paper.
         blur_rate: Change of the logarithm of the blur in an update, for an error of the mean |reward| of 1.
     """
@@ -184,11 +203,11 @@ class AgentSettings:
 
         The discriminators learn from blurred s'; the reward is computed at s' without blur, where it is least noisy.
         Simulated rows are columns `pair`, `following` and `parameters` (in [-1, 1]), logged rows are (pair, following).
-        With `slopes`, each simulated row is seen as under a fresh draw of the actors.
+        With `slopes`, each simulated row is seen as under a fresh draw of the actors, and counterfactual credit is had.
         """
 
         def update(agents: Agents, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
-            of_logged, of_simulated, of_blur, of_dropout, of_actors, of_draws = jax.random.split(key, 6)
+            of_logged, of_simulated, of_blur, of_dropout, of_actors, of_draws, of_group = jax.random.split(key, 7)
             rows = jax.random.randint(of_logged, (self.batch,), 0, len(logged[0]))
             drawn = replay.sample(simulated, of_simulated, self.batch)
             if slopes is not None:
@@ -202,7 +221,8 @@ class AgentSettings:
             common = overlap(agents.judges, drawn["pair"])
             share = common / common.mean() if self.weigh_overlap else jnp.ones_like(reward)
             agents, reward_metrics = self._steer_blur(agents, reward, share, resolution)
-            agents, value_metrics = self._update_critics(agents, drawn, reward, share, members, mixing)
+            loss_of = self._loss_of_critics(agents, drawn, reward, share, members, mixing, slopes, of_group)
+            agents, value_metrics = self._update_critics(agents, loss_of)
             agents, actor_metrics = self._update_actors(agents, members, resolution, told, of_actors)
             return agents, metrics | reward_metrics | value_metrics | actor_metrics | {"overlap": common.mean()}
 
@@ -236,7 +256,7 @@ class AgentSettings:
         }
         return replace(agents, log_blur=log_blur), metrics
 
-    def _update_critics(
+    def _loss_of_critics(
         self,
         agents: Agents,
         rows: dict[str, Array],
@@ -244,12 +264,32 @@ class AgentSettings:
         share: PerRow,
         members: Bool[Array, "groups d"],
         mixing: Mixing,
-    ) -> tuple[Agents, dict[str, Array]]:
-        def loss_of(critics: GroupCritics) -> Array:
-            values = critics.values(rows["parameters"], members)
-            left = critics.less_baseline(reward, rows["pair"]) if mixing == "dop" else reward
-            return value_loss(values, critics.weight, critics.bias, left, share, mixing)
+        slopes: Slopes | None,
+        key: PRNGKeyArray,
+    ) -> Callable[[GroupCritics], Scalar]:
+        """What the critics are to make small: Eq. (12), or the error of differences where rows can be redrawn."""
+        parameters = rows["parameters"]
+        if mixing != "counterfactual" or slopes is None:
 
+            def of_draws(critics: GroupCritics) -> Scalar:
+                left = reward if mixing in ("sum", "independent") else critics.less_baseline(reward, rows["pair"])
+                values = critics.values(parameters, members)
+                return value_loss(values, critics.weight, critics.bias, left, share, mixing)
+
+            return of_draws
+        group, without = set_back(parameters, jnp.tanh(jnp.asarray(agents.actors.mean)), members, key)
+        following = redrawn(slopes, rows, without)["following"]
+        difference = reward - log_dynamics_ratio(agents.judges, rows["pair"], following)
+
+        def of_differences(critics: GroupCritics) -> Scalar:
+            values, at_mean = (critics.values(each, members) for each in (parameters, without))
+            return counterfactual_loss(values, at_mean, group, difference, share)
+
+        return of_differences
+
+    def _update_critics(
+        self, agents: Agents, loss_of: Callable[[GroupCritics], Scalar]
+    ) -> tuple[Agents, dict[str, Array]]:
         loss, gradients = eqx.filter_value_and_grad(loss_of)(agents.critics)
         critics, optimiser = descend(adam(self.critic_rate), gradients, agents.critic_optimiser, agents.critics)
         return replace(agents, critics=critics, critic_optimiser=optimiser), {"value_loss": loss}
@@ -258,7 +298,8 @@ class AgentSettings:
         self, agents: Agents, members: Array, resolution: Resolution, told: Array | None, key: PRNGKeyArray
     ) -> tuple[Agents, dict[str, Array]]:
         entropy_weight = resolution.entropy_weight if self.entropy_weight is None else self.entropy_weight
-        weight = prior_weight(agents.updates, time_constant=self.prior_time, largest=self.prior_largest)
+        of_prior = prior_weight(agents.updates, time_constant=self.prior_time, largest=self.prior_largest)
+        of_values = value_weight(members.shape[1], resolution.shared_by) if told is None else 1.0
 
         def loss_of(actors: Actors) -> Array:
             draws, density = draw_parameters(actors, key, self.actor_batch)
@@ -267,7 +308,8 @@ class AgentSettings:
                 density,
                 divergence(actors, agents.prior).sum(),
                 entropy_weight=entropy_weight,
-                prior_weight=weight,
+                prior_weight=of_prior,
+                value_weight=of_values,
             )
 
         loss, gradients = jax.value_and_grad(loss_of)(agents.actors)

@@ -41,7 +41,9 @@ class Madoc:
     """Multi-agent domain calibration. `Madoc.paper()` has the paper's constants; these are leaner and faster.
 
     Attributes:
-        mixing: `dop` (Madoc), `sum` (Madoc-VDN) or `independent` (Madoc-ISAC).
+        mixing: How groups get their credit. `counterfactual`: where discriminators see innovations, from what the
+            reward of a row differs by if that group alone is set back to its mean, until then as `dop`. `dop`: by Eq.
+            (11) and (12), as in the paper. `sum` (Madoc-VDN) or `independent` (Madoc-ISAC).
         groups: `each` parameter an agent of its own (ungrouped), `physics` (an agent for parameters that move the same
             signals, by derivatives of the simulator), `learned` (by the paper's VAE), or `one` agent for all (Madoc-S).
         group_count: Number of groups; None takes the most stable number, or that of the task for `learned`.
@@ -76,7 +78,7 @@ class Madoc:
         agents: Hyperparameters of discriminators, critics and actors.
     """
 
-    mixing: Mixing = "dop"
+    mixing: Mixing = "counterfactual"
     groups: Grouping = "each"
     group_count: Count | None = None
     starts: StartMode | None = "policy"

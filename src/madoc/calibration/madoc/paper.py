@@ -3,6 +3,7 @@
 from madoc.calibration.madoc.agents import AgentSettings
 
 PAPER: dict[str, object] = {
+    "mixing": "dop",
     "groups": "learned",
     "features": "raw",
     "hidden": (256, 256),

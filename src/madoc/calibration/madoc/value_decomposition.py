@@ -1,15 +1,19 @@
-"""Value decomposition: a critic for each group, mixed into the value of a draw (DOP, VDN), or independent (ISAC)."""
+"""Credit of each group: a critic for each, and what its value is learnt from.
+
+Values are mixed into that of a draw (DOP, VDN), independent of each other (ISAC), or learnt from what the reward
+differs by where that group alone is set back (counterfactual).
+"""
 
 from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from madoc.learning.networks import Network, PerRow, Scalar, stack
 
-Mixing = Literal["dop", "sum", "independent"]
+Mixing = Literal["counterfactual", "dop", "sum", "independent"]
 
 
 class GroupCritics(eqx.Module):
@@ -67,9 +71,36 @@ def value_loss(
     """Eq. (12): half the mean of (V_tot - R)². A bandit: there is no next value.
 
     Rows are weighted by `share`, whose mean is 1; in the paper every share is 1.
+    `counterfactual` is as `dop` here, where rows cannot be had under other draws.
     `sum` (VDN) has k = 1 and b = 0; `independent` (ISAC) regresses every critic on the shared reward alone.
     """
     if mixing == "independent":
         return 0.5 * (share[:, None] * (values - reward[:, None]) ** 2).mean(0).sum()
-    total = total_value(values, weight, bias) if mixing == "dop" else values.sum(-1)
+    total = values.sum(-1) if mixing == "sum" else total_value(values, weight, bias)
     return 0.5 * (share * (total - reward) ** 2).mean()
+
+
+def set_back(
+    parameters: Float[Array, "rows d"], mean: Float[Array, " d"], members: Bool[Array, "groups d"], key: PRNGKeyArray
+) -> tuple[Int[Array, " rows"], Float[Array, "rows d"]]:
+    """One group of each row, drawn in proportion to its size, and the parameters with that group at its mean."""
+    chosen = jax.random.randint(key, (len(parameters),), 0, members.shape[1])
+    group = jnp.argmax(members[:, chosen], axis=0)
+    return group, jnp.where(members[group], mean[None], parameters)
+
+
+def counterfactual_loss(
+    values: Float[Array, "rows groups"],
+    without: Float[Array, "rows groups"],
+    group: Int[Array, " rows"],
+    difference: PerRow,
+    share: PerRow,
+) -> Scalar:
+    """Half the mean of (v_g(ξ^g) - v_g(μ^g) - D_g)², D_g = R(ξ) - R(ξ with ξ^g = μ^g); not in the paper.
+
+    `values` and `without` are those at ξ and at ξ with the row's group g set back to its mean μ^g, `difference` is D_g,
+    the difference reward (Wolpert and Tumer 2002; COMA: Foerster et al. 2018). What the other groups earn, and how well
+    the row is judged whatever its parameters, cancel in D_g, so that they are no noise on the credit of g.
+    """
+    own = jnp.take_along_axis(values - without, group[:, None], axis=1)[:, 0]
+    return 0.5 * (share * (own - difference) ** 2).mean()
