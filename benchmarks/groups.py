@@ -6,7 +6,8 @@ An Ant of our own truths, after figure 3b of Jiang et al. 2024: gravity, the tor
 dampings, armatures and friction losses, in an order that is drawn once, of which a run calibrates the first. What it
 does not calibrate has the same value in target and simulator. Each seed plants another truth, in the middle 80 % of
 every range, and records `medium` behaviour there. `random` has groups of the sizes of those by physics, of parameters
-drawn at random; of up to 4 parameters both make one group. Runs already there are skipped.
+drawn at random; of up to 4 parameters both make one group. `each-dop` is `each` with the credit of Eq. (12) throughout.
+Runs already there are skipped.
 """
 
 import argparse
@@ -34,7 +35,7 @@ from madoc.tasks import Task
 from madoc.types import Epoch
 
 RESULTS = Path(__file__).parent / "results" / "groups"
-GROUPS = ("one", "physics", "random", "learned", "each")
+GROUPS = ("one", "physics", "random", "learned", "each", "each-dop")
 WHOLE = (Parameter("gravity", "", -15.0, -5.0), Parameter("body_mass", "torso", 0.1, 0.55))
 OF_A_LEG = {
     "body_mass": {"aux": (0.01, 0.06), "ankle": (0.02, 0.11)},
@@ -123,7 +124,10 @@ def planted(simulator: CpuSimulator, seed: int, transitions: int) -> Dataset:
 def agents(groups: str, draws: int) -> Madoc:
     """Madoc, freely running, with `draws` an epoch and these groups."""
     settings = {"draws": draws, "horizon": -(-STEPS // draws), "epoch_steps": STEPS}
-    return AtRandom(groups="physics", **settings) if groups == "random" else Madoc(groups=groups, **settings)
+    if groups == "random":
+        return AtRandom(groups="physics", **settings)
+    name, _, mixing = groups.partition("-")
+    return Madoc(groups=name, **settings) if not mixing else Madoc(groups=name, mixing=mixing, **settings)
 
 
 def run(method: Madoc, problem: CalibrationProblem, dataset: Dataset, seed: int, budget: int) -> dict:

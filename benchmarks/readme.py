@@ -25,6 +25,7 @@ STUDIED = {
     "random": "random groups",
     "learned": "groups by the VAE",
     "each": "one agent a parameter",
+    "each-dop": "the same, credit by DOP",
 }
 """Who the agents of `benchmarks/groups.py` are, in the order of the columns."""
 PLACES = ("calibrated", "truth", "midrange")

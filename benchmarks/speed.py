@@ -23,7 +23,7 @@ import numpy as np
 from madoc import tasks
 from madoc.calibration import CalibrationProblem, LeastSquares, Madoc, calibrate
 from madoc.calibration.madoc import grouping
-from madoc.calibration.madoc.agents import AgentSettings
+from madoc.calibration.madoc.agents import OF_CHANGES, AgentSettings
 from madoc.data.targets import paper_truth
 from madoc.learning import replay
 from madoc.learning.cloning import continue_cloning
@@ -202,7 +202,6 @@ def calibration_update(method: Madoc) -> tuple[Callable[[], object], int]:
     dataset = record_quality(simulator, "medium", transitions=5000, key=jax.random.key(0))
     problem = CalibrationProblem(dataset, simulator)
     state = method.init(problem, jax.random.key(0))
-    _, features = problem.features.windows(method.features, 1)
     members = jnp.asarray(grouping.members(np.arange(14) % 6, 6))
     count = 50
 
@@ -211,10 +210,11 @@ def calibration_update(method: Madoc) -> tuple[Callable[[], object], int]:
             method.agents.update(
                 state.agents,
                 state.rows,
-                features,
+                method.collection(problem).logged,
                 members,
                 jax.random.key(1),
-                mixing="dop",
+                mixing=method.mixing,
+                resolution=OF_CHANGES,
                 count=count,
             )[1]
         )

@@ -117,10 +117,19 @@ def test_actors_follow_the_value_and_are_held_by_the_prior():
     assert slope(10.0) - slope(0.0) == pytest.approx(55.556, rel=1e-3)
 
 
-@pytest.mark.parametrize(("parameters", "shared_by", "weight"), [(3, 4.0, 1.0), (12, 4.0, 3.0), (32, np.inf, 1.0)])
-def test_values_weigh_more_where_more_parameters_share_the_reward(parameters, shared_by, weight):
-    assert value_weight(parameters, shared_by) == weight
-    # as above, with 0.1·(-1) - w·1 and 0.1·(-3) - w·3, mean -0.2 - 2 w; plus 1 is 0.8 - 2 w
-    terms = jnp.array([1.0, 3.0]), jnp.array([-1.0, -3.0]), jnp.asarray(0.5)
-    loss = actor_loss(*terms, entropy_weight=0.1, prior_weight=2.0, value_weight=weight)
-    assert loss == pytest.approx(0.8 - 2 * weight, rel=1e-6)
+@pytest.mark.parametrize(
+    ("told", "shared_by", "weights"),
+    [
+        # five parameters in two groups, of 0 and 3, and of the rest; a third group is empty
+        (None, 10.0, [1.0, 1.0, 1.0]),
+        (None, 2.0, [2.5, 2.5, 2.5]),
+        (None, np.inf, [1.0, 1.0, 1.0]),
+        ([False] * 5, 2.0, [2.5, 2.5, 2.5]),
+        ([False, False, False, True, False], 2.0, [1.0, 2.5, 2.5]),
+        ([True] * 5, 2.0, [1.0, 1.0, 2.5]),
+    ],
+)
+def test_values_weigh_more_where_more_parameters_share_the_reward(told, shared_by, weights):
+    members = jnp.array([[True, False, False, True, False], [False, True, True, False, True], [False] * 5])
+    told = None if told is None else jnp.array(told)
+    np.testing.assert_allclose(value_weight(members, told, shared_by), weights)

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from scipy import stats
 
 from madoc.calibration.madoc.value_decomposition import (
     GroupCritics,
@@ -176,55 +177,39 @@ def test_a_baseline_takes_what_it_says_of_each_row_and_the_papers_takes_nothing(
     np.testing.assert_allclose(constant.less_baseline(REWARD, pair), [1.5, -0.5])
 
 
-def test_one_group_of_each_row_is_set_back_to_its_mean(compiled):
-    drawn, mean = parameters(2000), jnp.array([0.1, 0.2, 0.3, 0.4])
-    group, without = compiled(set_back)(drawn, mean, MEMBERS, jax.random.key(3))
+def test_one_group_of_each_row_is_set_back_to_its_centre(compiled):
+    drawn, centre = parameters(2000), jnp.array([0.1, 0.2, 0.3, 0.4])
+    group, without = compiled(set_back)(drawn, centre, MEMBERS, jax.random.key(3))
     own = np.asarray(MEMBERS)[np.asarray(group)]
-    np.testing.assert_array_equal(without, np.where(own, mean, drawn))
+    np.testing.assert_array_equal(without, np.where(own, centre, drawn))
     # the first group has two of four parameters, the others one each: shares of a half and two quarters
     np.testing.assert_allclose(np.bincount(group, minlength=3) / 2000, [0.5, 0.25, 0.25], atol=0.04)
 
 
 def test_counterfactual_loss_by_hand(compiled):
     # own differences: 2 - 0.5 = 1.5 and 3 - 1 = 2, less D of 1 and 4: errors 0.5 and -2, at shares 1.5 and 0.5
-    without = jnp.array([[9.0, 0.5], [1.0, 9.0]])
+    at_centre = jnp.array([[1.0, 0.5]])
     loss = compiled(counterfactual_loss)(
-        VALUES, without, jnp.array([1, 0]), jnp.array([1.0, 4.0]), jnp.array([1.5, 0.5])
+        VALUES, at_centre, jnp.array([1, 0]), jnp.array([1.0, 4.0]), jnp.array([1.5, 0.5])
     )
     assert loss == pytest.approx((1.5 * 0.25 + 0.5 * 4.0) / 4)
 
 
-@pytest.mark.parametrize("counterfactual", [True, False])
-def test_what_differs_from_row_to_row_is_no_noise_on_differences(counterfactual):
-    """A reward of which a weak parameter is a fiftieth: its critic learns from differences, and not from draws."""
-    optimiser, members = optax.adam(1e-2), jnp.eye(4, dtype=bool)
+def test_counterfactual_credit_is_that_of_dop_where_rows_cannot_be_redrawn():
+    terms = VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, EVEN
+    assert value_loss(*terms, "counterfactual") == value_loss(*terms, "dop")
 
-    def loss_of(made, key):
-        of_draws, of_rows, of_group = jax.random.split(key, 3)
-        drawn = jax.random.uniform(of_draws, (64, 4), minval=-1.0)
-        of_row = 5.0 * jax.random.normal(of_rows, (64,))
-        group, without = set_back(drawn, jnp.zeros(4), members, of_group)
-        reward, at_mean = (of_row + each[:, 0] + 0.1 * each[:, 3] for each in (drawn, without))
-        values = made.values(drawn, members)
-        if counterfactual:
-            return counterfactual_loss(values, made.values(without, members), group, reward - at_mean, jnp.ones(64))
-        return value_loss(values, made.weight, made.bias, reward, jnp.ones(64), "dop")
 
-    @eqx.filter_jit
-    def trained(made):
-        arrays, static = eqx.partition(made, eqx.is_array)
-
-        def update(carry, key):
-            made = eqx.combine(carry[0], static)
-            made, state = descend(optimiser, eqx.filter_grad(loss_of)(made, key), carry[1], made)
-            return (eqx.filter(made, eqx.is_array), state), None
-
-        (arrays, _), _ = jax.lax.scan(
-            update, (arrays, optimiser.init(arrays)), jax.random.split(jax.random.key(4), 500)
-        )
-        return eqx.combine(arrays, static)
-
-    made = trained(GroupCritics(4, 4, (16, 16), key=jax.random.key(0)))
-    ends = made.values(jnp.array([[0, 0, 0, -1.0], [0, 0, 0, 1.0]]), members)[:, 3]
-    slope = float(ends[1] - ends[0]) / 2
-    assert (abs(slope - 0.1) < 0.02) == counterfactual, slope
+def test_differences_tell_of_a_weak_parameter_what_draws_do_not():
+    # parameter 3 earns 0.1 ξ_3, and 0.3 ξ_0 ξ_3 with another; (s, a) alone earn fifty times as much
+    drawn = parameters(4000)
+    of_row = 5.0 * jax.random.normal(jax.random.key(5), (4000,))
+    group, without = set_back(drawn, jnp.full(4, 0.2), MEMBERS, jax.random.key(6))
+    reward, less = (
+        np.asarray(of_row + each[:, 0] + 0.1 * each[:, 3] + 0.3 * each[:, 0] * each[:, 3]) for each in (drawn, without)
+    )
+    own = np.asarray(group) == 2
+    moved = np.asarray(drawn[:, 3])[own]
+    by_difference, by_draw = (stats.linregress(moved, earned[own]) for earned in (reward - less, reward))
+    assert by_difference.slope == pytest.approx(0.1, abs=3 * by_difference.stderr)
+    assert by_difference.stderr < 0.02 < 10 * by_difference.stderr < by_draw.stderr

@@ -46,8 +46,7 @@ class Resolution:
             the reward is too blunt to move it; where the reward is sharp, less of it will do.
         prior_rate: Rate of the prior's moving average. The actors move as fast as the prior follows them, so it is
             slow where their steps are noisy.
-        shared_by: Number of parameters that may share the reward before values weigh more in Eq. (13); with a prior
-            that stays they never do.
+        shared_by: Number of parameters that may share the reward before values weigh more in Eq. (13).
     """
 
     blur: float
@@ -119,7 +118,7 @@ class AgentSettings:
         prior_rate: Rate of the prior's moving average; None takes that of the `Resolution`.
         prior_every: Updates between two moves of the prior.
         average_rate: Rate of the moving average from which the estimate is read.
-        baseline: Whether b of Eq. (11) depends on (s, a), where credit has one; in the paper it does not.
+        baseline: Whether b of Eq. (11) depends on (s, a), wherever credit is that of DOP; in the paper it does not.
         reward_size: Mean |reward| to which the blur is steered; 0 for no blur, as in the paper.
         blur_rate: Change of the logarithm of the blur in an update, for an error of the mean |reward| of 1.
     """
@@ -203,7 +202,7 @@ class AgentSettings:
 
         The discriminators learn from blurred s'; the reward is computed at s' without blur, where it is least noisy.
         Simulated rows are columns `pair`, `following` and `parameters` (in [-1, 1]), logged rows are (pair, following).
-        With `slopes`, each simulated row is seen as under a fresh draw of the actors, and counterfactual credit is had.
+        With `slopes`, each simulated row is seen as under a fresh draw of the actors, and credit can be counterfactual.
         """
 
         def update(agents: Agents, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
@@ -221,7 +220,9 @@ class AgentSettings:
             common = overlap(agents.judges, drawn["pair"])
             share = common / common.mean() if self.weigh_overlap else jnp.ones_like(reward)
             agents, reward_metrics = self._steer_blur(agents, reward, share, resolution)
-            loss_of = self._loss_of_critics(agents, drawn, reward, share, members, mixing, slopes, of_group)
+            loss_of = self._loss_of_critics(
+                agents, drawn, reward, share, members=members, mixing=mixing, slopes=slopes, key=of_group
+            )
             agents, value_metrics = self._update_critics(agents, loss_of)
             agents, actor_metrics = self._update_actors(agents, members, resolution, told, of_actors)
             return agents, metrics | reward_metrics | value_metrics | actor_metrics | {"overlap": common.mean()}
@@ -262,12 +263,17 @@ class AgentSettings:
         rows: dict[str, Array],
         reward: PerRow,
         share: PerRow,
+        *,
         members: Bool[Array, "groups d"],
         mixing: Mixing,
         slopes: Slopes | None,
         key: PRNGKeyArray,
     ) -> Callable[[GroupCritics], Scalar]:
-        """What the critics are to make small: Eq. (12), or the error of differences where rows can be redrawn."""
+        """The loss of the critics, as a function of them.
+
+        It is Eq. (12); if `mixing` is `counterfactual` and there are slopes, the error of differences of rewards, of
+        which the second is that of the row redrawn, to first order, with one group at its actors' centre.
+        """
         parameters = rows["parameters"]
         if mixing != "counterfactual" or slopes is None:
 
@@ -277,13 +283,14 @@ class AgentSettings:
                 return value_loss(values, critics.weight, critics.bias, left, share, mixing)
 
             return of_draws
-        group, without = set_back(parameters, jnp.tanh(jnp.asarray(agents.actors.mean)), members, key)
+        centre = jnp.tanh(jnp.asarray(agents.actors.mean))
+        group, without = set_back(parameters, centre, members, key)
         following = redrawn(slopes, rows, without)["following"]
         difference = reward - log_dynamics_ratio(agents.judges, rows["pair"], following)
 
         def of_differences(critics: GroupCritics) -> Scalar:
-            values, at_mean = (critics.values(each, members) for each in (parameters, without))
-            return counterfactual_loss(values, at_mean, group, difference, share)
+            values, at_centre = (critics.values(each, members) for each in (parameters, centre[None]))
+            return counterfactual_loss(values, at_centre, group, difference, share)
 
         return of_differences
 
@@ -299,17 +306,16 @@ class AgentSettings:
     ) -> tuple[Agents, dict[str, Array]]:
         entropy_weight = resolution.entropy_weight if self.entropy_weight is None else self.entropy_weight
         of_prior = prior_weight(agents.updates, time_constant=self.prior_time, largest=self.prior_largest)
-        of_values = value_weight(members.shape[1], resolution.shared_by) if told is None else 1.0
+        of_values = value_weight(members, told, resolution.shared_by)
 
         def loss_of(actors: Actors) -> Array:
             draws, density = draw_parameters(actors, key, self.actor_batch)
             return actor_loss(
-                agents.critics.values(draws, members).sum(-1),
+                (agents.critics.values(draws, members) * of_values[None]).sum(-1),
                 density,
                 divergence(actors, agents.prior).sum(),
                 entropy_weight=entropy_weight,
                 prior_weight=of_prior,
-                value_weight=of_values,
             )
 
         loss, gradients = jax.value_and_grad(loss_of)(agents.actors)

@@ -41,9 +41,10 @@ class Madoc:
     """Multi-agent domain calibration. `Madoc.paper()` has the paper's constants; these are leaner and faster.
 
     Attributes:
-        mixing: How groups get their credit. `counterfactual`: where discriminators see innovations, from what the
-            reward of a row differs by if that group alone is set back to its mean, until then as `dop`. `dop`: by Eq.
-            (11) and (12), as in the paper. `sum` (Madoc-VDN) or `independent` (Madoc-ISAC).
+        mixing: How critics learn what their group is worth. `counterfactual` compares the reward of a row with what it
+            is if the group alone is set back to the centre of its actor; it needs innovations (see `features`), and is
+            `dop` until there are any. `dop` is Eq. (11) and (12), as in the paper. `sum` is that of Madoc-VDN,
+            `independent` that of Madoc-ISAC.
         groups: `each` parameter an agent of its own (ungrouped), `physics` (an agent for parameters that move the same
             signals, by derivatives of the simulator), `learned` (by the paper's VAE), or `one` agent for all (Madoc-S).
         group_count: Number of groups; None takes the most stable number, or that of the task for `learned`.

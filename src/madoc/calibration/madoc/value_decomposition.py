@@ -81,26 +81,34 @@ def value_loss(
 
 
 def set_back(
-    parameters: Float[Array, "rows d"], mean: Float[Array, " d"], members: Bool[Array, "groups d"], key: PRNGKeyArray
+    parameters: Float[Array, "rows d"], centre: Float[Array, " d"], members: Bool[Array, "groups d"], key: PRNGKeyArray
 ) -> tuple[Int[Array, " rows"], Float[Array, "rows d"]]:
-    """One group of each row, drawn in proportion to its size, and the parameters with that group at its mean."""
+    """One group of each row, drawn in proportion to its size, and the parameters with that group at its centre."""
     chosen = jax.random.randint(key, (len(parameters),), 0, members.shape[1])
     group = jnp.argmax(members[:, chosen], axis=0)
-    return group, jnp.where(members[group], mean[None], parameters)
+    return group, jnp.where(members[group], centre[None], parameters)
 
 
 def counterfactual_loss(
     values: Float[Array, "rows groups"],
-    without: Float[Array, "rows groups"],
+    at_centre: Float[Array, "1 groups"],
     group: Int[Array, " rows"],
     difference: PerRow,
     share: PerRow,
 ) -> Scalar:
     """Half the mean of (v_g(ξ^g) - v_g(μ^g) - D_g)², D_g = R(ξ) - R(ξ with ξ^g = μ^g); not in the paper.
 
-    `values` and `without` are those at ξ and at ξ with the row's group g set back to its mean μ^g, `difference` is D_g,
-    the difference reward (Wolpert and Tumer 2002; COMA: Foerster et al. 2018). What the other groups earn, and how well
-    the row is judged whatever its parameters, cancel in D_g, so that they are no noise on the credit of g.
+    μ^g is a fixed point, the centre of the actor of group g; which one does not matter to the expected slope of v_g.
+    D_g is the difference reward of Wolpert and Tumer (2002; compare COMA, Foerster et al. 2018). In it cancels what the
+    other groups earn by themselves, and what depends on (s, a) alone; what g earns together with others stays, and is
+    averaged over their draws. Critics are weighted by the rows of their group.
+
+    Args:
+        values: v_g(ξ^g) of every group.
+        at_centre: v_g(μ^g) of every group.
+        group: The group of each row that was set back.
+        difference: D_g of that group.
+        share: Weight of each row, 1 on average.
     """
-    own = jnp.take_along_axis(values - without, group[:, None], axis=1)[:, 0]
+    own = jnp.take_along_axis(values - at_centre, group[:, None], axis=1)[:, 0]
     return 0.5 * (share * (own - difference) ** 2).mean()
