@@ -220,7 +220,7 @@ class AgentSettings:
             common = overlap(agents.judges, drawn["pair"])
             share = common / common.mean() if self.weigh_overlap else jnp.ones_like(reward)
             agents, reward_metrics = self._steer_blur(agents, reward, share, resolution)
-            loss_of = self._loss_of_critics(
+            loss_of = self.loss_of_critics(
                 agents, drawn, reward, share, members=members, mixing=mixing, slopes=slopes, key=of_group
             )
             agents, value_metrics = self._update_critics(agents, loss_of)
@@ -257,7 +257,7 @@ class AgentSettings:
         }
         return replace(agents, log_blur=log_blur), metrics
 
-    def _loss_of_critics(
+    def loss_of_critics(
         self,
         agents: Agents,
         rows: dict[str, Array],
