@@ -62,8 +62,7 @@ def main() -> None:
         problem = CalibrationProblem(dataset, CpuSimulator(observed_task(task, dataset), threads=arguments.threads))
         for seed, method in product(arguments.seeds, arguments.methods):
             chosen = has_starts(method)
-            usual = ["policy" if DATA[data_is][1].hidden_velocities else "logged"]
-            for starts in (arguments.starts or usual) if chosen else ["-"]:
+            for starts in (arguments.starts or [usual_starts(data_is)]) if chosen else ["-"]:
                 words = [robot, arguments.quality, method, *([starts] if chosen else []), arguments.budget, seed]
                 words += [] if data_is == "clean" else [data_is]
                 path = arguments.results / ("-".join(map(str, words)) + ".json")
@@ -106,6 +105,11 @@ def run(method, changes, problem: CalibrationProblem, dataset: Dataset, seed: in
     except MadocError as refusal:
         return {"refusal": str(refusal)}
     return result.to_json() | {"method": method, "wall_seconds": round(time.monotonic() - started, 1)}
+
+
+def usual_starts(data_is: str) -> str:
+    """Where rollouts start on such data if nothing else is asked: states cannot be rebuilt without velocities."""
+    return "policy" if DATA[data_is][1].hidden_velocities else "logged"
 
 
 def has_starts(method: str) -> bool:

@@ -17,6 +17,8 @@ import paper
 import rates
 import readme
 
+from calibration import usual_starts
+
 RESULTS = Path(__file__).parent / "results"
 SETS = ("adversary", "rates")
 """Folders of results of one JSON file each that are shown together."""
@@ -60,8 +62,9 @@ def is_time(budget: int | str) -> bool:
 
 
 def label(row: dict) -> str:
-    """A method and where its rollouts start, if it can choose."""
-    return row["method"] if row["starts"] == "-" else f"{row['method']}, {row['starts']}"
+    """A method and where its rollouts start, if that is not where they usually do on such data."""
+    usual = "policy" if row["method"] == "madoc" else usual_starts(row["data"])
+    return row["method"] if row["starts"] in ("-", usual) else f"{row['method']}, {row['starts']}"
 
 
 def calibration() -> str:
@@ -122,12 +125,13 @@ def disturbed() -> str:
 
 
 def _disturbed(rows: list[dict]) -> str:
-    cells, methods, robots = defaultdict(list), {}, set()
+    cells, methods, robots = defaultdict(list), set(), set()
     for row in rows:
         cells[row["robot"], row["data"], row["budget"], label(row)].append(row)
         if row["data"] != "clean":
-            methods[label(row)] = None
+            methods.add(label(row))
             robots.add(row["robot"])
+    methods = sorted(methods, key=lambda name: (name not in ("least-squares", "madoc"), name))
     head = ("robot", "data", "budget", "seeds", "what the data tells, %", *methods)
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for robot, data, budget in sorted({cell[:3] for cell in cells}):
