@@ -126,8 +126,8 @@ def _studied(rows: Mapping[str, Mapping[int, dict]], name: str) -> str:
 
 
 def _mean(errors: Sequence[float]) -> str:
-    """Mean and number of seeds; nothing of none."""
-    return f"{np.mean(errors):.3f} ({len(errors)} seed{'s' * (len(errors) > 1)})" if errors else "not run"
+    """Mean, to two digits, and number of seeds; nothing of none."""
+    return f"{np.mean(errors):.2g} ({len(errors)} seed{'s' * (len(errors) > 1)})" if errors else "not run"
 
 
 def minutes(rows: Sequence[dict]) -> str:
