@@ -94,7 +94,7 @@ def test_agents_are_compared_in_pairs_of_the_same_log_and_seed(monkeypatch):
     found["ant-medium", "madoc-grouped"] = dict.fromkeys(range(5), 0.01)  # too few pairs to be compared
     monkeypatch.setattr(paper, "by_seed", lambda name: found)
     told = readme.errors()
-    assert "| Hopper | 0.110 (3 seeds) | not run | 0.090 (2 seeds) | 0.33 | 0.34 |" in told
+    assert "| Hopper | 0.11 (3 seeds) | not run | 0.09 (2 seeds) | 0.33 | 0.34 |" in told
     assert "| `madoc` against `madoc-s` | 6 | 6 | 0.25 (0.1" in told
     assert "against `madoc-grouped`" not in told
 
