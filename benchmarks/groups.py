@@ -127,7 +127,7 @@ def agents(groups: str, draws: int) -> Madoc:
     if groups == "random":
         return AtRandom(groups="physics", **settings)
     name, _, mixing = groups.partition("-")
-    return Madoc(groups=name, **settings) if not mixing else Madoc(groups=name, mixing=mixing, **settings)
+    return Madoc(groups=name, mixing=mixing or Madoc.mixing, **settings)
 
 
 def run(method: Madoc, problem: CalibrationProblem, dataset: Dataset, seed: int, budget: int) -> dict:

@@ -202,7 +202,8 @@ def calibration_update(method: Madoc) -> tuple[Callable[[], object], int]:
     dataset = record_quality(simulator, "medium", transitions=5000, key=jax.random.key(0))
     problem = CalibrationProblem(dataset, simulator)
     state = method.init(problem, jax.random.key(0))
-    members = jnp.asarray(grouping.members(np.arange(14) % 6, 6))
+    groups, parameters = len(state.agents.critics.weight), len(simulator.parameters)
+    members = jnp.asarray(grouping.members(np.arange(parameters) % groups, groups))
     count = 50
 
     def run() -> object:
