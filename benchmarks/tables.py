@@ -7,8 +7,6 @@ python benchmarks/tables.py            # prints, and writes results/README.md an
 
 import json
 from collections import defaultdict
-from itertools import product
-from pathlib import Path
 
 import adversary
 import coverage
@@ -16,10 +14,10 @@ import numpy as np
 import paper
 import rates
 import readme
+from disturbances import disturbed
+from kept import RESULTS, calibrations, is_time, learnt, shown
+from not_run import not_run
 
-from calibration import usual_starts
-
-RESULTS = Path(__file__).parent / "results"
 SETS = ("adversary", "rates")
 """Folders of results of one JSON file each that are shown together."""
 
@@ -48,23 +46,6 @@ def measured() -> str:
         not_run(),
     ]
     return "\n".join(part for part in parts if part)
-
-
-def calibrations() -> list[dict]:
-    """Every calibration that was run, refused ones included."""
-    rows = [json.loads(path.read_text()) for path in sorted((RESULTS / "calibration").glob("*.json"))]
-    return [{"robot": row.get("task"), "data": "clean", "budget": 300_000} | row for row in rows]
-
-
-def is_time(budget: int | str) -> bool:
-    """Whether a budget is a time, as "60s"."""
-    return isinstance(budget, str)
-
-
-def label(row: dict) -> str:
-    """A method and where its rollouts start, if that is not where they usually do on such data."""
-    usual = "policy" if row["method"] == "madoc" else usual_starts(row["data"])
-    return row["method"] if row["starts"] in ("-", usual) else f"{row['method']}, {row['starts']}"
 
 
 def calibration() -> str:
@@ -106,64 +87,6 @@ def groups() -> str:
     )
 
 
-def shown(errors: list[float]) -> str:
-    """Median (lowest to highest), three decimals or, below them, three digits."""
-    median, low, high = np.median(errors), min(errors), max(errors)
-    return f"{median:.3f} ({low:.3f} to {high:.3f})" if median >= 1e-3 else f"{median:.1e} ({low:.1e} to {high:.1e})"
-
-
-def disturbed() -> str:
-    """Error of every method on every kind of data, or that it refuses: at equal wall time, then at equal steps."""
-    timed = [row for row in calibrations() if is_time(row["budget"])]
-    counted = [row for row in calibrations() if not is_time(row["budget"])]
-    return (
-        "## Under disturbances\n\n`python benchmarks/calibration.py --data-is ...`. Median of the mean absolute error "
-        "over seeds, and in brackets in % of the range. *refuses*: with a sentence, kept in the result. Empty: not "
-        "run. What the data tells: the median over parameters of half the width of least squares' 95 % intervals, in % "
-        "of the range.\n\n" + "\n".join(_disturbed(rows) for rows in (timed, counted) if rows)
-    )
-
-
-def _disturbed(rows: list[dict]) -> str:
-    cells, methods, robots = defaultdict(list), set(), set()
-    for row in rows:
-        cells[row["robot"], row["data"], row["budget"], label(row)].append(row)
-        if row["data"] != "clean":
-            methods.add(label(row))
-            robots.add(row["robot"])
-    methods = sorted(methods, key=lambda name: (name not in ("least-squares", "madoc"), name))
-    head = ("robot", "data", "budget", "seeds", "what the data tells, %", *methods)
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-    for robot, data, budget in sorted({cell[:3] for cell in cells}):
-        columns = [cells.get((robot, data, budget, method), []) for method in methods]
-        if robot in robots and any(columns):
-            of_all = budget if is_time(budget) else f"{budget:,}"
-            seeds = sorted({len(column) for column in columns if column})
-            told = _half_width(cells.get((robot, data, budget, "least-squares"), []))
-            words = (robot, data, of_all, " to ".join(map(str, seeds[:: max(1, len(seeds) - 1)])), told)
-            lines.append(f"| {' | '.join((*words, *map(_cell, columns)))} |")
-    return "\n".join(lines) + "\n"
-
-
-def _half_width(rows: list[dict]) -> str:
-    """Half the width of intervals in % of the range, the median over parameters and seeds; empty without intervals."""
-    found = [
-        50.0 * (part["interval"][1] - part["interval"][0]) / (part["high"] - part["low"])
-        for row in rows
-        for part in row.get("parameters", {}).values()
-        if part.get("interval")
-    ]
-    return f"{np.median(found):.2g}" if found else ""
-
-
-def _cell(rows: list[dict]) -> str:
-    errors = [row["error"] for row in rows if "error" in row]
-    if not errors:
-        return "refuses" if rows else ""
-    percent = np.median([error["mean_percent_of_range"] for error in errors])
-    return f"{shown([error['mean_absolute'] for error in errors]).partition(' ')[0]} ({percent:.2g})"
-
-
 def policies() -> str:
     """Return in the target of every learner, where it learnt and how, over seeds."""
     cells = defaultdict(list)
@@ -191,11 +114,6 @@ def policies() -> str:
             f"| {_printed_return(robot, method, at)} | {np.median([row['seconds'] for row in rows]):.0f} |"
         )
     return "\n".join(lines) + "\n"
-
-
-def learnt() -> list[dict]:
-    """Every policy that was learnt and evaluated."""
-    return [json.loads(path.read_text()) for path in sorted((RESULTS / "policies").glob("*.json"))]
 
 
 def _printed_return(robot: str, method: str, at: str) -> str:
@@ -317,101 +235,6 @@ def fuzz() -> str:
     told = json.loads(path.read_text())
     counts = ", ".join(f"{name} {count:,}" for name, count in told.items() if isinstance(count, int) and name != "seed")
     return f"## Fuzzing\n\n`python benchmarks/fuzz.py --minutes {told['minutes']:g}`: {counts} ({told['commit']}).\n"
-
-
-ROBOTS = ("hopper", "halfcheetah")
-SIMULATING = {"hopper": "hidden=[128,128] updates_per_step=1", "halfcheetah": "hidden=[128,128] updates_per_step=0.25"}
-OFFLINE = dict.fromkeys(ROBOTS, "")
-POLICIES = [
-    ("sac", ("calibrated", "distribution", "uniform", "midrange", "truth"), (300_000, 300_000), SIMULATING),
-    ("sac-bc", ("calibrated",), (100_000, 300_000), SIMULATING),
-    ("dr-bc", ("-",), (100_000, 300_000), SIMULATING),
-    ("h2o", ("midrange",), (100_000, 300_000), SIMULATING),
-    ("bc", ("-",), (20_000, 20_000), OFFLINE),
-    ("cql", ("-",), (50_000, 50_000), dict.fromkeys(ROBOTS, "hidden=[128,128] critic_hidden=[128,128] samples=4")),
-    (
-        "morec",
-        ("-",),
-        ("900s", "900s"),
-        {"hopper": "hidden=[128,128] penalty=2.5", "halfcheetah": "hidden=[128,128]"},
-    ),
-]
-"""Learners, where they learn, and the budget and settings on each robot that fit two cores; of 3 seeds. MOREC's penalty
-is chosen for each robot, as its authors do."""
-
-
-def policies_not_run() -> list[str]:
-    """Of every learner, robot and place, the seeds that the table should hold and does not."""
-    done = {
-        (row["robot"], row["method"], row["at"], row["budget"], " ".join(row["set"]), row["seed"]) for row in learnt()
-    }
-    lines = []
-    for (method, places, budgets, settings), (index, robot) in product(POLICIES, enumerate(ROBOTS)):
-        budget, chosen = budgets[index], settings[robot]
-        for at in places:
-            seeds = [str(seed) for seed in range(3) if (robot, method, at, budget, chosen, seed) not in done]
-            words = [
-                *([f"--at {at}"] if at != "-" else []),
-                f"--budget {budget}",
-                *([f"--set {chosen}"] if chosen else []),
-            ]
-            if seeds:
-                lines.append(
-                    f"- `python benchmarks/policies.py --robots {robot} --methods {method} {' '.join(words)} "
-                    f"--seeds {' '.join(seeds)}`"
-                )
-    return lines
-
-
-CALIBRATORS = ("dropo", "e-dropo", "droid", "oted", "cma-es", "cma-es-distribution", "least-squares", "nominal")
-"""Besides Madoc, with the paper's budget."""
-
-
-DISTURBED = ("noise-1", "noise-10", "modern", "friction-20", "hidden", "shuffled-rows", "shuffled-next")
-
-
-def disturbed_not_run() -> list[str]:
-    """Of every calibrator and robot, the disturbances that it has not met for an equal wall time."""
-    timed = (row for row in calibrations() if is_time(row["budget"]))
-    done = {(row.get("method"), row["robot"], row["data"]) for row in timed}
-    lines = []
-    for method, robot in product((*CALIBRATORS, "madoc"), ROBOTS):
-        data = [name for name in DISTURBED if (method, robot, name) not in done]
-        if data:
-            lines.append(
-                f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --data-is {' '.join(data)} "
-                "--budget 60s --seeds 0`"
-            )
-    return lines
-
-
-def not_run() -> str:
-    """What the tables should hold and do not, each with the command that runs it."""
-    lines = []
-    for robot, starts in product(("hopper", "halfcheetah", "walker2d", "ant"), ("logged", "policy")):
-        for method in ("madoc", "madoc-s") if robot == "halfcheetah" else ("madoc",):
-            wanted = range(5 if robot == "halfcheetah" else 3)
-            name = f"{robot}-medium-{method}-{starts}-300000"
-            seeds = [seed for seed in wanted if not (RESULTS / "calibration" / f"{name}-{seed}.json").exists()]
-            if seeds:
-                lines.append(
-                    f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --starts {starts} "
-                    f"--seeds {' '.join(map(str, seeds))}`"
-                )
-    for method, robot in product(CALIBRATORS, ROBOTS):
-        found = [row for row in calibrations() if (row.get("method"), row["robot"]) == (method, robot)]
-        done = {row["seed"] for row in found if row["data"] == "clean"}
-        seeds = [str(seed) for seed in range(3) if seed not in done]
-        if seeds:
-            lines.append(
-                f"- `python benchmarks/calibration.py --robots {robot} --methods {method} --budget 1000000 "
-                f"--seeds {' '.join(seeds)}`"
-            )
-    lines += disturbed_not_run()
-    lines += policies_not_run()
-    if not (RESULTS / "speed.json").exists():
-        lines.append("- `python benchmarks/speed.py`")
-    return "\n".join(["## Not run yet\n", *lines]) + "\n" if lines else ""
 
 
 if __name__ == "__main__":

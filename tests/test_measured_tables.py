@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import costs
 import embedding
 import figure_2
+import kept
 import paper
 import paper_cells
 import readme
@@ -29,16 +30,16 @@ STALE = "stale: run make figures"
 def test_the_readme_says_what_was_measured():
     text = readme.README.read_text()
     assert text.count("<!-- measured: ") == 4
-    assert readme.rewritten(text, tables.learnt()) == text, STALE
+    assert readme.rewritten(text, kept.learnt()) == text, STALE
 
 
 def test_the_tables_say_what_was_measured():
-    assert tables.measured() == (tables.RESULTS / "README.md").read_text(), STALE
+    assert tables.measured() == (kept.RESULTS / "README.md").read_text(), STALE
 
 
 @pytest.mark.slow
 def test_the_papers_tables_say_what_was_measured():
-    assert paper.tables() == (tables.RESULTS / "paper.md").read_text(), STALE
+    assert paper.tables() == (kept.RESULTS / "paper.md").read_text(), STALE
 
 
 def test_the_picture_of_groups_says_what_was_measured():
