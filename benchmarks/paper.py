@@ -86,7 +86,7 @@ def collect(name: str, folder: Path) -> int:
     }
     if found:
         keep(name, earlier | found)
-    return len(earlier | found)
+    return len((earlier | found).keys() & {cell.name for cell in (own.cells if own else wanted)(plan)})
 
 
 def told(result: Result) -> dict:

@@ -1,6 +1,7 @@
 """Cells of the paper's suites: what they ask, what was kept of them, and what the paper prints beside them."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -12,6 +13,8 @@ from madoc.suites.planning import Plan, plan_of
 SUITES = Path(__file__).parent / "suites"
 RESULTS = Path(__file__).parent / "results" / "paper"
 OUT = "runs/paper"
+NO_SCORES = ("table-3", "figure-2")
+"""What keeps more than a score of a cell, each in a file of its own; suites of scores share their cells and a file."""
 
 
 @cache
@@ -40,24 +43,33 @@ def asked(cell: Cell) -> dict:
     return flat(KINDS[cell.kind], cell.order)
 
 
+def file_of(name: str) -> Path:
+    """Where what a suite has found is kept."""
+    return RESULTS / f"{name if name in NO_SCORES else 'scores'}.json"
+
+
 def kept(name: str) -> dict[str, dict]:
-    """What was collected of a suite, by cell."""
-    file = RESULTS / f"{name}.json"
+    """What was collected of a suite, by cell, with the cells of all suites that share its file."""
+    file = file_of(name)
     return json.loads(file.read_text()) if file.exists() else {}
 
 
 def keep(name: str, found: Mapping[str, Mapping]) -> None:
-    """Keep what was collected of a suite, a cell a line."""
+    """Keep what was collected of a suite, a cell a line, in place of what its file held."""
     RESULTS.mkdir(parents=True, exist_ok=True)
     lines = ",\n".join(f' "{cell}": {json.dumps(row)}' for cell, row in sorted(found.items()))
-    (RESULTS / f"{name}.json").write_text(f"{{\n{lines}\n}}\n")
+    file_of(name).write_text(f"{{\n{lines}\n}}\n")
 
 
 def how_far(name: str, cells: Sequence[Cell]) -> str:
-    """How many of a suite's cells are not run, and the command that runs them."""
-    missing = len(cells) - len(kept(name).keys() & {cell.name for cell in cells})
+    """How many of a suite's cells are not run, the command that runs them, and the commits that were measured."""
+    found = kept(name)
+    commits = Counter(found[cell.name]["commit"] for cell in cells if cell.name in found)
     command = f"`madoc suite benchmarks/suites/{name}.yaml --out {OUT}`"
-    return f"{missing} of {len(cells)} cells are not run: {command}" if missing else f"All cells are run by {command}"
+    missing = len(cells) - commits.total()
+    told = f"{missing} of {len(cells)} cells are not run: {command}" if missing else f"All cells are run by {command}"
+    measured = ", ".join(f"{count} at {each}" for each, count in commits.most_common())
+    return f"{told}; {measured}" if measured else told
 
 
 def printed(name: str, row: str, column: str) -> tuple[float, float] | None:

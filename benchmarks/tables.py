@@ -80,7 +80,7 @@ def calibration() -> str:
 def groups() -> str:
     """Error of groups, one agent and one agent a parameter: on the four robots, and by parameters and draws."""
     return (
-        "## Groups or one agent\n\n`madoc suite benchmarks/suites/groups.yaml` (each seed is in `paper/groups.json`). "
+        "## Groups or one agent\n\n`madoc suite benchmarks/suites/groups.yaml` (each seed is in `paper/scores.json`). "
         "Mean absolute error on medium data after 300,000 control steps, mean over seeds.\n\n"
         + readme.errors()
         + readme.study()
