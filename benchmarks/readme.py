@@ -69,29 +69,37 @@ def errors() -> str:
 
 
 def _comparison(found: Mapping[tuple[str, str], Mapping[int, float]]) -> str:
-    """Who errs less over pairs of runs with the same log and seed."""
+    """Who errs less over pairs of runs with the same log and seed, on all robots and on each."""
     lines = []
     for first, second in combinations(COLUMNS, 2):
-        pairs = [
-            (error, beside[seed])
-            for (task, method), errors in found.items()
-            if method == first
-            for seed, error in errors.items()
-            if seed in (beside := found[task, second])
-        ]
+        of_robots = {
+            name: [
+                (error, beside[seed])
+                for seed, error in found[f"{robot}-medium", first].items()
+                if seed in (beside := found[f"{robot}-medium", second])
+            ]
+            for robot, name in NAMES.items()
+        }
+        pairs = [pair for each in of_robots.values() for pair in each]
         if len(pairs) >= FEWEST_PAIRS:
             less = sum(ours < theirs for ours, theirs in pairs)
-            names = f"`{first}` against `{second}`"
-            lines.append(f"| {names} | {len(pairs)} | {less} | {ratio(pairs)} |")
-    header = "\n| pairs of runs with the same log and seed | pairs | err less | ratio of errors |\n|---|---|---|---|\n"
-    return header + "\n".join(lines) + "\n" if lines else ""
+            means = " | ".join(f"{_mean_ratio(each):.2g}" if each else "" for each in of_robots.values())
+            lines.append(f"| `{first}` against `{second}` | {len(pairs)} | {less} | {ratio(pairs)} | {means} |")
+    names = " | ".join(NAMES.values())
+    header = f"| pairs of runs with the same log and seed | pairs | err less | ratio of errors (95 %) | {names} |"
+    return "\n".join(["", header, "|---" * (4 + len(NAMES)) + "|", *lines, ""]) if lines else ""
+
+
+def _mean_ratio(pairs: Sequence[tuple[float, float]]) -> float:
+    """Geometric mean of the ratio of the first error of each pair to the second."""
+    return float(stats.gmean([ours / theirs for ours, theirs in pairs]))
 
 
 def ratio(pairs: Sequence[tuple[float, float]]) -> str:
     """Geometric mean of the ratio of the first error of each pair to the second, and its 95 % interval."""
     logs = np.log([ours / theirs for ours, theirs in pairs])
     low, high = np.exp(stats.ttest_1samp(logs, 0.0).confidence_interval())
-    return f"{np.exp(logs.mean()):.2f} ({low:.2f} to {high:.2f})"
+    return f"{_mean_ratio(pairs):.2f} ({low:.2f} to {high:.2f})"
 
 
 def study() -> str:

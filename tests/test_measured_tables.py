@@ -100,6 +100,7 @@ def test_agents_are_compared_in_pairs_of_the_same_log_and_seed(monkeypatch):
     told = readme.errors()
     assert "| Hopper | 0.11 (3 seeds) | not run | 0.09 (2 seeds) | 0.33 | 0.34 |" in told
     assert "| `madoc` against `madoc-s` | 6 | 6 | 0.25 (0.1" in told
+    assert "| 0.25 |  |  | 0.25 |" in told  # of Hopper's pairs √(1/2 · 1/8), of Ant's 1/4, and of two robots none
     assert "against `madoc-grouped`" not in told
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from madoc.calibration import CALIBRATORS, CmaEs, Dropo, LeastSquares, Madoc
+from madoc.calibration.madoc.agents import AgentSettings
 from madoc.errors import MadocError
 from madoc.policies import LEARNERS, SAC
 from madoc.types import entry_of
@@ -60,6 +61,11 @@ def test_a_method_of_ones_own_is_named_after_its_class():
         ),
         (lambda: Dropo(draws=1), "expected draws of Dropo to be greater than or equal to 2, got 1"),
         (lambda: SAC(discount=float("nan")), "expected discount of SAC to be greater than or equal to 0, got nan"),
+        (lambda: AgentSettings(dropout=1.0), "expected dropout of AgentSettings to be less than 1, got 1.0"),
+        (
+            lambda: Madoc(agents=AgentSettings(reward_size=0.0)),
+            "agents.reward_size=0 leaves no mismatch to watch, so nothing can stop: set patience=0",
+        ),
         (lambda: SAC(batch=1.5), "expected batch of SAC to be a valid integer, got 1.5"),
         (lambda: SAC(epoch_steps=5), "expected epoch_steps of at least the 20 environments, got 5"),
         (

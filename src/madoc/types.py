@@ -28,6 +28,10 @@ Layers = tuple[Count, ...]
 """Number of units in each hidden layer of a network."""
 NotNegative = Annotated[float, Field(ge=0.0)]
 """A hyperparameter that is a number of at least 0, such as a rate or a weight."""
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+"""A hyperparameter that is a share of a whole, such as the weight of the newest value in a moving average."""
+BelowOne = Annotated[float, Field(ge=0.0, lt=1.0)]
+"""A hyperparameter that is a share of a whole of which something has to be left, such as a dropout rate."""
 Positive = Annotated[float, Field(gt=0.0)]
 """A hyperparameter that is a number above 0, such as a time or a standard deviation."""
 

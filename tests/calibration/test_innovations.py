@@ -80,16 +80,15 @@ def test_the_scale_is_that_of_logged_and_simulated_innovations_together():
     assert (found.reference.age, found.control_steps) == (0, 120 + 400 + 150 * 3)
     logged = innovations.innovations(problem.simulator, middle, problem.dataset.transitions)
     scale = np.median(np.abs(np.concatenate([logged, logged[:120]])), axis=0)
-    reference = found.reference
-    np.testing.assert_allclose(reference.scale, np.maximum(scale, 1e-4 * problem.typical_change))
-    np.testing.assert_allclose(reference.slopes.floor, reference.scale / problem.typical_change, rtol=1e-6)
+    reference, floor = found.reference, np.maximum(scale / problem.typical_change, 1e-4)
+    np.testing.assert_allclose(reference.slopes.floor, floor, rtol=1e-6)
     np.testing.assert_allclose(reference.slopes.deviation, 0.1, rtol=1e-6)
     pair = problem.features.standardised.features(problem.dataset.transitions)[0]
-    spread = slopes.shares(reference.slopes, jnp.asarray(pair))[1]
+    spread = slopes.spreads(reference.slopes, jnp.asarray(pair))
     features = np.arcsinh(logged / problem.typical_change / spread)
     np.testing.assert_allclose(found.following.reshape(120, 2), features[:120], rtol=1e-3, atol=1e-6)
     assert sorted(reference.following[:, 1].tolist()) == pytest.approx(sorted(features[:, 1].tolist()), rel=1e-3)
-    assert reference.size(2.0 * reference.scale) == pytest.approx(0.5)
+    assert reference.size == pytest.approx(np.sqrt(np.mean(floor**2)))
 
 
 def test_derivatives_by_hand():
@@ -157,7 +156,11 @@ def test_where_innovations_cannot_be_had():
         assert word in innovations.obstacle(other, 1, silent)
         with pytest.raises(MadocError, match="features=innovations cannot be had here"):
             Madoc(features="innovations").init(other, KEY)
-        assert Madoc().init(other, KEY).reference is None
+        state = Madoc(cloning_epochs=0, epoch_steps=200, updates=2).init(other, KEY)
+        assert state.reference is None
+        watched = replace(state, watch=replace(state.watch, epochs=SETTLING))
+        (warning,) = [text for text in Madoc().estimate(other, watched).warnings if "no innovations" in text]
+        assert word in warning
 
 
 def test_innovations_begin_where_rows_overlap_and_a_checkpoint_holds_them(monkeypatch, tmp_path):
@@ -178,6 +181,7 @@ def test_innovations_begin_where_rows_overlap_and_a_checkpoint_holds_them(monkey
     assert ages == [-1] * (SETTLING + 1) + [0, 1]
     assert spent == [200] * (SETTLING + 1) + [1250, 400]  # simulated, predicted, 400 logged rows, derivatives of 150
     assert state.watch.began == SETTLING + 1
+    assert not method.estimate(counted, state).settled  # the discriminators began anew two epochs ago
     middle = problem.simulator.parameters.middle
     assert state.reference is not None
     assert (state.reference.parameters != middle).all()

@@ -48,6 +48,7 @@ def test_as_many_rows_are_compared_as_tell_a_state(log):
     assert [rows_compared(problem) for problem in problems] == [1, 3]
     unordered = problem_of(log, hidden_velocities=True, shuffled="rows")
     assert rows_compared(unordered) == 1
+    assert Madoc().collection(unordered).scaling.length == 1
 
 
 def test_rollouts_start_at_logged_states_where_those_are_known(log):

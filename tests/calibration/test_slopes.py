@@ -27,9 +27,7 @@ def slopes_of(derivatives, deviation, floor):
 def test_innovations_are_seen_in_the_spread_of_the_actors_by_hand():
     # Deviations of 1 and 8 move the signal by 3 and 4, and 12 are of other causes: √(9 + 16 + 144) = 13.
     known = slopes_of([[3.0, 0.5]], [1.0, 8.0], [12.0])
-    share, spread = slopes.shares(known, jnp.zeros((1, 2)))
-    np.testing.assert_allclose(spread, [[13.0]])
-    np.testing.assert_allclose(share, [[[3.0 / 13.0, 4.0 / 13.0]]], rtol=1e-6)
+    np.testing.assert_allclose(slopes.spreads(known, jnp.zeros((1, 2))), [[13.0]])
     seen = slopes.standardised(known, jnp.zeros((1, 2)), jnp.array([[26.0]]))
     np.testing.assert_allclose(seen, [[np.arcsinh(2.0)]], rtol=1e-6)
 

@@ -24,8 +24,9 @@ def actors(value):
     return Actors(np.full(2, value, np.float32), np.zeros(2, np.float32))
 
 
-def watched(watch, epochs, *, blur, size=1.0, at_bound=0.0, estimate=0.0, steered_to=1.0):
-    metrics = {"blur": blur, "reward_size": size, "reward_at_bound": at_bound, "overlap": 0.5}
+def watched(watch, epochs, *, blur=None, size=1.0, at_bound=0.0, estimate=0.0, steered_to=1.0):
+    metrics = {"reward_size": size, "reward_at_bound": at_bound, "overlap": 0.5}
+    metrics |= {} if blur is None else {"blur": blur}
     for _ in range(epochs):
         watch = observe(watch, metrics, actors(estimate), steered_to=steered_to, blur_range=(SMALLEST, LARGEST))
     return watch
@@ -105,8 +106,8 @@ def test_a_crumb_is_better_but_no_progress():
 
 
 def test_without_a_blur_the_latest_estimate_is_taken_and_it_never_stalls():
-    watch = watched(begun(), 3 * SETTLING, blur=0.0, size=2.0, steered_to=0.0)
-    watch = watched(watch, 1, blur=0.0, size=3.0, steered_to=0.0, estimate=0.6)
+    watch = watched(begun(), 3 * SETTLING, size=2.0, steered_to=0.0)
+    watch = watched(watch, 1, size=3.0, steered_to=0.0, estimate=0.6)
     assert float(watch.best.mean[0]) == pytest.approx(0.6)
     assert stalled(watch, 1) is None
 
@@ -168,6 +169,9 @@ def test_where_features_change_earlier_mismatches_do_not_compare():
     later = watched(again, 1, blur=0.3, estimate=0.7)  # a mismatch fifteen times as large, of other features
     assert float(later.best.mean[0]) == pytest.approx(0.7)
     assert later.mismatch == pytest.approx(0.3)
+    (warning,) = warned(later)
+    assert "1 epochs of calibration with innovations are fewer" in warning
+    assert warned(watched(later, SETTLING, blur=0.3)) == ()
 
 
 def test_rows_overlap_only_once_discriminators_have_settled():

@@ -48,7 +48,7 @@ def test_all_of_it(words, tmp_path, capsys):
 
 
 def test_a_policy_over_the_distribution_of_the_estimate(words, tmp_path, capsys):
-    asked = ["--policy-at", "distribution", "--policy.share", "0.5", "--policy.width", "2", "--no-yardsticks"]
+    asked = ["--policy-at", "distribution", "--policy-share", "0.5", "--policy-width", "2", "--no-yardsticks"]
     answer, code = asked_for_json(capsys, [*words, *asked, "--out", tmp_path / "all"])
     assert code == 0
     assert list(answer["evaluation"]["at_estimate"]) == ["distribution"]
@@ -59,8 +59,8 @@ def test_a_policy_over_the_distribution_of_the_estimate(words, tmp_path, capsys)
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
-        (["--policy.share", "0.5"], "--policy.share and --policy.width are of --policy-at distribution"),
-        (["--policy-at", "distribution", "--policy.share", "0"], "expected a share of systems to draw above 0"),
+        (["--policy-share", "0.5"], "--policy-share and --policy-width are of --policy-at distribution"),
+        (["--policy-at", "distribution", "--policy-share", "0"], "expected a share of systems to draw above 0"),
         (["--holdout", "1"], "expected a share of the rows to hold out between 0 and 1, got 1"),
         (["--draws", "0"], "expected at least 1 draw, got 0"),
         (["--learner", "rlpd"], "rlpd learns from logged observations, and no log has the goals of cart: wanted;"),

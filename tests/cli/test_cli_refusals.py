@@ -67,7 +67,10 @@ def places(recorded, whole, tmp_path):
         ("run hopper-medium --out {out} --level hrad", "no range level 'hrad' for hopper"),
         ("run hopper-medium --out {out} --truth {strange}", "did you mean gravity?"),
         ("run hopper-medium --out {out} --truth {part}", "no value for body_mass.torso"),
-        ("run hopper-medium --out {out} --learner bc --policy-at distribution", "leave out --policy-at distribution"),
+        (
+            "run hopper-medium --out {out} --learner bc --policy-at distribution",
+            "and --policy-at distribution would change nothing",
+        ),
         ("run hopper-medium --out {out} --learner h2o --hide-velocities", "hopper-medium hides velocities"),
         ("run hopper-medium --out {out} --learner sacc", "did you mean sac?"),
         ("run hopper --data {corrupt} --out {out}", "corrupt.npz"),

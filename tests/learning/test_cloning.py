@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from affine import affine
-from madoc.learning.cloning import cloning_loss, continue_cloning, fresh_clone
+from madoc.learning.cloning import cloning_epoch, cloning_loss, continue_cloning, fresh_clone
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.types import Transitions
 
@@ -73,3 +73,13 @@ def test_the_same_key_clones_the_same(logged):
     first, again, other = (continue_cloning(begun, logged, jax.random.key(seed), **FEW)[0].policy for seed in (5, 5, 6))
     jax.tree.map(np.testing.assert_array_equal, first, again)
     assert not np.array_equal(first.network.layers[0].weight, other.network.layers[0].weight)
+
+
+def test_an_epoch_of_cloning_is_a_part_of_its_stage(logged):
+    begun, given = fresh(logged, (4,), 1e-3), jax.random.key(5)
+    of_batches, rest = jax.random.split(given)
+    same, metrics = continue_cloning(begun, logged, of_batches, **FEW)
+    clone, key, epoch = cloning_epoch(begun, logged, given, epochs=4, **FEW)
+    jax.tree.map(np.testing.assert_array_equal, clone.policy, same.policy)
+    np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(rest))
+    assert (epoch.stage, epoch.fraction, epoch.metrics) == ("cloning", 0.25, metrics)

@@ -11,6 +11,7 @@ from madoc.learning.networks import stack
 from madoc.learning.sac_losses import TwinCritic
 from madoc.policies.imagination import (
     ImaginedRows,
+    Models,
     StateValue,
     WithoutNoise,
     chosen_candidate,
@@ -40,14 +41,11 @@ def imagined(
 ):
     """Two models, changes 1 and 3 (0.5 and 1.5 physical); past discriminators whose logit rises by `slope` with it."""
     past = stack(2, lambda key: affine([[0.0, 0.0, slope]], [0.0]), jax.random.key(0))
-    return imagine(
+    models = Models(
         certain([1.0, 3.0]),
         jnp.arange(2),
         past,
         FEATURES,
-        lambda observation, key: jnp.zeros_like(observation),
-        start_imagining(LOGGED[:1], 4, jax.random.key(1)),
-        value,
         logged=LOGGED,
         terminated=terminated,
         state_of=lambda observation: observation,
@@ -55,6 +53,12 @@ def imagined(
         selection_temperature=0.0,
         threshold=threshold,
         worst=jnp.asarray(-7.0),
+    )
+    return imagine(
+        models,
+        lambda observation, key: jnp.zeros_like(observation),
+        start_imagining(LOGGED[:1], 4, jax.random.key(1)),
+        value,
         horizon=horizon,
         penalty=penalty,
         steps=steps,

@@ -57,13 +57,28 @@ def test_units_of_signals_come_from_the_spec_of_a_robot_of_ones_own(bare):
         ("result.json", b"{", "result.json is not valid JSON"),
         ("spec.json", b'{"seed": "one"}', "spec.json is damaged .seed: Input should be a valid integer"),
         ("metrics.jsonl", b"{\n{}\n", "metrics.jsonl, line 1, is not JSON"),
-        ("evidence.npz", b"PK\x03\x04 no", "evidence.npz is damaged"),
-        ("embeddings.npz", b"", "embeddings.npz is damaged"),
+        ("evidence.npz", b"PK\x03\x04 no", "evidence.npz as npz .*is damaged.*restore it or delete it"),
+        ("embeddings.npz", b"", "embeddings.npz as npz .*is damaged.*restore it or delete it"),
     ],
 )
 def test_a_damaged_file_is_named(bare, file, content, message):
     (bare / file).write_bytes(content)
     with pytest.raises(MadocError, match=message):
+        read_run(bare)
+
+
+@pytest.mark.parametrize("place", ["in the packed bytes", "in the directory"])
+def test_flipped_bytes_in_a_compressed_array_are_told_of(bare, place):
+    path = bare / "evidence.npz"
+    np.savez_compressed(path, signals=np.array(["a"]), scale=np.ones(1))
+    content = bytearray(path.read_bytes())
+    if place == "in the packed bytes":
+        # behind the 30 bytes of a member's header, its name and its extra field: a block of the reserved type 3
+        content[30 + int.from_bytes(content[26:28], "little") + int.from_bytes(content[28:30], "little")] |= 0b110
+    else:
+        content[content.index(b"PK\x01\x02") + 10] = 99  # a way of packing that there is not
+    path.write_bytes(content)
+    with pytest.raises(MadocError, match=r"cannot read .*evidence.npz as npz .*restore it or delete it"):
         read_run(bare)
 
 

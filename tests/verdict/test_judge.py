@@ -1,6 +1,7 @@
 """Every verdict from numbers chosen by hand."""
 
 from dataclasses import replace
+from typing import get_args
 
 import pytest
 
@@ -15,7 +16,7 @@ from madoc.calibration.holdout import (
 )
 from madoc.commands.answer import EXIT_CODES
 from madoc.identification.term_tests import MissingTerm
-from madoc.verdict import WORDS, judge
+from madoc.verdict import Word, judge
 from madoc.verdict.judge import beats_mid_range, explains_all
 
 
@@ -240,7 +241,7 @@ def test_a_sentence_names_three_other_terms_at_most(good):
 
 
 def test_every_word_has_an_exit_code_of_its_own():
-    codes = [EXIT_CODES[word] for word in WORDS]
+    codes = [EXIT_CODES[word] for word in get_args(Word)]
     assert len(set(codes)) == len(codes)
     assert EXIT_CODES["CALIBRATED"] == 0
     assert not {1, 2, 130} & set(codes)

@@ -16,7 +16,7 @@ Word = Literal["CALIBRATED", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMAT
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict on an estimate: a key of `madoc.verdict.WORDS`, the reason, and the parameters it concerns."""
+    """The verdict on an estimate: its word, the reason, and the parameters it concerns."""
 
     word: Word
     sentence: str

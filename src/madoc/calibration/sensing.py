@@ -28,6 +28,8 @@ def noise_deviation(problem: CalibrationProblem, share: SensorNoise) -> Float[np
     if share == "estimated":
         return problem.estimated_noise
     share = problem.dataset.disturbance.noise if share is None else float(share)
+    if not share:
+        return np.zeros(problem.dataset.transitions.observation.shape[-1])
     # The logged change holds the noise of two readings; the share is that of the change without noise.
     return share / np.sqrt(1.0 + 2.0 * share**2) * row_change(problem.dataset)
 

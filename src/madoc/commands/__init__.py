@@ -2,7 +2,3 @@
 
 Nothing heavy is imported before `run`: `madoc --help` is quick.
 """
-
-from madoc.commands.answer import Answer
-
-__all__ = ["Answer"]

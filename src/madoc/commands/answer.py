@@ -76,7 +76,7 @@ def evaluation_text(evaluation: "EvaluationRecord") -> tuple[RenderableType, ...
     """Returns where policies were evaluated, what errors of the estimate cost, and how near the truth's return is."""
     parts: list[RenderableType] = []
     if evaluation.policies:
-        parts.append(_returns_table("in the target", evaluation.policies, evaluation))
+        parts.append(_target_table(evaluation))
     if evaluation.over_draws:
         parts.append(_estimate_table(evaluation))
     parts += [_costs_table(name, costs) for name, costs in evaluation.error_costs.items()]
@@ -86,14 +86,14 @@ def evaluation_text(evaluation: "EvaluationRecord") -> tuple[RenderableType, ...
     return tuple(parts)
 
 
-def _returns_table(where: str, returns: Mapping[str, Mapping[str, float]], evaluation: "EvaluationRecord") -> Table:
-    """Returns in one system, a row for each policy."""
-    title = f"{evaluation.task}: returns {where}, {evaluation.episodes} episodes"
+def _target_table(evaluation: "EvaluationRecord") -> Table:
+    """Returns in the target, a row for each policy."""
+    title = f"{evaluation.task}: returns in the target, {evaluation.episodes} episodes"
     table = Table(title=title, title_justify="left")
     table.add_column("policy learnt")
     for heading in ("return ± std", "normalized", "length"):
         table.add_column(heading, justify="right")
-    for name, row in returns.items():
+    for name, row in evaluation.policies.items():
         table.add_row(
             PLACE_NAMES.get(name, name),
             f"{row['return']:,.1f} ± {row['return_std']:,.1f}",

@@ -2,18 +2,17 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes
 
 from madoc.commands.answer import Answer, Output
+from madoc.pipeline.orders import Physics
 
 if TYPE_CHECKING:
     from madoc.tasks import Task
     from madoc.types import MethodEntry
-
-PHYSICS = ("legacy", "modern")
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Tasks:
         table.add_column("physics")
         for task in tasks:
             counts = (task.observation_size, task.action_size, len(task.parameters))
-            table.add_row(task.name, *map(str, counts), ", ".join(PHYSICS))
+            table.add_row(task.name, *map(str, counts), ", ".join(get_args(Physics)))
         details = tuple(map(_parameter_table, tasks)) if self.verbose else ()
         return Answer({"tasks": [_described(task) for task in tasks]}, (table, *details))
 
@@ -83,7 +82,7 @@ def _described(task: "Task") -> dict[str, object]:
         "observations": task.observation_size,
         "motors": task.action_size,
         "groups": task.groups,
-        "physics": list(PHYSICS),
+        "physics": list(get_args(Physics)),
         "parameters": [
             {
                 "name": parameter.name,

@@ -133,7 +133,7 @@ def _told(standing: "Standing", plan: "Plan", out: Path, *, whole: bool, allow_c
     reasons = tuple(
         f"{outcome.status}: {outcome.sentence} ({cell.folder(out)})"
         for cell, outcome in standing.ended.values()
-        if outcome.status not in ("finished", "converged")
+        if not outcome.usable
     )
     shown = reasons[:10] + ((f"and {len(reasons) - 10} more",) if len(reasons) > 10 else ())
     told = ", ".join(f"{count:,} {name}" for name, count in counts.items())

@@ -10,7 +10,7 @@ from jaxtyping import PRNGKeyArray
 from madoc.data import d4rl, minari_reader, native, neorl
 from madoc.data.dataset import Dataset, subsample
 from madoc.data.validation import require_file
-from madoc.errors import MadocError
+from madoc.errors import MadocError, unknown_name
 from madoc.tasks import Task
 
 
@@ -64,7 +64,7 @@ def load(
     """
     source = Path(path).expanduser()
     if format is not None and format not in FORMATS:
-        raise MadocError(f"unknown format {format!r}; there are: {', '.join(FORMATS)}")
+        raise unknown_name("format", format, FORMATS)
     if max_transitions is not None and key is None:
         raise MadocError("max_transitions draws episodes at random and needs a key, got none; pass key=")
     name = format or recognise(source)

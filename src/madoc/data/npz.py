@@ -5,11 +5,14 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 
 from madoc.data.validation import require_file
 from madoc.errors import MadocError
 
 ZIP_SIGNATURE = b"PK\x03\x04"
+MAKE_AGAIN = "copy or make it again"
+"""What to do about a log that cannot be read."""
 _UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, KeyError, zipfile.BadZipFile, zlib.error)
 
 
@@ -25,18 +28,27 @@ def holds(path: Path, *names: str) -> bool:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Every array of an archive by name; one that is missing, damaged or holds Python objects is refused."""
+    """Every array of a log by name; one that is missing, damaged or holds Python objects is refused."""
     require_file(path)
     if not _is_npz(path):
         raise MadocError(f"{path} is not an npz file; pass the --format it has")
+    return unpack(path)
+
+
+def unpack(path: Path, remedy: str = MAKE_AGAIN) -> dict[str, np.ndarray]:
+    """Every array of an archive by name.
+
+    Raises:
+        MadocError: The archive is damaged, or holds anything but arrays; its sentence ends with the remedy.
+    """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with path.open("rb") as file, NpzFile(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except _UNREADABLE as error:
-        raise _damaged(path, error) from error
+        raise _damaged(path, error, remedy) from error
     for name, array in arrays.items():
         if not isinstance(array, np.ndarray):  # NumPy returns other members of a zip archive as bytes
-            raise MadocError(f"expected only arrays in {path}, got the file {name!r}; this is no log of columns")
+            raise MadocError(f"expected only arrays in {path}, got the file {name!r}; {remedy}")
     return arrays
 
 
@@ -48,8 +60,7 @@ def _is_npz(path: Path) -> bool:
         return file.read(len(ZIP_SIGNATURE)) == ZIP_SIGNATURE
 
 
-def _damaged(path: Path, error: Exception) -> MadocError:
+def _damaged(path: Path, error: Exception, remedy: str = MAKE_AGAIN) -> MadocError:
     return MadocError(
-        f"cannot read {path} as npz ({error}); it is damaged, was cut short or holds Python objects, "
-        "copy or make it again"
+        f"cannot read {path} as npz ({error}); it is damaged, was cut short or holds Python objects, {remedy}"
     )

@@ -30,6 +30,12 @@ class Split:
     sentence: str
 
 
+def check_share(share: float) -> None:
+    """Refuse a share of rows to hold out that is not between 0 and 1."""
+    if not 0.0 < share < 1.0:
+        raise MadocError(f"expected a share of the rows to hold out between 0 and 1, got {share}")
+
+
 def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
     """Hold out about `share` of the rows: whole episodes drawn at random, at least one on each side.
 
@@ -41,8 +47,7 @@ def hold_out(dataset: Dataset, share: float, key: PRNGKeyArray) -> Split:
     Raises:
         MadocError: The share is not between 0 and 1, or there are fewer than 2 rows.
     """
-    if not 0.0 < share < 1.0:
-        raise MadocError(f"expected a share of the rows to hold out between 0 and 1, got {share}")
+    check_share(share)
     rows, starts = len(dataset), dataset.episode_starts
     if rows < 2:
         raise MadocError(f"expected at least 2 rows to hold one out, got {rows} in {dataset.origin}")

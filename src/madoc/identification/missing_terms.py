@@ -39,6 +39,7 @@ from madoc.identification.term_tests import (
     MissingTerm,
     TermTests,
     imitated_terms,
+    named,
     term_of,
 )
 from madoc.parameters import FIELDS, ParameterSpace
@@ -289,7 +290,7 @@ def _with_terms(tests: TermTests, chosen: list[int]) -> Alternative:
         if tests.tried[index].cause == INTEGRATION:
             alone = tests.score(index)
             error = np.hypot(error, 0.0 if alone is None else alone.shifts)
-    causes = tuple(dict.fromkeys(_name(tests.tried[index]) for index in chosen))
+    causes = tuple(dict.fromkeys(named(tests.tried[index]) for index in chosen))
     return tests.alternative(causes, shift, error, terms=True)
 
 
@@ -337,7 +338,7 @@ def _fitted(
             significance = deviate((value - candidate.nominal) / deviation, found.freedom)
             term = replace(term_of(candidate, found, shifts), value=value, standard_error=deviation, t=significance)
             terms[candidate.parameter] = term
-    causes = tuple(_name(candidate) for candidate, _, _ in possible)
+    causes = tuple(named(candidate) for candidate, _, _ in possible)
     return _RicherModel(terms, Alternative(causes, True, shifts, tests.by_name(beyond)), fit.control_steps)
 
 
@@ -358,7 +359,7 @@ def _of_friction(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
         by_friction = found.shifts / found.change
         shift, error = 0.5 * (low + high) * by_friction, 0.5 * (high - low) * np.abs(by_friction)
         if np.max((np.abs(shift) + error) / tests.half_widths) >= WORTH_FITTING:
-            yield tests.alternative((_name(candidate),), shift, error, bounded=True)
+            yield tests.alternative((named(candidate),), shift, error, bounded=True)
 
 
 def _of_forces(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
@@ -384,7 +385,3 @@ def _of_other_windows(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterato
     if apart:
         beyond = {name: NORMAL_95 * errors[name] for name in apart}
         yield Alternative((OTHER_WINDOWS,), False, {name: shifts[name] for name in apart}, beyond)
-
-
-def _name(candidate: Candidate) -> str:
-    return f"{candidate.cause} ({candidate.parameter})" if candidate.parameter else candidate.cause

@@ -48,6 +48,11 @@ class MissingTerm:
     shifts: dict[str, float]
 
 
+def named(term: MissingTerm | Candidate) -> str:
+    """What a term stands for, and the parameter that adds it where there is one."""
+    return f"{term.cause} ({term.parameter})" if term.parameter else term.cause
+
+
 @dataclass(frozen=True)
 class Alternative:
     """Another estimate that the log does not exclude: of a model with more terms, or of other parts of the log.

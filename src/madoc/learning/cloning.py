@@ -10,7 +10,7 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from madoc.learning.networks import Actions, Observations, Scalar, adam, minimise
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy, log_density
-from madoc.types import Metrics, Transitions
+from madoc.types import Epoch, Metrics, Transitions
 
 Pairs = tuple[Observations, Actions]
 """Logged observations and actions on the device, float32."""
@@ -52,6 +52,28 @@ def continue_cloning(
     carried = clone.policy, clone.optimiser
     policy, optimiser, loss = _train(*carried, logged, key, adam(learning_rate), batch, updates)
     return Clone(policy, optimiser, clone.epochs + 1), {"cloning_loss": float(loss)}
+
+
+def cloning_epoch(
+    clone: Clone,
+    logged: Pairs,
+    key: PRNGKeyArray,
+    *,
+    learning_rate: float,
+    batch: int,
+    updates: int,
+    epochs: int,
+) -> tuple[Clone, PRNGKeyArray, Epoch]:
+    """`continue_cloning` as an epoch of a method that clones for so many `epochs` before it calibrates.
+
+    Returns:
+        The clone, the key of what follows, and what the epoch did.
+    """
+    of_batches, key = jax.random.split(key)
+    clone, metrics = continue_cloning(
+        clone, logged, of_batches, learning_rate=learning_rate, batch=batch, updates=updates
+    )
+    return clone, key, Epoch(metrics, stage="cloning", fraction=clone.epochs / max(1, epochs))
 
 
 @eqx.filter_jit

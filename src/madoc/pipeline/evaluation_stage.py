@@ -14,6 +14,7 @@ from madoc.pipeline.data_stage import Machine, read_truth
 from madoc.pipeline.film_stage import leave_film
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import EvaluationOrder
+from madoc.pipeline.refusals import check_counts
 from madoc.policies import ErrorCost, OverDraws, costs_of_errors, load_policy, over_draws
 from madoc.report.records import EvaluationRecord, SpecRecord, read_spec
 from madoc.runs.files import write_json
@@ -45,9 +46,7 @@ def evaluate_folder(
         MadocError: There is no policy, neither truth nor calibration is known, or a number is out of range.
     """
     order = order or EvaluationOrder()
-    for what, value in {"episode": order.episodes, "draw": order.draws}.items():
-        if value < 1:
-            raise MadocError(f"expected at least 1 {what}, got {value}")
+    check_counts(episode=order.episodes, draw=order.draws)
     key = stage_key(order.seed, "evaluating")
     found = find_policies(folder)
     policies = {name: load_policy(found[name]) for name in names or found}

@@ -64,9 +64,9 @@ def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
         times = []
         for _ in range(2):
             started = time.monotonic()
-            state, _ = method.step(problem, state)
+            state, epoch = method.step(problem, state)
             times.append(time.monotonic() - started)
     except MadocError as error:
         return Forecast(name, None, 0, str(error))
-    epochs = budget / method.epoch_steps
+    epochs = budget / epoch.control_steps
     return Forecast(name, times[0] + PREPARATION * epochs * times[1], budget)

@@ -17,7 +17,8 @@ from madoc.pipeline.data_stage import load_source, read_truth
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
-from madoc.pipeline.orders import DEFAULT_LEARNER, Drawing, Place, PolicyOrder, parse_settings
+from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder, parse_settings
+from madoc.pipeline.refusals import check_drawing, check_place, policy_budget
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
@@ -27,7 +28,6 @@ from madoc.policies import (
     learn_policy,
     require_reward,
 )
-from madoc.runs.budget import read_budget
 from madoc.simulation import Simulator
 from madoc.tasks import Task
 from madoc.types import entry_of
@@ -48,11 +48,8 @@ def learn_in(
     """
     method = make_method(LEARNERS, order.method, parse_settings(order.set))
     entry = entry_of(method, LEARNERS)
-    budget = read_budget(entry.usual_budget if order.budget is None else order.budget, entry.unit)
-    if not entry.needs_parameters and order.at != PLACES[0]:
-        raise MadocError(
-            f"{order.method} does not learn at given parameters, so --at {order.at} would change nothing; leave it out"
-        )
+    budget = policy_budget(order.method, order.budget)
+    check_place(order.method, order.at, f"--at {order.at}")
     require_reward(calibrated.task)
     require_no_goals(calibrated.task, order.method)
     key = stage_key(order.seed, "learning")
@@ -123,10 +120,7 @@ def _system(
     at = order.at
     if at not in PLACES:
         raise unknown_name("place to learn at", at, PLACES)
-    if at != "distribution" and order.drawing != Drawing():
-        raise MadocError(
-            f"--share and --width are of --at distribution and would change nothing at {at}; leave them out"
-        )
+    check_drawing(order.drawing, at, "--share and --width are of --at distribution")
     if truth is not None:
         calibrated.machine.check_truth(truth, calibrated.task)
     if at == "truth":

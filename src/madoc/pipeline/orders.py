@@ -227,7 +227,10 @@ class RunOrder:
     """JSON file {parameter: value} to judge by; no method ever sees it. Default: the data's, if it has any."""
     policy_at: Literal["calibrated", "distribution"] = "calibrated"
     """Learn at the estimate, or over draws from the calibrated distribution."""
-    drawing: Annotated[Drawing, arg(name="policy")] = field(default_factory=Drawing)
+    policy_share: float = 1.0
+    """Share of the systems that are drawn from the distribution of the estimate; the others are the estimate itself."""
+    policy_width: float = 1.0
+    """Spread of the drawn systems, as a multiple of the estimate's own."""
     learner: str = DEFAULT_LEARNER
     """A policy learner, as `madoc methods` lists it."""
     policy_set: Settings = ()
@@ -241,6 +244,11 @@ class RunOrder:
     """Episodes for the evaluation of each policy."""
     draws: int = 50
     """Systems drawn from the calibrated distribution for the evaluation of each policy."""
+
+    @property
+    def drawing(self) -> Drawing:
+        """How systems are drawn where the policy is learnt over the distribution."""
+        return Drawing(self.policy_share, self.policy_width)
 
 
 def parse_settings(settings: tuple[tuple[str, ...], ...], *, starts: str | None = None) -> dict[str, str]:

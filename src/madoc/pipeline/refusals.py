@@ -3,10 +3,12 @@
 from pathlib import Path
 
 from madoc import robots
+from madoc.data.split import check_share
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.keys import check_seed
-from madoc.pipeline.orders import AUTO, CalibrationOrder, Search
-from madoc.runs.budget import read_budget
+from madoc.pipeline.orders import AUTO, CalibrationOrder, Drawing, Search
+from madoc.policies import LEARNERS
+from madoc.runs.budget import Budget, read_budget
 from madoc.tasks import Task
 
 
@@ -24,8 +26,8 @@ def check_order(order: CalibrationOrder, out: Path | None = None) -> None:
     check_seed(order.search.seed)
     if order.search.budget is not None:
         read_budget(order.search.budget)
-    if order.holdout is not None and not 0.0 < order.holdout < 1.0:
-        raise MadocError(f"expected a share of the rows to hold out between 0 and 1, got {order.holdout}")
+    if order.holdout is not None:
+        check_share(order.holdout)
     if out is None:
         return
     folder = out.expanduser().resolve()
@@ -33,6 +35,49 @@ def check_order(order: CalibrationOrder, out: Path | None = None) -> None:
         log = Path(path).expanduser().resolve()
         if log == folder or (log.exists() and log.is_relative_to(folder) and not (folder / "spec.json").exists()):
             raise MadocError(f"the run folder {out} holds the log {path}; choose another --out")
+
+
+def check_counts(**counts: int) -> None:
+    """Refuse counts below 1; each is given by the name of what it counts.
+
+    Raises:
+        MadocError: Names what is counted.
+    """
+    for what, count in counts.items():
+        if count < 1:
+            raise MadocError(f"expected at least 1 {what}, got {count}")
+
+
+def policy_budget(method: str, given: Budget | str | None) -> Budget:
+    """The budget of a policy learner, in its unit: what it usually has, where none is given.
+
+    Raises:
+        MadocError: It is no budget, or not positive.
+    """
+    entry = LEARNERS[method]
+    return read_budget(entry.usual_budget if given is None else given, entry.unit)
+
+
+def check_place(method: str, at: str, written: str) -> None:
+    """Refuse a place to learn at, as `written` in the order, of a learner that does not learn at given parameters.
+
+    Raises:
+        MadocError: Names the learner and the place.
+    """
+    if at != "calibrated" and not LEARNERS[method].needs_parameters:
+        raise MadocError(
+            f"{method} does not learn at given parameters, and {written} would change nothing; leave it out"
+        )
+
+
+def check_drawing(drawing: Drawing, at: str, written: str) -> None:
+    """Refuse a way to draw systems where none are drawn; `written` says in the order's words where they are.
+
+    Raises:
+        MadocError: Names the options.
+    """
+    if at != "distribution" and drawing != Drawing():
+        raise MadocError(f"{written} and would change nothing at {at}; leave them out")
 
 
 def check_search(search: Search, task: Task, name: str) -> None:

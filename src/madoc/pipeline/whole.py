@@ -25,13 +25,11 @@ from madoc.pipeline.orders import (
     Source,
     parse_settings,
 )
-from madoc.pipeline.refusals import check_order, check_search
+from madoc.pipeline.refusals import check_counts, check_drawing, check_order, check_place, check_search, policy_budget
 from madoc.policies import LEARNERS, require_reward
 from madoc.report.records import Summary, read_object, read_record
 from madoc.robots import is_spec_path
-from madoc.runs.budget import read_budget
 from madoc.runs.files import read_json
-from madoc.types import entry_of
 
 
 def run_all(
@@ -100,13 +98,7 @@ def _spec(order: RunOrder, machine: Machine, out: Path) -> dict[str, object]:
             if own
             else f"expected TASK-QUALITY to record, as {order.name}-medium, or --data FILE to load"
         )
-    for what, value in {
-        "transition": order.transitions,
-        "episode": order.episodes,
-        "draw": order.draws,
-    }.items():
-        if value is not None and value < 1:
-            raise MadocError(f"expected at least 1 {what}, got {value}")
+    check_counts(transition=order.transitions, episode=order.episodes, draw=order.draws)
     asked = _calibration_order(order, Source(order.data or (order.name,)))
     check_order(asked, out)
     check_search(order.search, machine.task, order.name)
@@ -114,15 +106,12 @@ def _spec(order: RunOrder, machine: Machine, out: Path) -> dict[str, object]:
     if truth is not None:
         calibrated = order.search.parameters or machine.task.parameters.names
         machine.check_truth(truth, machine.task.with_parameters(list(calibrated)))
-    if order.policy_at != "distribution" and order.drawing != Drawing():
-        raise MadocError("--policy.share and --policy.width are of --policy-at distribution; leave them out, or add it")
+    check_drawing(order.drawing, order.policy_at, "--policy-share and --policy-width are of --policy-at distribution")
     learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
-    if order.policy_at != "calibrated" and not LEARNERS[order.learner].needs_parameters:
-        raise MadocError(f"{order.learner} does not learn at given parameters; leave out --policy-at {order.policy_at}")
+    check_place(order.learner, order.policy_at, f"--policy-at {order.policy_at}")
     require_no_goals(machine.task, order.learner)
     require_velocities(order.learner, order.reading.disturbance, f"the data of {order.name}")
-    if order.policy_budget is not None:
-        read_budget(order.policy_budget, entry_of(learner, LEARNERS).unit)
+    policy_budget(order.learner, order.policy_budget)
     resolved = {
         "command": "run",
         "truth": truth,

@@ -12,7 +12,7 @@ from madoc.learning.cql_losses import cql_loss, proposals
 from madoc.learning.networks import scalars, scan_updates
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -55,8 +55,8 @@ class CQL:
     cloning_updates: CountOrZero = 4000
     epoch_updates: Count = 20
     batch: Count = 256
-    discount: NotNegative = 0.99
-    target_rate: NotNegative = 0.005
+    discount: Share = 0.99
+    target_rate: Share = 0.005
     policy_learning_rate: NotNegative = 1e-4
     critic_learning_rate: NotNegative = 3e-4
 

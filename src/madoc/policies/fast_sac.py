@@ -44,7 +44,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, UniformPolicy, remember, roll_on, start_acting
 from madoc.policies.judging import Judged, judge
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
 
 SMALLEST_DEVIATION = 1e-2
 """Added to the standard deviation of each observation value: a value that hardly moved yet may move far later."""
@@ -100,8 +100,8 @@ class FastSAC:
     policy_delay: Count = 2
     warmup_steps: Count = 10_000
     batch: Annotated[int, Field(ge=2)] = 256
-    discount: NotNegative = 0.99
-    target_rate: NotNegative = 0.005
+    discount: Share = 0.99
+    target_rate: Share = 0.005
     learning_rate: NotNegative = 1e-3
     replay_capacity: Count = 1_000_000
     standardise: bool = True

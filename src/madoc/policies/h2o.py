@@ -20,7 +20,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, check_epoch, explore_or_act, start_acting
 from madoc.policies.judging import Judged, judge
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -88,8 +88,8 @@ class H2O:
     gap_spread: NotNegative = 1.0
     bound: NotNegative = 2.0
     pair_bound: NotNegative = 10.0
-    discount: NotNegative = 0.99
-    target_rate: NotNegative = 0.005
+    discount: Share = 0.99
+    target_rate: Share = 0.005
     learning_rate: NotNegative = 3e-4
     replay_capacity: Count = 1_000_000
     judge_every: CountOrZero = 10_000

@@ -54,6 +54,8 @@ def mean_return(reward: Float[np.ndarray, "steps rows"], ended: Float[np.ndarray
 
 
 Value = Callable[[Float[Array, "rows observation"]], Float[Array, " rows"]]
+Bounds = tuple[Float[Array, " observation"], Float[Array, " observation"]]
+"""The smallest and the largest observation that is imagined."""
 
 
 class StateValue(eqx.Module):
@@ -97,23 +99,43 @@ def chosen_candidate(
     return candidates[chosen, rows], rewards[chosen, rows]
 
 
+class Models(eqx.Module):
+    """The models that rows are imagined in, with all that does not depend on who acts.
+
+    Attributes:
+        ensemble: The dynamics models.
+        elites: Indices of the models to sample from.
+        past: The discriminators of the dynamics reward.
+        features: The standardisation of the data.
+        logged: Observations to restart at.
+        terminated: Whether the task ends at a state.
+        state_of: The state at an observation.
+        samples: Number of next states drawn from each elite.
+        selection_temperature: Of the draw of one of them; 0 takes the one with the highest dynamics reward.
+        threshold: The smallest dynamics reward of a row that looks real; a fall is a fall, whatever it looks like.
+        worst: Value of a step that looks unreal and of all that follows it, which stands in the place of its reward.
+    """
+
+    ensemble: Ensemble
+    elites: Int[Array, " elites"]
+    past: Network
+    features: Features
+    logged: Float[Array, "logged observation"]
+    terminated: Callable[[Array], Bool[Array, " rows"]]
+    state_of: Callable[[Array], Array]
+    samples: int
+    selection_temperature: float
+    threshold: float
+    worst: Float[Array, ""]
+
+
 @eqx.filter_jit
 def imagine(
-    ensemble: Ensemble,
-    elites: Int[Array, " elites"],
-    past: Network,
-    features: Features,
+    models: Models,
     policy: Policy,
     under_way: ImaginedRows,
     value: Value | None,
     *,
-    logged: Float[Array, "logged observation"],
-    terminated: Callable[[Array], Bool[Array, " rows"]],
-    state_of: Callable[[Array], Array],
-    samples: int,
-    selection_temperature: float,
-    threshold: float,
-    worst: Float[Array, ""],
     horizon: int,
     penalty: float,
     steps: int,
@@ -129,20 +151,10 @@ def imagine(
     it, an action that leads there has no target at all, and the policy comes to prefer it.
 
     Args:
-        ensemble: The dynamics models.
-        elites: Indices of the models to sample from.
-        past: The discriminators of the dynamics reward.
-        features: The standardisation of the data.
+        models: What the rows are imagined in.
         policy: The policy that acts.
         under_way: The rows.
         value: The values by which the models' uncertainty is measured as in MOBILE; None measures it as in MOPO.
-        logged: Observations to restart at.
-        terminated: Whether the task ends at a state.
-        state_of: The state at an observation.
-        samples: Number of next states drawn from each elite.
-        selection_temperature: Of the draw of one of them; 0 takes the one with the highest dynamics reward.
-        threshold: The smallest dynamics reward of a row that looks real; a fall is a fall, whatever it looks like.
-        worst: Value of a step that looks unreal and of all that follows it, which stands in the place of its reward.
         horizon: Number of steps after which a row restarts.
         penalty: The weight of the models' uncertainty in the reward.
         steps: Number of steps.
@@ -151,67 +163,105 @@ def imagine(
     Returns:
         The rows after the last step, the transitions flat in time and row, and metrics.
     """
-    low, high = logged.min(0), logged.max(0)
-    low, high = low - (high - low), high + (high - low)
-
-    def within_range(observation: Array) -> Array:
-        bounds = (jnp.broadcast_to(bound, observation.shape) for bound in (low, high))
-        return jnp.clip(observation, *bounds)
+    low, high = models.logged.min(0), models.logged.max(0)
+    bounds = low - (high - low), high + (high - low)
 
     def step(under_way: ImaginedRows, key: PRNGKeyArray) -> tuple[ImaginedRows, tuple[Batch, dict[str, Array]]]:
-        of_action, of_sample, of_choice, of_restart = jax.random.split(key, 4)
-        observation = under_way.observation
-        action = policy(observation, of_action)
-        pair = features.pair(observation, action)
-        mean, std = ensemble(pair)
-        elite_mean, elite_std = mean[elites], std[elites]
-        shape = (samples, *elite_mean.shape)
-        noise = jax.random.normal(of_sample, shape)
-        drawn = jnp.broadcast_to(elite_mean, shape) + jnp.broadcast_to(elite_std, shape) * noise
-        candidates = drawn.reshape(-1, *elite_mean.shape[1:])
-        change = jnp.clip(candidates[..., :-1], -LARGEST_CHANGE, LARGEST_CHANGE)
-        pairs = jnp.broadcast_to(pair, (*change.shape[:2], pair.shape[-1]))
-        outcome, reality = chosen_candidate(
-            jnp.concatenate([change, candidates[..., -1:]], axis=-1),
-            reward_of(past, pairs, change),
-            selection_temperature,
-            of_choice,
-        )
-        following = within_range(features.following(observation, outcome[:, :-1]))
-        if value is None:
-            uncertainty = uncertainty_penalty(std, features)
-        else:
-            expected = jnp.clip(elite_mean[..., :-1], -LARGEST_CHANGE, LARGEST_CHANGE)
-            beside = jnp.broadcast_to(observation, expected.shape)
-            could_follow = within_range(features.following(beside, expected)).reshape(-1, observation.shape[-1])
-            worth = value(could_follow) * ~terminated(state_of(could_follow))
-            uncertainty = bellman_inconsistency(worth.reshape(len(elites), -1))
-        reward = features.reward_offset + features.reward_scale * outcome[:, -1]
-        fell = terminated(state_of(following))
-        unreal = (reality < threshold) & ~fell
-        ends = fell | unreal
-        row = {
-            "observation": observation,
-            "action": action,
-            "reward": jnp.where(unreal, worst, reward - penalty * uncertainty),
-            "next_observation": following,
-            "terminated": ends.astype(jnp.float32),
-        }
-        again = ends | (under_way.age + 1 >= horizon)
-        fresh = _some(logged, len(observation), of_restart)
-        state = jnp.where(jnp.broadcast_to(again[:, None], fresh.shape), fresh, following)
-        metrics = {
-            "dynamics_reward": reality.mean(),
-            "unreal": unreal.mean(),
-            "penalty": uncertainty.mean(),
-            "imagined_reward": reward.mean(),
-            "net_reward": row["reward"].mean(),
-        }
-        return ImaginedRows(state, jnp.where(again, 0, under_way.age + 1)), (row, metrics)
+        return _step(models, policy, under_way, value, key, bounds=bounds, horizon=horizon, penalty=penalty)
 
     under_way, (rows, metrics) = jax.lax.scan(step, under_way, jax.random.split(key, steps))
     flat = {name: column.reshape(-1, *column.shape[2:]) for name, column in rows.items()}
     return under_way, flat, jax.tree.map(jnp.mean, metrics)
+
+
+def _step(
+    models: Models,
+    policy: Policy,
+    under_way: ImaginedRows,
+    value: Value | None,
+    key: PRNGKeyArray,
+    *,
+    bounds: Bounds,
+    horizon: int,
+    penalty: float,
+) -> tuple[ImaginedRows, tuple[Batch, dict[str, Array]]]:
+    """One step of every row: the rows after it, the transitions, and metrics."""
+    of_action, of_sample, of_choice, of_restart = jax.random.split(key, 4)
+    features, observation = models.features, under_way.observation
+    action = policy(observation, of_action)
+    pair = features.pair(observation, action)
+    mean, std = models.ensemble(pair)
+    elite_mean, elite_std = mean[models.elites], std[models.elites]
+    outcome, reality = _outcome(models, pair, elite_mean, elite_std, (of_sample, of_choice))
+    following = _within(bounds, features.following(observation, outcome[:, :-1]))
+    if value is None:
+        uncertainty = uncertainty_penalty(std, features)
+    else:
+        uncertainty = _inconsistency(models, value, observation, elite_mean, bounds)
+    reward = features.reward_offset + features.reward_scale * outcome[:, -1]
+    fell = models.terminated(models.state_of(following))
+    unreal = (reality < models.threshold) & ~fell
+    ends = fell | unreal
+    row = {
+        "observation": observation,
+        "action": action,
+        "reward": jnp.where(unreal, models.worst, reward - penalty * uncertainty),
+        "next_observation": following,
+        "terminated": ends.astype(jnp.float32),
+    }
+    again = ends | (under_way.age + 1 >= horizon)
+    fresh = _some(models.logged, len(observation), of_restart)
+    state = jnp.where(jnp.broadcast_to(again[:, None], fresh.shape), fresh, following)
+    metrics = {
+        "dynamics_reward": reality.mean(),
+        "unreal": unreal.mean(),
+        "penalty": uncertainty.mean(),
+        "imagined_reward": reward.mean(),
+        "net_reward": row["reward"].mean(),
+    }
+    return ImaginedRows(state, jnp.where(again, 0, under_way.age + 1)), (row, metrics)
+
+
+def _outcome(
+    models: Models,
+    pair: Float[Array, "rows pair"],
+    mean: Float[Array, "elites rows outputs"],
+    std: Float[Array, "elites rows outputs"],
+    keys: tuple[PRNGKeyArray, PRNGKeyArray],
+) -> tuple[Float[Array, "rows outputs"], Float[Array, " rows"]]:
+    """What is kept of what elites draw, standardised, and its dynamics reward; keys of the draws and of the choice."""
+    shape = (models.samples, *mean.shape)
+    noise = jax.random.normal(keys[0], shape)
+    drawn = jnp.broadcast_to(mean, shape) + jnp.broadcast_to(std, shape) * noise
+    candidates = drawn.reshape(-1, *mean.shape[1:])
+    change = jnp.clip(candidates[..., :-1], -LARGEST_CHANGE, LARGEST_CHANGE)
+    pairs = jnp.broadcast_to(pair, (*change.shape[:2], pair.shape[-1]))
+    return chosen_candidate(
+        jnp.concatenate([change, candidates[..., -1:]], axis=-1),
+        reward_of(models.past, pairs, change),
+        models.selection_temperature,
+        keys[1],
+    )
+
+
+def _inconsistency(
+    models: Models,
+    value: Value,
+    observation: Float[Array, "rows observation"],
+    mean: Float[Array, "elites rows outputs"],
+    bounds: Bounds,
+) -> Float[Array, " rows"]:
+    """How much elites differ on the value of what they expect to follow; where the task has ended it is 0."""
+    expected = jnp.clip(mean[..., :-1], -LARGEST_CHANGE, LARGEST_CHANGE)
+    beside = jnp.broadcast_to(observation, expected.shape)
+    could_follow = _within(bounds, models.features.following(beside, expected)).reshape(-1, observation.shape[-1])
+    worth = value(could_follow) * ~models.terminated(models.state_of(could_follow))
+    return bellman_inconsistency(worth.reshape(len(models.elites), -1))
+
+
+def _within(bounds: Bounds, observation: Float[Array, "*rows observation"]) -> Float[Array, "*rows observation"]:
+    """Observations clipped to bounds."""
+    return jnp.clip(observation, *(jnp.broadcast_to(bound, observation.shape) for bound in bounds))
 
 
 def imagined_return(

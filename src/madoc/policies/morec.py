@@ -25,6 +25,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.imagination import (
     ImaginedRows,
+    Models,
     StateValue,
     WithoutNoise,
     imagine,
@@ -33,7 +34,7 @@ from madoc.policies.imagination import (
     worst_value,
 )
 from madoc.policies.judging import Judged
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -149,7 +150,7 @@ class MOREC:
     holdout_every: Annotated[int, Field(ge=2)] = 100
     batch: Annotated[int, Field(ge=2)] = 256
     discount: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.995
-    target_rate: NotNegative = 0.005
+    target_rate: Share = 0.005
     model_learning_rate: NotNegative = 1e-3
     policy_learning_rate: NotNegative = 3e-4
     critic_learning_rate: NotNegative = 3e-4
@@ -340,12 +341,11 @@ class MOREC:
     def _imagining(
         self, problem: PolicyProblem, state: MORECState
     ) -> Callable[..., tuple[ImaginedRows, Batch, dict[str, Array]]]:
-        """`imagine`, given the models and all that does not depend on who acts."""
+        """`imagine`, given the models."""
         task = problem.simulator.task
         assert task.state_from_observation is not None
         starts = require_data(problem, rows=0).episode_starts
-        return partial(
-            imagine,
+        models = Models(
             state.fitting.models,
             state.elites,
             state.opposition.past,
@@ -358,6 +358,7 @@ class MOREC:
             threshold=self.threshold,
             worst=worst_value(np.asarray(problem.logged["reward"]), starts, self.discount),
         )
+        return partial(imagine, models)
 
     @eqx.filter_jit
     def _update_policy(

@@ -15,7 +15,7 @@ from madoc.policies.base import PolicyProblem, draw_rows, require_data
 from madoc.policies.interaction import Interaction, check_epoch, explore_or_act, start_acting
 from madoc.policies.judging import Judged, judge
 from madoc.policies.systems import UniformParameters
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -68,8 +68,8 @@ class SAC:
     updates_per_step: NotNegative = 1.0
     warmup_steps: CountOrZero = 5000
     batch: Count = 256
-    discount: NotNegative = 0.99
-    target_rate: NotNegative = 0.005
+    discount: Share = 0.99
+    target_rate: Share = 0.005
     learning_rate: NotNegative = 3e-4
     replay_capacity: Count = 1_000_000
     cloning: NotNegative | None = None

@@ -19,6 +19,8 @@ from madoc.report.words import number
 
 WIDTH = 340
 """Width of a chart in its own units: about its pixels on a page, so that font sizes are what they say."""
+_HEIGHT = 190
+"""Height of a chart of lines in the same units."""
 POINTS = 240
 """Largest number of points of a line; a longer line is thinned."""
 Scale = Callable[[ArrayLike], np.ndarray]
@@ -55,7 +57,6 @@ def line_chart(
     x_words: Callable[[float], str] = number,
     y_range: tuple[float, float] | None = None,
     levels: Sequence[Level] = (),
-    height: int = 190,
     log: bool = False,
 ) -> Markup:
     """Lines over a shared axis; the page's script shows the values under a reader's pointer.
@@ -68,11 +69,10 @@ def line_chart(
         x_words: How its ticks are written.
         y_range: Of the vertical axis; None fits what is drawn.
         levels: Horizontal lines.
-        height: In the units of `WIDTH`.
         log: The vertical axis in powers of ten; values that are not positive are left out.
     """
     low, high = y_range or _extent(lines, levels, log)
-    right, base = WIDTH - _RIGHT, height - _BOTTOM
+    right, base = WIDTH - _RIGHT, _HEIGHT - _BOTTOM
     to_x, to_y = _scale(float(x[0]), float(x[-1]), _LEFT, right), _scale(low, high, base, _TOP, log=log)
     across = to_x(x)
     heights = [(float(to_y(mark)), number(mark, 3)) for mark in (_decades(low, high) if log else ticks(low, high, 4))]
@@ -86,7 +86,7 @@ def line_chart(
         "line",
         label=label,
         width=WIDTH,
-        height=height,
+        height=_HEIGHT,
         values=json.dumps(values, ensure_ascii=False),
         left=_LEFT,
         top=_TOP,

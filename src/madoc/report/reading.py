@@ -1,7 +1,6 @@
 """A run folder as a report needs it: everything that is there, finished or not."""
 
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,6 +12,7 @@ from ruamel.yaml import YAML, YAMLError
 
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
+from madoc.data.npz import unpack
 from madoc.errors import MadocError
 from madoc.report.records import EvaluationRecord, SpecRecord, read_object, read_record, read_spec
 from madoc.robots.document import yaml_text
@@ -280,11 +280,7 @@ def read_arrays(path: Path, *needed: str) -> dict[str, np.ndarray] | None:
     """
     if not path.exists():
         return None
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = dict(file)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise MadocError(f"{path} is damaged ({error}); restore it or delete it") from error
+    arrays = unpack(path, "restore it or delete it")
     missing = [name for name in needed if name not in arrays]
     if missing:
         raise MadocError(f"expected the array {missing[0]} in {path}, got {', '.join(arrays)}; restore or delete it")

@@ -32,7 +32,7 @@ class SignalSpec(Part):
     name: Name = Field(description="What a log's column is called, unless `log: columns:` says otherwise.")
     reads: str = Field(
         description="position(JOINT), velocity(JOINT), sensor(NAME), one value of several as sensor(NAME)[2], or an "
-        "expression of them: + - * / **, sin cos tan asin acos atan atan2 sqrt abs exp, pi."
+        "expression of them: + - * / **, sin cos tan asin acos atan atan2 sqrt abs exp tanh min max where, pi."
     )
     unit: str | None = Field(None, description="For people. Default: that of the joint, where `reads` is one.")
 

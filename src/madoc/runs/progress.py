@@ -40,7 +40,7 @@ Show = Callable[[Moment], None]
 
 @contextmanager
 def display(description: str, *, unit: str, quiet: bool = False) -> Iterator[Show]:
-    """Show the progress of work of unknown size.
+    """Show the progress of work whose caller tells the share that is done.
 
     `with display("Madoc", unit="control steps") as show: show(Moment(0.1, 500, "cloning"))`.
     """
@@ -60,7 +60,7 @@ def bar(description: str, *, total: int, unit: str, quiet: bool = False) -> Iter
     done = 0
     with display(description, unit=unit, quiet=quiet) as show:
 
-        def advance(count: int = 1) -> None:
+        def advance(count: int) -> None:
             nonlocal done
             done += count
             show(Moment(min(done / total, 1.0) if total else 1.0, done))

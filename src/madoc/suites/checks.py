@@ -26,9 +26,16 @@ from madoc.pipeline.orders import (
     Settings,
     parse_settings,
 )
-from madoc.pipeline.refusals import check_order, check_search, method_of
+from madoc.pipeline.refusals import (
+    check_counts,
+    check_drawing,
+    check_order,
+    check_place,
+    check_search,
+    method_of,
+    policy_budget,
+)
 from madoc.policies import LEARNERS, require_reward
-from madoc.runs.budget import read_budget
 from madoc.runs.files import read_json
 from madoc.suites.cells import Kind, hashed
 from madoc.suites.options import Misfit, Order, stored
@@ -99,20 +106,18 @@ def check_policy(
 
     task = _robot(calibration.task, calibration.search.physics, allow_code)
     with under("method"):
-        entry = _learner(order.method, ())
+        _learner(order.method, ())
     with under("set"):
         _learner(order.method, order.set)
     with under("budget"):
-        read_budget(LEARNERS[order.method].usual_budget if order.budget is None else order.budget)
+        policy_budget(order.method, order.budget)
     with under("at"):
-        if not entry and order.at != "calibrated":
-            raise MadocError(f"{order.method} does not learn at given parameters; leave out at: {order.at}")
+        check_place(order.method, order.at, f"at: {order.at}")
         truths = (order.truth, calibration.truth, recording)
         if order.at == "truth" and not any(truths) and not _may_tell_truth(calibration.source.paths):
             raise MadocError("the true parameters are not known here; add truth: FILE.json")
     with under("share" if order.drawing.share != Drawing().share else "width"):
-        if order.at != "distribution" and order.drawing != Drawing():
-            raise MadocError("share: and width: are of at: distribution; leave them out")
+        check_drawing(order.drawing, order.at, "share: and width: are of at: distribution")
     with under(""):
         require_reward(task)
     with under("method"):
@@ -136,8 +141,7 @@ def check_recording(order: RecordOrder) -> None:
         if not split_name(order.name)[1]:
             raise MadocError(f"expected TASK-QUALITY to record, as hopper-medium, got {order.name!r}")
     with under("transitions"):
-        if order.transitions < 1:
-            raise MadocError(f"expected at least 1 transition, got {order.transitions}")
+        check_counts(transition=order.transitions)
     with under("friction"):
         replace(order.disturbance, friction=order.friction)
     with under("seed"):
@@ -150,10 +154,10 @@ def check_evaluation(order: EvaluationOrder, calibration: CalibrationOrder, *, a
     Raises:
         Misfit: Names the key.
     """
-    for key, what, count in (("episodes", "episode", order.episodes), ("draws", "draw", order.draws)):
-        with under(key):
-            if count < 1:
-                raise MadocError(f"expected at least 1 {what}, got {count}")
+    with under("episodes"):
+        check_counts(episode=order.episodes)
+    with under("draws"):
+        check_counts(draw=order.draws)
     with under("seed"):
         check_seed(order.seed)
     _check_truth(order.truth, calibration, allow_code)
@@ -294,7 +298,5 @@ def _calibrator(method: str, settings: Settings, starts: str | None) -> None:
 
 
 @cache
-def _learner(method: str, settings: Settings) -> bool:
-    """Whether a learner takes parameters to learn at."""
+def _learner(method: str, settings: Settings) -> None:
     make_method(LEARNERS, method, parse_settings(settings))
-    return LEARNERS[method].needs_parameters

@@ -13,13 +13,12 @@ from typing import Literal
 import filelock
 
 from madoc.errors import MadocError
+from madoc.pipeline.folders import ENDED
 from madoc.runs.files import read_json, remove_leftovers, write_json
 from madoc.suites.cells import Cell
 
 Ending = Literal["finished", "converged", "diverged", "refused", "failed"]
 
-USABLE: tuple[Ending, ...] = ("finished", "converged")
-"""Endings of a cell after which the cells that need it can start."""
 MOST_ATTEMPTS = 10
 """How often a cell is begun without getting any further than the time before; then it has failed."""
 _OUTCOME, _ATTEMPTS = "outcome.json", "attempts.json"
@@ -49,7 +48,7 @@ class Outcome:
     @property
     def usable(self) -> bool:
         """Whether other cells can take its result."""
-        return self.status in USABLE
+        return self.status in ENDED
 
 
 class Claim:

@@ -20,17 +20,15 @@ def prepare(suite: Path) -> None:
     take_core()
 
 
-def take_core() -> int | None:
+def take_core() -> None:
     """Keep this process to a core that no other worker of this machine has, by a lock that ends with the process.
 
-    A core decides how fast a cell is, not what it finds.
-
-    Returns:
-        The core; None where there is no such choice: one core only, all taken, or a system without affinity.
+    A core decides how fast a cell is, not what it finds. None is taken where there is no choice: one core only, all
+    taken, or a system without affinity.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     if _held or not hasattr(os, "sched_setaffinity"):
-        return None
+        return
     cores = sorted(os.sched_getaffinity(0))
     folder = Path(tempfile.gettempdir()) / f"madoc-cores-{os.getuid()}"  # in a container it may have no name
     folder.mkdir(mode=0o700, exist_ok=True)
@@ -42,5 +40,4 @@ def take_core() -> int | None:
             continue
         _held.append(lock)
         os.sched_setaffinity(0, {core})
-        return core
-    return None
+        return

@@ -41,7 +41,7 @@ def ant(physics: str = "legacy") -> Task:
         frame_skip=5,
         reward=partial(forward_reward, terminated=terminated, dt=0.05, cost=0.5),
         terminated=terminated,
-        reset_noise=partial(uniform_and_normal_noise, positions=15, velocities=14, scale=0.1),
+        reset_noise=partial(uniform_and_normal_noise, positions=15, velocities=14),
         groups=6,
         reference_returns=(-325.6, 3879.7),
     )

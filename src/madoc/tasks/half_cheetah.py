@@ -33,7 +33,7 @@ def half_cheetah(physics: str = "legacy") -> Task:
         frame_skip=5,
         reward=partial(forward_reward, dt=0.05, cost=0.1),
         terminated=never_terminated,
-        reset_noise=partial(uniform_and_normal_noise, positions=9, velocities=9, scale=0.1),
+        reset_noise=partial(uniform_and_normal_noise, positions=9, velocities=9),
         groups=6,
         reference_returns=(-280.178953, 12135.0),
         total_mass=14.0,

@@ -90,13 +90,11 @@ def uniform_noise(key: PRNGKeyArray, count: int, *, size: int, scale: float) -> 
     return jax.random.uniform(key, (count, size), minval=-scale, maxval=scale)
 
 
-def uniform_and_normal_noise(
-    key: PRNGKeyArray, count: int, *, positions: int, velocities: int, scale: float
-) -> jax.Array:
-    """Offsets of an initial state: positions uniform in ±scale, velocities normal with deviation `scale`."""
+def uniform_and_normal_noise(key: PRNGKeyArray, count: int, *, positions: int, velocities: int) -> jax.Array:
+    """Offsets of an initial state, as Gymnasium's: positions uniform in ±0.1, velocities normal with deviation 0.1."""
     of_position, of_velocity = jax.random.split(key)
-    normal = scale * jax.random.normal(of_velocity, (count, velocities))
-    return jax.numpy.concatenate([uniform_noise(of_position, count, size=positions, scale=scale), normal], axis=-1)
+    normal = 0.1 * jax.random.normal(of_velocity, (count, velocities))
+    return jax.numpy.concatenate([uniform_noise(of_position, count, size=positions, scale=0.1), normal], axis=-1)
 
 
 def _space(bodies: Sequence[str], joints: Sequence[str], ranges: Ranges) -> ParameterSpace:

@@ -3,10 +3,9 @@
 from madoc.calibration.holdout import Fitted, HoldOut, Predicted, ToldApart, Verdict, Word
 from madoc.verdict.assessment import Assessment, assess
 from madoc.verdict.bench import Bench
-from madoc.verdict.judge import WORDS, judge
+from madoc.verdict.judge import judge
 
 __all__ = [
-    "WORDS",
     "Assessment",
     "Bench",
     "Fitted",

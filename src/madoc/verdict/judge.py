@@ -13,7 +13,6 @@ from madoc.calibration.holdout import (
     PredictionErrors,
     ToldApart,
     Verdict,
-    Word,
 )
 from madoc.identification.candidate_terms import (
     BELOW_MINIMUM,
@@ -29,7 +28,7 @@ from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
 from madoc.identification.information import OPEN
 from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
-from madoc.identification.term_tests import MissingTerm
+from madoc.identification.term_tests import MissingTerm, named
 from madoc.parameters import FIELDS
 from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END
@@ -52,14 +51,6 @@ CHANGE_LOG = "log it without its filter, or shift its column by that time"
 CHANGE_DRIVE = "give its actuator that lag in the model, by MuJoCo's dyntype filter"
 """The same for a sensor and for a drive that are late."""
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
-
-WORDS: dict[Word, str] = {
-    "CALIBRATED": "the hold-out is predicted better than by mid-range, about as well as parameters can",
-    "NO_IMPROVEMENT": "the hold-out is predicted no better than by mid-range, or far from as well as parameters could",
-    "NOT_IDENTIFIABLE": "the data leaves some parameters open",
-    "MODEL_MISMATCH": "the residuals are not noise: no parameters in the ranges explain the data",
-    "DATA_REJECTED": "next observations do not follow from their rows",
-}
 
 CHANCE = 0.01
 """Significance level in [0, 1]: data is rejected where no prediction is better than chance at this level."""
@@ -155,7 +146,7 @@ def _missing(holdout: HoldOut) -> Verdict | None:
     effect = " and ".join(f"{name} by {abs(term.shifts[name]):.2g}" for name in moved)
     return Verdict(
         "MODEL_MISMATCH",
-        f"the model lacks {_named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
+        f"the model lacks {named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
         f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
         f"{_others(holdout, term)}{about_timestep(holdout, term)}; {_remedy(term)}{_at_end(holdout)}"
         f"{_disagreeing(holdout)}",
@@ -163,13 +154,9 @@ def _missing(holdout: HoldOut) -> Verdict | None:
     )
 
 
-def _named(term: MissingTerm) -> str:
-    return f"{term.cause} ({term.parameter})" if term.parameter else term.cause
-
-
 def _others(holdout: HoldOut, term: MissingTerm) -> str:
     """Which other terms are as likely as the one named."""
-    others = list(dict.fromkeys(map(_named, as_likely(holdout, term))))[:_MOST_NAMED]
+    others = list(dict.fromkeys(map(named, as_likely(holdout, term))))[:_MOST_NAMED]
     return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
 
 
@@ -255,7 +242,7 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
     term = likeliest([each for each in holdout.missing_terms if is_certain(each) and each.cause not in DRIFTS])
     if term is not None:
         sentence += (
-            f"; of single terms {_named(term)} is the likeliest: {_value(term)} explains {100 * term.explained:.2g} % "
+            f"; of single terms {named(term)} is the likeliest: {_value(term)} explains {100 * term.explained:.2g} % "
             f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}){_others(holdout, term)}; "
             f"{_remedy(term)}"
         )

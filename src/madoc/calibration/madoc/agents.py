@@ -28,7 +28,7 @@ from madoc.calibration.madoc.value_decomposition import (
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
 from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend, moving_average, scan_updates
-from madoc.types import Count, Layers, NotNegative, Positive, check_hyperparameters
+from madoc.types import BelowOne, Count, Layers, NotNegative, Positive, Share, check_hyperparameters
 
 AT_BOUND = 0.95
 """Share of the reward's bound above which a reward counts as saturated."""
@@ -128,19 +128,19 @@ class AgentSettings:
     bound: NotNegative = 2.0
     pair_bound: NotNegative = 10.0
     weigh_overlap: bool = True
-    dropout: NotNegative = 0.0
+    dropout: BelowOne = 0.0
     batch: Count = 256
     actor_batch: Count = 64
     discriminator_rate: NotNegative = 1e-3
     critic_rate: NotNegative = 1e-3
     actor_rate: NotNegative = 3e-3
-    judge_rate: NotNegative = 0.01
+    judge_rate: Share = 0.01
     entropy_weight: NotNegative | None = None
     prior_time: Positive = 2e5
     prior_largest: NotNegative = 10.0
-    prior_rate: NotNegative | None = None
+    prior_rate: Share | None = None
     prior_every: Count = 10
-    average_rate: NotNegative = 1e-3
+    average_rate: Share = 1e-3
     baseline: bool = True
     reward_size: NotNegative = 1.0
     blur_rate: NotNegative = 3e-3
@@ -244,18 +244,22 @@ class AgentSettings:
     def _steer_blur(
         self, agents: Agents, reward: PerRow, share: PerRow, resolution: Resolution
     ) -> tuple[Agents, dict[str, Array]]:
-        """Widen the blur where the mean |reward| is above `reward_size`, and narrow it where it is below."""
+        """Widen the blur where the mean |reward| is above `reward_size`, and narrow it where it is below.
+
+        Without a blur, with `reward_size` 0, nothing is steered.
+        """
         size = (share * jnp.abs(reward)).mean()
-        surplus = jnp.clip(size - self.reward_size, -1.0, 1.0)
-        limits = np.log([resolution.smallest, resolution.largest])
-        log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *limits)
         metrics = {
             "reward": (share * reward).mean(),
             "reward_size": size,
             "reward_at_bound": (share * (jnp.abs(reward) > AT_BOUND * 2 * self.bound)).mean(),
-            "blur": jnp.exp(log_blur),
         }
-        return replace(agents, log_blur=log_blur), metrics
+        if not self.reward_size:
+            return agents, metrics
+        surplus = jnp.clip(size - self.reward_size, -1.0, 1.0)
+        limits = np.log([resolution.smallest, resolution.largest])
+        log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *limits)
+        return replace(agents, log_blur=log_blur), metrics | {"blur": jnp.exp(log_blur)}
 
     def loss_of_critics(
         self,

@@ -20,8 +20,7 @@ FARTHEST = 0.95
 def first_actors(problem: CalibrationProblem) -> Actors:
     """Actors at the problem's prior, squashed of its means and deviations; those of the paper where it tells nothing.
 
-    The deviations are at least `NARROWEST`, and before squashing at most 1. Actors are independent, so what the prior
-    may know of correlations is not used.
+    The deviations are at least `NARROWEST`, and before squashing at most 1.
     """
     space, prior = problem.simulator.parameters, problem.prior
     if prior is None:

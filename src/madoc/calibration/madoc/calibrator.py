@@ -22,12 +22,11 @@ from madoc.calibration.madoc.grouping import VOTES, VOTING, Grouping, GroupingVA
 from madoc.calibration.madoc.paper import PAPER
 from madoc.calibration.madoc.state import MadocState
 from madoc.calibration.madoc.value_decomposition import Mixing
-from madoc.calibration.sensing import SensorNoise, noise_deviation
+from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.errors import MadocError
 from madoc.identification.states import probing_windows
 from madoc.learning import replay
-from madoc.learning.cloning import continue_cloning, fresh_clone
-from madoc.learning.features import HIDDEN_WINDOW
+from madoc.learning.cloning import cloning_epoch, fresh_clone
 from madoc.learning.networks import adam, scalars
 from madoc.simulation.rollout import out_of_step
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
@@ -64,10 +63,11 @@ class Madoc:
         cloning_updates: Updates in each epoch of cloning.
         keep_cloning: Whether cloning continues during calibration, as in the paper.
         grouping_epochs: Epochs of grouping, outside the budget. One spends at most 100 · (1 + 2 d) control steps by
-            physics, `epoch_steps` if groups are learned.
+            physics; if groups are learned `epoch_steps`, or where that is more `horizon` for each of d parameters.
         grouping_updates: Updates of the VAE in each epoch of grouping, rounded up to tens while groups are voted on.
-        epoch_steps: Control steps of rollouts in an epoch. Predictions for innovations take as many again, and those of
-            logged rows at a new reference, with derivatives of a few, come on top.
+        epoch_steps: Control steps of rollouts in an epoch; `draws` times `horizon` where that is more. Predictions for
+            innovations take as many again, and those of logged rows at a new reference, with derivatives of a few, come
+            on top.
         updates: Calibration updates in an epoch.
         draws: Parameter draws in an epoch; None takes 100, of `policy` 20 for up to `FEW` parameters.
         horizon: Control steps under one draw; None takes 1 for `replay`, 5 for `logged`, for `policy` 10, or 50 for up
@@ -75,7 +75,8 @@ class Madoc:
         batch: Rows in an update of cloning or grouping.
         learning_rate: Adam's learning rate of clone and VAE.
         replay_capacity: Number of simulated rows that are kept.
-        patience: Epochs without a smaller mismatch after which Madoc stops; 0 never stops.
+        patience: Epochs without a smaller mismatch after which Madoc stops; 0 never stops. The mismatch is measured by
+            the blur: without one (`agents.reward_size` 0) it has to be 0.
         agents: Hyperparameters of discriminators, critics and actors.
     """
 
@@ -106,6 +107,8 @@ class Madoc:
         check_hyperparameters(self)
         if self.groups in ("one", "each") and self.group_count:
             raise MadocError(f"group_count is of groups=physics or learned; leave it out with groups={self.groups}")
+        if self.patience and not self.agents.reward_size:
+            raise MadocError("agents.reward_size=0 leaves no mismatch to watch, so nothing can stop: set patience=0")
         if self.starts == "replay" and self.horizon not in (None, 1):
             raise MadocError(f"starts=replay replays single steps: expected horizon 1 or none, got {self.horizon}")
         if self.starts == "replay" and self.window not in (None, 1):
@@ -174,7 +177,11 @@ class Madoc:
             groups=tuple(tuple(group) for group in groups),
             group_stability=state.stability if self._finds_groups(state) and grouped else None,
             failures=state.failures,
-            warnings=(*watch.warnings(state.watch, scaled, space.names), *self.collection(problem).warnings),
+            warnings=(
+                *watch.warnings(state.watch, scaled, space.names),
+                *self._of_features(problem, state),
+                *self.collection(problem).warnings,
+            ),
             settled=watch.settled(state.watch),
             began=sentence(problem),
         )
@@ -190,8 +197,7 @@ class Madoc:
     def collection(self, problem: CalibrationProblem) -> Collection:
         """How rows of this problem are simulated; what is None in the hyperparameters is chosen here."""
         mode = self.starts or ("logged" if problem.states.starts_known else "policy")
-        one_row = problem.states.kind == "exact" or mode == "replay"
-        window = self.window or (1 if one_row else HIDDEN_WINDOW)
+        window = self.window or (1 if mode == "replay" else rows_compared(problem))
         systems, horizon = geometry(mode, len(problem.simulator.parameters))
         kind: Literal["standardised", "raw"] = "raw" if self.features == "raw" else "standardised"
         scaling, logged = problem.features.windows(kind, window)
@@ -213,6 +219,19 @@ class Madoc:
         if reason and self.features:
             raise MadocError(f"features=innovations cannot be had here: {reason}; leave features= out")
         return not reason
+
+    def _of_features(self, problem: CalibrationProblem, state: MadocState) -> tuple[str, ...]:
+        """Why discriminators saw changes of s' throughout, in a sentence, where innovations were to be had."""
+        if self.features not in (None, "innovations") or not state.watch.epochs:
+            return ()
+        if state.reference is None:
+            collection = self.collection(problem)
+            reason = innovations.obstacle(problem, collection.scaling.length, collection.noise)
+        elif state.reference.age < 0:
+            reason = "simulated rows were too seldom where logged ones are"
+        else:
+            return ()
+        return (f"discriminators saw changes of s' and no innovations, which are sharper: {reason}",)
 
     def _fresh_agents(self, problem: CalibrationProblem, resolution: Resolution, key: PRNGKeyArray) -> Agents:
         window, observation = self.collection(problem).scaling.sizes
@@ -248,29 +267,39 @@ class Madoc:
         """Whether groups are to be found, rather than one of all or one for each."""
         return 1 < len(state.agents.critics.weight) < len(state.labels)
 
+    def _prepared(self, state: MadocState) -> float:
+        """Share of the epochs of cloning and grouping that are done."""
+        cloning = 0 if self.starts == "replay" else self.cloning_epochs
+        grouping = self.grouping_epochs if self._finds_groups(state) else 0
+        return min(1.0, (min(state.clone.epochs, cloning) + state.grouped) / max(1, cloning + grouping))
+
     def _clone(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
-        of_batches, key = jax.random.split(state.key)
-        clone, metrics = continue_cloning(
+        clone, key, epoch = cloning_epoch(
             state.clone,
             problem.features.pairs,
-            of_batches,
+            state.key,
             learning_rate=self.learning_rate,
             batch=self.batch,
             updates=self.cloning_updates,
+            epochs=self.cloning_epochs,
         )
-        epoch = Epoch(metrics, stage="cloning", fraction=clone.epochs / max(1, self.cloning_epochs))
-        return replace(state, clone=clone, key=key), epoch
+        following = replace(state, clone=clone, key=key)
+        return following, replace(epoch, fraction=self._prepared(following))
 
     def _group_by_physics(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
-        """The effects of all parameters at `STATES` more states of the log; groups once all have been seen."""
+        """The effects of all parameters at `STATES` more states of the log; groups once all have been seen.
+
+        Where there are fewer states than epochs, some epochs see none.
+        """
         of_resampling, key = jax.random.split(state.key)
         every = probing_windows(
             problem.states, problem.dataset, problem.simulator, steps=1, count=self.grouping_epochs * STATES
         )
         seen = every.of(np.array_split(np.arange(len(every)), self.grouping_epochs)[state.grouped])
-        jacobian, failures = effects.sensitivities(problem.simulator, seen, problem.typical_change)
-        moments = state.moments.copy()
-        moments[state.grouped] = effects.shared_effects(jacobian)
+        moments, failures = state.moments.copy(), 0
+        if len(seen):
+            jacobian, failures = effects.sensitivities(problem.simulator, seen, problem.typical_change)
+            moments[state.grouped] = effects.shared_effects(jacobian)
         following = replace(
             state, moments=moments, key=key, grouped=state.grouped + 1, failures=state.failures + failures
         )
@@ -280,7 +309,11 @@ class Madoc:
             following = replace(following, labels=found.labels, stability=found.stability)
         steps = len(seen) * (1 + 2 * len(state.labels))
         return following, Epoch(
-            {"stability": following.stability}, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=1.0
+            {"stability": following.stability},
+            control_steps=steps,
+            unbudgeted=steps,
+            stage="grouping",
+            fraction=self._prepared(following),
         )
 
     def _learn_groups(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
@@ -288,7 +321,7 @@ class Madoc:
         of_draws, of_start, of_action, of_restart, of_batches, key = jax.random.split(state.key, 6)
         draws, walkers = grouping.one_at_a_time(of_draws, count), collection.begin(count, of_start)
         rollout, _ = collection.roll(state.clone.policy, draws, walkers, (of_action, of_restart))
-        rows = collection.remember(state.rows, rollout, draws, np.arange(count))
+        rows = _some(collection.remember(state.rows, rollout, draws, np.arange(count)), collection)
         grouped, schemes = state.grouped + 1, state.schemes
         voting = grouped > self.grouping_epochs - self._voting
         parts = VOTES if voting else 1
@@ -322,7 +355,8 @@ class Madoc:
             failures=state.failures + rollout.failures,
         )
         steps, metrics = rollout.valid.size, {"grouping_loss": float(np.mean(losses))}
-        return following, Epoch(metrics, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=1.0)
+        fraction = self._prepared(following)
+        return following, Epoch(metrics, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=fraction)
 
     def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         of_draws, of_start, of_action, of_restart, of_reference, of_networks, of_updates, key = jax.random.split(
@@ -346,13 +380,8 @@ class Madoc:
                 rows = replay.clear(rows) if seen.reference.age == 0 else rows
                 reference, described, resolution = seen.reference, seen.following, OF_INNOVATIONS
                 logged = reference.pair, reference.following
-                unit = reference.size(problem.typical_change)
-        rows = collection.remember(rows, rollout, draws, np.zeros(systems, np.int64), described)
-        if not int(rows.written):
-            raise MadocError(
-                f"madoc: every row simulated so far diverged or ended within {collection.scaling.length} steps, so "
-                "there is nothing to compare with the log; narrow the ranges of the parameters"
-            )
+                unit = reference.size
+        rows = _some(collection.remember(rows, rollout, draws, np.zeros(systems, np.int64), described), collection)
         agents, device_metrics = self.agents.update(
             agents,
             rows,
@@ -390,3 +419,17 @@ class Madoc:
             metrics |= cloning.metrics
         stalled = watch.stalled(watched, self.patience) if self.patience else None
         return following, Epoch(metrics, control_steps=steps, converged=stalled)
+
+
+def _some(rows: replay.Replay, collection: Collection) -> replay.Replay:
+    """The rows simulated so far.
+
+    Raises:
+        MadocError: There are none.
+    """
+    if not int(rows.written):
+        raise MadocError(
+            f"madoc: every row simulated so far diverged or ended within {collection.scaling.length} steps, so "
+            "there is nothing to compare with the log; narrow the ranges of the parameters"
+        )
+    return rows

@@ -46,8 +46,6 @@ class Reference:
 
     Attributes:
         parameters: In physical units.
-        scale: Scale of each channel's innovations: the median of their absolute values, as those at impacts are a
-            hundred times those in flight.
         pair: Features of (s, a) of the logged rows.
         following: Features of their innovations.
         age: Epochs since it was chosen; negative before the first is.
@@ -55,15 +53,18 @@ class Reference:
     """
 
     parameters: Float[np.ndarray, " d"]
-    scale: Float[np.ndarray, " observation"]
     pair: Float[Array, "rows pair"]
     following: Float[Array, "rows observation"]
     age: int
     slopes: Slopes
 
-    def size(self, typical_change: Float[np.ndarray, " observation"]) -> float:
-        """Root mean square, over channels, of the scale in typical changes: the unit of the features."""
-        return float(np.sqrt(np.mean((self.scale / typical_change) ** 2)))
+    @property
+    def size(self) -> float:
+        """Root mean square, over channels, of the least spread of an innovation in typical changes of a signal.
+
+        It is taken for the unit of the features, whose spreads differ from row to row.
+        """
+        return float(np.sqrt(np.mean(np.asarray(self.slopes.floor, np.float64) ** 2)))
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def no_reference(problem: CalibrationProblem, scaling: Scaling, key: PRNGKeyArra
     rows, channels, space = min(ROWS, len(problem.states.rows)), len(scaling.next_scale), problem.simulator.parameters
     pair, following = jnp.zeros((rows, len(scaling.pair_offset))), jnp.zeros((rows, channels))
     unknown = slopes.no_slopes(pair.shape[1], channels, len(space), key)
-    return Reference(space.middle, np.ones(channels), pair, following, -1, unknown)
+    return Reference(space.middle, pair, following, -1, unknown)
 
 
 def seen(
@@ -152,7 +153,7 @@ def seen(
         )
         learnt = slopes.learn(learnt, known[probed], derivatives, of_slopes)
         seen_of_log = jnp.asarray(_features(problem, learnt, known, logged))
-        new = Reference(estimate, scale, jnp.asarray(known), seen_of_log, 0, learnt)
+        new = Reference(estimate, jnp.asarray(known), seen_of_log, 0, learnt)
         steps += len(derivatives) * len(mean)
         return Seen(new, _features(problem, learnt, pair, following), steps, failures)
     if reference.age < 0:
@@ -211,7 +212,10 @@ def _scale(
     logged: Float[np.ndarray, "rows observation"],
     simulated: Float[np.ndarray, "*rows observation"],
 ) -> Float[np.ndarray, " observation"] | None:
-    """The scale of logged and simulated innovations together; None where there are none of either."""
+    """The median |e| of logged and simulated innovations together; None where there are none of either.
+
+    It is a median, as innovations at impacts are a hundred times those in flight.
+    """
     known = [each[np.isfinite(each).all(-1)] for each in (logged, _flat(simulated))]
     if not all(map(len, known)):
         return None

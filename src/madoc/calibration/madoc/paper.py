@@ -11,7 +11,6 @@ PAPER: dict[str, object] = {
     "cloning_updates": 1000,
     "keep_cloning": True,
     "grouping_epochs": 200,
-    "grouping_updates": 1000,
     "updates": 1000,
     "draws": 10,
     "horizon": 100,

@@ -145,17 +145,10 @@ def _derivatives(slopes: Slopes, network: Network, pair: Float[Array, "rows pair
     return network(pair).reshape(len(pair), *slopes.size.shape)
 
 
-def shares(
-    slopes: Slopes, pair: Float[Array, "rows pair"]
-) -> tuple[Float[Array, "rows channels d"], Float[Array, "rows channels"]]:
-    """By how many spreads a deviation of each parameter moves a signal of a row, and that spread.
-
-    The spread is the standard deviation of an innovation under the actors, √(Σ_j (J_cj σ_j)² + floor_c²), as a Kalman
-    filter has it.
-    """
+def spreads(slopes: Slopes, pair: Float[Array, "rows pair"]) -> Float[Array, "rows channels"]:
+    """The standard deviation of an innovation under the actors, √(Σ_j (J_cj σ_j)² + floor_c²), as a Kalman filter's."""
     effect = _derivatives(slopes, slopes.network, pair) * (slopes.size * slopes.deviation[None])[None]
-    spread = jnp.sqrt((effect**2).sum(-1) + slopes.floor[None] ** 2)
-    return effect / spread[..., None], spread
+    return jnp.sqrt((effect**2).sum(-1) + slopes.floor[None] ** 2)
 
 
 @eqx.filter_jit
@@ -163,11 +156,11 @@ def standardised(
     slopes: Slopes, pair: Float[Array, "rows pair"], innovation: Float[Array, "rows channels"]
 ) -> Float[Array, "rows channels"]:
     """Features of innovations: asinh of each in its spread, as few are far larger than was expected."""
-    return jnp.arcsinh(innovation / shares(slopes, pair)[1])
+    return jnp.arcsinh(innovation / spreads(slopes, pair))
 
 
 def redrawn(slopes: Slopes, rows: dict[str, Array], draws: Float[Array, "rows d"]) -> dict[str, Array]:
     """Simulated rows as they were under other draws of the parameters in [-1, 1], to first order."""
     slope = _derivatives(slopes, slopes.network, rows["pair"]) * slopes.size[None]
-    moved = jnp.einsum("rcd,rd->rc", slope, draws - rows["parameters"]) / shares(slopes, rows["pair"])[1]
+    moved = jnp.einsum("rcd,rd->rc", slope, draws - rows["parameters"]) / spreads(slopes, rows["pair"])
     return rows | {"parameters": draws, "following": jnp.arcsinh(jnp.sinh(rows["following"]) + moved)}

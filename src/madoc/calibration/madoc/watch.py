@@ -80,24 +80,26 @@ def observe(
 ) -> Watch:
     """The watch after one more epoch, whose estimate is kept unless an earlier mismatch was clearly lower.
 
-    `unit` is the unit of the blur in typical changes of a signal.
+    `unit` is the unit of the blur in typical changes of a signal. Without a blur, `metrics` need not have any.
 
     Mismatches are compared once the discriminators have settled, provided that the mean |reward| is near `steered_to`,
     its set value, or the blur is at its lower limit. Before that, without a blur (`steered_to` is then 0), and while
     rewards are at their bound under the largest blur, the latest estimate is kept.
     """
-    blur, size, at_bound = metrics["blur"], metrics["reward_size"], metrics["reward_at_bound"]
-    mismatch = unit * blur * size / steered_to if steered_to else size
+    size, at_bound = metrics["reward_size"], metrics["reward_at_bound"]
+    mismatch = unit * metrics["blur"] * size / steered_to if steered_to else size
     overlap = metrics["overlap"]
     if watch.epochs > watch.began:
         mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
         overlap = watch.overlap + SMOOTHING * (overlap - watch.overlap)
     watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, overlap=overlap, at_bound=at_bound)
-    smallest, largest = blur_range
-    immeasurable = blur > 0.99 * largest and at_bound > SATURATED
-    if not steered_to or watch.epochs - watch.began <= SETTLING or immeasurable:
-        return _mark(replace(watch, best=average, best_mismatch=mismatch))
+    latest = _mark(replace(watch, best=average, best_mismatch=mismatch))
+    if not steered_to:
+        return latest
+    (smallest, largest), blur = blur_range, metrics["blur"]
+    if watch.epochs - watch.began <= SETTLING or (blur > 0.99 * largest and at_bound > SATURATED):
+        return latest
     if size < LEAST_REWARD * steered_to and blur > 1.01 * smallest:
         return watch
     lowest = min(mismatch, watch.best_mismatch)
@@ -119,8 +121,8 @@ def stalled(watch: Watch, patience: int) -> str | None:
 
 
 def settled(watch: Watch) -> bool:
-    """Whether there were enough epochs for the discriminators to say anything."""
-    return watch.epochs >= SETTLING
+    """Whether the discriminators, which begin anew with other features of s', have had the epochs that they need."""
+    return watch.epochs - watch.began >= SETTLING
 
 
 def warnings(watch: Watch, scaled: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -128,8 +130,8 @@ def warnings(watch: Watch, scaled: np.ndarray, names: tuple[str, ...]) -> tuple[
     sentences = []
     if not settled(watch):
         sentences.append(
-            f"{watch.epochs} epochs of calibration are fewer than the {SETTLING} in which the discriminators settle; "
-            "give it a larger budget"
+            f"{watch.epochs - watch.began} epochs of calibration {'with innovations ' * (watch.began > 0)}are fewer "
+            f"than the {SETTLING} in which the discriminators settle; give it a larger budget"
         )
     if watch.at_bound > SATURATED:
         sentences.append(

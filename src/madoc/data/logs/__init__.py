@@ -14,7 +14,7 @@ from madoc.data.findings import Finding
 from madoc.data.logs import csv_reader, hdf5_reader, lerobot_reader, mcap_reader, minari_runs, parquet_reader
 from madoc.data.logs.assembly import assemble, wanted_columns
 from madoc.data.logs.jumps import split_episodes, without_copies
-from madoc.data.logs.tables import Run, Table, tables_of
+from madoc.data.logs.tables import Run, tables_of
 from madoc.data.minari_reader import recognises as is_minari
 from madoc.data.npz import read_arrays
 from madoc.data.validation import require_file, validate
@@ -30,12 +30,10 @@ class LogFormat:
         read: (path, wanted columns) -> runs, with other columns too. A file that is damaged or of another layout raises
             a MadocError, as does a library that is not installed.
         suffixes: Endings of its files; empty where it is a folder.
-        description: A short description of the layout, for lists.
     """
 
     read: Callable[[Path, Collection[str]], list[Run]]
     suffixes: tuple[str, ...]
-    description: str
 
 
 def _read_npz(path: Path, wanted: Collection[str]) -> list[Run]:
@@ -43,17 +41,13 @@ def _read_npz(path: Path, wanted: Collection[str]) -> list[Run]:
 
 
 LOG_FORMATS: dict[str, LogFormat] = {
-    "csv": LogFormat(csv_reader.read, (".csv", ".tsv", ".txt"), "a header, then one line for each row"),
-    "npz": LogFormat(
-        _read_npz, (".npz",), "an array is a column; a matrix `position` is the columns `position[0]`, ..."
-    ),
-    "hdf5": LogFormat(
-        hdf5_reader.read, (".h5", ".hdf5", ".hdf"), "one dataset for each column; numbered groups are runs"
-    ),
-    "parquet": LogFormat(parquet_reader.read, (".parquet", ".pq"), "columns of numbers or of lists"),
-    "mcap": LogFormat(mcap_reader.read, (".mcap",), "topics of JSON or ROS 2 messages"),
-    "minari": LogFormat(minari_runs.read, (), "a Minari directory: each episode is a run"),
-    "lerobot": LogFormat(lerobot_reader.read, (), "a LeRobot directory: each episode is a run"),
+    "csv": LogFormat(csv_reader.read, (".csv", ".tsv", ".txt")),
+    "npz": LogFormat(_read_npz, (".npz",)),
+    "hdf5": LogFormat(hdf5_reader.read, (".h5", ".hdf5", ".hdf")),
+    "parquet": LogFormat(parquet_reader.read, (".parquet", ".pq")),
+    "mcap": LogFormat(mcap_reader.read, (".mcap",)),
+    "minari": LogFormat(minari_runs.read, ()),
+    "lerobot": LogFormat(lerobot_reader.read, ()),
 }
 
 _BY_SUFFIX = {suffix: entry for entry in LOG_FORMATS.values() for suffix in entry.suffixes}
@@ -170,4 +164,4 @@ def _distinct(runs: list[Run]) -> list[Run]:
     return named
 
 
-__all__ = ["LOG_FORMATS", "LogFormat", "Run", "Table", "files_of", "read"]
+__all__ = ["files_of", "read"]

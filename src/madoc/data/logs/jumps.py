@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.data.findings import Finding
-from madoc.data.logs.tables import Run, Table
+from madoc.data.logs.tables import MISSING, Run, Table
 from madoc.data.logs.timing import Series
 
 EPISODES = ("episode", "episode_id", "episode_index", "trial")
@@ -20,7 +20,7 @@ _WITHIN = 1.05
 _SLOW = 0.25
 """Median change of an angle from row to row, the shorter way round, in turns; above it either way may be meant."""
 _TRUE = frozenset(("true", "t", "yes", "y", "on"))
-_FALSE = frozenset(("", "false", "f", "no", "n", "off", "nan", "na", "n/a", "none", "null", "-"))
+_FALSE = frozenset(("false", "f", "no", "n", "off")) | MISSING
 
 
 def unwrapped(

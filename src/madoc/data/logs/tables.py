@@ -11,7 +11,8 @@ from madoc.errors import MadocError
 WIDEST = 1000
 """Number of values per row; an array with more is taken for a picture and not read."""
 
-_MISSING = frozenset(("", "nan", "na", "n/a", "none", "null", "-"))
+MISSING = frozenset(("", "nan", "na", "n/a", "none", "null", "-"))
+"""Words, in lower case, in the place of a number that is not there."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def _seconds(values: np.ndarray) -> Float[np.ndarray, " rows"]:
 def _number(cell: object, table: Table, name: str, run: str, row: int) -> float:
     text = cell.decode(errors="replace") if isinstance(cell, bytes) else "" if cell is None else str(cell)
     bare = text.strip()
-    if bare.lower() in _MISSING:
+    if bare.lower() in MISSING:
         return np.nan
     try:
         if "_" not in bare:  # Python reads 1_000

@@ -32,14 +32,10 @@ class Ladder:
 
     Attributes:
         saved: The policies.
-        control_steps: Control steps of training of each.
-        returns: Mean return of each in the target, with sampled actions.
         qualities: By quality, the indices of its policies.
     """
 
     saved: tuple[NumpyPolicy, ...]
-    control_steps: tuple[int, ...]
-    returns: tuple[float, ...]
     qualities: dict[str, list[int]]
 
 
@@ -55,7 +51,7 @@ def ladder(task_name: str) -> Ladder:
     size = weights[0].shape[1]
     networks = zip(zip(*weights, strict=True), zip(*biases, strict=True), strict=True)
     saved = tuple(NumpyPolicy(task_name, *network, np.zeros(size), np.ones(size)) for network in networks)
-    return Ladder(saved, tuple(about["control_steps"]), tuple(about["returns"]), about["qualities"])
+    return Ladder(saved, about["qualities"])
 
 
 def record_quality(

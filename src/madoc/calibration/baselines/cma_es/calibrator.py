@@ -26,7 +26,7 @@ from madoc.calibration.baselines.population_search import (
 )
 from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
 from madoc.identification.windows import first_rows
-from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
+from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
 from madoc.learning.features import HIDDEN_WINDOW, unbroken, windows_ending
 from madoc.simulation.rollout import Walkers, begin, out_of_step, reset_states, roll
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
@@ -189,17 +189,17 @@ class CmaEs:
         return Actor(clone, out_of_step(walkers, simulator.task.max_episode_steps))
 
     def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Epoch]:
-        of_batches, key = jax.random.split(state.inner.key)
-        clone, metrics = continue_cloning(
+        clone, key, epoch = cloning_epoch(
             actor.clone,
             problem.features.pairs,
-            of_batches,
+            state.inner.key,
             learning_rate=self.learning_rate,
             batch=self.batch,
             updates=self.cloning_updates,
+            epochs=self.cloning_epochs,
         )
         following = replace(state, inner=replace(state.inner, key=key), actor=replace(actor, clone=clone))
-        return following, Epoch(metrics, stage="cloning", fraction=clone.epochs / self.cloning_epochs)
+        return following, epoch
 
     def _standardised(
         self, problem: CalibrationProblem, rows: Float[np.ndarray, "*rows values"]

@@ -28,11 +28,11 @@ from madoc.calibration.baselines.population_search import independent_estimate
 from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
 from madoc.errors import MadocError
 from madoc.learning import replay
-from madoc.learning.cloning import Clone, continue_cloning, fresh_clone
+from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
 from madoc.learning.features import HIDDEN_WINDOW, last_rows, unbroken, windows_ending
 from madoc.learning.networks import Network, adam, moving_average
 from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll, unbiased_starts
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Positive, check_hyperparameters
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Positive, Share, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -88,7 +88,7 @@ class Oted:
     std_rate: NotNegative = 0.1
     first_std: Positive = 0.6
     smallest_std: Positive = 0.02
-    average_rate: NotNegative = 0.03
+    average_rate: Share = 0.03
     hidden: Layers = (128, 128)
     cloning_epochs: CountOrZero = 40
     cloning_updates: Count = 200
@@ -151,16 +151,15 @@ class Oted:
         return (self.starts or ("logged" if problem.states.kind == "exact" else "policy")) == "logged"
 
     def _clone(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
-        of_batches, key = jax.random.split(state.key)
-        clone, metrics = continue_cloning(
+        clone, key, epoch = cloning_epoch(
             state.clone,
             problem.features.pairs,
-            of_batches,
+            state.key,
             learning_rate=self.learning_rate,
             batch=self.batch,
             updates=self.cloning_updates,
+            epochs=self.cloning_epochs,
         )
-        epoch = Epoch(metrics, stage="cloning", fraction=clone.epochs / self.cloning_epochs)
         return replace(state, clone=clone, key=key), epoch
 
     def _calibrate(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
