@@ -7,8 +7,8 @@ dampings, armatures and friction losses, in an order that is drawn once, of whic
 does not calibrate has the same value in target and simulator. Each seed plants another truth, in the middle 80 % of
 every range, and records `medium` behaviour there. `random` has groups of the sizes of those by physics, of parameters
 drawn at random; of up to 4 parameters both make one group. `each-dop` is `each` with the credit of Eq. (12) throughout.
-Logs are exact, so nothing but rounding limits what they tell, and errors are in % of the ranges. Runs already there are
-skipped.
+Errors are in % of the ranges: parameters have different units, and exact logs tell all of them to within rounding. Runs
+already there are skipped.
 """
 
 import argparse

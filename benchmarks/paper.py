@@ -85,7 +85,7 @@ def collect(name: str, folder: Path) -> int:
         if result.status not in ("not run", "failed")
     }
     if found:
-        keep(name, earlier | found)
+        keep(name, found)
     return len((earlier | found).keys() & {cell.name for cell in (own.cells if own else wanted)(plan)})
 
 

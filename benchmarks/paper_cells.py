@@ -55,21 +55,21 @@ def kept(name: str) -> dict[str, dict]:
 
 
 def keep(name: str, found: Mapping[str, Mapping]) -> None:
-    """Keep what was collected of a suite, a cell a line, in place of what its file held."""
+    """Keep what was collected of a suite, a cell a line, beside what its file holds."""
     RESULTS.mkdir(parents=True, exist_ok=True)
-    lines = ",\n".join(f' "{cell}": {json.dumps(row)}' for cell, row in sorted(found.items()))
+    lines = ",\n".join(f' "{cell}": {json.dumps(row)}' for cell, row in sorted((kept(name) | dict(found)).items()))
     file_of(name).write_text(f"{{\n{lines}\n}}\n")
 
 
 def how_far(name: str, cells: Sequence[Cell]) -> str:
-    """How many of a suite's cells are not run, the command that runs them, and the commits that were measured."""
+    """How many of a suite's cells are not run, the command that runs them, and at which commits they were collected."""
     found = kept(name)
     commits = Counter(found[cell.name]["commit"] for cell in cells if cell.name in found)
     command = f"`madoc suite benchmarks/suites/{name}.yaml --out {OUT}`"
     missing = len(cells) - commits.total()
     told = f"{missing} of {len(cells)} cells are not run: {command}" if missing else f"All cells are run by {command}"
-    measured = ", ".join(f"{count} at {each}" for each, count in commits.most_common())
-    return f"{told}; {measured}" if measured else told
+    collected = ", ".join(f"{count} at {each}" for each, count in commits.most_common())
+    return f"{told}; collected {collected}" if collected else told
 
 
 def printed(name: str, row: str, column: str) -> tuple[float, float] | None:

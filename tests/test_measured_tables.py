@@ -77,6 +77,7 @@ def test_figure_3b_says_how_many_parameters_and_shares_the_cells_of_all():
 
 
 def test_what_was_measured_is_in_a_table_whatever_options_were_added_since():
+    assert set(paper_cells.NO_SCORES) == paper.OWN.keys()
     every = {cell.name for name in paper.TITLES for cell in paper.planned(name).cells}
     assert paper.kept("table-10").keys() <= every
 

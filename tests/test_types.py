@@ -60,11 +60,11 @@ def test_a_method_of_ones_own_is_named_after_its_class():
             "expected starts of Madoc to be 'policy', 'logged' or 'replay', got 'nowhere'",
         ),
         (lambda: Dropo(draws=1), "expected draws of Dropo to be greater than or equal to 2, got 1"),
-        (lambda: SAC(discount=float("nan")), "expected discount of SAC to be greater than or equal to 0, got nan"),
+        (lambda: SAC(discount=float("nan")), "expected discount of SAC to be less than or equal to 1, got nan"),
         (lambda: AgentSettings(dropout=1.0), "expected dropout of AgentSettings to be less than 1, got 1.0"),
         (
             lambda: Madoc(agents=AgentSettings(reward_size=0.0)),
-            "agents.reward_size=0 leaves no mismatch to watch, so nothing can stop: set patience=0",
+            "patience waits for a smaller mismatch, which agents.reward_size=0 leaves unmeasured: set patience=0",
         ),
         (lambda: SAC(batch=1.5), "expected batch of SAC to be a valid integer, got 1.5"),
         (lambda: SAC(epoch_steps=5), "expected epoch_steps of at least the 20 environments, got 5"),

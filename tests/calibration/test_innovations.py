@@ -161,6 +161,8 @@ def test_where_innovations_cannot_be_had():
         watched = replace(state, watch=replace(state.watch, epochs=SETTLING))
         (warning,) = [text for text in Madoc().estimate(other, watched).warnings if "no innovations" in text]
         assert word in warning
+        early = Madoc().estimate(other, replace(state, watch=replace(state.watch, epochs=SETTLING - 1)))
+        assert "no innovations" not in " ".join(early.warnings)
 
 
 def test_innovations_begin_where_rows_overlap_and_a_checkpoint_holds_them(monkeypatch, tmp_path):
@@ -182,6 +184,11 @@ def test_innovations_begin_where_rows_overlap_and_a_checkpoint_holds_them(monkey
     assert spent == [200] * (SETTLING + 1) + [1250, 400]  # simulated, predicted, 400 logged rows, derivatives of 150
     assert state.watch.began == SETTLING + 1
     assert not method.estimate(counted, state).settled  # the discriminators began anew two epochs ago
+    for overlap, reason in ((0.1, "too seldom where logged"), (0.9, "no row could be predicted")):
+        seen_alone = replace(state, reference=replace(state.reference, age=-1))
+        seen_alone = replace(seen_alone, watch=replace(state.watch, began=0, overlap=overlap))
+        monkeypatch.setattr(innovations, "OVERLAP", 0.3)
+        assert reason in " ".join(method.estimate(counted, seen_alone).warnings)
     middle = problem.simulator.parameters.middle
     assert state.reference is not None
     assert (state.reference.parameters != middle).all()

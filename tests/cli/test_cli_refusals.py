@@ -69,7 +69,7 @@ def places(recorded, whole, tmp_path):
         ("run hopper-medium --out {out} --truth {part}", "no value for body_mass.torso"),
         (
             "run hopper-medium --out {out} --learner bc --policy-at distribution",
-            "and --policy-at distribution would change nothing",
+            "so --policy-at distribution would change nothing",
         ),
         ("run hopper-medium --out {out} --learner h2o --hide-velocities", "hopper-medium hides velocities"),
         ("run hopper-medium --out {out} --learner sacc", "did you mean sac?"),

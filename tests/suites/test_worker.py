@@ -8,6 +8,7 @@ import pytest
 from suite_files import CELL
 
 from madoc.errors import MadocError, NotAllowed
+from madoc.runs.checkpoint import OtherState
 from madoc.suites import process, stages
 from madoc.suites.cells import Cell, write_plan
 from madoc.suites.claims import MOST_ATTEMPTS, attempts_of, claimed, outcome_of, try_again
@@ -87,6 +88,18 @@ def test_what_has_changed_since_it_was_planned_stands_under_no_old_name(planned,
     assert [outcome.status for outcome in work(out)] == ["failed"]
     assert outcome_of(cell, out).sentence.startswith("since this cell was planned a file that it names has changed")
     assert not (cell.folder(out) / "spec.json").exists()
+
+
+@pytest.mark.parametrize(("error", "status"), [(OtherState, "failed"), (MadocError, "refused")])
+def test_a_checkpoint_of_another_version_is_no_refusal(planned, monkeypatch, error, status):
+    out, (cell,) = planned(CELL)
+
+    def calibrate_in(*arguments, **options):
+        raise error("a sentence")
+
+    monkeypatch.setattr(stages, "calibrate_in", calibrate_in)
+    assert [outcome.status for outcome in work(out)] == [status]
+    assert outcome_of(cell, out).sentence == "a sentence"
 
 
 def test_only_one_of_two_claims_gets_a_cell(planned):

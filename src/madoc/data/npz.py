@@ -48,7 +48,7 @@ def unpack(path: Path, remedy: str = MAKE_AGAIN) -> dict[str, np.ndarray]:
         raise _damaged(path, error, remedy) from error
     for name, array in arrays.items():
         if not isinstance(array, np.ndarray):  # NumPy returns other members of a zip archive as bytes
-            raise MadocError(f"expected only arrays in {path}, got the file {name!r}; {remedy}")
+            raise MadocError(f"expected only arrays in {path}, got the file {name!r}; give an archive of arrays alone")
     return arrays
 
 

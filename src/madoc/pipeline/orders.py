@@ -227,10 +227,10 @@ class RunOrder:
     """JSON file {parameter: value} to judge by; no method ever sees it. Default: the data's, if it has any."""
     policy_at: Literal["calibrated", "distribution"] = "calibrated"
     """Learn at the estimate, or over draws from the calibrated distribution."""
-    policy_share: float = 1.0
-    """Share of the systems that are drawn from the distribution of the estimate; the others are the estimate itself."""
-    policy_width: float = 1.0
-    """Spread of the drawn systems, as a multiple of the estimate's own."""
+    policy_share: float = Drawing.share
+    """With `--policy-at distribution`: share of the systems that are drawn from it; the others are the estimate."""
+    policy_width: float = Drawing.width
+    """With `--policy-at distribution`: spread of the drawn systems, as a multiple of the estimate's own."""
     learner: str = DEFAULT_LEARNER
     """A policy learner, as `madoc methods` lists it."""
     policy_set: Settings = ()

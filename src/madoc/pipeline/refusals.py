@@ -66,7 +66,7 @@ def check_place(method: str, at: str, written: str) -> None:
     """
     if at != "calibrated" and not LEARNERS[method].needs_parameters:
         raise MadocError(
-            f"{method} does not learn at given parameters, and {written} would change nothing; leave it out"
+            f"{method} does not learn at given parameters, so {written} would change nothing; leave it out"
         )
 
 

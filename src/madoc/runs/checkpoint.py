@@ -56,6 +56,10 @@ class Leaf:
         return same_kind and self.dtype == other.dtype and self.shape == other.shape
 
 
+class OtherState(MadocError):
+    """A checkpoint holds the state of another method, setting or version."""
+
+
 Layout = dict[str, Leaf]
 """The leaves of a state by path, for example `state.actor.layers[0].weight`."""
 
@@ -123,18 +127,19 @@ def load(path: Path, like: State) -> tuple[State, dict[str, Any]]:
         like: A state from the method's `init`, which gives the structure and the functions.
 
     Raises:
-        MadocError: The file is missing or damaged, or holds the state of another method, setting or version.
+        OtherState: The file holds the state of another method, setting or version.
+        MadocError: It is missing or damaged.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             about = json.loads(archive.read("checkpoint.json"))
             if about["format"] != FORMAT:
-                raise MadocError(f"{path} has format {about['format']}, expected {FORMAT}; written by another madoc")
+                raise OtherState(f"{path} has format {about['format']}, expected {FORMAT}; written by another madoc")
             saved = {name: Leaf(**leaf | {"shape": tuple(leaf["shape"])}) for name, leaf in about["leaves"].items()}
             wanted = {name: leaf for name, leaf in layout(like).items() if leaf.kind != "static"}
             problem = difference(saved, wanted)
             if problem:
-                raise MadocError(f"{path} does not fit this method: {problem}; different settings or another version?")
+                raise OtherState(f"{path} does not fit this method: {problem}; different settings or another version?")
             leaves = [
                 _restore(archive, name, saved[name], about["values"]) if name in saved else leaf
                 for name, leaf in _leaves(like)

@@ -10,6 +10,7 @@ from madoc.errors import MadocError, NotAllowed
 from madoc.pipeline import calibrate_in, evaluate_folder, learn_in, read_calibration, record_named
 from madoc.pipeline.folders import ENDED, holds_run
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
+from madoc.runs.checkpoint import OtherState
 from madoc.suites.cells import RECORDED, Cell, read_plans
 from madoc.suites.checks import forget_contents, name_of
 from madoc.suites.claims import MOST_ATTEMPTS, Claim, Outcome
@@ -37,9 +38,10 @@ def carry_out(claim: Claim, suite: Path, *, allow_code: bool = False) -> Outcome
         claim.take_back()
         raise  # another worker may be allowed to
     except MadocError as error:
-        # A full disk, or a file that is gone or changed, is no refusal: the same order may go through another time.
-        kind = "failed" if isinstance(error, _Changed) or isinstance(error.__cause__, OSError) else "refused"
-        return claim.end(kind, str(error), monotonic() - started)  # type: ignore[arg-type]
+        # A full disk, a file that is gone or changed, or a checkpoint of another version is no refusal: the same order
+        # may go through another time.
+        broken = isinstance(error, (_Changed, OtherState)) or isinstance(error.__cause__, OSError)
+        return claim.end("failed" if broken else "refused", str(error), monotonic() - started)
     except Exception as error:
         (claim.folder / "failure.txt").write_text(traceback.format_exc(), encoding="utf-8")
         sentence = f"{type(error).__name__}: {error}; see {claim.folder / 'failure.txt'}"

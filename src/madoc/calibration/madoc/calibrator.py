@@ -63,11 +63,11 @@ class Madoc:
         cloning_updates: Updates in each epoch of cloning.
         keep_cloning: Whether cloning continues during calibration, as in the paper.
         grouping_epochs: Epochs of grouping, outside the budget. One spends at most 100 · (1 + 2 d) control steps by
-            physics; if groups are learned `epoch_steps`, or where that is more `horizon` for each of d parameters.
+            physics, and as one of calibration, with a draw for each of d parameters, if groups are learned.
         grouping_updates: Updates of the VAE in each epoch of grouping, rounded up to tens while groups are voted on.
-        epoch_steps: Control steps of rollouts in an epoch; `draws` times `horizon` where that is more. Predictions for
-            innovations take as many again, and those of logged rows at a new reference, with derivatives of a few, come
-            on top.
+        epoch_steps: Control steps of rollouts in an epoch, rounded down to as many rows for each draw; one row for each
+            where that is more. Predictions for innovations take as many again, and those of logged rows at a new
+            reference, with derivatives of a few, come on top.
         updates: Calibration updates in an epoch.
         draws: Parameter draws in an epoch; None takes 100, of `policy` 20 for up to `FEW` parameters.
         horizon: Control steps under one draw; None takes 1 for `replay`, 5 for `logged`, for `policy` 10, or 50 for up
@@ -108,7 +108,9 @@ class Madoc:
         if self.groups in ("one", "each") and self.group_count:
             raise MadocError(f"group_count is of groups=physics or learned; leave it out with groups={self.groups}")
         if self.patience and not self.agents.reward_size:
-            raise MadocError("agents.reward_size=0 leaves no mismatch to watch, so nothing can stop: set patience=0")
+            raise MadocError(
+                "patience waits for a smaller mismatch, which agents.reward_size=0 leaves unmeasured: set patience=0"
+            )
         if self.starts == "replay" and self.horizon not in (None, 1):
             raise MadocError(f"starts=replay replays single steps: expected horizon 1 or none, got {self.horizon}")
         if self.starts == "replay" and self.window not in (None, 1):
@@ -221,14 +223,15 @@ class Madoc:
         return not reason
 
     def _of_features(self, problem: CalibrationProblem, state: MadocState) -> tuple[str, ...]:
-        """Why discriminators saw changes of s' throughout, in a sentence, where innovations were to be had."""
-        if self.features not in (None, "innovations") or not state.watch.epochs:
+        """Why discriminators saw changes of s' throughout, in a sentence; none where they were asked to."""
+        if self.features not in (None, "innovations") or not watch.settled(state.watch):
             return ()
         if state.reference is None:
             collection = self.collection(problem)
             reason = innovations.obstacle(problem, collection.scaling.length, collection.noise)
         elif state.reference.age < 0:
-            reason = "simulated rows were too seldom where logged ones are"
+            apart = state.watch.overlap < innovations.OVERLAP
+            reason = "simulated rows were too seldom where logged ones are" if apart else "no row could be predicted"
         else:
             return ()
         return (f"discriminators saw changes of s' and no innovations, which are sharper: {reason}",)
@@ -305,7 +308,8 @@ class Madoc:
         )
         if following.grouped == self.grouping_epochs:
             seed = int(jax.random.randint(of_resampling, (), 0, 2**31 - 1))
-            found = effects.partition(moments, count=self.group_count, seed=seed)
+            known = moments[moments.any((1, 2))]
+            found = effects.partition(known if len(known) else moments, count=self.group_count, seed=seed)
             following = replace(following, labels=found.labels, stability=found.stability)
         steps = len(seen) * (1 + 2 * len(state.labels))
         return following, Epoch(

@@ -52,7 +52,8 @@ class Collection:
             from each logged state under the action logged there.
         systems: Number of parameter draws in an epoch.
         steps: Control steps of each row under one draw.
-        epoch_steps: Control steps in an epoch, of all rows together; more where each draw's one row takes more.
+        epoch_steps: Control steps in an epoch, of all rows together, as far as they go into as many rows for each draw;
+            each has at least one.
         scaling: Scaling of the windows that the discriminators see.
         logged: Features of all logged windows, and of the observations after them.
         noise: Standard deviation of the noise that simulated observations are given.
