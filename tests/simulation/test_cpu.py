@@ -335,7 +335,7 @@ def test_a_force_from_outside_acts_as_an_actuator_would_and_is_gone_after_its_st
 def test_what_motors_and_position_servos_exert():
     motor, servo, other = (
         '<motor joint="a" gear="3" ctrllimited="true" ctrlrange="-1 1"/>',
-        '<position joint="b" kp="10" kv="2" forcelimited="true" forcerange="-4 4"/>',
+        '<position jointinparent="b" kp="10" kv="2" forcelimited="true" forcerange="-4 4"/>',
         '<motor tendon="both"/>',
     )
     xml = f"""<mujoco><worldbody>

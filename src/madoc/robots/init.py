@@ -15,7 +15,7 @@ from madoc.robots.expressions import Read
 from madoc.robots.model import ModelFiles, compiled, is_single, is_slide
 from madoc.robots.space import SLIDE_UNITS
 from madoc.runs.files import replacing
-from madoc.simulation.write import element_names, heavy_bodies, nominal_values
+from madoc.simulation.write import OF_A_JOINT, element_names, heavy_bodies, nominal_values
 from madoc.tasks import TASKS
 
 Fields = dict[str, str | float]
@@ -201,7 +201,7 @@ def _scaled(
 
 def _dissipation(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
     """Damping and dry friction of joints; those neither driven nor damped are comments, as they may be a root's."""
-    on_joints = np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    on_joints = np.isin(model.actuator_trntype, OF_A_JOINT)
     # Through tendons an actuator may drive any joint.
     driven = set(model.actuator_trnid[:, 0]) if model.nu and on_joints.all() else set(range(model.njnt))
     for field, wanted in (("dof_damping", True), ("dof_frictionloss", False)):

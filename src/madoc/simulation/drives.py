@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-_OF_ONE_DOF = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+from madoc.simulation.write import OF_A_JOINT, ONE_DOF
+
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 """Biases of motors, and of position and velocity servos."""
 
@@ -22,11 +23,11 @@ def joint_drives(
     for index in range(model.nu):
         joint, given = int(model.actuator_trnid[index, 0]), control[:, index]
         usual = (
-            model.actuator_trntype[index] == int(mujoco.mjtTrn.mjTRN_JOINT)
+            model.actuator_trntype[index] in OF_A_JOINT
             and model.actuator_gaintype[index] == int(mujoco.mjtGain.mjGAIN_FIXED)
             and model.actuator_biastype[index] in _BIASES
         )
-        if not usual or model.jnt_type[joint] not in _OF_ONE_DOF:
+        if not usual or model.jnt_type[joint] not in ONE_DOF:
             continue
         if clamped and model.actuator_ctrllimited[index]:
             given = np.clip(given, *model.actuator_ctrlrange[index])
@@ -41,7 +42,7 @@ def joint_drives(
             force = np.clip(force, *model.actuator_forcerange[index])
         forces[:, dof] += gear * force
     for joint in np.flatnonzero(model.jnt_actfrclimited).tolist():
-        if model.jnt_type[joint] in _OF_ONE_DOF:
+        if model.jnt_type[joint] in ONE_DOF:
             dof = int(model.jnt_dofadr[joint])
             forces[:, dof] = np.clip(forces[:, dof], *model.jnt_actfrcrange[joint])
     return forces

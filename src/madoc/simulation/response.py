@@ -9,6 +9,7 @@ from jaxtyping import Float
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
 from madoc.simulation.cpu import without_warnings
+from madoc.simulation.write import OF_A_JOINT, ONE_DOF
 
 _PUSH = 1e-3
 """Half the difference of an action, in [-1, 1], by which the response of a joint is computed."""
@@ -16,8 +17,6 @@ _SCALE = 1.25
 """Factor on masses and forces, or on positions."""
 _SAME = 1e-3
 """Difference of two next states relative to the largest change; up to it they are equal but for the solver's error."""
-_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _FORCES = (
     "body_mass",
     "body_inertia",
@@ -72,7 +71,7 @@ def driven_joints(simulator: Simulator) -> tuple[DrivenJoint, ...]:
     found = []
     for action, actuator in enumerate(actuators):
         joint = int(model.actuator_trnid[actuator, 0])
-        if int(model.actuator_trntype[actuator]) in _JOINT and int(model.jnt_type[joint]) in _SINGLE:
+        if int(model.actuator_trntype[actuator]) in OF_A_JOINT and int(model.jnt_type[joint]) in ONE_DOF:
             hinge = bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE)
             found.append(DrivenJoint(action, model.joint(joint).name, hinge, *_place(model, joint)))
     return tuple(found)
@@ -81,7 +80,7 @@ def driven_joints(simulator: Simulator) -> tuple[DrivenJoint, ...]:
 def single_joints(simulator: Simulator) -> dict[str, tuple[int, int]]:
     """Indices in a state of the position and of the velocity of every hinge and slide, by its name."""
     model = simulator.task.model
-    single = (joint for joint in range(model.njnt) if int(model.jnt_type[joint]) in _SINGLE)
+    single = (joint for joint in range(model.njnt) if int(model.jnt_type[joint]) in ONE_DOF)
     return {model.joint(joint).name: _place(model, joint) for joint in single}
 
 

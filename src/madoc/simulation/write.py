@@ -24,7 +24,10 @@ _KINDS = {
 }
 """By kind of element, MuJoCo's object type and the attribute of a model that counts them."""
 
-_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+ONE_DOF = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+"""Types of joints with one degree of freedom."""
+OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+"""Transmissions of actuators that act on one joint; for a hinge or a slide the two are the same."""
 _INERTIAL_FRAMES = (mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA, mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT)
 
 
@@ -177,7 +180,7 @@ def _write_kv(model: mujoco.MjModel, actuator: int, value: float) -> None:
 
 def _write_ref(model: mujoco.MjModel, joint: int, value: float) -> None:
     """The joint's limits, and the position at which its spring is at rest, stay where they are in space."""
-    if int(model.jnt_type[joint]) not in _SINGLE:
+    if int(model.jnt_type[joint]) not in ONE_DOF:
         raise MadocError(f"jnt_ref: joint {model.joint(joint).name!r} is a ball or free; only a hinge or slide has one")
     address = model.jnt_qposadr[joint]
     shift = value - model.qpos0[address]
