@@ -171,7 +171,7 @@ class Madoc:
     def estimate(self, problem: CalibrationProblem, state: MadocState) -> Estimate:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
         space, (scaled, std) = problem.simulator.parameters, squashed(state.watch.best)
-        grouped = state.grouped == self.grouping_epochs
+        grouped, collection = state.grouped == self.grouping_epochs, self.collection(problem)
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
             mean=space.to_physical(scaled),
@@ -181,8 +181,8 @@ class Madoc:
             failures=state.failures,
             warnings=(
                 *watch.warnings(state.watch, scaled, space.names),
-                *self._of_features(problem, state),
-                *self.collection(problem).warnings,
+                *self._of_features(problem, collection, state),
+                *collection.warnings,
             ),
             settled=watch.settled(state.watch),
             began=sentence(problem),
@@ -222,12 +222,11 @@ class Madoc:
             raise MadocError(f"features=innovations cannot be had here: {reason}; leave features= out")
         return not reason
 
-    def _of_features(self, problem: CalibrationProblem, state: MadocState) -> tuple[str, ...]:
+    def _of_features(self, problem: CalibrationProblem, collection: Collection, state: MadocState) -> tuple[str, ...]:
         """Why discriminators saw changes of s' throughout, in a sentence; none where they were asked to."""
         if self.features not in (None, "innovations") or not watch.settled(state.watch):
             return ()
         if state.reference is None:
-            collection = self.collection(problem)
             reason = innovations.obstacle(problem, collection.scaling.length, collection.noise)
         elif state.reference.age < 0:
             apart = state.watch.overlap < innovations.OVERLAP
