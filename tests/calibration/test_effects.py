@@ -86,8 +86,8 @@ def test_groups_by_physics_are_found_from_fewer_rows_than_epochs():
         fractions.append(epoch.fraction)
     assert np.diff(fractions).min() > 0.0  # the bar goes on
     assert fractions[-1] == 1.0
-    assert state.moments.any((1, 2)).sum() == 12
-    whole = effects.partition(state.moments[:12], count=2, seed=0)
+    assert state.grouping.moments.any((1, 2)).sum() == 12
+    whole = effects.partition(state.grouping.moments[:12], count=2, seed=0)
     np.testing.assert_array_equal(state.labels, whole.labels)
     assert len(set(state.labels.tolist())) == 2
     assert state.stability == pytest.approx(whole.stability, abs=0.3)  # of other draws

@@ -6,7 +6,6 @@ Jiang et al. 2024, Algorithm 1. Its equations are in the files beside this one a
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,21 +17,18 @@ from madoc.calibration.madoc.actors import draw_parameters, squashed
 from madoc.calibration.madoc.agents import OF_CHANGES, OF_INNOVATIONS, Agents, AgentSettings, Resolution
 from madoc.calibration.madoc.beginning import first_actors, sentence, told
 from madoc.calibration.madoc.collection import Collection, Features, StartMode, geometry
-from madoc.calibration.madoc.grouping import VOTES, VOTING, Grouping, GroupingVAE
+from madoc.calibration.madoc.effects import SharedEffects
+from madoc.calibration.madoc.grouping import Grouping, GroupingVAE, Votes
 from madoc.calibration.madoc.paper import PAPER
 from madoc.calibration.madoc.state import MadocState
 from madoc.calibration.madoc.value_decomposition import Mixing
 from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.errors import MadocError
-from madoc.identification.states import probing_windows
 from madoc.learning import replay
 from madoc.learning.cloning import cloning_epoch, fresh_clone
-from madoc.learning.networks import adam, scalars
+from madoc.learning.networks import scalars
 from madoc.simulation.rollout import out_of_step
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
-
-STATES = 100
-"""Logged states in an epoch of grouping by physics."""
 
 
 @dataclass(frozen=True)
@@ -137,17 +133,19 @@ class Madoc:
         collection = self.collection(problem)
         window, following = collection.scaling.sizes
         of_policy, of_vae, of_agents, of_start, of_slopes, key = jax.random.split(key, 6)
-        vae = GroupingVAE(count, window, following, self.hidden, key=of_vae)
+        found: Votes | SharedEffects | None = None
+        if 1 < groups < count and self.groups == "physics":
+            found = SharedEffects(np.zeros((self.grouping_epochs, count, count)))
+        elif 1 < groups < count:
+            vae = GroupingVAE(count, window, following, self.hidden, key=of_vae)
+            found = grouping.begin_votes(vae, epochs=self.grouping_epochs, learning_rate=self.learning_rate)
         seen = self._sees_innovations(problem, collection)
         reference = innovations.no_reference(problem, collection.scaling.scaling, of_slopes) if seen else None
         agents = self._fresh_agents(problem, OF_CHANGES, of_agents)
         logged, time_limit = problem.dataset.transitions, problem.simulator.task.max_episode_steps
         return MadocState(
             clone=fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy),
-            vae=vae,
-            vae_optimiser=adam(self.learning_rate).init(eqx.filter(vae, eqx.is_array)),
-            schemes=np.zeros((self._voting * VOTES, count), dtype=np.int64),
-            moments=np.zeros((self.grouping_epochs, count, count)),
+            grouping=found,
             stability=0.0,
             labels=np.arange(count) if groups == count else np.zeros(count, dtype=np.int64),
             agents=agents,
@@ -161,23 +159,25 @@ class Madoc:
         )
 
     def step(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
-        """One epoch of cloning, of grouping where groups are to be learned, or of calibration."""
+        """One epoch of cloning, of grouping where groups are to be found, or of calibration."""
         if self.starts != "replay" and state.clone.epochs < self.cloning_epochs:
             return self._clone(problem, state)
-        if self._finds_groups(state) and state.grouped < self.grouping_epochs:
-            return (self._group_by_physics if self.groups == "physics" else self._learn_groups)(problem, state)
+        if state.grouped < self.grouping_epochs and isinstance(state.grouping, SharedEffects):
+            return self._see_effects(problem, state, state.grouping)
+        if state.grouped < self.grouping_epochs and isinstance(state.grouping, Votes):
+            return self._learn_votes(problem, state, state.grouping)
         return self._calibrate(problem, state)
 
     def estimate(self, problem: CalibrationProblem, state: MadocState) -> Estimate:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
         space, (scaled, std) = problem.simulator.parameters, squashed(state.watch.best)
-        grouped, collection = state.grouped == self.grouping_epochs, self.collection(problem)
+        collection = self.collection(problem)
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
             mean=space.to_physical(scaled),
             std=std * (space.high - space.low) / 2.0,
             groups=tuple(tuple(group) for group in groups),
-            group_stability=state.stability if self._finds_groups(state) and grouped else None,
+            group_stability=state.stability if state.grouped == self.grouping_epochs else None,
             failures=state.failures,
             warnings=(
                 *watch.warnings(state.watch, scaled, space.names),
@@ -190,11 +190,7 @@ class Madoc:
 
     def embeddings(self, problem: CalibrationProblem, state: MadocState) -> np.ndarray | None:
         """A vector for each parameter, from its effects or the VAE's encoder; None before any grouping."""
-        if not state.grouped:
-            return None
-        if self.groups == "physics":
-            return effects.embedding(state.moments.sum(0))
-        return np.asarray(state.vae.embeddings(), dtype=np.float64)
+        return state.grouping.embeddings() if state.grouping is not None and state.grouped else None
 
     def collection(self, problem: CalibrationProblem) -> Collection:
         """How rows of this problem are simulated; what is None in the hyperparameters is chosen here."""
@@ -260,20 +256,11 @@ class Madoc:
         most = effects.most_groups(count) if self.groups == "physics" else problem.simulator.task.groups
         return min(count, self.group_count or most)
 
-    @property
-    def _voting(self) -> int:
-        """Number of epochs of grouping in which the VAE's groups are voted on."""
-        return max(1, int(VOTING * self.grouping_epochs))
-
-    def _finds_groups(self, state: MadocState) -> bool:
-        """Whether groups are to be found, rather than one of all or one for each."""
-        return 1 < len(state.agents.critics.weight) < len(state.labels)
-
     def _prepared(self, state: MadocState) -> float:
         """Share of the epochs of cloning and grouping that are done."""
         cloning = 0 if self.starts == "replay" else self.cloning_epochs
-        grouping = self.grouping_epochs if self._finds_groups(state) else 0
-        return min(1.0, (min(state.clone.epochs, cloning) + state.grouped) / max(1, cloning + grouping))
+        finding = self.grouping_epochs if state.grouping is not None else 0
+        return min(1.0, (min(state.clone.epochs, cloning) + state.grouped) / max(1, cloning + finding))
 
     def _clone(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         clone, key, epoch = cloning_epoch(
@@ -288,78 +275,55 @@ class Madoc:
         following = replace(state, clone=clone, key=key)
         return following, replace(epoch, fraction=self._prepared(following))
 
-    def _group_by_physics(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
-        """The effects of all parameters at `STATES` more states of the log; groups once all have been seen.
-
-        Where there are fewer states than epochs, some epochs see none.
-        """
+    def _see_effects(
+        self, problem: CalibrationProblem, state: MadocState, found: SharedEffects
+    ) -> tuple[MadocState, Epoch]:
         of_resampling, key = jax.random.split(state.key)
-        every = probing_windows(
-            problem.states, problem.dataset, problem.simulator, steps=1, count=self.grouping_epochs * STATES
-        )
-        seen = every.of(np.array_split(np.arange(len(every)), self.grouping_epochs)[state.grouped])
-        moments, failures = state.moments.copy(), 0
-        if len(seen):
-            jacobian, failures = effects.sensitivities(problem.simulator, seen, problem.typical_change)
-            moments[state.grouped] = effects.shared_effects(jacobian)
+        found, steps, failures = effects.see_more(found, problem, state.grouped)
         following = replace(
-            state, moments=moments, key=key, grouped=state.grouped + 1, failures=state.failures + failures
+            state, grouping=found, key=key, grouped=state.grouped + 1, failures=state.failures + failures
         )
         if following.grouped == self.grouping_epochs:
             seed = int(jax.random.randint(of_resampling, (), 0, 2**31 - 1))
-            known = moments[moments.any((1, 2))]
-            found = effects.partition(known if len(known) else moments, count=self.group_count, seed=seed)
-            following = replace(following, labels=found.labels, stability=found.stability)
-        steps = len(seen) * (1 + 2 * len(state.labels))
-        return following, Epoch(
-            {"stability": following.stability},
-            control_steps=steps,
-            unbudgeted=steps,
-            stage="grouping",
-            fraction=self._prepared(following),
-        )
+            groups = found.groups(count=self.group_count, seed=seed)
+            following = replace(following, labels=groups.labels, stability=groups.stability)
+        return following, self._of_grouping(following, {"stability": following.stability}, steps)
 
-    def _learn_groups(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
+    def _learn_votes(self, problem: CalibrationProblem, state: MadocState, votes: Votes) -> tuple[MadocState, Epoch]:
         count, collection = len(problem.simulator.parameters), self.collection(problem)
         of_draws, of_start, of_action, of_restart, of_batches, key = jax.random.split(state.key, 6)
         draws, walkers = grouping.one_at_a_time(of_draws, count), collection.begin(count, of_start)
         rollout, _ = collection.roll(state.clone.policy, draws, walkers, (of_action, of_restart))
         rows = _some(collection.remember(state.rows, rollout, draws, np.arange(count)), collection)
-        grouped, schemes = state.grouped + 1, state.schemes
-        voting = grouped > self.grouping_epochs - self._voting
-        parts = VOTES if voting else 1
-        vae, optimiser_state, losses = state.vae, state.vae_optimiser, []
-        for key_of_part in jax.random.split(of_batches, parts):
-            vae, optimiser_state, loss = grouping.train(
-                vae,
-                optimiser_state,
-                rows,
-                key_of_part,
-                optimiser=adam(self.learning_rate),
-                batch=self.batch,
-                count=-(-self.grouping_updates // parts),
-                state_at=None if collection.scaling.scaling.difference else collection.scaling.last_row,
-            )
-            losses.append(loss)
-            if voting:
-                scheme = grouping.cluster(vae.embeddings(), self._group_count(problem), seed=grouped)
-                schemes = np.concatenate([schemes[1:], scheme[None]])
+        grouped = state.grouped + 1
+        voting = grouped > self.grouping_epochs - grouping.voting_epochs(self.grouping_epochs)
+        votes, loss = grouping.learn_votes(
+            votes,
+            rows,
+            of_batches,
+            learning_rate=self.learning_rate,
+            batch=self.batch,
+            updates=self.grouping_updates,
+            groups=self._group_count(problem) if voting else None,
+            seed=grouped,
+            state_at=None if collection.scaling.scaling.difference else collection.scaling.last_row,
+        )
         done = grouped == self.grouping_epochs
         following = replace(
             state,
-            vae=vae,
-            vae_optimiser=optimiser_state,
-            schemes=schemes,
-            labels=grouping.vote(schemes) if done else state.labels,
-            stability=grouping.agreement(schemes) if done else 0.0,
+            grouping=votes,
+            labels=grouping.vote(votes.schemes) if done else state.labels,
+            stability=grouping.agreement(votes.schemes) if done else 0.0,
             rows=replay.clear(rows) if done else rows,
             key=key,
             grouped=grouped,
             failures=state.failures + rollout.failures,
         )
-        steps, metrics = rollout.valid.size, {"grouping_loss": float(np.mean(losses))}
+        return following, self._of_grouping(following, {"grouping_loss": loss}, rollout.valid.size)
+
+    def _of_grouping(self, following: MadocState, metrics: dict[str, float], steps: int) -> Epoch:
         fraction = self._prepared(following)
-        return following, Epoch(metrics, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=fraction)
+        return Epoch(metrics, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=fraction)
 
     def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         of_draws, of_start, of_action, of_restart, of_reference, of_networks, of_updates, key = jax.random.split(

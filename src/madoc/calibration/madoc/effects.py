@@ -1,16 +1,21 @@
 """Groups of parameters that move the same signals, from derivatives of the simulator at states of the log."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.madoc.grouping import by_first_appearance
 from madoc.identification.linearisation import difference_points, linearise
 from madoc.identification.replay import window_residuals
+from madoc.identification.states import probing_windows
 from madoc.identification.windows import Windows
 from madoc.simulation.base import Simulator
 
+STATES = 100
+"""Logged states in each epoch of grouping."""
 MOST = 8
 """Largest number of groups that is chosen; the paper's tasks have 4 to 6."""
 RESAMPLINGS = 50
@@ -21,6 +26,26 @@ UNRELATED = 1e-6
 """Smallest affinity, so that the graph of parameters stays connected."""
 
 Moment = Float[np.ndarray, "d d"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SharedEffects:
+    """What the parameters' effects have in common, in each epoch of grouping: a stretch of the log each, 0 if unseen.
+
+    Epochs that come after the last logged state see none.
+    """
+
+    moments: Float[np.ndarray, "blocks d d"]
+
+    def embeddings(self) -> Float[np.ndarray, "d d"]:
+        """One vector for each parameter; inner products of the vectors are the affinities."""
+        return embedding(self.moments.sum(0))
+
+    def groups(self, *, count: int | None, seed: int) -> "Partition":
+        """The groups by all stretches of the log that were seen."""
+        seen = self.moments[self.moments.any((1, 2))]
+        return partition(seen if len(seen) else self.moments, count=count, seed=seed)
 
 
 @dataclass(frozen=True)
@@ -42,6 +67,19 @@ def sensitivities(
     points = difference_points(np.zeros(len(simulator.parameters)))
     residuals = window_residuals(simulator, windows, points, scale)
     return linearise(points, residuals).jacobian, int((~np.isfinite(residuals).all(-1)).sum())
+
+
+def see_more(effects: SharedEffects, problem: CalibrationProblem, epoch: int) -> tuple[SharedEffects, int, int]:
+    """The effects of all parameters at `STATES` more states of the log; also control steps, and failed simulations."""
+    epochs, count = effects.moments.shape[:2]
+    every = probing_windows(problem.states, problem.dataset, problem.simulator, steps=1, count=epochs * STATES)
+    seen = every.of(np.array_split(np.arange(len(every)), epochs)[epoch])
+    if not len(seen):
+        return effects, 0, 0
+    jacobian, failures = sensitivities(problem.simulator, seen, problem.typical_change)
+    moments = effects.moments.copy()
+    moments[epoch] = shared_effects(jacobian)
+    return replace(effects, moments=moments), len(seen) * (1 + 2 * count), failures
 
 
 def shared_effects(jacobian: Float[np.ndarray, "windows values d"]) -> Moment:

@@ -1,5 +1,6 @@
 """Groups of parameters with similar effects: a VAE embeds parameters by their effects, k-means groups them."""
 
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from madoc.learning import replay
-from madoc.learning.networks import Network, Observations, Scalar, minimise
+from madoc.learning.networks import Network, Observations, Scalar, adam, minimise
 
 Grouping = Literal["physics", "learned", "one", "each"]
 VOTING = 0.05
@@ -49,6 +50,68 @@ class GroupingVAE(eqx.Module):
         """The predicted features of s' - s, given the value (in [-1, 1]) of the varied parameter, and its index."""
         repeated = jnp.repeat(value[:, None], LATENT, axis=1)
         return self.decoder(jnp.concatenate([pair, repeated, self.embeddings()[identity]], axis=-1))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Votes:
+    """The VAE, the state of its optimiser, and the groups that it proposed in the last epochs of grouping."""
+
+    vae: GroupingVAE
+    optimiser: PyTree
+    schemes: Int[np.ndarray, "votes d"]
+
+    def embeddings(self) -> Float[np.ndarray, "d latent"]:
+        """The VAE's embedding of each parameter."""
+        return np.asarray(self.vae.embeddings(), dtype=np.float64)
+
+
+def voting_epochs(epochs: int) -> int:
+    """Number of the epochs of grouping, the last ones, in which groups are voted on."""
+    return max(1, int(VOTING * epochs))
+
+
+def begin_votes(vae: GroupingVAE, *, epochs: int, learning_rate: float) -> Votes:
+    """A VAE that has not learnt, with room for the votes of as many epochs of grouping."""
+    count = int(vae.encoder.layers[0].in_features)
+    schemes = np.zeros((voting_epochs(epochs) * VOTES, count), dtype=np.int64)
+    return Votes(vae, adam(learning_rate).init(eqx.filter(vae, eqx.is_array)), schemes)
+
+
+def learn_votes(
+    votes: Votes,
+    rows: replay.Replay,
+    key: PRNGKeyArray,
+    *,
+    learning_rate: float,
+    batch: int,
+    updates: int,
+    groups: int | None,
+    seed: int,
+    state_at: int | None,
+) -> tuple[Votes, float]:
+    """An epoch of the VAE on simulated rows, and its mean loss; `VOTES` times in it a vote, unless `groups` is None.
+
+    While groups are voted on, updates are rounded up to as many for each vote. `state_at` is that of `train`.
+    """
+    parts, losses = VOTES if groups else 1, []
+    for key_of_part in jax.random.split(key, parts):
+        vae, optimiser, loss = train(
+            votes.vae,
+            votes.optimiser,
+            rows,
+            key_of_part,
+            optimiser=adam(learning_rate),
+            batch=batch,
+            count=-(-updates // parts),
+            state_at=state_at,
+        )
+        votes = replace(votes, vae=vae, optimiser=optimiser)
+        losses.append(loss)
+        if groups:
+            scheme = cluster(vae.embeddings(), groups, seed=seed)
+            votes = replace(votes, schemes=np.concatenate([votes.schemes[1:], scheme[None]]))
+    return votes, float(np.mean(losses))
 
 
 def reconstruction_loss(

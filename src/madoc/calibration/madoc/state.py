@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Int, PRNGKeyArray
 
 from madoc.calibration.madoc.agents import Agents
-from madoc.calibration.madoc.grouping import GroupingVAE
+from madoc.calibration.madoc.effects import SharedEffects
+from madoc.calibration.madoc.grouping import Votes
 from madoc.calibration.madoc.innovations import Reference
 from madoc.calibration.madoc.watch import Watch
 from madoc.learning import replay
@@ -22,10 +23,7 @@ class MadocState:
 
     Attributes:
         clone: The running policy.
-        vae: The network that embeds parameters by their effect.
-        vae_optimiser: State of its optimiser.
-        schemes: Groups proposed in the last epochs of grouping by the VAE.
-        moments: What the parameters' effects have in common, in each epoch of grouping by physics.
+        grouping: What was learnt of the parameters' effects, by the VAE or by physics; None where no groups are found.
         labels: Group of each parameter.
         stability: Mean adjusted Rand index of the groups with those of resampled states, or with those proposed in
             other epochs; 0 before there are groups.
@@ -40,10 +38,7 @@ class MadocState:
     """
 
     clone: Clone
-    vae: GroupingVAE
-    vae_optimiser: PyTree
-    schemes: Int[np.ndarray, "votes d"]
-    moments: Float[np.ndarray, "blocks d d"]
+    grouping: Votes | SharedEffects | None
     labels: Int[np.ndarray, " d"]
     stability: float
     agents: Agents
