@@ -14,42 +14,17 @@ from madoc.calibration.holdout import (
     ToldApart,
     Verdict,
 )
-from madoc.identification.candidate_terms import (
-    BELOW_MINIMUM,
-    EARLY,
-    LATE_SENSOR,
-    SATURATION,
-    SPACING,
-    TILTS,
-    is_late,
-)
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
 from madoc.identification.information import OPEN
-from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import MissingTerm, named
-from madoc.parameters import FIELDS
 from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END
+from madoc.verdict.remedies import WARM_UP, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, WORTH_GAINING, beyond_noise, growth_beside_noise
 from madoc.verdict.systematic import EXPLAINED
 
-REMEDIES = {
-    EARLY: "log each action with what was seen just before it",
-    BELOW_MINIMUM: "look for what acts against it: a force, a gain or a sign that the model has wrong",
-    SPACING: "check control_step of the spec against the log's time column",
-    SATURATION: "narrow low and high of the spec's actions to what the drive follows, or log smaller actions",
-    **dict.fromkeys(TILTS, "level it, or tilt the gravity of the model (its option gravity) as the base is"),
-}
-"""What to do about terms that no further parameter of a spec adds."""
-WARM_UP = "let the machine warm up before it is logged, or leave the begin of each run out"
-"""The same for a parameter that changes within each run."""
-CHANGE_MACHINE = "no parameter of a spec adds it: take it out of the machine, or log motions in which it is small"
-"""The same for a force at a joint."""
-CHANGE_LOG = "log it without its filter, or shift its column by that time"
-CHANGE_DRIVE = "give its actuator that lag in the model, by MuJoCo's dyntype filter"
-"""The same for a sensor and for a drive that are late."""
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
 
 CHANCE = 0.01
@@ -130,10 +105,10 @@ def _missing(holdout: HoldOut) -> Verdict | None:
     term = missing_term(holdout)
     if term is None:
         return None
-    value = _value(term)
+    value = value_of(term)
     if term.cause in DRIFTS:
         within = term.cause == WITHIN_RUNS
-        change = _value(replace(term, value=2.0 * term.value, standard_error=2.0 * term.standard_error))
+        change = value_of(replace(term, value=2.0 * term.value, standard_error=2.0 * term.standard_error))
         where = f"by {change} from the begin of a run to its end" if within else f"by {value} between its parts"
         return Verdict(
             "MODEL_MISMATCH",
@@ -148,7 +123,7 @@ def _missing(holdout: HoldOut) -> Verdict | None:
         "MODEL_MISMATCH",
         f"the model lacks {named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
         f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
-        f"{_others(holdout, term)}{about_timestep(holdout, term)}; {_remedy(term)}{_at_end(holdout)}"
+        f"{_others(holdout, term)}{about_timestep(holdout, term)}; {remedy(term)}{_at_end(holdout)}"
         f"{_disagreeing(holdout)}",
         tuple(moved),
     )
@@ -170,29 +145,6 @@ def _disagreeing(holdout: HoldOut) -> str:
     """Which parameters the parts of the log disagree on."""
     names = dict.fromkeys(name for each in holdout.alternatives if each.parts for name in each.shifts)
     return f"; parts of the log disagree on {', '.join(names)}" if names else ""
-
-
-def _value(term: MissingTerm) -> str:
-    unit = "" if term.unit == "1" else term.unit
-    return f"{term.value:.3g} ± {term.standard_error:.1g} {unit}".rstrip()
-
-
-def _remedy(term: MissingTerm) -> str:
-    """What to do about a missing term: the line of the spec that adds it, where there is one."""
-    field, _, element = term.parameter.partition(".")
-    if term.cause in REMEDIES:
-        return REMEDIES[term.cause]
-    if is_late(term.cause):
-        return CHANGE_LOG if term.cause.startswith(LATE_SENSOR) else CHANGE_DRIVE
-    if is_joint_force(term.cause):
-        return CHANGE_MACHINE
-    high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
-    low = 0.0 if term.value >= 0.0 else max(-high, FIELDS[field].minimum)
-    high = 0.0 if field == "gravity" and term.value < 0.0 else high  # it points downwards
-    joints = element.split("+")
-    named = f", element: {element}" if element else ""
-    named = named if len(joints) == 1 else f", elements: [{', '.join(joints)}]"
-    return f"add to the spec's parameters: {{field: {field}{named}, low: {low:.2g}, high: {high:.2g}}}"
 
 
 def _contradicted(holdout: HoldOut) -> Verdict | None:
@@ -242,9 +194,9 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
     term = likeliest([each for each in holdout.missing_terms if is_certain(each) and each.cause not in DRIFTS])
     if term is not None:
         sentence += (
-            f"; of single terms {named(term)} is the likeliest: {_value(term)} explains {100 * term.explained:.2g} % "
+            f"; of single terms {named(term)} is the likeliest: {value_of(term)} explains {100 * term.explained:.2g} % "
             f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}){_others(holdout, term)}; "
-            f"{_remedy(term)}"
+            f"{remedy(term)}"
         )
     return Verdict("MODEL_MISMATCH", f"{sentence}{about_timestep(holdout)}", pinned)
 

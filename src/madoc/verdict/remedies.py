@@ -1,0 +1,46 @@
+"""What a user can do about a term that the model lacks."""
+
+from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, LATE_SENSOR, SATURATION, SPACING, TILTS, is_late
+from madoc.identification.joint_forces import is_joint_force
+from madoc.identification.term_tests import MissingTerm
+from madoc.parameters import FIELDS
+
+REMEDIES = {
+    EARLY: "log each action with what was seen just before it",
+    BELOW_MINIMUM: "look for what acts against it: a force, a gain or a sign that the model has wrong",
+    SPACING: "check control_step of the spec against the log's time column",
+    SATURATION: "narrow low and high of the spec's actions to what the drive follows, or log smaller actions",
+    **dict.fromkeys(TILTS, "level it, or tilt the gravity of the model (its option gravity) as the base is"),
+}
+"""What to do about terms that no further parameter of a spec adds."""
+WARM_UP = "let the machine warm up before it is logged, or leave the begin of each run out"
+"""The same for a parameter that changes within each run."""
+CHANGE_MACHINE = "no parameter of a spec adds it: take it out of the machine, or log motions in which it is small"
+"""The same for a force at a joint."""
+CHANGE_LOG = "log it without its filter, or shift its column by that time"
+CHANGE_DRIVE = "give its actuator that lag in the model, by MuJoCo's dyntype filter"
+"""The same for a sensor and for a drive that are late."""
+
+
+def value_of(term: MissingTerm) -> str:
+    """The value of a missing term with its standard error and unit."""
+    unit = "" if term.unit == "1" else term.unit
+    return f"{term.value:.3g} ± {term.standard_error:.1g} {unit}".rstrip()
+
+
+def remedy(term: MissingTerm) -> str:
+    """What to do about a missing term: the line of the spec that adds it, where there is one."""
+    field, _, element = term.parameter.partition(".")
+    if term.cause in REMEDIES:
+        return REMEDIES[term.cause]
+    if is_late(term.cause):
+        return CHANGE_LOG if term.cause.startswith(LATE_SENSOR) else CHANGE_DRIVE
+    if is_joint_force(term.cause):
+        return CHANGE_MACHINE
+    high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
+    low = 0.0 if term.value >= 0.0 else max(-high, FIELDS[field].minimum)
+    high = 0.0 if field == "gravity" and term.value < 0.0 else high  # it points downwards
+    joints = element.split("+")
+    named = f", element: {element}" if element else ""
+    named = named if len(joints) == 1 else f", elements: [{', '.join(joints)}]"
+    return f"add to the spec's parameters: {{field: {field}{named}, low: {low:.2g}, high: {high:.2g}}}"
