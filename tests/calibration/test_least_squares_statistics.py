@@ -11,10 +11,12 @@ from madoc.calibration.least_squares.statistics import (
     alternation,
     autocorrelation,
     clipped_change,
+    consecutive_residuals,
     outlier_limits,
     steady_cost,
 )
 from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE
+from madoc.data import Disturbance, disturb
 from madoc.identification.settling import cost_of_noise
 from robots import SPRING_TRUTH, recorded, spring
 
@@ -28,6 +30,17 @@ def test_noise_takes_turns_and_a_wrong_model_does_not():
     assert alternation(before + 3.0, after + 3.0) < -0.5
     assert alternation(noise[0], noise[1]) == pytest.approx(0.0, abs=0.03)
     assert alternation(before[:0], after[:0]) == 0.0
+
+
+def test_rows_without_an_order_have_no_pairs():
+    task = spring()
+    log = disturb(
+        recorded(task, SPRING_TRUTH, 50, jax.random.key(0)), Disturbance(shuffled="rows"), task, jax.random.key(1)
+    )
+    problem = CalibrationProblem(log, simulation.make(task, threads=1))
+    (before, after), spent = consecutive_residuals(problem, np.zeros(len(SPRING_TRUTH)), np.arange(50))
+    assert (before.shape, after.shape, spent) == ((0, 2), (0, 2), 0)
+    assert alternation(before, after) == 0.0
 
 
 def test_half_of_the_channels_tell_of_noise():

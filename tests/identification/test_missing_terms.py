@@ -3,11 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from madoc import robots, simulation
-from madoc.data import logs, typical_change
+from madoc.data import Disturbance, disturb, logs, typical_change
 from madoc.identification import missing_terms as terms
 from madoc.identification.candidate_terms import CAUSES, EARLY, LATE_DRIVE, LATE_SENSOR, Candidate, _cut_off, is_late
 from madoc.identification.drifts import DRIFT, WITHIN_RUNS, _between_runs, _drifts, _of_fitted_runs, _Part
@@ -111,6 +112,17 @@ def test_the_missing_term_is_named_with_its_value(tmp_path, lacks, parameter, va
     assert best.parameter == parameter
     assert abs(best.t) > 10
     assert best.value == pytest.approx(value, rel=0.3)
+
+
+def test_rows_without_an_order_tell_a_missing_friction_as_well(tmp_path):
+    dataset, simulator = plant(tmp_path, friction=0.01)
+    loose = disturb(dataset, Disturbance(shuffled="rows"), simulator.task, jax.random.key(0))
+    best = scores(loose, simulator)[0]
+    assert best.parameter == "dof_frictionloss.hinge"
+    assert best.t > 10
+    assert best.value == pytest.approx(0.01, rel=0.2)
+    honest = disturb(plant(tmp_path)[0], loose.disturbance, simulator.task, jax.random.key(0))
+    assert all(abs(term.t) < 5 for term in scores(honest, simulator))
 
 
 def test_actions_that_come_early_are_told_though_the_delay_is_calibrated(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 
 import madoc.tasks
 from madoc.errors import MadocError
-from madoc.parameters import Parameter
+from madoc.parameters import Parameter, ParameterSpace
 from madoc.robots import load
 from madoc.simulation.cpu import CpuSimulator, CpuSystem
 from madoc.simulation.drives import joint_drives
@@ -179,6 +179,15 @@ def test_a_hopper_touches_the_ground_when_it_is_low(hopper):
     states = np.stack([hopper.initial_state] * 2)
     states[:, 1] += 1.0, -0.05
     assert hopper.contacts(states).tolist() == [0, 1]  # of the foot and the floor, at two points
+
+
+def test_contacts_are_where_a_calibrated_zero_places_the_bodies(hopper):
+    space = ParameterSpace((Parameter("jnt_ref", "rootz", 0.0, 2.0),))
+    simulator, state = CpuSimulator(replace(hopper.task, parameters=space)), hopper.initial_state[None] + 0.0
+    state[:, 1] -= 0.05
+    drawn = float(hopper.task.model.joint("rootz").qpos0[0])
+    touching = [int(simulator.contacts(state, np.array([value]))[0] > 0) for value in (drawn, drawn - 0.2)]
+    assert touching == [1, 0]
 
 
 def test_the_users_own_warning_handler_comes_back(hopper, make_batch):

@@ -103,6 +103,37 @@ def test_a_shifted_zero_leaves_the_arm_where_it_hangs_and_moves_what_it_reads(tw
     np.testing.assert_allclose(shifted.jnt_range[0] - model.jnt_range[0], 0.3, rtol=1e-15)
 
 
+def test_a_shifted_zero_leaves_fixed_tendons_as_long_in_space():
+    text = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size=".1"/></body></worldbody>
+    <tendon><fixed name="cord" stiffness="10" springlength="0" range="-.4 .4"><joint joint="hinge" coef="2"/></fixed>
+    </tendon></mujoco>"""
+    forces = []
+    for shift in (0.0, 0.3):
+        model = written(mujoco.MjModel.from_xml_string(text), Parameter("jnt_ref", "hinge", -1.0, 1.0), shift)
+        data = mujoco.MjData(model)
+        data.qpos[0] = 0.1 + shift
+        mujoco.mj_forward(model, data)
+        assert data.nefc == 0  # within its limits
+        forces.append(data.qfrc_passive[0])
+    np.testing.assert_allclose(forces, -10 * 2 * 0.1 * 2, rtol=1e-12)
+
+
+def test_only_an_actuator_of_fixed_gain_has_a_gain_to_write():
+    text = """<mujoco><worldbody><body><joint name="hinge"/><geom size=".1"/></body></worldbody>
+    <actuator><damper name="brake" joint="hinge" kv="2" ctrlrange="0 1"/></actuator></mujoco>"""
+    with pytest.raises(MadocError, match=r"actuator_gain: the force of actuator 'brake' is not its command times"):
+        written(mujoco.MjModel.from_xml_string(text), Parameter("actuator_gain", "brake", 0.0, 1.0), 0.5)
+
+
+def test_rounding_gives_a_centre_of_mass_no_direction():
+    text = """<mujoco><worldbody><body name="ring"><joint name="hinge"/><geom size=".1" pos="{} 0 0"/></body>
+    </worldbody></mujoco>"""
+    moved = written(mujoco.MjModel.from_xml_string(text.format(1e-3)), Parameter("body_com", "ring", 0.0, 1.0), 0.05)
+    np.testing.assert_allclose(moved.body("ring").ipos, (0.05, 0.0, 0.0), rtol=1e-12)
+    with pytest.raises(MadocError, match="has no direction"):
+        written(mujoco.MjModel.from_xml_string(text.format(1e-11)), Parameter("body_com", "ring", 0.0, 1.0), 0.05)
+
+
 def test_only_a_position_servo_has_a_damping_of_its_own(two_link_arm):
     with pytest.raises(MadocError, match=r"actuator_kv: actuator 'shoulder' is not a position servo; use dof_damping"):
         written(two_link_arm, Parameter("actuator_kv", "shoulder", 0.0, 1.0), 0.5)
@@ -136,6 +167,13 @@ def test_a_mass_has_a_floor(field):
     model = written(madoc.tasks.make("hopper").compile(), Parameter(field, "thigh", 0.0, 1.0), 0.0)
     assert model.body("thigh").mass[0] == MASS_FLOOR
     assert (model.body("thigh").inertia > 0).all()
+
+
+def test_a_body_of_less_than_a_gram_keeps_its_mass():
+    text = '<mujoco><worldbody><body name="fly"><joint/><geom size=".01" mass="8e-4"/></body></worldbody></mujoco>'
+    for mass in (8e-4, 5e-5):
+        model = written(mujoco.MjModel.from_xml_string(text), Parameter("body_mass", "fly", 0.0, 1.0), mass)
+        assert model.body("fly").mass[0] == mass
 
 
 def test_half_cheetah_at_the_low_end_of_every_mass_does_not_explode():

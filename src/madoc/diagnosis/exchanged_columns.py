@@ -14,7 +14,7 @@ from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, first_rows, longest_fit, windows_at
 from madoc.simulation.base import Simulator
-from madoc.simulation.response import single_joints
+from madoc.simulation.response import places_of_joints
 
 BETTER = 0.5
 """Ratio of errors; columns count as exchanged or reversed where the log put right is predicted better than that."""
@@ -178,7 +178,7 @@ def _joints(simulator: Simulator) -> dict[str, list[int]]:
     read = np.asarray(task.posture(np.concatenate([np.zeros((1, count)), np.eye(count)])))
     depends = np.isfinite(read[1:]) & (read[1:] != read[:1])
     found = {}
-    for joint, place in single_joints(simulator).items():
+    for joint, place in places_of_joints(simulator).items():
         columns = [np.flatnonzero(depends[:, index]) for index in place]
         if all(len(each) == 1 for each in columns):
             found[joint] = [int(each[0]) for each in columns]

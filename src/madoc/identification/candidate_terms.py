@@ -11,12 +11,13 @@ from jaxtyping import Float
 from scipy.constants import g as standard_gravity
 
 from madoc import simulation
+from madoc.identification.coarseness import FINER
 from madoc.identification.replay import Readings
 from madoc.identification.score_tests import Score
 from madoc.identification.states import LoggedStates
 from madoc.parameters import FIELDS, Parameter
 from madoc.simulation.base import Simulator
-from madoc.simulation.write import element_names, heavy_bodies, nominal_values
+from madoc.simulation.write import element_names, has_gain, heavy_bodies, nominal_values, off_centre
 
 CAUSES = {
     "dof_frictionloss": "Coulomb friction",
@@ -109,14 +110,13 @@ def candidates(
         if name:
             references = references_of(logged, simulator, model.joint(name))
             wanted += [(field, name, reference) for field, reference in references.items()]
-    for channel in task.actions:
-        wanted.append(
-            ("actuator_gain", channel.actuator, abs(float(model.actuator(channel.actuator).gainprm[0])) or 1.0)
-        )
+    for actuator in (model.actuator(channel.actuator) for channel in task.actions):
+        if has_gain(model, actuator.id):
+            wanted.append(("actuator_gain", actuator.name, abs(float(actuator.gainprm[0])) or 1.0))
     weighed = {element for field, element in calibrated if field in ("body_mass", "body_mass_and_inertia")}
     for body in heavy_bodies(model):
         at = model.body(body) if body in element_names(model, "body") else model.body(model.joint(body).bodyid[0])
-        distance = float(np.linalg.norm(at.ipos))
+        distance = off_centre(model, at.id)
         wanted += [("body_mass", body, float(at.mass[0]))] * (body not in weighed)
         wanted += [("body_com", body, distance)] * (distance > 0.0)
     if "gravity" not in fields:
@@ -191,7 +191,7 @@ def effects(
     late = replace(readings, actions=readings.actions + _LATER * (earlier - readings.actions))
     saturated = replace(readings, actions=_cut_off(readings.actions, simulator))
     stretched = simulation.make(simulator.task.with_time_step(1.0 + CHANGE))
-    finer = simulation.make(simulator.task.with_time_step(0.25, substeps=4))
+    finer = simulation.make(simulator.task.with_time_step(1.0 / FINER, substeps=FINER))
     fields = {each.field for each in simulator.parameters.parameters}
     tilts = TILTS if np.any(simulator.task.model.opt.gravity) else ()
     for candidate, other, inputs, change in (

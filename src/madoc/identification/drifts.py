@@ -82,9 +82,12 @@ def drifts_of(
 
 
 def _drifts(tests: TermTests) -> Iterator[MissingTerm]:
-    """How each parameter changes over the log: in a straight line, in its first third, in its last, in every run."""
+    """How each parameter changes over the log: in a straight line, in its first third, in its last, in every run.
+
+    A line's value is the change from the middle of the first third to that of the last, as those of the thirds are.
+    """
     time, age = np.linspace(-1.0, 1.0, len(tests.products)), _since_begin(tests.runs)
-    shapes = [(DRIFT, shape - np.mean(shape)) for shape in (time, time < -1.0 / 3.0, time > 1.0 / 3.0)]
+    shapes = [(DRIFT, shape - np.mean(shape)) for shape in (0.75 * time, time < -1.0 / 3.0, time > 1.0 / 3.0)]
     shapes += [(WITHIN_RUNS, age)] if len(np.unique(tests.runs)) > 1 and age.any() else []
     for index, row in enumerate(tests.space.parameters):
         for cause, shape in shapes:

@@ -46,8 +46,9 @@ class LoggedWindows:
     Attributes:
         readings: What was observed and done in them.
         states: Guesses of their initial states.
-        before: The action before each.
-        earlier: Logged states before each, of as many rows as it has; the first of its episode where that begins later.
+        before: The action before each, or its first one where every row is an episode of its own.
+        earlier: Logged states before each, of as many rows as it has; the first of its episode where that begins later,
+            and none where every row is an episode of its own.
         runs: The episode of each.
     """
 
@@ -64,7 +65,8 @@ def windows_of(
     """Windows to test a model by, evenly spread over the log.
 
     They are shorter than `STRIDES` where the log has not enough rows for `fewest` of that length, or where the episode
-    of its median row is shorter.
+    of its median row is shorter. Where every row is an episode of its own they are single rows, as many as make up
+    those windows, and the action before each, which is not known, is taken to be its own.
     """
     lengths = dataset.episode_ends - dataset.episode_starts
     age = logged.rows - dataset.episode_starts[dataset.episode_of(logged.rows)]
@@ -73,15 +75,20 @@ def windows_of(
     )  # behind the actions that are pending, and one action at least
     usual = max(1, int(np.median(np.repeat(lengths, lengths))) - earliest)
     affordable = min(max(stride(dataset), len(dataset) // fewest - 2), usual)
-    rows, states = logged.rows[age > 0], logged.states[age > 0]
+    loose = bool(lengths.max() == 1)
+    rows, states = logged.rows[loose | (age > 0)], logged.states[loose | (age > 0)]
     steps, chosen = min(STRIDES * stride(dataset), affordable), np.zeros(0, np.int64)
     if len(rows):
         steps = longest_fit(dataset, rows, steps)
-        chosen = evenly(disjoint_windows(dataset, rows, steps), max(WINDOWS, fewest))
+        most = WINDOWS * STRIDES if loose else WINDOWS
+        chosen = evenly(disjoint_windows(dataset, rows, steps), max(most, fewest))
     readings = Readings.at(dataset, logged, rows[chosen], steps, scale)
-    before = np.asarray(dataset.transitions.action, np.float64)[rows[chosen] - 1]
     runs = dataset.episode_of(rows[chosen])
-    wanted = np.maximum(rows[chosen, None] - np.arange(steps, 0, -1), dataset.episode_starts[runs, None])
+    acted = np.maximum(rows[chosen] - 1, dataset.episode_starts[runs])
+    before = np.asarray(dataset.transitions.action, np.float64)[acted]
+    wanted = np.maximum(
+        rows[chosen, None] - np.arange(0 if loose else steps, 0, -1), dataset.episode_starts[runs, None]
+    )
     earlier = logged.states[np.searchsorted(logged.rows, wanted).clip(max=len(logged.rows) - 1)]
     return LoggedWindows(readings, states[chosen], before, earlier, runs)
 

@@ -73,7 +73,8 @@ def joint_forces(
         exerted: What its drive exerts.
         others: Positions and speeds of other joints.
         turns: Whether it is a hinge: what depends on its position then repeats with every turn.
-        earlier: Logged positions before each window, which say how far friction has built up when it begins.
+        earlier: Logged positions before each window, which say how far friction has built up when it begins; such
+            friction is left out where there are none, and begins with each window by default.
     """
     fast, strong = (float(np.sqrt(np.nanmean(values**2))) for values in (speed, exerted))
     moves, drives = fast > _SMALLEST, strong > _SMALLEST
@@ -91,6 +92,7 @@ def joint_forces(
     if moves:
         found |= {SLOW: [-direction * np.exp(-((speed / (LOW_SPEED * fast)) ** 2))]}
         found |= {UNEVEN: [-direction * place for place in places], PLACED: [*places, *finer]}
+    if moves and (earlier is None or earlier.shape[1]):
         spread = max(float(np.nanstd(position)), _SMALLEST)
         lacking = direction * np.exp(-_since_reversal(position / spread, speed) / BUILD_UP[0])
         way = position if earlier is None else np.concatenate([earlier, position], axis=1)

@@ -1,5 +1,6 @@
 """Windows of a log simulated under many parameter vectors, and their residuals."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +34,7 @@ def window_residuals(
         np.ascontiguousarray(np.broadcast_to(windows.states, (len(points), *windows.states.shape)))
     )
     residuals = (_observations(system, states, windows.actions) - windows.following) / scale
-    return residuals.reshape(len(points), len(windows.states), -1)
+    return residuals.reshape(len(points), len(windows.states), math.prod(residuals.shape[2:]))
 
 
 @dataclass(frozen=True)
@@ -101,9 +102,10 @@ class Readings:
 
         Spends windows · steps control steps.
         """
-        system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
+        values = simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))
+        system = simulator.bind(values[None])
         visited = np.concatenate([states[:, None], system.roll_out(states[None], self.actions[None])[0]], axis=1)
-        return simulator.contacts(visited.reshape(-1, visited.shape[-1])).reshape(visited.shape[:2])
+        return simulator.contacts(visited.reshape(-1, visited.shape[-1]), values).reshape(visited.shape[:2])
 
     def trajectories(
         self, simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]

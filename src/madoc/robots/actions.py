@@ -5,6 +5,7 @@ import numpy as np
 
 from madoc.robots.model import AddedActuator, Draft, is_slide
 from madoc.robots.spec import SCALES, ActionSpec
+from madoc.simulation.write import OF_A_JOINT
 from madoc.tasks.base import ActionChannel
 
 KNOWN_UNITS = (*SCALES, "N·m", "Nm", "N", "rad", "rad/s", "m", "m/s", "V", "A", "%", "1")
@@ -93,7 +94,7 @@ def _check_free(draft: Draft, index: int) -> None:
     action = draft.spec.actions[index]
     key, driven = ("actuator", action.actuator) if action.joint is None else ("joint", action.joint)
     for actuator in draft.base.actuators:
-        if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == action.joint:
+        if int(actuator.trntype) in OF_A_JOINT and actuator.target == action.joint:
             name = actuator.name or "without a name"
             raise draft.document.error(
                 ("actions", index, key),

@@ -14,6 +14,7 @@ from madoc.errors import MadocError
 from madoc.robots.document import Document
 from madoc.robots.functions import PythonFile
 from madoc.robots.spec import RobotSpec
+from madoc.simulation.write import OF_A_JOINT, ONE_DOF
 from madoc.tasks.base import compiled_model
 
 _MESH = re.compile(r"""<mesh[^>]*\bfilename\s*=\s*["']([^"']+)["']""")
@@ -78,7 +79,7 @@ class ModelFiles:
         _name_by_owner(
             [(joint, joint.parent.name) for joint in spec.joints if len(joint.parent.joints) == 1], spec.joints
         )
-        of_joint = [part for part in spec.actuators if part.trntype == mujoco.mjtTrn.mjTRN_JOINT]
+        of_joint = [part for part in spec.actuators if int(part.trntype) in OF_A_JOINT]
         _name_by_owner([(actuator, actuator.target) for actuator in of_joint], spec.actuators)
         return spec
 
@@ -163,7 +164,7 @@ def is_slide(model: mujoco.MjModel, joint: int) -> bool:
 
 def is_single(model: mujoco.MjModel, joint: int) -> bool:
     """Whether a joint is a hinge or a slide, with one position and one velocity."""
-    return int(model.jnt_type[joint]) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    return int(model.jnt_type[joint]) in ONE_DOF
 
 
 def _name_by_owner(

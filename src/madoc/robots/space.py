@@ -7,7 +7,7 @@ from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_slide
 from madoc.robots.signals import signal_unit
 from madoc.robots.spec import ParameterSpec
-from madoc.simulation.write import element_names, find_elements
+from madoc.simulation.write import OF_A_JOINT, element_names, find_elements
 
 SLIDE_UNITS = {
     "dof_damping": "N·s/m",
@@ -92,14 +92,14 @@ def _element_unit(draft: Draft, model: mujoco.MjModel, given: ParameterSpec, ele
         return signal_unit(draft, model, parse(draft.spec.signals[index].reads), index)
     if given.field == "actuator_kv":
         driven = model.actuator(element)
-        on_joint = driven.trntype[0] == mujoco.mjtTrn.mjTRN_JOINT
+        on_joint = int(driven.trntype[0]) in OF_A_JOINT
         return "N·s/m" if on_joint and is_slide(model, int(driven.trnid[0])) else ""
     return _gain_unit(model, int(model.actuator(element).id)) if given.field == "actuator_gain" else ""
 
 
 def _gain_unit(model: mujoco.MjModel, actuator: int) -> str:
     """The unit of a servo on a joint: force per position or velocity. Other gains have no unit of their own."""
-    if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
+    if int(model.actuator_trntype[actuator]) not in OF_A_JOINT:
         return ""
     slide = is_slide(model, int(model.actuator_trnid[actuator, 0]))
     gain, (_, position, velocity) = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, :3]

@@ -91,8 +91,13 @@ class Simulator(Protocol):
         """Dynamics at physical values: those of one system, by name or as a vector, or of one system in each row."""
         ...
 
-    def contacts(self, state: Float[np.ndarray, "rows state"]) -> Int[np.ndarray, " rows"]:
-        """Number of pairs of geoms in contact in each state; no parameter changes the shape of a body."""
+    def contacts(
+        self, state: Float[np.ndarray, "rows state"], values: Float[np.ndarray, " parameters"] | None = None
+    ) -> Int[np.ndarray, " rows"]:
+        """Number of pairs of geoms in contact in each state, at physical values, which are mid-range unless given.
+
+        No parameter changes the shape of a body; only `jnt_ref` changes where positions place it.
+        """
         ...
 
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:

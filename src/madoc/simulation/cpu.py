@@ -121,13 +121,20 @@ class CpuSimulator:
         control[..., self._actuators] = self._centre + self._half * action
         return control
 
-    def contacts(self, state: Float[np.ndarray, "rows state"]) -> Int[np.ndarray, " rows"]:
-        """Number of pairs of geoms in contact in each state; no parameter changes the shape of a body."""
+    def contacts(
+        self, state: Float[np.ndarray, "rows state"], values: Float[np.ndarray, " parameters"] | None = None
+    ) -> Int[np.ndarray, " rows"]:
+        """Number of pairs of geoms in contact in each state, at physical values, which are mid-range unless given.
+
+        No parameter changes the shape of a body; only `jnt_ref` changes where positions place it.
+        """
+        placed = any(parameter.field == "jnt_ref" for parameter in self.parameters.parameters)
+        model = self.model(self.parameters.middle if values is None else values) if placed else self._model
         data, contacts = self._data[0], np.zeros(len(state), dtype=np.int64)
-        for row, position in enumerate(state[:, : self._model.nq]):
+        for row, position in enumerate(state[:, : model.nq]):
             data.qpos[:] = position
-            mujoco.mj_kinematics(self._model, data)
-            mujoco.mj_collision(self._model, data)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
             contacts[row] = len(set(map(tuple, data.contact.geom.tolist()))) if data.ncon > 1 else data.ncon
         return contacts
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from madoc.parameters import FIELDS
 from madoc.simulation.base import Simulator
 from madoc.simulation.cpu import without_warnings
-from madoc.simulation.write import OF_A_JOINT, ONE_DOF
+from madoc.simulation.write import OF_A_JOINT, ONE_DOF, single_joints
 
 _PUSH = 1e-3
 """Half the difference of an action, in [-1, 1], by which the response of a joint is computed."""
@@ -77,11 +77,10 @@ def driven_joints(simulator: Simulator) -> tuple[DrivenJoint, ...]:
     return tuple(found)
 
 
-def single_joints(simulator: Simulator) -> dict[str, tuple[int, int]]:
-    """Indices in a state of the position and of the velocity of every hinge and slide, by its name."""
+def places_of_joints(simulator: Simulator) -> dict[str, tuple[int, int]]:
+    """Indices in a state of the position and of the velocity of every hinge and slide that has a name, by the name."""
     model = simulator.task.model
-    single = (joint for joint in range(model.njnt) if int(model.jnt_type[joint]) in ONE_DOF)
-    return {model.joint(joint).name: _place(model, joint) for joint in single}
+    return {joint.name: _place(model, joint.id) for joint, _ in single_joints(model)}
 
 
 def _place(model: mujoco.MjModel, joint: int) -> tuple[int, int]:

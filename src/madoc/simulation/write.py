@@ -15,6 +15,12 @@ MASS_FLOOR = 1e-3
 INERTIA_FLOOR = 1e-9
 """Smallest moment of inertia of a body in kg·m²; smaller values are raised to it for the same reason."""
 
+LEAST = 1e-3
+"""Share of a body's mass or inertia in the model, below which a value is raised to it, where the floors are larger."""
+
+CENTRED = 1e-6
+"""Distance of a centre of mass from its body's origin, in radii of gyration, up to which rounding makes it."""
+
 _KINDS = {
     "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
     "joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
@@ -111,7 +117,8 @@ def _dofs(model: mujoco.MjModel, joint: int) -> slice:
 
 
 def _write_mass(model: mujoco.MjModel, body: int, value: float) -> None:
-    model.body_mass[body] = max(value, MASS_FLOOR)
+    before = float(model.body_mass[body])
+    model.body_mass[body] = max(value, min(MASS_FLOOR, LEAST * before) if before else MASS_FLOOR)
 
 
 def _write_mass_and_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
@@ -128,11 +135,18 @@ def _write_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
     if largest == 0.0:
         name = model.body(body).name
         raise MadocError(f"body_inertia: body {name!r} has no inertia to scale; give it one in the model")
-    model.body_inertia[body] *= max(value, INERTIA_FLOOR) / largest
+    model.body_inertia[body] *= max(value, min(INERTIA_FLOOR, LEAST * largest)) / largest
+
+
+def off_centre(model: mujoco.MjModel, body: int) -> float:
+    """Distance of a body's centre of mass from its origin, m; 0 where it is there but for rounding."""
+    distance = float(np.linalg.norm(model.body_ipos[body]))
+    gyration = np.sqrt(model.body_inertia[body].max() / max(float(model.body_mass[body]), MASS_FLOOR))
+    return distance if distance > CENTRED * gyration else 0.0
 
 
 def _write_centre_of_mass(model: mujoco.MjModel, body: int, value: float) -> None:
-    distance = np.linalg.norm(model.body_ipos[body])
+    distance = off_centre(model, body)
     if distance == 0.0:
         raise MadocError(
             f"body_com: the centre of mass of body {model.body(body).name!r} is at its origin, so it has no direction "
@@ -156,8 +170,18 @@ def _keep_shapes(model: mujoco.MjModel, body: int, moved: np.ndarray) -> None:
         model.bvh_aabb[first : first + count, :3] -= turned
 
 
+def has_gain(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator has a fixed gain; the first number of others is something else."""
+    return int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+
+
 def _write_gain(model: mujoco.MjModel, actuator: int, value: float) -> None:
     """A servo pulls with gain · (target - position or velocity): the gain is in its bias too, with the other sign."""
+    if not has_gain(model, actuator):
+        raise MadocError(
+            f"actuator_gain: the force of actuator {model.actuator(actuator).name!r} is not its command times a fixed "
+            "gain (gaintype fixed in the model); leave it out, or model the drive as a motor"
+        )
     gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
     for term in (1, 2):  # of the position, of the velocity
         if gain != 0.0 and bias[term] == -gain and not bias[1:term].any():
@@ -179,7 +203,7 @@ def _write_kv(model: mujoco.MjModel, actuator: int, value: float) -> None:
 
 
 def _write_ref(model: mujoco.MjModel, joint: int, value: float) -> None:
-    """The joint's limits, and the position at which its spring is at rest, stay where they are in space."""
+    """Limits and springs of the joint, and those of fixed tendons over it, stay where they are in space."""
     if int(model.jnt_type[joint]) not in ONE_DOF:
         raise MadocError(f"jnt_ref: joint {model.joint(joint).name!r} is a ball or free; only a hinge or slide has one")
     address = model.jnt_qposadr[joint]
@@ -188,6 +212,13 @@ def _write_ref(model: mujoco.MjModel, joint: int, value: float) -> None:
     model.qpos_spring[address] += shift
     if model.jnt_limited[joint]:
         model.jnt_range[joint] += shift
+    for tendon in range(model.ntendon):
+        wraps = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+        over = (model.wrap_type[wraps] == mujoco.mjtWrap.mjWRAP_JOINT) & (model.wrap_objid[wraps] == joint)
+        longer = shift * model.wrap_prm[wraps][over].sum()
+        model.tendon_lengthspring[tendon] += longer
+        if model.tendon_limited[tendon]:
+            model.tendon_range[tendon] += longer
 
 
 _NUMBERS: dict[str, Callable[[mujoco.MjModel, int], np.ndarray]] = {

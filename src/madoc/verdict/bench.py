@@ -181,12 +181,13 @@ def _doubts(
     """What the log says against the model, and whether that was tested with a finer integration step.
 
     Where the error of the integration step explains much, it hides other terms or looks like them. These are then
-    tested with steps of a quarter of the length, unless their error explains much there too.
+    tested with steps of a quarter of the length, unless their error explains much there too. A log that tells neither
+    states nor what is needed to fit them cannot be tested, nor can one without pairs of consecutive observations.
     """
     problem, task = bench.problem, bench.problem.simulator.task
-    ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
-    if bench.states.kind == "unknown" or problem.dataset.disturbance.shuffled != "none" or not ordered:
-        return Suspicions(), False
+    paired = problem.dataset.disturbance.shuffled != "next_observations"
+    if not paired or not (bench.states_known or bench.fitted):
+        return Suspicions(tested=False), False
     given = problem.dataset, bench.states
     doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change)
     doubts = replace(doubts, alternatives=in_full(doubts.alternatives, doubts.terms))

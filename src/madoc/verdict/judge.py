@@ -256,11 +256,17 @@ def _open(holdout: HoldOut, combinations: Sequence[Combination]) -> Verdict | No
 def _untested(holdout: HoldOut) -> Verdict | None:
     if holdout.tested:
         return None
-    return Verdict(
-        "NOT_IDENTIFIABLE",
-        f"{_how_good(holdout)}, but the log has too few windows that the model can follow to tell whether it lacks "
-        "anything; log more, or in longer runs",
-    )
+    if isinstance(holdout, ToldApart):
+        why = (
+            "the log tells no states, which testing whether the model lacks anything takes; log positions and "
+            "velocities, or rows in their order"
+        )
+    else:
+        why = (
+            "the log has too few windows that the model can follow to tell whether it lacks anything; log more, or in "
+            "longer runs"
+        )
+    return Verdict("NOT_IDENTIFIABLE", f"{_how_good(holdout)}, but {why}")
 
 
 def _no_improvement(holdout: HoldOut) -> Verdict | None:

@@ -18,7 +18,7 @@ WARM_UP = "let the machine warm up before it is logged, or leave the begin of ea
 CHANGE_MACHINE = "no parameter of a spec adds it: take it out of the machine, or log motions in which it is small"
 """The same for a force at a joint."""
 CHANGE_LOG = "log it without its filter, or shift its column by that time"
-CHANGE_DRIVE = "give its actuator that lag in the model, by MuJoCo's dyntype filter"
+CHANGE_DRIVE = "no parameter of a spec adds the lag of one drive (action_delay is that of all): take out its filter"
 """The same for a sensor and for a drive that are late."""
 
 

@@ -153,6 +153,6 @@ def consecutive_residuals(
     both = np.concatenate([first, first + 1])
     windows = windows_at(problem.dataset, states[both], known[both], 1)
     residuals = window_residuals(problem.simulator, windows, point[None], problem.typical_change)[0]
-    whole = np.isfinite(residuals).all(-1).reshape(2, -1).all(0)
-    before, after = residuals.reshape(2, len(first), -1)[:, whole]
+    pairs = residuals.reshape(2, len(first), residuals.shape[-1])
+    before, after = pairs[:, np.isfinite(pairs).all((0, 2))]
     return (before, after), len(both)
