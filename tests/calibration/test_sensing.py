@@ -31,7 +31,8 @@ def problem_of(log, **disturbance):
 
 def test_windows_are_as_long_as_the_observation_wants(log):
     seen, hidden = problem_of(log), problem_of(log, hidden_velocities=True)
-    assert [Madoc().collection(problem).scaling.length for problem in (seen, hidden)] == [1, 3]
+    derived = problem_of(log, hidden_velocities=True, velocities="differences")
+    assert [Madoc().collection(problem).scaling.length for problem in (seen, hidden, derived)] == [1, 3, 3]
     assert Madoc(window=5).collection(hidden).scaling.length == 5
     assert Madoc(starts="replay").collection(hidden).scaling.length == 1
     with pytest.raises(MadocError, match=r"no episode .* has the 301 rows of a window; take a shorter one"):

@@ -145,6 +145,7 @@ def test_a_parameter_at_the_end_of_its_range_is_named():
 def test_a_saturated_reward_is_warned():
     (warning,) = warned(settled(blur=0.1, at_bound=0.75))
     assert "sure of 75% of the simulated rows (reward at its bound)" in warning
+    assert warning.endswith("has no slope; narrow the ranges")  # as rollouts cannot start elsewhere
     assert warned(settled(blur=0.1, at_bound=SATURATED - 0.01)) == ()
 
 

@@ -71,6 +71,10 @@ def places(recorded, whole, tmp_path):
             "run hopper-medium --out {out} --learner bc --policy-at distribution",
             "so --policy-at distribution would change nothing",
         ),
+        (
+            "run hopper-medium --out {out} --learner sac --policy-set randomize=true --policy-at distribution",
+            "dr does not learn at given parameters",
+        ),
         ("run hopper-medium --out {out} --learner h2o --hide-velocities", "hopper-medium hides velocities"),
         ("run hopper-medium --out {out} --learner sacc", "did you mean sac?"),
         ("run hopper --data {corrupt} --out {out}", "corrupt.npz"),

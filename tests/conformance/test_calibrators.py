@@ -266,7 +266,8 @@ def test_draws_that_explode_are_left_out_and_counted(method, dataset, task):
     assert 0 < estimate.failures < sum(epoch.control_steps for epoch in epochs)
     result = calibrate(method, problem, key=KEY, budget=BUDGET)
     (warning,) = (told for told in result.warnings if "exploded" in told)
-    assert f"{estimate.failures} of {result.control_steps - PROBING:,} simulated rows" in warning
+    steps = result.control_steps - PROBING
+    assert f"{estimate.failures:,} simulated rows or windows exploded, in {steps:,} control steps" in warning
 
 
 def test_nothing_is_traced_again(method, problem, traced):

@@ -9,6 +9,7 @@ from madoc.data.logs.jumps import split_episodes
 from madoc.data.logs.tables import Run, Table
 from madoc.data.logs.timing import Series, held_finding
 from madoc.errors import MadocError
+from robots import ARM
 
 
 @pytest.fixture(scope="module")
@@ -185,3 +186,21 @@ def test_a_command_that_is_held_for_long_is_told():
     assert held_finding(commands, 1.1) == []
     (told,) = held_finding(commands, 3.0)
     assert told.sentence.startswith("log.mcap: its last action is 2.1 s before its last signal, and is held until then")
+
+
+def test_a_quaternion_that_changes_its_sign_is_made_continuous(tmp_path):
+    model = ARM.replace(
+        "<worldbody>", '<worldbody><body name="ball"><joint name="ball" type="ball"/><geom size=".1"/></body>'
+    )
+    parts = "".join(f"  - {{name: q{part}, reads: 'position(ball)[{part}]'}}\n" for part in range(4))
+    robot = arm_of(tmp_path, SPEC.replace("signals:\n", f"signals:\n{parts}"), model=model)
+    assert [signal.quaternion for signal in robot.signals] == ["ball"] * 4 + [""] * 4
+    columns = columns_of(robot)
+    half = np.linspace(0.0, 1.5 * np.pi, 50)
+    turning = {"q0": np.cos(half), "q1": np.sin(half), "q2": 0.0 * half, "q3": 0.0 * half}
+    positive = np.where(turning["q0"] < 0.0, -1.0, 1.0)
+    logged = columns | {name: positive * part for name, part in turning.items()}
+    dataset = logs.read(write_csv(tmp_path / "log.csv", logged), robot)
+    expected = np.stack([turning["q0"], turning["q1"]], axis=-1)[:-1]
+    np.testing.assert_allclose(dataset.transitions.observation[:, :2], expected, atol=1e-8)
+    assert any("the quaternion of 'ball' changes its sign in 1 rows" in each for each in sentences(dataset))

@@ -54,7 +54,7 @@ def told(folder):
     return result, [(line["stage"], line["control_steps"], line["metrics"]) for line in lines]
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [1, pytest.param(20, marks=pytest.mark.slow)])
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, kills):
     moments = random.Random(kills)
     budget = 100 * (20 + 40 * kills)

@@ -92,7 +92,7 @@ def covered(task, seed):
 
 
 def test_noise_at_contacts_misleads_neither_estimates_nor_intervals(bouncer):
-    assert np.sum([covered(bouncer, seed) for seed in range(4)]) >= 11
+    assert np.sum([covered(bouncer, seed) for seed in range(2)]) >= 5
 
 
 @pytest.mark.slow

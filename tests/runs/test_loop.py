@@ -168,6 +168,7 @@ def test_a_nan_stops_the_run_and_leaves_good_and_bad_state(tmp_path, place):
     last, _ = checkpoint.load(tmp_path / "run/checkpoint.npz", like)
     dump, _ = checkpoint.load(tmp_path / "run/diverged.npz", like)
     assert checkpoint.first_non_finite(last) is None
+    assert bits(finished.state) == bits(last)
     assert dump.epoch == 21
     assert json.loads((tmp_path / "run/result.json").read_text())["status"] == "diverged"
     if place == "metric":

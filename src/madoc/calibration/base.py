@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.data import Dataset, typical_change
+from madoc.data.disturbing import row_change
 from madoc.errors import MadocError
 from madoc.identification.information import NORMAL_95
-from madoc.identification.noise import regression_noise
+from madoc.identification.noise import difference_noise, regression_noise
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.learning.features import LoggedFeatures
 from madoc.simulation.base import Simulator
@@ -86,6 +87,16 @@ class CalibrationProblem:
     def typical_change(self) -> Float[np.ndarray, " observation"]:
         """Standard deviation of each channel's change in a stride of rows, as `data.timescale.typical_change`."""
         return typical_change(self.dataset)
+
+    @cached_property
+    def row_change(self) -> Float[np.ndarray, " observation"]:
+        """Standard deviation of each channel's change from a row to the next."""
+        return row_change(self.dataset)
+
+    @cached_property
+    def noise_by_differences(self) -> Float[np.ndarray, " observation"]:
+        """Standard deviation of the sensor noise of each channel by differences of successive rows."""
+        return difference_noise(self.dataset)
 
     @cached_property
     def estimated_noise(self) -> Float[np.ndarray, " observation"]:

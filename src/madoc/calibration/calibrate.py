@@ -13,12 +13,14 @@ from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
 from madoc.identification.combinations import combinations
 from madoc.parameters import ParameterSpace
-from madoc.runs import checkpoint, loop
+from madoc.runs import loop
 from madoc.runs.budget import Budget
 from madoc.runs.files import replacing
 from madoc.runs.run_folder import RunFolder
 from madoc.simulation.sensitivity import refuse_insensitive
 from madoc.types import State, entry_of
+
+DIVERGED = "the run diverged: the estimate is that of its last checkpoint, which may be where it began"
 
 
 def calibrate(
@@ -60,14 +62,11 @@ def calibrate(
         checkpoint_every=checkpoint_every,
         trace=lambda state: _trace(space, method.estimate(problem, state)),
     )
-    state = finished.state
-    if finished.status == "diverged":
-        state = method.init(problem, key)
-        if folder is not None:
-            state, _ = checkpoint.load(folder.checkpoint, state)
-    estimate = method.estimate(problem, state)
+    estimate = method.estimate(problem, finished.state)
     told = estimate.covariance if estimate.interval is not None else None
     warnings = (*estimate.warnings, *exploded(estimate.failures, finished.control_steps))
+    if finished.status == "diverged":
+        warnings = (DIVERGED, *warnings)
     result = CalibrationResult(
         method=entry.name,
         task=problem.simulator.task.name,
@@ -89,7 +88,7 @@ def calibrate(
         problem=problem,
     )
     if folder is not None:
-        vectors = method.embeddings(problem, state) if isinstance(method, EmbedsParameters) else None
+        vectors = method.embeddings(problem, finished.state) if isinstance(method, EmbedsParameters) else None
         if vectors is not None:
             with replacing(folder.path / "embeddings.npz") as stream:
                 np.savez(stream, allow_pickle=False, names=np.array(space.names), vectors=vectors)

@@ -15,11 +15,11 @@ def at_end_of_range(
 
 
 def exploded(failures: int, control_steps: int) -> tuple[str, ...]:
-    """Warn of simulated rows that diverged, if any did."""
+    """Warn of simulated rows, or windows of them, that diverged, if any did."""
     if not failures:
         return ()
     return (
-        f"{failures} of {control_steps:,} simulated rows exploded and were left out; "
+        f"{failures:,} simulated rows or windows exploded, in {control_steps:,} control steps, and were left out; "
         "the ranges may hold impossible parameters",
     )
 

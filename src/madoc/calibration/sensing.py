@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.data.disturbing import row_change
 from madoc.learning.features import HIDDEN_WINDOW, last_rows
 from madoc.simulation.rollout import Rollout
 from madoc.types import NotNegative, named_key
@@ -18,9 +17,13 @@ SensorNoise = NotNegative | Literal["estimated"] | None
 
 
 def rows_compared(problem: CalibrationProblem) -> int:
-    """Rows that are compared at a time: one where it tells a state, or no episode has more, else `HIDDEN_WINDOW`."""
-    tells = problem.states.kind == "exact" or not len(last_rows(problem.dataset, HIDDEN_WINDOW))
-    return 1 if tells else HIDDEN_WINDOW
+    """Rows that are compared at a time: one where it tells a state, or no episode has more, else `HIDDEN_WINDOW`.
+
+    A row does not tell which actions are pending, nor a velocity that is a difference of positions.
+    """
+    derived = problem.dataset.disturbance.velocities == "differences" or problem.simulator.task.pending
+    tells = problem.states.kind == "exact" and not derived
+    return 1 if tells or not len(last_rows(problem.dataset, HIDDEN_WINDOW)) else HIDDEN_WINDOW
 
 
 def noise_deviation(problem: CalibrationProblem, share: SensorNoise) -> Float[np.ndarray, " observation"]:
@@ -31,7 +34,7 @@ def noise_deviation(problem: CalibrationProblem, share: SensorNoise) -> Float[np
     if not share:
         return np.zeros(problem.dataset.transitions.observation.shape[-1])
     # The logged change holds the noise of two readings; the share is that of the change without noise.
-    return share / np.sqrt(1.0 + 2.0 * share**2) * row_change(problem.dataset)
+    return share / np.sqrt(1.0 + 2.0 * share**2) * problem.row_change
 
 
 def with_sensor_noise(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:

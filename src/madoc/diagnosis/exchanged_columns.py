@@ -27,7 +27,7 @@ MOST_STEPS = 60_000
 _BEYOND = 1.05
 """Largest action over the largest logged one, or over the range; sensors of current read more than the range."""
 _NEGLIGIBLE = 1e-3
-"""Error in typical changes of a step, up to which the log is predicted exactly, so that nothing is to be corrected."""
+"""Error in typical changes of a stride, up to which the log is predicted exactly, and nothing is to be corrected."""
 
 
 @dataclass(frozen=True)

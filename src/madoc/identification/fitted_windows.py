@@ -24,7 +24,7 @@ about 10 % with so many."""
 STRIDES = 20
 """A window's length in strides; over longer ones derivatives no longer predict what a small error of the model does."""
 NEGLIGIBLE = 1e-5
-"""Residual in typical changes of a step; below it there is nothing to explain."""
+"""Residual in typical changes of a stride; below it there is nothing to explain."""
 LINEARISATIONS = 4
 """Largest number of times that derivatives are simulated in a fit of parameters, and again in one of initial states."""
 STEPS = 4

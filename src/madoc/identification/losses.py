@@ -79,7 +79,7 @@ def scale_of(residuals: Residuals, loss: Loss) -> float:
 
 
 def robust_deviation(size: Float[np.ndarray, "*values"]) -> float:
-    """The standard deviation of normal noise with the same median of |residuals|, in typical changes of a step.
+    """The standard deviation of normal noise with the same median of |residuals|, in typical changes of a stride.
 
     Where a robot rests and its sensors are coarse, most residuals are 0. It is therefore at least a fifth of the
     standard deviation by the 90th percentile, of which at most 1, a step's change, counts.

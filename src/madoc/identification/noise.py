@@ -23,7 +23,7 @@ OUTLIER = 5.0
 """Robust standard deviations to which residuals are clipped, as contacts turn small noise into large ones; of normal
 values one in two million is larger."""
 STEP = 1e-3
-"""Change of an observation, in typical changes of a step, by which the derivative of a control step is taken."""
+"""Change of an observation, in typical changes of a stride, by which the derivative of a control step is taken."""
 SLOPE_LIMIT = 2.0
 """Largest derivative of a channel by itself over a control step; a contact's is larger, and is clipped to it."""
 _MOST_ROWS = 20_000
@@ -134,7 +134,7 @@ def channel_noise(
 
     A residual's variance is σ² (1 - leverage), whatever was fitted.
 
-    Residuals are in typical changes of a step, `spare` is 1 - leverage of each.
+    Residuals are in typical changes of a stride, `spare` is 1 - leverage of each.
     """
     free = spare > _LEAST_SPARE
     scaled = np.where(free, residuals / np.sqrt(np.where(free, spare, 1.0)), np.nan)

@@ -78,7 +78,7 @@ def standardise(
 
 def drop(rows: Float[Array, "*rows units"], rate: float, key: PRNGKeyArray) -> Float[Array, "*rows units"]:
     """Dropout that spends one random byte a unit, four of each 32-bit draw, so the rate is exact to within 1/512."""
-    bound = round(256 * rate)
+    bound = min(round(256 * rate), 255)
     words = jax.random.bits(key, (-(-rows.size // 4),), jnp.uint32)
     draws = jax.lax.bitcast_convert_type(words, jnp.uint8).reshape(-1)[: rows.size].reshape(rows.shape)
     return jnp.where(draws >= bound, rows * (256 / (256 - bound)), 0.0)

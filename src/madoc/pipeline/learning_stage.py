@@ -48,14 +48,14 @@ def learn_in(
     """
     method = make_method(LEARNERS, order.method, parse_settings(order.set))
     entry = entry_of(method, LEARNERS)
-    budget = policy_budget(order.method, order.budget)
-    check_place(order.method, order.at, f"--at {order.at}")
+    budget = policy_budget(entry.name, order.budget)
+    check_place(entry.name, order.at, f"--at {order.at}")
     require_reward(calibrated.task)
-    require_no_goals(calibrated.task, order.method)
+    require_no_goals(calibrated.task, entry.name)
     key = stage_key(order.seed, "learning")
     truth = read_truth(order.truth) or calibrated.spec.truth
     simulator, parameters = _system(calibrated, order, truth)
-    dataset = _logged(calibrated, order.method) if entry.needs_data else None
+    dataset = _logged(calibrated, entry.name) if entry.needs_data else None
     spec = {
         "command": "learn",
         "task": calibrated.task.name,

@@ -30,6 +30,7 @@ from madoc.policies import LEARNERS, require_reward
 from madoc.report.records import Summary, read_object, read_record
 from madoc.robots import is_spec_path
 from madoc.runs.files import read_json
+from madoc.types import entry_of
 
 
 def run_all(
@@ -62,7 +63,8 @@ def run_all(
         if result.status not in ENDED:
             return replace(summary, status=result.status, sentence=f"calibration: {result.sentence}")
         truth_known = calibrated.spec.truth is not None
-        compared = order.yardsticks and truth_known and LEARNERS[order.learner].needs_parameters
+        learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
+        compared = order.yardsticks and truth_known and entry_of(learner, LEARNERS).needs_parameters
         places: tuple[Place, ...] = (order.policy_at, *(("midrange", "truth") if compared else ()))
         for at in places:
             policy = _learn(order, calibrated, at, out / f"policy-{at}", quiet=quiet)
@@ -108,10 +110,11 @@ def _spec(order: RunOrder, machine: Machine, out: Path) -> dict[str, object]:
         machine.check_truth(truth, machine.task.with_parameters(list(calibrated)))
     check_drawing(order.drawing, order.policy_at, "--policy-share and --policy-width are of --policy-at distribution")
     learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
-    check_place(order.learner, order.policy_at, f"--policy-at {order.policy_at}")
-    require_no_goals(machine.task, order.learner)
-    require_velocities(order.learner, order.reading.disturbance, f"the data of {order.name}")
-    policy_budget(order.learner, order.policy_budget)
+    recognised = entry_of(learner, LEARNERS).name
+    check_place(recognised, order.policy_at, f"--policy-at {order.policy_at}")
+    require_no_goals(machine.task, recognised)
+    require_velocities(recognised, order.reading.disturbance, f"the data of {order.name}")
+    policy_budget(recognised, order.policy_budget)
     resolved = {
         "command": "run",
         "truth": truth,

@@ -36,7 +36,7 @@ class Learning:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class H2OState:
-    """The state of H2O; `judged` counts in control steps of learning."""
+    """The state of H2O; `judged` counts in control steps."""
 
     learning: Learning
     interaction: Interaction
@@ -71,8 +71,8 @@ class H2O:
         target_rate: τ of the target critics.
         learning_rate: Adam's, for everything.
         replay_capacity: Simulated rows kept.
-        judge_every: Control steps of learning after which the policy acts whole episodes, without noise, in the
-            systems it is learnt in; the best so far is what is handed back, as of SAC. 0 hands back the last.
+        judge_every: Control steps, those of the warm-up counted, after which the policy acts whole episodes, without
+            noise, in the systems it is learnt in; the best so far is handed back, as of SAC. 0 hands back the last.
         judge_episodes: Episodes it is judged by. Their control steps are counted, but not against the budget.
     """
 

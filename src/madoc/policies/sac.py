@@ -56,9 +56,9 @@ class SAC:
             TD3+BC's (Fujimoto & Gu 2021), with its w = 2.5; and as there, networks see observations standardised.
         randomize: Draw every environment's parameters anew each epoch, uniformly over the simulator's whole box,
             whatever those of the problem: with `cloning`, the paper's baseline DR+BC.
-        judge_every: Control steps of learning after which the policy acts whole episodes, without noise, in the
-            systems it is learnt in; the best so far is what is handed back, as returns of SAC rise and fall from
-            one thousand updates to the next. 0 hands back the last.
+        judge_every: Control steps, those of the warm-up counted, after which the policy acts whole episodes, without
+            noise, in the systems it is learnt in; the best so far is what is handed back, as returns of SAC rise and
+            fall from one thousand updates to the next. 0 hands back the last.
         judge_episodes: Episodes it is judged by. Their control steps are counted, but not against the budget.
     """
 

@@ -15,6 +15,8 @@ _NOT_SI = re.compile(
     r"\b(deg\w*|grad|mrad|rev|revolutions?|rpm|turns?|mm|cm|km|inch(es)?|ft|feet|foot)\b|°|/min\b", re.IGNORECASE
 )
 """Units of length, angle and speed that are not m, rad, m/s or rad/s."""
+_FIRST_OF_QUATERNION = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
+"""Index of the quaternion's first component among the positions of a joint of this type."""
 
 
 def read_signals(draft: Draft, model: mujoco.MjModel) -> Signals:
@@ -58,6 +60,18 @@ def turn_of(model: mujoco.MjModel, expression: Expression) -> float:
     if single is None or single[0].kind != "position" or is_slide(model, int(model.joint(single[0].name).id)):
         return 0.0
     return 2.0 * math.pi * abs(single[1])
+
+
+def quaternion_of(model: mujoco.MjModel, expression: Expression) -> str:
+    """The free or ball joint of whose quaternion an expression is one component, as it is; empty where it is none."""
+    affine = expression.affine()
+    if affine is None or affine[1] or list(affine[0].values()) != [1.0]:
+        return ""
+    (read,) = affine[0]
+    if read.kind != "position" or read.index is None:
+        return ""
+    first = _FIRST_OF_QUATERNION.get(int(model.joint(read.name).type[0]), read.index + 1)
+    return read.name if first <= read.index < first + 4 else ""
 
 
 def signal_unit(draft: Draft, model: mujoco.MjModel, expression: Expression, index: int) -> str:

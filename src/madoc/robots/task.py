@@ -16,7 +16,7 @@ from madoc.robots.actions import action_channel, added_actuator, idle_actuators
 from madoc.robots.episodes import Episode, no_reward, read_episode
 from madoc.robots.functions import PythonFile
 from madoc.robots.model import Draft, ModelFiles, compiled, make_model
-from madoc.robots.signals import read_signals, signal_unit, turn_of
+from madoc.robots.signals import quaternion_of, read_signals, signal_unit, turn_of
 from madoc.robots.space import parameter_space
 from madoc.robots.spec import RobotSpec, read_spec
 from madoc.tasks.base import ActionChannel, Batch, Task, never_terminated
@@ -26,13 +26,15 @@ from madoc.tasks.base import ActionChannel, Batch, Task, never_terminated
 class Signal:
     """One value of an observation: its name, its unit, and the expression it is.
 
-    `turn` is the change of its value in a turn of the hinge whose position it is; 0 where it is none.
+    `turn` is the change of its value in a turn of the hinge whose position it is; 0 where it is none. `quaternion` is
+    the free or ball joint of whose quaternion it is a component; empty where it is none.
     """
 
     name: str
     unit: str
     reads: str
     turn: float = 0.0
+    quaternion: str = ""
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,13 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
         with document.at("python"):
             _try_out(task.for_policies)
     shown = tuple(
-        Signal(given.name, signal_unit(draft, model, expression, index), expression.text, turn_of(model, expression))
+        Signal(
+            given.name,
+            signal_unit(draft, model, expression, index),
+            expression.text,
+            turn_of(model, expression),
+            quaternion_of(model, expression),
+        )
         for index, (given, expression) in enumerate(zip(spec.signals, signals.expressions, strict=True))
     )
     return Robot(Path(file), spec, task, shown, signals.undetermined(), idle_actuators(model, actions))

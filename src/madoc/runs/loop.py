@@ -63,7 +63,8 @@ class Finished(Generic[State]):
     """How a run ended.
 
     Attributes:
-        state: The last state, even if the run diverged.
+        state: The last state; of a run that diverged, that of the last checkpoint. Without a folder it is that of the
+            time when one was due, in which buffers that are written in place hold later rows.
         status: `finished` (the budget is spent), `converged`, `interrupted` (by the user) or `diverged` (a NaN).
         sentence: The status in words.
         control_steps: Simulated control steps.
@@ -163,6 +164,7 @@ class _Session(Generic[State]):
         self.state = state
         self.resumed = resume and folder is not None and folder.checkpoint.exists()
         self.outcome: tuple[Status, str] | None = None
+        self._good = state
         self._tally = Tally()
         self._trace = trace
         self._budget, self._unit = budget, unit
@@ -177,6 +179,7 @@ class _Session(Generic[State]):
         self._peak: int | None = 0
         if folder and self.resumed:
             self.state, extra = checkpoint.load(folder.checkpoint, like=state)
+            self._good = self.state
             self._tally = Tally(**extra["tally"])
             self._offset = int(extra["metrics_bytes"])
             self._earlier = float(extra["seconds"])
@@ -255,7 +258,9 @@ class _Session(Generic[State]):
             bad = checkpoint.first_non_finite(self.state)
             if bad:
                 self._diverge(f"{bad} holds a NaN or an infinity")
-            elif self._folder and self._log:
+                return
+            self._good = self.state
+            if self._folder and self._log:
                 problem = checkpoint.difference(checkpoint.layout(self.state), self._layout)
                 if problem:
                     raise MadocError(f"the method changed the layout of its state: {problem}")
@@ -271,12 +276,22 @@ class _Session(Generic[State]):
         if self.outcome is None:
             raise RuntimeError("finish() before the run has ended")
         status, sentence = self.outcome
+        if status == "diverged" and self._folder and self._folder.checkpoint.exists():
+            self._good, _ = checkpoint.load(self._folder.checkpoint, like=self._good)
         tally, seconds = self._tally, self._seconds()
         if self._folder and not self._folder.result.exists():
             write_peak(self._folder.path, self._peak)
             counts = {"control_steps": tally.control_steps, "updates": tally.updates, "seconds": seconds}
             self._folder.write_json("result.json", {"status": status, "sentence": sentence} | counts)
-        return Finished(self.state, status, sentence, tally.control_steps, tally.updates, self.spent, seconds)
+        return Finished(
+            self._good if status == "diverged" else self.state,
+            status,
+            sentence,
+            tally.control_steps,
+            tally.updates,
+            self.spent,
+            seconds,
+        )
 
     def _diverge(self, what: str) -> None:
         where = ""

@@ -40,6 +40,7 @@ from madoc.runs.files import read_json
 from madoc.suites.cells import Kind, hashed
 from madoc.suites.options import Misfit, Order, stored
 from madoc.tasks import TASKS, Task
+from madoc.types import entry_of
 
 
 @contextmanager
@@ -108,11 +109,11 @@ def check_policy(
     with under("method"):
         _learner(order.method, ())
     with under("set"):
-        _learner(order.method, order.set)
+        learner = _learner(order.method, order.set)
     with under("budget"):
-        policy_budget(order.method, order.budget)
+        policy_budget(learner, order.budget)
     with under("at"):
-        check_place(order.method, order.at, f"at: {order.at}")
+        check_place(learner, order.at, f"at: {order.at}")
         truths = (order.truth, calibration.truth, recording)
         if order.at == "truth" and not any(truths) and not _may_tell_truth(calibration.source.paths):
             raise MadocError("the true parameters are not known here; add truth: FILE.json")
@@ -121,9 +122,9 @@ def check_policy(
     with under(""):
         require_reward(task)
     with under("method"):
-        require_no_goals(task, order.method)
+        require_no_goals(task, learner)
         for disturbance in (calibration.source.reading.disturbance, *((recording.disturbance,) if recording else ())):
-            require_velocities(order.method, disturbance, "the data of this cell")
+            require_velocities(learner, disturbance, "the data of this cell")
     with under("seed"):
         check_seed(order.seed)
     _check_truth(order.truth, calibration, allow_code)
@@ -298,5 +299,6 @@ def _calibrator(method: str, settings: Settings, starts: str | None) -> None:
 
 
 @cache
-def _learner(method: str, settings: Settings) -> None:
-    make_method(LEARNERS, method, parse_settings(settings))
+def _learner(method: str, settings: Settings) -> str:
+    """The name of what a learner is with its settings: `sac` that is told to randomize is `dr`."""
+    return entry_of(make_method(LEARNERS, method, parse_settings(settings)), LEARNERS).name

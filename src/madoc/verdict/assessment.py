@@ -11,7 +11,6 @@ from madoc.calibration import CalibrationProblem, CalibrationResult
 from madoc.calibration.holdout import HoldOut, ToldApart, Verdict
 from madoc.data import Dataset
 from madoc.errors import MadocError
-from madoc.identification.noise import difference_noise
 from madoc.simulation.base import Simulator
 from madoc.verdict.adequacy import about_imitated, with_widened_intervals
 from madoc.verdict.bench import Bench, judged
@@ -90,7 +89,7 @@ def measured(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.nda
         return predicted(bench, point, interval)
     if bench.fitted is not None:
         return fitted(bench, bench.fitted, point, interval)
-    noise = difference_noise(bench.problem.dataset) / bench.change
+    noise = bench.problem.noise_by_differences / bench.change
     areas = bench.area_at_mid_range, bench.area_of_rollouts(point)
     record = partial(ToldApart, area_at_mid_range=areas[0], area_at_estimate=areas[1])
     return judged(record, bench, point, interval, at=point, residual=noise, by_model=(), noise=noise, control_steps=0)

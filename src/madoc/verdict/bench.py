@@ -20,7 +20,6 @@ from madoc.identification.candidate_terms import INTEGRATION
 from madoc.identification.coarseness import FINER, coarseness
 from madoc.identification.excitation import expected_half_widths
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
-from madoc.identification.noise import difference_noise
 from madoc.identification.states import LoggedStates, logged_states
 from madoc.identification.windows import consecutive_rows, evenly, horizons
 from madoc.learning.features import Scaling
@@ -170,7 +169,7 @@ class Bench:
             self.simulator.parameters.to_physical(point),
             length=length,
             key=named_key(self.key, "rollouts"),
-            noise=difference_noise(self.problem.dataset),
+            noise=self.problem.noise_by_differences,
         )
         return classify(self.view.sample(held), self.view.sample(simulated), overlap=True)
 

@@ -68,7 +68,7 @@ class FittedReplays:
     ) -> tuple[Float[np.ndarray, "systems windows readings channels"], int]:
         """Simulated minus measured observations of whole windows, and the control steps that were simulated.
 
-        They are in typical changes of a step; NaN in a window whose simulation failed.
+        They are in typical changes of a stride; NaN in a window whose simulation failed.
         """
         states, spent = self.starts(points)
         flat = self.readings.residuals(self.simulator, points, states)[:, 0]

@@ -149,7 +149,7 @@ def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
     Where states can be rebuilt, it is computed from the residuals at the best parameters near mid-range.
     """
     if not bench.states_known:
-        return sensors.difference_noise(bench.problem.dataset)
+        return bench.problem.noise_by_differences
     mid_range = np.zeros((1, len(bench.simulator.parameters)))
     points = np.concatenate([mid_range, nearby_best(bench.replays, mid_range[0])[0]])
     sizes = bench.replays.magnitudes(bench.replays.residuals(points)).mean((0, -1))

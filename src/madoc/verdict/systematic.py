@@ -15,7 +15,7 @@ FOLDS = 5
 _FEWEST = 2 * FOLDS
 """Smallest number of rows to which regressions are fitted; with fewer, nothing counts as explained."""
 _ROUNDING = 1e-6
-"""Residual in typical changes of a step; a smaller one is within the tolerance of MuJoCo's solver at contacts."""
+"""Residual in typical changes of a stride; a smaller one is within the tolerance of MuJoCo's solver at contacts."""
 
 EXPLAINED = 0.1
 """Share in [0, 1] of squared residuals that state and action explain on unseen rows; above it residuals are

@@ -88,7 +88,7 @@ def replayed(
     """A random half of the windows as they were logged, the other half as simulated, with noise added.
 
     `before` is the first observation and the mean action of a window, `after` the change over the whole window.
-    Residuals, and the noise among them, are in typical changes of a step.
+    Residuals, and the noise among them, are in typical changes of a stride.
     """
     windows = replays.windows
     start, end = replays.observation, windows.following[:, -1]

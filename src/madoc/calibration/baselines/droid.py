@@ -2,7 +2,7 @@
 
 Tsai et al. 2021, "DROID: minimizing the reality gap using single-shot human demonstration" (arXiv 2102.11003). Its
 cost adds an L1 and an L2 distance of trajectories; their weights and channels are not public. Here
-every channel is in units of its typical change in one step, and both distances count the same.
+every channel is in units of its typical change in a stride, and both distances count the same.
 """
 
 from dataclasses import dataclass

@@ -61,7 +61,7 @@ def replay_residuals(
     steps: int,
     windows: int,
 ) -> Float[np.ndarray, "candidates windows values"]:
-    """Residuals of random windows under each candidate, in typical changes of a step; NaN where a simulation failed."""
+    """Residuals of random windows under each candidate, in typical changes of a stride; NaN where it failed."""
     drawn = draw_windows(problem, steps, windows, key)
     return window_residuals(problem.simulator, drawn, candidates, problem.typical_change)
 

@@ -33,8 +33,7 @@ from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import stride
 from madoc.identification.information import identifiability, quantile, sandwich
 from madoc.identification.losses import Loss
-from madoc.identification.noise import difference_noise
-from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
+from madoc.types import Count, Epoch, NotNegative, check_hyperparameters, named_key
 
 InitialStates = Literal["logged", "estimated"]
 Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening", "widening"]
@@ -92,7 +91,7 @@ class LeastSquaresState:
 class LeastSquares:
     """Damped Gauss-Newton on differences between simulated and logged observations, over windows of the log.
 
-    Residuals are in typical changes of a channel in one step. With `logged` initial states, which are assumed to be
+    Residuals are in typical changes of a channel in a stride. With `logged` initial states, which are assumed to be
     exact, noise in them biases the estimate. With `estimated` ones each window's initial state is a further unknown,
     its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
     has settled, windows become nine times as long, by way of three times where the longest show contacts or fail, while
@@ -140,7 +139,7 @@ class LeastSquares:
         stage = self._first_stage(problem)
         return LeastSquaresState(
             known=None if stage == "estimated" else self._known(problem).init(problem, key),
-            unknown=() if stage == "logged" else self._all_lengths(problem, jax.random.fold_in(key, 1)),
+            unknown=() if stage == "logged" else self._all_lengths(problem, named_key(key, "unknown starts")),
             stage=stage,
             length=0,
             best=0,
@@ -351,8 +350,8 @@ def _noisy_rows(problem: CalibrationProblem) -> bool:
 
     There noise need not alternate: steps of an encoder and filters of a drive last for several rows.
     """
-    dataset = problem.dataset
-    return stride(dataset) > 1 and bool((difference_noise(dataset) > NOISY_STRIDE * problem.typical_change).any())
+    loud = problem.noise_by_differences > NOISY_STRIDE * problem.typical_change
+    return stride(problem.dataset) > 1 and bool(loud.any())
 
 
 def _begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:

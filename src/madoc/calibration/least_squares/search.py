@@ -52,7 +52,7 @@ class SearchState:
         state_errors: Standard errors of an unknown initial state's values, by which differences are widened.
         damping: λ of each search's steps of the parameters.
         state_damping: λ of each unknown initial state's step.
-        cost: Mean loss of a residual, `ALL_FAILED` before the first epoch. In squared typical changes of a step; in
+        cost: Mean loss of a residual, `ALL_FAILED` before the first epoch. In squared typical changes of a stride; in
             squared standard deviations of the noise where initial states are unknown and the search refines.
         moved: The largest component of each search's last step, relative to one that matters; below 1 it has settled.
         rows: First rows of the windows.

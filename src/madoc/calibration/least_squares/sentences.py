@@ -4,6 +4,7 @@ import numpy as np
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.search import SearchState
+from madoc.data import stride
 
 LONG_TAILS = 1.1
 """Cost of residuals, in squared standard deviations; above it they are not normal noise, whose cost is 0.8 with
@@ -13,7 +14,7 @@ MOST_LEFT_OUT = 0.05
 FEWEST_LEFT_OUT = 3
 """Number of windows; fewer may be left out by chance, however few there are."""
 EXACT = 1e-6
-"""Residual in typical changes of a step; smaller ones mean that states were logged without noise."""
+"""Residual in typical changes of a stride; smaller ones mean that states were logged without noise."""
 NOT_SETTLED = (
     "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"
 )
@@ -36,7 +37,9 @@ def about_estimated_states(problem: CalibrationProblem, search: SearchState, hor
     if not search.refining:
         return sentence
     noise = 100.0 * float(np.median(search.deviation))
-    return f"{sentence}; the noise it finds is {noise:.2g} % of a step's change"
+    rows = stride(problem.dataset)
+    change = "a step's typical change" if rows == 1 else f"the typical change in {rows} steps"
+    return f"{sentence}; the noise it finds is {noise:.2g} % of {change}"
 
 
 def have_long_tails(problem: CalibrationProblem, search: SearchState) -> bool:

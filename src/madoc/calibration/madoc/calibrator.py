@@ -109,6 +109,8 @@ class Madoc:
             )
         if self.starts == "replay" and self.horizon not in (None, 1):
             raise MadocError(f"starts=replay replays single steps: expected horizon 1 or none, got {self.horizon}")
+        if self.starts == "replay" and self.keep_cloning:
+            raise MadocError("starts=replay replays logged actions, without a clone: set keep_cloning=false")
         if self.starts == "replay" and self.window not in (None, 1):
             raise MadocError(f"starts=replay replays single steps: expected window 1 or none, got {self.window}")
 
@@ -118,7 +120,8 @@ class Madoc:
 
         The authors' prior is a squared distance of means; Eq. (13)'s KL is kept here. Their code draws a
         parameter vector every 100 control steps of one walker; so does this, for ten walkers at a time. Networks have
-        the paper's two hidden layers, where their code has three in discriminators and VAE.
+        the paper's two hidden layers, where their code has three in discriminators and VAE. The VAE has no dropout, and
+        the clone is kept once groups are found, where line 9 of Algorithm 1 begins it anew.
         """
         return cls(**(PAPER | changes))  # type: ignore[arg-type]
 
@@ -172,6 +175,7 @@ class Madoc:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
         space, (scaled, std) = problem.simulator.parameters, squashed(state.watch.best)
         collection = self.collection(problem)
+        may_start = collection.mode == "policy" and problem.states.starts_known
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
             mean=space.to_physical(scaled),
@@ -180,7 +184,7 @@ class Madoc:
             group_stability=state.stability if state.grouped == self.grouping_epochs else None,
             failures=state.failures,
             warnings=(
-                *watch.warnings(state.watch, scaled, space.names),
+                *watch.warnings(state.watch, scaled, space.names, may_start_logged=may_start),
                 *self._of_features(problem, collection, state),
                 *collection.warnings,
             ),

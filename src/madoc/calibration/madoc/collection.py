@@ -8,7 +8,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.sensing import with_sensor_noise
-from madoc.data.disturbing import row_change
 from madoc.learning import replay
 from madoc.learning.features import WindowScaling, unbroken, windows_ending
 from madoc.simulation.rollout import (
@@ -164,7 +163,7 @@ class Collection:
                     "rollouts start at states whose velocities were taken from positions, which is not exact"
                 )
         if self.noise.any():
-            change = row_change(self.problem.dataset)
+            change = self.problem.row_change
             share = 100.0 * np.median(self.noise[change > 0.0] / change[change > 0.0])
             sentences.append(f"simulated observations were given sensor noise of {share:.2g} % of a step's change")
         return tuple(sentences)

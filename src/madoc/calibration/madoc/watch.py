@@ -125,8 +125,13 @@ def settled(watch: Watch) -> bool:
     return watch.epochs - watch.began >= SETTLING
 
 
-def warnings(watch: Watch, scaled: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Warnings about the estimate `scaled` (d,) in [-1, 1], one sentence each."""
+def warnings(
+    watch: Watch, scaled: np.ndarray, names: tuple[str, ...], *, may_start_logged: bool = False
+) -> tuple[str, ...]:
+    """Warnings about the estimate `scaled` (d,) in [-1, 1], one sentence each.
+
+    `may_start_logged` says that rollouts start at resets and could start at logged states.
+    """
     sentences = []
     if not settled(watch):
         sentences.append(
@@ -136,6 +141,6 @@ def warnings(watch: Watch, scaled: np.ndarray, names: tuple[str, ...]) -> tuple[
     if watch.at_bound > SATURATED:
         sentences.append(
             f"the discriminators are sure of {watch.at_bound:.0%} of the simulated rows (reward at its bound), "
-            "so the reward has no slope; start rollouts at logged states, or narrow the ranges"
+            f"so the reward has no slope; {'start rollouts at logged states, or ' * may_start_logged}narrow the ranges"
         )
     return *sentences, *at_end_of_range(scaled, names, beyond=AT_END)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from madoc.data.dataset import Dataset, close_episodes, join
 from madoc.data.findings import Finding
-from madoc.data.logs.jumps import unwrapped
+from madoc.data.logs.jumps import of_one_sign, unwrapped
 from madoc.data.logs.tables import Run, Table, as_numbers
 from madoc.data.logs.timing import (
     Resample,
@@ -173,7 +173,9 @@ def _series(run: Run, table: Table, columns: Sequence[str], robot: Robot) -> tup
     names = wanted_columns(robot)
     turns = {names[signal.name]: signal.turn for signal in robot.signals}
     values, wraps = unwrapped(series, columns, turns)
-    return replace(series, values=values), findings + wraps
+    series = replace(series, values=values)
+    values, signs = of_one_sign(series, columns, {names[each.name]: each.quaternion for each in robot.signals})
+    return replace(series, values=values), [*findings, *wraps, *signs]
 
 
 def _lost(series: Series, lost: Bool[np.ndarray, " rows"], what: str, consequence: str) -> list[Finding]:

@@ -1,4 +1,4 @@
-"""Jumps in a log that are no motion: angles that wrap around, episodes in one table, and runs that are there twice."""
+"""Jumps in a log that are no motion: of angles, of a quaternion's sign, between episodes, and runs that are copies."""
 
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
@@ -43,6 +43,28 @@ def unwrapped(
             values[known, index] = np.unwrap(angle, period=turn)
             what = f"column {column!r} jumps by a whole turn in {count:,} rows: it was unwrapped"
             findings.append(Finding("note", what, series.run, "a policy needs the unwrapped angle too"))
+    return values, findings
+
+
+def of_one_sign(
+    series: Series, columns: Sequence[str], quaternions: Mapping[str, str]
+) -> tuple[Float[np.ndarray, "rows columns"], list[Finding]]:
+    """The values of a series, its quaternions made continuous where they change their sign, and a note on each.
+
+    `quaternions` are the joints of whose quaternion columns are components. A quaternion and its negative are the same
+    orientation, and trackers often log the one whose real part is positive. One without all four columns is left alone.
+    """
+    values, findings = series.values.copy(), []
+    for joint in filter(None, dict.fromkeys(quaternions.values())):
+        parts = [index for index, column in enumerate(columns) if quaternions.get(column) == joint]
+        known = np.flatnonzero(np.isfinite(values[:, parts]).all(1))
+        logged = values[:, parts][known]
+        turned = (logged[1:] * logged[:-1]).sum(1) < 0.0
+        if len(parts) == 4 and turned.any():
+            sign = np.where(np.cumsum(turned) % 2, -1.0, 1.0)
+            values[known[1:, None], parts] *= sign[:, None]
+            what = f"the quaternion of {joint!r} changes its sign in {int(turned.sum()):,} rows: it was made continuous"
+            findings.append(Finding("note", what, series.run, "a policy needs the continuous quaternion too"))
     return values, findings
 
 

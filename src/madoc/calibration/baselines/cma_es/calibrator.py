@@ -25,6 +25,7 @@ from madoc.calibration.baselines.population_search import (
     replay_residuals,
 )
 from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
+from madoc.errors import MadocError
 from madoc.identification.windows import first_rows
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
 from madoc.learning.features import HIDDEN_WINDOW, unbroken, windows_ending
@@ -116,6 +117,8 @@ class CmaEs:
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
+        if self.starts and self.objective == "one-step":
+            raise MadocError("starts is of objective=distribution (cma-es-distribution): leave it out of one-step")
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> CmaEsState:
         """The search about mid-range; features, clone and walkers where they are needed.

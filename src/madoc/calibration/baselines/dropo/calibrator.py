@@ -55,7 +55,7 @@ class Dropo:
 
     The authors draw 100 parameter vectors for each of a few fixed transitions. Here a generation costs population ·
     draws · transitions control steps: draws are few and the same for all candidates, the covariance over them is
-    shrunk, and the few transitions are drawn anew. Residuals are in units of each channel's typical change in one step,
+    shrunk, and the few transitions are drawn anew. Residuals are in units of each channel's typical change in a stride,
     and so is ε, to which the variance of the sensors' noise is added.
 
     Attributes:
