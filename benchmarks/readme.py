@@ -120,15 +120,35 @@ def study() -> str:
     ]
     for (count, draws), rows in sorted(cells.items()):
         lines.append(f"| {count} | {draws} | " + " | ".join(_studied(rows, name) for name in used) + " |")
+    fewest = min(draws for _, draws in cells)
+    lines += [
+        f"\nThe same runs as ratios to one agent, and to {fewest} draws an epoch, with the same truth.\n",
+        f"| parameters | draws an epoch | {STUDIED['physics']} to one agent | {STUDIED['each']} to one agent | "
+        + " | ".join(f"{STUDIED[name]} to {fewest} draws" for name in ("one", "physics", "each"))
+        + " |",
+        "|---" * 7 + "|",
+    ]
+    for (count, draws), rows in sorted(cells.items()):
+        compared = [(rows.get(name, {}), rows.get("one", {})) for name in ("physics", "each")]
+        before = cells[count, fewest] if draws > fewest else {}
+        compared += [(rows.get(name, {}), before.get(name, {})) for name in ("one", "physics", "each")]
+        found = [_ratio_of(*pair) for pair in compared]
+        if any(found):
+            lines.append(f"| {count} | {draws} | {' | '.join(found)} |")
     return "\n".join(lines) + "\n"
+
+
+def _ratio_of(rows: Mapping[int, dict], others: Mapping[int, dict]) -> str:
+    """The ratio of errors of runs with the same seed and its interval; empty of fewer than three pairs."""
+    pairs = [(rows[seed]["error"], others[seed]["error"]) for seed in rows if seed in others]
+    return ratio(pairs) if len(pairs) > 2 else ""
 
 
 def _studied(rows: Mapping[str, Mapping[int, dict]], name: str) -> str:
     if not (runs := rows.get(name)):
         return "not run"
-    beside = rows.get("each", {})
-    pairs = [(row["error"], beside[seed]["error"]) for seed, row in runs.items() if seed in beside]
-    compared = f": {ratio(pairs)}" if name != "each" and len(pairs) > 2 else ""
+    beside = _ratio_of(runs, rows.get("each", {})) if name != "each" else ""
+    compared = f": {beside}" if beside else ""
     seeds = f"{len(runs)} seed{'s' * (len(runs) > 1)}"
     return f"{np.mean([row['error'] for row in runs.values()]):.2f} ({seeds}){compared}"
 
