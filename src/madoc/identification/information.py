@@ -122,10 +122,10 @@ def sandwich(bread: Float[np.ndarray, "d d"], meat: Float[np.ndarray, "d d"]) ->
     root = inverse @ along * np.sqrt(np.maximum(scatter, np.finfo(float).eps * max(float(scatter[-1]), 0.0)))
     covariance = root @ root.T
     identified &= np.einsum("id,ij,jd->d", vectors, covariance, vectors) < BOX_VARIANCE
-    kept, lost = vectors[:, identified] @ vectors[:, identified].T, vectors[:, ~identified]
+    kept, lost = vectors[:, identified] @ (vectors[:, identified].T @ root), vectors[:, ~identified]
     deviation = np.sqrt(np.maximum(np.diag(inverse), np.finfo(float).tiny))
     return Uncertainty(
-        covariance=kept @ covariance @ kept + BOX_VARIANCE * lost @ lost.T,
+        covariance=kept @ kept.T + BOX_VARIANCE * lost @ lost.T,
         correlation=inverse / deviation[:, None] / deviation,
         unidentified=lost.T,
     )
