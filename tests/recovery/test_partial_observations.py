@@ -12,12 +12,13 @@ from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
 from madoc.data import Disturbance, disturb
 from own_robots import ARM_SPEC, BOUNCER, BOUNCER_SPEC, PENDULUM_SPEC, write_robot
-from robots import recorded
+from robots import ARM_TRUTH, recorded
 
 ARM = {"body_mass.fore": 0.4, "dof_damping.shoulder": 0.3, "dof_damping.elbow": 0.35}
 LEFT_OUT = ("velocity(", "gravity", "element: upper")
 EXACT = 1e-4
 """% of its range that least squares may be off on exact readings."""
+KEY = jax.random.key(0)
 NEAR = 10.0
 """And Madoc, in seconds."""
 
@@ -114,6 +115,16 @@ def test_madoc_compares_windows_of_encoders(arm):
     result = calibrate(method, problem_of(arm, ARM, rows=5000), key=jax.random.key(0), budget=80_000)
     assert (off(result, arm, ARM) < NEAR).all(), off(result, arm, ARM)
     assert any("windows of 3 rows" in warning for warning in result.warnings)
+
+
+@pytest.mark.slow
+def test_madoc_compares_windows_where_actions_are_late(tmp_path):
+    """One row does not tell which actions are pending: with `window=1` the mean error is 12 % of the ranges."""
+    spec = ARM_SPEC.replace("groups: 2", "  - {field: action_delay, low: 0, high: 0.06}\ngroups: 2")
+    task = robots.load(write_robot(tmp_path, spec)).task
+    truth = ARM_TRUTH | {"action_delay": 0.03}
+    result = calibrate(quick("madoc", patience=0), problem_of(task, truth, rows=5000), key=KEY, budget=80_000)
+    assert (off(result, task, truth) < NEAR).all(), off(result, task, truth)
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from madoc.simulation.write import OF_A_JOINT, ONE_DOF
+from madoc.simulation.write import OF_A_JOINT, ONE_DOF, has_gain
 
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 """Biases of motors, and of position and velocity servos."""
@@ -16,7 +16,7 @@ def joint_drives(
     """The force on each degree of freedom by actuators of hinges and slides, in N or N·m.
 
     States are (qpos, qvel, ...). Actuators of other transmissions, gains or biases than those of motors and servos are
-    left out. Controls and forces are cut off where the model does so.
+    left out, and so is gravity compensation by actuators. Controls and forces are cut off where the model does so.
     """
     forces = np.zeros((len(state), model.nv))
     clamped = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
@@ -24,7 +24,7 @@ def joint_drives(
         joint, given = int(model.actuator_trnid[index, 0]), control[:, index]
         usual = (
             model.actuator_trntype[index] in OF_A_JOINT
-            and model.actuator_gaintype[index] == int(mujoco.mjtGain.mjGAIN_FIXED)
+            and has_gain(model, index)
             and model.actuator_biastype[index] in _BIASES
         )
         if not usual or model.jnt_type[joint] not in ONE_DOF:

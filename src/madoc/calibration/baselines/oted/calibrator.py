@@ -109,7 +109,7 @@ class Oted:
         observation, action, count = task.observation_size, simulator.action_size, len(simulator.parameters)
         of_policy, of_discriminator, of_start, key = jax.random.split(key, 4)
         clone = fresh_clone(problem.dataset.transitions, self.hidden, learning_rate=self.learning_rate, key=of_policy)
-        pair = rows_compared(problem) * (observation + action)
+        pair = self._window(problem) * (observation + action)
         discriminator = Network(pair, 1, self.hidden, key=of_discriminator)
         distribution = Distribution(np.zeros(count), np.full(count, np.log(self.first_std)))
         return OtedState(
@@ -140,7 +140,7 @@ class Oted:
     def _starts(self, problem: CalibrationProblem) -> tuple[Starts, Int[np.ndarray, " rows"]]:
         """Where rollouts start, and how often the true system visits each logged window from there."""
         if not self._anew(problem):
-            windows = last_rows(problem.dataset, rows_compared(problem))
+            windows = last_rows(problem.dataset, self._window(problem))
             return reset_states(problem.simulator), np.ones(len(windows), dtype=np.int64)
         states, rows = problem.states.exact()
         chosen = comparable_starts(problem.dataset, rows, self.horizon)
@@ -149,6 +149,10 @@ class Oted:
     def _anew(self, problem: CalibrationProblem) -> bool:
         """Whether rollouts start anew at logged states in every epoch."""
         return (self.starts or ("logged" if problem.states.kind == "exact" else "policy")) == "logged"
+
+    def _window(self, problem: CalibrationProblem) -> int:
+        """Rows that are compared at a time; single ones where rollouts start at logged states."""
+        return 1 if self._anew(problem) else rows_compared(problem)
 
     def _clone(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         clone, key, epoch = cloning_epoch(
@@ -185,7 +189,7 @@ class Oted:
         )
         if not anew:
             rollout = with_sensor_noise(rollout, noise_deviation(problem, None), of_action)
-        length, seen = rows_compared(problem), rollout.transitions
+        length, seen = self._window(problem), rollout.transitions
         scaling, (logged, _) = problem.features.windows("standardised", length)
         # The first pair of a row is its start, which does not depend on the draw.
         pairs = scaling.features(windows_ending(seen, np.arange(max(1, length - 1), len(seen)), length))[0]
