@@ -30,6 +30,11 @@ def test_a_run_is_exported_beside_itself(whole, tmp_path, capsys):
     ranges = read_yaml((tmp_path / "out" / "randomization.yaml").read_text())
     spread = np.array([row["std"] for row in ranges["parameters"].values()])
     np.testing.assert_allclose(1.96 * spread, calibrated.half_widths, rtol=1e-3)
+    assert main(["export", str(whole), "--out", str(tmp_path / "out"), "--quiet"]) == 0  # over an export of its own
+    (tmp_path / "out" / "patch.yaml").write_text("mine")
+    assert main(["export", str(whole), "--out", str(tmp_path / "out")]) == 2
+    assert "holds model.xml, patch.yaml, randomization.yaml" in capsys.readouterr().err
+    assert (tmp_path / "out" / "patch.yaml").read_text() == "mine"
 
 
 def test_policies_go_along_as_onnx_when_asked(whole, tmp_path):

@@ -97,6 +97,7 @@ MALFORMED = {
     "a field nobody knows": (spec("field: body_mass", "field: body_mas"), "nearest: body_mass"),
     "a mass below zero": (spec("low: 0.5, high: 2.0", "low: -0.5, high: 2.0"), "below its physical bound"),
     "a parameter twice": (spec("element: fore", "element: upper"), "on line 14 already"),
+    "an empty parameter": (spec("{field: body_mass, element: upper, low: 0.5, high: 2.0}", "{}"), "expected"),
     "no signals": (spec("signals:", "signal:"), "unknown key 'signal'; nearest: signals"),
     # Models.
     "no model": (lambda folder, columns: (folder / "arm.xml").unlink(), "there is no model file"),
@@ -120,7 +121,8 @@ MALFORMED = {
     "time that goes back": (log(time=(40, 0.0)), "time to go forward"),
     "time in milliseconds": (log(time=(slice(None), 20.0 * np.arange(60))), "is it in ms?"),
     "an action out of its range": (log(elbow_torque=(3, 0.9)), "within its range of [0, 0.4] N·m, got 0.9"),
-    "hardly a finite row": (log(elbow=(slice(0, 50), np.nan)), "got NaN, infinity or nothing"),
+    "hardly a reading that can be meant": (log(elbow=(slice(0, 50), 1e200)), "got NaN, infinity, more than 1e+30"),
+    "hardly a finite row": (log(elbow=(slice(0, 50), np.nan)), "got NaN, infinity, more than 1e+30 or nothing"),
     "nothing ever moves": (
         log(**dict.fromkeys(("shoulder", "elbow", "shoulder_speed", "elbow_speed"), (slice(None), 0.0))),
         "it never moves: 0 in all 59 rows",

@@ -86,6 +86,7 @@ def places(recorded, whole, tmp_path):
         ("calibrate hopper --data {corrupt} --out {out}", "corrupt.npz"),
         ("calibrate hopper --data {narrow} --out {out}", "expected 11 values"),
         ("calibrate walker2d --data {data} --out {out}", "hopper"),
+        ("learn {used} --method sacc", "unknown method 'sacc'"),
         (CALIBRATE + "--format tape", "unknown format"),
         (CALIBRATE + "--max-transitions 0", "max_transitions"),
         (CALIBRATE + "--level harder", "harder"),

@@ -131,6 +131,18 @@ def test_learn_from_the_data_alone(whole, tmp_path, capsys):
     assert read(moved / "policy-bc" / "result.json")["updates"] == 20
 
 
+def test_a_log_that_has_changed_since_the_calibration_is_not_learnt_from(whole, tmp_path, capsys):
+    moved = tmp_path / "run"
+    shutil.copytree(whole, moved)
+    with np.load(moved / "data.npz") as archive:
+        arrays = dict(archive)
+    arrays["observation"] = arrays["observation"] + 1.0
+    np.savez(moved / "data.npz", **arrays)
+    assert main(["learn", str(moved), "--method", "bc", "--budget", "20"]) == 2
+    assert "has changed since the calibration" in capsys.readouterr().err
+    assert not (moved / "policy-bc").exists()
+
+
 @pytest.mark.parametrize("method", ["bc", "cql", "morec", "dr-bc"])
 def test_a_place_that_would_change_nothing_is_refused(whole, capsys, method):
     assert main(["learn", str(whole), "--method", method, "--at", "midrange"]) == 2

@@ -335,7 +335,7 @@ def test_a_row_that_is_not_finite_is_cut_with_a_word(robot, columns, tmp_path):
     dataset = logs.read(write_csv(tmp_path / "log.csv", holed), robot)
     assert dataset.episode_starts.tolist() == [0, 29]
     assert len(dataset) == 47
-    assert "1 of 50 rows have NaN, infinity or nothing in a signal or action, the first line 32" in (
+    assert "1 of 50 rows have NaN, infinity, more than 1e+30 or nothing in a signal or action, the first line 32" in (
         dataset.findings[0].what
     )
 

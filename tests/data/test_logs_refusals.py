@@ -73,7 +73,10 @@ def times(factor):
             "shoulder_torque within its range of [-0.5, 0.5] N·m, got 0.9 in line 5",
         ),
         (at("elbow_torque", 3, -1e-3), "expected elbow_torque within its range of [0, 0.4] N·m, got -0.001 in line 5"),
-        (at("elbow", slice(0, 40), np.nan), "got NaN, infinity or nothing in a signal or action in 40 of 50 rows"),
+        (
+            at("elbow", slice(0, 40), np.nan),
+            "got NaN, infinity, more than 1e+30 or nothing in a signal or action in 40 of 50 rows",
+        ),
         (at("time", slice(0, 40), np.inf), "got no finite time in column 'time' in 40 of 50 rows, the first line 2"),
         (at("elbow", slice(1, 50, 2), np.inf), "expected two rows in a row in log.csv"),
         (
@@ -186,6 +189,16 @@ def test_a_file_that_was_cut_short_or_is_of_another_kind(robot, columns, tmp_pat
     file.write_bytes(b"anything else")
     with pytest.raises(MadocError, match=rf"log\.{suffix}"):
         logs.read(file, robot)
+
+
+def test_a_byte_of_an_mcap_file_that_was_changed(robot, columns, tmp_path):
+    write_mcap(tmp_path / "log.mcap", columns)
+    content = bytearray((tmp_path / "log.mcap").read_bytes())
+    place = content.index(b'"elbow": ') + 10
+    content[place] ^= 1  # another digit
+    (tmp_path / "log.mcap").write_bytes(bytes(content))
+    with pytest.raises(MadocError, match=r"cannot read log\.mcap"):
+        logs.read(tmp_path / "log.mcap", robot)
 
 
 def test_columns_of_unequal_lengths(robot, columns, tmp_path):

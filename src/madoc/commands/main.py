@@ -115,7 +115,7 @@ def _one_sentence(box: str) -> str:
     paragraphs = [text.strip("─ ") for text in paragraphs]
     if not paragraphs:
         return " ".join(box.split())
-    parts = [paragraphs[0].rstrip(".")]
+    parts = [re.sub(r"^Error parsing \S+: ", "", paragraphs[0]).rstrip(".")]
     parts += [text for text in paragraphs[1:-1] if text.startswith(("Perhaps", "Available"))][:1]
     read_on = paragraphs[-1] if paragraphs[-1].startswith("For full") else ""
     read_on = read_on[read_on.find("madoc") :]

@@ -58,6 +58,8 @@ def hide_velocities(task: Task) -> Task:
         MadocError: Its velocities are not the last values of an observation.
     """
     if not task.velocities:
+        if task.source is not None:
+            raise MadocError(f"only madoc's robots hide velocities: take their signals out of the spec of {task.name}")
         raise MadocError(f"an observation of {task.name} does not end in velocities, so they cannot be hidden")
     size, observe, rebuild = task.observation_size - task.velocities, task.observe, task.state_from_observation
 

@@ -11,6 +11,9 @@ from madoc.robots.document import yaml_text
 from madoc.runs.files import replacing
 from madoc.simulation.mjcf import Change
 
+OF_PATCH = "What a calibration changed in the model, and how sure it is."
+"""The first line of a patch."""
+
 
 @dataclass(frozen=True)
 class Exported:
@@ -48,7 +51,15 @@ def save_patch(
             asdict(change) | {"old": _single(change.old), "new": _single(change.new)} for change in changes
         ],
     }
-    _write(path, "What a calibration changed in the model, and how sure it is.", content)
+    _write(path, OF_PATCH, content)
+
+
+def is_patch(path: Path) -> bool:
+    """Whether a file is one that `save_patch` wrote."""
+    try:
+        return path.read_text(encoding="utf-8").startswith(f"# {OF_PATCH}")
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def save_randomization(

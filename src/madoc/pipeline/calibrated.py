@@ -80,7 +80,7 @@ def read_calibration(path: str | Path, *, physics: str | None = None, allow_code
     Raises:
         MadocError: There is no calibration, or it has not ended.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     folder = path if path.is_dir() else path.parent
     if path.is_dir() and (folder / "calibration" / "spec.json").exists():
         folder = folder / "calibration"
@@ -90,6 +90,10 @@ def read_calibration(path: str | Path, *, physics: str | None = None, allow_code
         raise MadocError(f"the calibration in {folder} has not ended; go on with it with --resume first")
     if not file.exists():
         raise MadocError(f"there is no calibration at {path}; name a run folder or its result.json")
+    if physics is not None and spec.physics and physics != spec.physics:
+        raise MadocError(
+            f"the calibration in {folder} is of {spec.physics} physics, not {physics}; leave --physics out"
+        )
     result = CalibrationResult.from_json(read_json(file))
     machine = Machine.restored(replace(spec, task=result.task, physics=spec.physics or physics), allow_code=allow_code)
     task = replace(machine.task, parameters=_calibrated_space(result, machine.task.parameters))

@@ -14,10 +14,11 @@ from madoc.errors import MadocError
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.calibration_stage import methods_for
 from madoc.pipeline.forecast import Forecast, forecast
-from madoc.pipeline.keys import stage_key
+from madoc.pipeline.keys import check_seed, stage_key
 from madoc.pipeline.orders import CalibrationOrder, CheckOrder, SelftestOrder
 from madoc.pipeline.preparation import prepare
 from madoc.pipeline.refusals import check_order
+from madoc.runs.budget import read_budget
 from madoc.verdict.predicted import sensor_noise
 from madoc.verdict.selftest import Selftest, selftest
 
@@ -50,6 +51,8 @@ def check_logs(order: CheckOrder, *, allow_code: bool = False) -> Checked:
     Raises:
         MadocError: The robot's spec or its model is refused; the refusal of a log is part of the outcome.
     """
+    check_seed(order.seed)
+    read_budget(order.budget)
     robot = robots.load(order.spec, allow_code=allow_code)
     task = robot.task
     try:

@@ -147,6 +147,7 @@ def find_policies(folder: Path) -> dict[str, Path]:
     Raises:
         MadocError: There is none.
     """
+    folder = folder.expanduser()
     if not folder.is_dir():
         raise MadocError(f"there is no run folder {folder}; check the path")
     files = [folder / "policy.npz", *sorted(folder.glob("policy-*/policy.npz"))]

@@ -1,5 +1,6 @@
 """Export as a stage: a finished calibration as files for other tools."""
 
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from madoc import simulation
 from madoc.errors import MadocError
-from madoc.export import Exported, save_onnx, save_patch, save_randomization, save_sysid_parameters
+from madoc.export import Exported, is_patch, save_onnx, save_patch, save_randomization, save_sysid_parameters
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
@@ -48,6 +49,11 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False, allow_
         "randomization ranges": folder / "randomization.yaml",
         "mujoco.sysid parameters": folder / "sysid_parameters.yaml",
     }
+    names = [name if len(policies) > 1 else "" for name in policies]
+    targets = {
+        name: folder / f"policy{f'-{part}' * bool(part)}.onnx" for name, part in zip(policies, names, strict=True)
+    }
+    _require_ours(folder, [*files.values(), *targets.values()])
     changes = save_mjcf(simulator, result.mean, files["model"])
     save_patch(files["patch"], exported, provenance, changes=changes, stepping=_stepping(simulator))
     save_randomization(
@@ -55,10 +61,16 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False, allow_
     )
     save_sysid_parameters(files["mujoco.sysid parameters"], exported)
     for name, file in policies.items():
-        target = folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx")
-        save_onnx(NumpyPolicy.load(file), target)
-        files[f"policy {name}"] = target
+        save_onnx(NumpyPolicy.load(file), targets[name])
+        files[f"policy {name}"] = targets[name]
     return files
+
+
+def _require_ours(folder: Path, files: Iterable[Path]) -> None:
+    """Raise MadocError where a file to be written is there already, unless an earlier export has left it."""
+    taken = [file.name for file in files if file.exists()]
+    if taken and not is_patch(folder / "patch.yaml"):
+        raise MadocError(f"{folder} holds {', '.join(taken)} already, of no export of madoc; choose another --out")
 
 
 def provenance_of(calibrated: Calibrated) -> dict[str, object]:

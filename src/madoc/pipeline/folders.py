@@ -28,6 +28,7 @@ def working_folder(
     Raises:
         MadocError: As `RunFolder.create` and `RunFolder.open`.
     """
+    path = path.expanduser()
     made = not path.exists()
     folder = RunFolder.open(path, spec) if resume else RunFolder.create(path, spec)
     try:

@@ -13,7 +13,7 @@ from madoc.data.disturbance import Disturbance
 from madoc.errors import MadocError, unknown_name
 from madoc.parameters import ParameterDistribution
 from madoc.pipeline.calibrated import Calibrated
-from madoc.pipeline.data_stage import load_source, read_truth
+from madoc.pipeline.data_stage import fingerprint, load_source, read_truth
 from madoc.pipeline.folders import working_folder
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
@@ -70,14 +70,14 @@ def learn_in(
         "truth": truth,
     } | calibrated.machine.stored()
     with working_folder(out, spec, resume=resume) as folder:
-        # The policy of an interrupted run would look finished if this run were killed.
-        (out / "policy.npz").unlink(missing_ok=True)
         problem = PolicyProblem(simulator, parameters, dataset)
         return learn_policy(method, problem, key=key, budget=budget, folder=folder, resume=resume, quiet=quiet)
 
 
 def policy_folder_name(at: str, method: str) -> str:
     """`policy-calibrated`, with the method unless that is the default; `policy-cql` where it needs no parameters."""
+    if method not in LEARNERS:
+        raise unknown_name("method", method, LEARNERS)
     if not LEARNERS[method].needs_parameters:
         return f"policy-{method}"
     return f"policy-{at}" if method == DEFAULT_LEARNER else f"policy-{at}-{method}"
@@ -110,6 +110,12 @@ def _logged(calibrated: Calibrated, method: str) -> Dataset:
         )
     dataset = load_source(calibrated.source, calibrated.machine, seed=calibrated.result.seed)
     require_velocities(method, dataset.disturbance, dataset.origin)
+    recorded = "" if calibrated.spec.data is None else calibrated.spec.data.fingerprint
+    if recorded and fingerprint(dataset) != recorded:
+        raise MadocError(
+            f"{dataset.origin} has changed since the calibration in {calibrated.folder}; calibrate anew, or bring the "
+            "log back that it was calibrated to"
+        )
     return dataset
 
 

@@ -66,7 +66,7 @@ def learn_policy(
     )
     policy = method.policy(finished.state)
     if folder is not None:
-        save_policy(policy, folder.path / "policy.npz", task_name=problem.simulator.task.name)
+        save_policy(policy, folder.policy, task_name=problem.simulator.task.name)
     seconds = round(finished.seconds, 3)
     counts = finished.control_steps, finished.updates, finished.spent, entry.unit, seconds
     return LearnedPolicy(policy, finished.status, finished.sentence, *counts)

@@ -35,7 +35,7 @@ class Document:
         part = self.data
         line: int = part.lc.line if isinstance(part, CommentedMap | CommentedSeq) else 0
         for key in place:
-            if not isinstance(part, CommentedMap | CommentedSeq) or key not in part.lc.data:
+            if not isinstance(part, CommentedMap | CommentedSeq) or key not in (part.lc.data or {}):
                 break
             line, part = part.lc.data[key][0], part[key]
         return line + 1

@@ -212,8 +212,8 @@ class _Session(Generic[State]):
         self._measured = self._folder is not None and forget_peak()
         self._look_at_memory()
         if self._folder:
-            self._folder.result.unlink(missing_ok=True)
-            self._folder.diverged.unlink(missing_ok=True)
+            for outcome in (self._folder.result, self._folder.diverged, self._folder.policy):
+                outcome.unlink(missing_ok=True)  # those of an earlier part would look finished if this one were killed
             self._log = stack.enter_context(self._folder.log(self._offset, self.spent, unit=self._unit))
         if not self.resumed:
             self.save()

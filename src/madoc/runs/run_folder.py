@@ -24,7 +24,8 @@ class RunFolder:
 
     It holds `spec.json` (the settings and versions), `metrics.jsonl` (one line for each epoch), `tensorboard/`,
     `checkpoint.npz` (the last good state), `result.json` (how the run ended; missing until then), `memory.json` (the
-    most memory held, where the system tells) and `diverged.npz` (the last state, if it held a NaN). All files but the
+    most memory held, where the system tells) and `diverged.npz` (the last state, if it held a NaN); of a learner also
+    `policy.npz`. All files but the
     logs, which grow, are written whole or not at all.
 
     Call `create` or `open` to make one.
@@ -33,7 +34,7 @@ class RunFolder:
     def __init__(self, path: Path, spec: Mapping[str, object], lock: filelock.BaseFileLock) -> None:
         self.path, self.spec, self._lock = path, spec, lock
         self.checkpoint, self.diverged = path / "checkpoint.npz", path / "diverged.npz"
-        self.result = path / "result.json"
+        self.result, self.policy = path / "result.json", path / "policy.npz"
 
     @classmethod
     def create(cls, path: str | Path, spec: Mapping[str, object]) -> "RunFolder":
@@ -42,7 +43,7 @@ class RunFolder:
         Raises:
             MadocError: The folder already holds a run, is locked, or cannot be written.
         """
-        path = Path(path)
+        path = Path(path).expanduser()
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -65,7 +66,7 @@ class RunFolder:
             MadocError: The folder is missing, holds no run, or is locked; or a spec is given that differs from that
                 of the run in more than the budget.
         """
-        path = Path(path)
+        path = Path(path).expanduser()
         if not (path / "spec.json").exists():
             what = "holds no run" if path.is_dir() else "does not exist"
             raise MadocError(f"cannot resume: the folder {path} {what}; check the path, or leave out --resume")

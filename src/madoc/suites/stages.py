@@ -38,9 +38,9 @@ def carry_out(claim: Claim, suite: Path, *, allow_code: bool = False) -> Outcome
         claim.take_back()
         raise  # another worker may be allowed to
     except MadocError as error:
-        # A full disk, a file that is gone or changed, or a checkpoint of another version is no refusal: the same order
-        # may go through another time.
-        broken = isinstance(error, (_Changed, OtherState)) or isinstance(error.__cause__, OSError)
+        # A full disk, a missing library, a file that is gone or changed, or a checkpoint of another version is no
+        # refusal: the same order may go through another time.
+        broken = isinstance(error, (_Changed, OtherState)) or isinstance(error.__cause__, OSError | ImportError)
         return claim.end("failed" if broken else "refused", str(error), monotonic() - started)
     except Exception as error:
         (claim.folder / "failure.txt").write_text(traceback.format_exc(), encoding="utf-8")

@@ -56,7 +56,7 @@ _NOT_LOGS = frozenset((".yaml", ".yml", ".xml", ".urdf", ".md", ".json", ".pdf",
 """Endings of files that are often kept beside logs; they are skipped without a note."""
 _PROSE = frozenset(("readme", "license", "notes", "changelog"))
 """Names, without their endings, of files that are no logs even where their endings are those of logs."""
-_OF_A_RUN = ("metrics.jsonl", "result.json")
+_OF_A_RUN = ("metrics.jsonl", "result.json", "data.npz")
 """Files that, beside spec.json, mark a run folder of Madoc."""
 _OF_A_SUITE = ("plans", "cells")
 """Folders that mark the folder of a suite of Madoc."""

@@ -29,7 +29,9 @@ from madoc.types import Transitions
 DEFAULT_TIME = "time"
 _MOST_LOST = 0.5
 """Share of a run's rows that may be unusable, from 0 to 1; a run that loses more is refused."""
-_BROKEN = "NaN, infinity or nothing in a signal or action"
+LARGEST = 1e30
+"""Largest reading, in any unit, that a sensor can have meant."""
+_BROKEN = f"NaN, infinity, more than {LARGEST:.0e} or nothing in a signal or action"
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,7 @@ def _series(run: Run, table: Table, columns: Sequence[str], robot: Robot) -> tup
     check_ascending(series)
     names = wanted_columns(robot)
     turns = {names[signal.name]: signal.turn for signal in robot.signals}
+    series = replace(series, values=np.where(np.abs(series.values) > LARGEST, np.nan, series.values))
     values, wraps = unwrapped(series, columns, turns)
     series = replace(series, values=values)
     values, signs = of_one_sign(series, columns, {names[each.name]: each.quaternion for each in robot.signals})
@@ -254,8 +257,9 @@ def _scaled(
         row, column = (int(index) for index in np.argwhere(outside)[0])
         channel = robot.actions[column]
         smallest, largest = action[:, column].min(), action[:, column].max()
+        span = f"[{channel.low:g}, {channel.high:g}] {channel.unit}".rstrip()
         raise MadocError(
-            f"expected {channel.name} within its range of [{channel.low:g}, {channel.high:g}] {channel.unit}, got "
+            f"expected {channel.name} within its range of {span}, got "
             f"{action[row, column]:.6g} in {steps.place(int(used[row]))} of {run} ({int(outside[:, column].sum())} "
             f"such rows; the log has {smallest:.4g} to {largest:.4g}); is the unit right? Else widen low and high in "
             "the spec, or pass --clip-actions where the motor driver clips as well"

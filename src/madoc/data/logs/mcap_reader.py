@@ -73,15 +73,14 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
 
 def _messages(path: Path) -> Iterator[tuple["Channel", "Schema | None", "Message"]]:
     try:
-        from mcap.exceptions import McapError
         from mcap.reader import make_reader
     except ImportError as error:
         raise MadocError(f"MCAP logs need the library mcap: {EXTRA} ({error})") from error
     try:
         with path.open("rb") as file:
-            for schema, channel, message in make_reader(file).iter_messages():
+            for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
                 yield channel, schema, message
-    except (McapError, OSError, ValueError, EOFError, KeyError, RuntimeError) as error:
+    except Exception as error:  # the reader passes on what its decompressors and unpackers raise
         raise MadocError(
             f"cannot read {path.name} as MCAP ({type(error).__name__}: {error}); it is damaged or was cut short, "
             "`mcap recover` may save it"
