@@ -197,7 +197,7 @@ def tasks() -> str:
     seeds = f"{counts[0]} to {counts[-1]} seeds" if counts[1:] else f"{counts[0]} seed{'s' * (counts[0] > 1)}"
     within = f"{len(rows) - len(above)}, all but {' and '.join(above)}" if above else "each of them"
     return (
-        f"On {len(rows)} of the paper's 21 tasks, {seeds} each, `madoc` errs by {ours:.2f} on "
+        f"On {len(rows)} of the paper's 21 tasks, {seeds} each, `madoc` errs by {ours:.2g} on "
         f"average where the paper prints {theirs:.2f},\nand by no more than printed in {within}. It learns from "
         "300 000 control steps.\n"
     )

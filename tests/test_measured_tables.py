@@ -121,7 +121,7 @@ def test_tasks_that_are_worse_than_printed_are_named(monkeypatch):
     rows = [("a-low", 0.1, 0.2, 1), ("b-low", 0.5, 0.4, 2)]
     monkeypatch.setattr(paper, "beside_printed", lambda column: rows)
     told = readme.tasks()
-    assert "On 2 of the paper's 21 tasks, 1 to 2 seeds each, `madoc` errs by 0.30 on average" in told
+    assert "On 2 of the paper's 21 tasks, 1 to 2 seeds each, `madoc` errs by 0.3 on average" in told
     assert "where the paper prints 0.30,\nand by no more than printed in 1, all but b-low." in told
     monkeypatch.setattr(paper, "beside_printed", lambda column: rows[:1])
     assert "by no more than printed in each of them." in readme.tasks()
