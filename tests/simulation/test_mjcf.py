@@ -80,6 +80,9 @@ LIFT = """
       </body>
     </body>
   </worldbody>
+  <tendon>
+    <fixed name="cord" springlength="0.1" stiffness="1" range="-1 2"><joint joint="hinge" coef="1.5"/></fixed>
+  </tendon>
   <actuator>
     <position name="target" joint="rail" kp="30" kv="3"/>
     <motor name="torque" joint="hinge"/>

@@ -136,7 +136,7 @@ class Judged:
         missing_terms: Terms that the model may lack, the most significant first.
         alternatives: Other estimates that the log does not exclude, which the intervals cover.
         imitated: Terms that the model has none of and parameters imitate, which the intervals do not cover.
-        tested: False where the log should tell whether the model lacks a term, but is too short for that.
+        tested: False where the log cannot tell whether the model lacks a term: it is too short, or tells no states.
         at_end: Parameters estimated at an end of their range that is no physical bound.
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
         coarseness: By how many typical changes predictions one stride ahead change where the model is integrated in

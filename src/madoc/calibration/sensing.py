@@ -19,10 +19,10 @@ SensorNoise = NotNegative | Literal["estimated"] | None
 def rows_compared(problem: CalibrationProblem) -> int:
     """Rows that are compared at a time: one where it tells a state, or no episode has more, else `HIDDEN_WINDOW`.
 
-    A row does not tell which actions are pending, nor a velocity that is a difference of positions.
+    A row alone does not tell which actions are pending, nor a velocity that is a difference of positions.
     """
-    derived = problem.dataset.disturbance.velocities == "differences" or problem.simulator.task.pending
-    tells = problem.states.kind == "exact" and not derived
+    of_several = problem.dataset.disturbance.velocities == "differences" or problem.simulator.task.pending
+    tells = problem.states.kind == "exact" and not of_several
     return 1 if tells or not len(last_rows(problem.dataset, HIDDEN_WINDOW)) else HIDDEN_WINDOW
 
 

@@ -72,7 +72,7 @@ class Suspicions:
         alternatives: Other estimates that it does not exclude.
         imitated: Terms that the model has none of and of which the log cannot tell whether they are missing.
         control_steps: Control steps that were simulated to find that out.
-        tested: Whether there were enough windows to find anything.
+        tested: Whether there were states to begin at, and enough windows to find anything.
     """
 
     terms: tuple[MissingTerm, ...] = ()

@@ -1,8 +1,8 @@
 """Logged and simulated rows as features of order one, as networks see them.
 
 `Scaling` works on NumPy arrays in float64, `Features` does the same inside jitted updates in float32. Where velocities
-are hidden, (s, a) does not determine s', so `WindowScaling` describes a window of consecutive rows in place of one. The
-paper has no windows: its robots show their whole state.
+are hidden or actions late, (s, a) does not determine s', so `WindowScaling` describes a window of consecutive rows in
+place of one. The paper has no windows: its robots show their whole state.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from madoc.learning.cloning import Pairs
 from madoc.types import Transitions
 
 HIDDEN_WINDOW = 3
-"""Window length, in rows, where velocities are hidden: two rows give a velocity, a third an acceleration."""
+"""Window length, in rows, where one row tells no state: two rows give a velocity, a third an acceleration."""
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ class Finished(Generic[State]):
 
     Attributes:
         state: The last state; of a run that diverged, that of the last checkpoint. Without a folder it is that of the
-            time when one was due, in which buffers that are written in place hold later rows.
+            time when one was due, and buffers that are written in place are not to be read.
         status: `finished` (the budget is spent), `converged`, `interrupted` (by the user) or `diverged` (a NaN).
         sentence: The status in words.
         control_steps: Simulated control steps.
@@ -212,8 +212,10 @@ class _Session(Generic[State]):
         self._measured = self._folder is not None and forget_peak()
         self._look_at_memory()
         if self._folder:
-            for outcome in (self._folder.result, self._folder.diverged, self._folder.policy):
-                outcome.unlink(missing_ok=True)  # those of an earlier part would look finished if this one were killed
+            self._folder.result.unlink(missing_ok=True)
+            self._folder.diverged.unlink(missing_ok=True)
+            if self.resumed:  # its policy would look finished if this part were killed
+                self._folder.policy.unlink(missing_ok=True)
             self._log = stack.enter_context(self._folder.log(self._offset, self.spent, unit=self._unit))
         if not self.resumed:
             self.save()

@@ -208,7 +208,8 @@ def _write_rows(
         old, new = _row(nominal, array, index), _row(bound, array, index)
         if old == new:
             continue
-        if attribute in _ANGLES and spec.compiler.degree and int(element.type) == int(mujoco.mjtJoint.mjJNT_HINGE):
+        turns = kind == "joint" and int(element.type) == int(mujoco.mjtJoint.mjJNT_HINGE)
+        if attribute in _ANGLES and spec.compiler.degree and turns:
             old, new = np.rad2deg(old).tolist(), np.rad2deg(new).tolist()
         if np.ndim(getattr(element, attribute)):
             getattr(element, attribute)[: max(len(old), len(new))] = [*new, *[0.0] * (len(old) - len(new))]
@@ -250,6 +251,8 @@ _ROWS = (
     ("joint", "ref", "qpos0"),
     ("joint", "springref", "qpos_spring"),
     ("joint", "range", "jnt_range"),
+    ("tendon", "springlength", "tendon_lengthspring"),
+    ("tendon", "range", "tendon_range"),
     ("geom", "friction", "geom_friction"),
     ("geom", "size", "geom_size"),
     ("geom", "pos", "geom_pos"),

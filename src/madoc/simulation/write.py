@@ -10,13 +10,13 @@ from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter
 
 MASS_FLOOR = 1e-3
-"""Smallest mass of a body in kg; smaller values are raised to it, as the motion of a massless body diverges."""
+"""Mass of a body in kg to which smaller values are raised, as the motion of a massless body diverges; see `LEAST`."""
 
 INERTIA_FLOOR = 1e-9
-"""Smallest moment of inertia of a body in kg·m²; smaller values are raised to it for the same reason."""
+"""Moment of inertia in kg·m² to which smaller values are raised for the same reason; see `LEAST`."""
 
 LEAST = 1e-3
-"""Share of a body's mass or inertia in the model, below which a value is raised to it, where the floors are larger."""
+"""Share of a body's own mass or inertia in the model to which they are raised, where that is less than the floors."""
 
 CENTRED = 1e-6
 """Distance of a centre of mass from its body's origin, in radii of gyration, up to which rounding makes it."""

@@ -52,7 +52,7 @@ def judge(
 ) -> Verdict:
     """The first verdict that applies: rejected data, a mismatch, open parameters, no improvement; else calibrated.
 
-    A log that is too short to tell whether the model lacks a term leaves its parameters open.
+    A log that is too short to tell whether the model lacks a term, or tells no states, leaves its parameters open.
 
     Args:
         holdout: What the hold-out says of the estimate.
@@ -68,9 +68,9 @@ def judge(
         or _outside(holdout)
         or (_unlike_noise(holdout) if long_tails else None)
         or _open(holdout, combinations)
-        or _untested(holdout)
         or _no_improvement(holdout)
         or (None if settled else Verdict("NO_IMPROVEMENT", f"{_how_good(holdout)}, but {UNSETTLED}"))
+        or _untested(holdout)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and every parameter is known to within half of its range")
     )
 

@@ -385,7 +385,7 @@ class Madoc:
             failures=state.failures + failures,
         )
         metrics |= {"mismatch": watched.mismatch, "failures": float(following.failures)}
-        if self.keep_cloning and self.starts != "replay":
+        if self.keep_cloning:
             following, cloning = self._clone(problem, following)
             metrics |= cloning.metrics
         stalled = watch.stalled(watched, self.patience) if self.patience else None

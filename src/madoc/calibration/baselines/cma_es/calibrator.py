@@ -45,7 +45,7 @@ class Clouds:
 
     Attributes:
         of_pairs: Features of observations and actions, compared for `policy` starts; of windows of both where
-            velocities are hidden.
+            one row tells no state.
         of_observations: Features of observations, whose change is compared for `logged` starts.
         pair: Mean of the features of pairs over logged rows; zeros until the log has been read.
         change: Change in a step of the mean of the features of observations, over logged rows.

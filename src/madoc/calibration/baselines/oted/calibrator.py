@@ -55,7 +55,7 @@ class OtedState:
 class Oted:
     """Match the (s, a) distribution of a cloned policy's rollouts to that of the data.
 
-    Where velocities are hidden, windows of `HIDDEN_WINDOW` rows take the place of (s, a). Rows that run freely are
+    Where one row tells no state, windows of `HIDDEN_WINDOW` rows take the place of (s, a). Rows that run freely are
     given the noise that the data says it has.
 
     Attributes:
