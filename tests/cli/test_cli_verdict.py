@@ -92,6 +92,7 @@ def test_auto_goes_on_to_the_next_method_when_the_first_diverges(log, tmp_path, 
     assert answer["control_steps"] == sum(part["control_steps"] for part in parts)
 
 
+@pytest.mark.slow
 def test_auto_lets_madoc_begin_at_least_squares_estimate(log, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(calibration_stage, "_reason_to_stop", lambda tried: "")
     out = tmp_path / "run"

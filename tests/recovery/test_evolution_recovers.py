@@ -62,6 +62,7 @@ def test_a_likely_distribution_stands_about_the_truth(robot, weight):
     assert (error < LIKELY).all(), error
 
 
+@pytest.mark.slow
 def test_an_entropy_bonus_keeps_the_distribution_wide():
     narrow, wide = (off(Dropo(entropy_weight=weight), "spring")[1].std for weight in (0.0, 3.0))
     assert (wide > narrow).all()
