@@ -5,12 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
-@pytest.mark.slow
 def test_the_spring_is_found():
     ran = subprocess.run(
         [sys.executable, EXAMPLES / "01_spring.py"], capture_output=True, text=True, timeout=280, check=True
