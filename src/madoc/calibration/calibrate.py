@@ -21,6 +21,7 @@ from madoc.simulation.sensitivity import refuse_insensitive
 from madoc.types import State, entry_of
 
 DIVERGED = "the run diverged: the estimate is that of its last checkpoint, which may be where it began"
+"""A warning that comes before those of the method."""
 
 
 def calibrate(

@@ -78,7 +78,7 @@ def read_calibration(path: str | Path, *, physics: str | None = None, allow_code
         allow_code: Run the Python file of the robot's spec, if it has one; else such a run is refused.
 
     Raises:
-        MadocError: There is no calibration, or it has not ended.
+        MadocError: There is no calibration, it has not ended, or it is of other physics.
     """
     path = Path(path).expanduser()
     folder = path if path.is_dir() else path.parent

@@ -49,10 +49,7 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False, allow_
         "randomization ranges": folder / "randomization.yaml",
         "mujoco.sysid parameters": folder / "sysid_parameters.yaml",
     }
-    names = [name if len(policies) > 1 else "" for name in policies]
-    targets = {
-        name: folder / f"policy{f'-{part}' * bool(part)}.onnx" for name, part in zip(policies, names, strict=True)
-    }
+    targets = {name: folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx") for name in policies}
     if out is not None:
         _require_ours(folder, [*files.values(), *targets.values()])
     changes = save_mjcf(simulator, result.mean, files["model"])

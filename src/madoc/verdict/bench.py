@@ -184,9 +184,9 @@ def _doubts(
     states nor what is needed to fit them cannot be tested, nor can one without pairs of consecutive observations.
     """
     problem, task = bench.problem, bench.problem.simulator.task
-    shuffled = problem.dataset.disturbance.shuffled
-    told = bench.states_known or (bench.states.kind == "approximate" and shuffled == "none")
-    if not told or shuffled == "next_observations":
+    ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
+    told = bench.states_known or (bench.states.kind == "approximate" and ordered)
+    if not told or problem.dataset.disturbance.shuffled == "next_observations":
         return Suspicions(tested=False), False
     given = problem.dataset, bench.states
     doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change)
