@@ -60,8 +60,7 @@ def main() -> None:
         UniformPolicy(1), simulator, TRUTH, transitions=2000, key=jax.random.key(0), origin="random pushes"
     )
     problem = madoc.CalibrationProblem(dataset, simulator)
-    method = madoc.Madoc(starts="replay", epoch_steps=500)
-    print(madoc.calibrate(method, problem, key=jax.random.key(1), budget=15_000, truth=TRUTH))
+    print(madoc.calibrate(madoc.LeastSquares(), problem, key=jax.random.key(1), budget=100_000, truth=TRUTH))
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ def madoc(**changes) -> Madoc:
     method = Madoc()
     agents = replace(method.agents, hidden=(16,), critic_hidden=(16,), batch=32, actor_batch=16)
     tiny = {"hidden": (16,), "cloning_epochs": 5, "cloning_updates": 5, "grouping_epochs": 5, "grouping_updates": 5}
+    tiny |= {"regression_hidden": (16,), "regression_epochs": 5, "regression_updates": 5}
     tiny |= {"epoch_steps": 100, "updates": 5, "draws": 5, "batch": 32, "replay_capacity": 500, "agents": agents}
     return replace(method, **(tiny | changes))
 
@@ -44,7 +45,7 @@ def go_on(path: str, budget: int):
 def wide() -> dict:
     """Layers and batches as large as the defaults, so that XLA and MuJoCo would share the work among cores."""
     settings = Madoc()
-    names = ("hidden", "batch", "epoch_steps", "agents")
+    names = ("hidden", "regression_hidden", "batch", "epoch_steps", "agents")
     method = madoc(**{name: getattr(settings, name) for name in names}, draws=None, replay_capacity=5000)
     seen = problem()
     result = calibrate(method, seen, key=KEY, budget=6000)

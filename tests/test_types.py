@@ -16,7 +16,7 @@ from madoc.types import entry_of
     [
         (Madoc(updates=3), "madoc"),
         (Madoc(groups="one", mixing="sum"), "madoc-s"),
-        (Madoc(starts=None, updates=3), "madoc-local"),
+        (Madoc(groups="learned", updates=3), "madoc-grouped"),
         (Madoc(groups="each", mixing="sum"), "madoc-vdn"),
         (Madoc(features="raw"), "madoc"),
         (Madoc.paper(updates=3), "madoc-paper"),
@@ -55,9 +55,11 @@ def test_a_method_of_ones_own_is_named_after_its_class():
     [
         (lambda: Madoc(updates=0), "expected updates of Madoc to be greater than or equal to 1, got 0"),
         (lambda: Madoc(hidden=(8, 0)), "expected hidden of Madoc to be greater than or equal to 1, got 0"),
+        (lambda: Madoc(groups="physics"), "expected groups of Madoc to be 'each', 'learned' or 'one', got 'physics'"),
+        (lambda: Madoc(group_count=2), "group_count is of groups=learned; leave it out with groups=each"),
         (
-            lambda: Madoc(starts="nowhere"),
-            "expected starts of Madoc to be 'policy', 'logged' or 'replay', got 'nowhere'",
+            lambda: AgentSettings(smallest_blur=0.2, first_blur=0.1, largest_blur=3.0),
+            "expected agents.smallest_blur ≤ agents.first_blur ≤ agents.largest_blur, got 0.2, 0.1 and 3.0",
         ),
         (lambda: Dropo(draws=1), "expected draws of Dropo to be greater than or equal to 2, got 1"),
         (lambda: SAC(discount=float("nan")), "expected discount of SAC to be less than or equal to 1, got nan"),

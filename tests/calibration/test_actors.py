@@ -11,7 +11,6 @@ from madoc.calibration.madoc.actors import (
     draw_parameters,
     initial_actors,
     prior_weight,
-    value_weight,
 )
 from madoc.learning.tanh_gaussian import log_density
 
@@ -115,21 +114,3 @@ def test_actors_follow_the_value_and_are_held_by_the_prior():
     assert slope(0.0) < -2
     # λ d KL / d mean = λ (0 + 0.5) / 0.3² = 5.5556 λ
     assert slope(10.0) - slope(0.0) == pytest.approx(55.556, rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("told", "shared_by", "weights"),
-    [
-        # five parameters in two groups, of 0 and 3, and of the rest; a third group is empty
-        (None, 10.0, [1.0, 1.0, 1.0]),
-        (None, 2.0, [2.5, 2.5, 2.5]),
-        (None, np.inf, [1.0, 1.0, 1.0]),
-        ([False] * 5, 2.0, [2.5, 2.5, 2.5]),
-        ([False, False, False, True, False], 2.0, [1.0, 2.5, 2.5]),
-        ([True] * 5, 2.0, [1.0, 1.0, 2.5]),
-    ],
-)
-def test_values_weigh_more_where_more_parameters_share_the_reward(told, shared_by, weights):
-    members = jnp.array([[True, False, False, True, False], [False, True, True, False, True], [False] * 5])
-    told = None if told is None else jnp.array(told)
-    np.testing.assert_allclose(value_weight(members, told, shared_by), weights)

@@ -96,17 +96,6 @@ def test_training_shows_the_value_of_the_moved_parameter_alone():
     jax.tree.map(np.testing.assert_array_equal, trained, same)
 
 
-def test_where_features_hold_the_next_state_itself_its_change_is_predicted():
-    # the same rows with s' in place of s' - s, s being the first two of (s, a)
-    rows = simulated_rows((0, 0, 1, 1), count=200)
-    whole = replay.Replay(rows.rows | {"following": rows.rows["following"] + rows.rows["pair"][:, :2]}, rows.written)
-    vae, state = untrained(hidden=(8,))
-    settings = {"optimiser": OPTIMISER, "batch": 32, "count": 5}
-    _, _, of_change = grouping.train(vae, state, rows, jax.random.key(0), **settings)
-    _, _, of_state = grouping.train(vae, state, whole, jax.random.key(0), state_at=0, **settings)
-    assert of_state == pytest.approx(float(of_change), rel=1e-5)
-
-
 def test_one_at_a_time_moves_one_parameter_a_draw():
     draws = grouping.one_at_a_time(jax.random.key(0), 200)
     assert draws.shape == (200, 200)

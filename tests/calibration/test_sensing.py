@@ -29,19 +29,21 @@ def problem_of(log, **disturbance):
     return CalibrationProblem(shown, simulation.make(observed_task(WHOLE, shown), threads=1))
 
 
+def collection_of(problem, method=None):
+    return (method or Madoc())._collection(problem, noise_deviation(problem, None))
+
+
 def test_windows_are_as_long_as_the_observation_wants(log):
     seen, hidden = problem_of(log), problem_of(log, hidden_velocities=True)
     derived = problem_of(log, hidden_velocities=True, velocities="differences")
-    assert [Madoc().collection(problem).scaling.length for problem in (seen, hidden, derived)] == [1, 3, 3]
-    assert Madoc(window=5).collection(hidden).scaling.length == 5
-    assert Madoc(starts="replay").collection(hidden).scaling.length == 1
+    assert [collection_of(problem).scaling.length for problem in (seen, hidden, derived)] == [1, 3, 3]
+    assert collection_of(hidden, Madoc(window=5)).scaling.length == 5
     with pytest.raises(MadocError, match=r"no episode .* has the 301 rows of a window; take a shorter one"):
         seen.features.windows("standardised", 301)
 
 
 def test_many_parameters_have_more_draws_for_a_shorter_time():
-    assert [geometry("policy", count) for count in (16, 17)] == [(20, 50), (100, 10)]
-    assert geometry("logged", 8) == geometry("logged", 40) == (100, 5)
+    assert [geometry(count) for count in (16, 17)] == [(20, 50), (100, 10)]
 
 
 def test_as_many_rows_are_compared_as_tell_a_state(log):
@@ -49,17 +51,14 @@ def test_as_many_rows_are_compared_as_tell_a_state(log):
     assert [rows_compared(problem) for problem in problems] == [1, 3]
     unordered = problem_of(log, hidden_velocities=True, shuffled="rows")
     assert rows_compared(unordered) == 1
-    assert Madoc().collection(unordered).scaling.length == 1
+    assert collection_of(unordered).scaling.length == 1
 
 
-def test_rollouts_start_at_logged_states_where_those_are_known(log):
+def test_baselines_start_at_logged_states_where_those_are_known(log):
     seen, hidden = problem_of(log), problem_of(log, hidden_velocities=True)
     blind = CalibrationProblem(
         log, simulation.make(replace(WHOLE, state_from_observation=None, posture=None), threads=1)
     )
-    modes = [Madoc(starts=None).collection(problem).mode for problem in (seen, hidden, blind)]
-    assert modes == ["logged", "logged", "policy"]
-    assert {Madoc().collection(problem).mode for problem in (seen, hidden, blind)} == {"policy"}
     assert [Oted()._anew(problem) for problem in (seen, hidden, blind)] == [True, False, False]
     assert [CmaEs("distribution")._acts(problem) for problem in (seen, hidden, blind)] == [False, True, True]
 
@@ -70,9 +69,22 @@ def test_simulated_readings_carry_the_noise_that_the_data_says_it_has(log):
     change = clean.typical_change
     np.testing.assert_allclose(noise_deviation(noisy, None), 0.1 * change, rtol=0.05)
     np.testing.assert_allclose(noise_deviation(noisy, "estimated"), 0.1 * change, rtol=0.3)
-    (warning,) = Madoc().collection(noisy).warnings
-    assert warning == "simulated observations were given sensor noise of 9.9 % of a step's change"
-    assert Madoc().collection(clean).warnings == ()
+    (warning,) = collection_of(noisy).warnings
+    assert warning == "simulated observations were given sensor noise of up to 9.9 % of a step's change"
+    assert collection_of(clean).warnings == ()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1])
+def test_noise_that_nobody_declared_is_estimated_once_the_regression_has_learnt(share):
+    exact = recorded(WHOLE, ARM_TRUTH, 1000, KEY)
+    shown = replace(disturb(exact, Disturbance(noise=share), WHOLE, KEY), disturbance=Disturbance())
+    clean, problem = (CalibrationProblem(log, simulation.make(WHOLE, threads=1)) for log in (exact, shown))
+    method = Madoc(cloning_epochs=0, regression_hidden=(64, 64), regression_epochs=10)
+    state = method.init(problem, KEY)
+    for _ in range(method.regression_epochs):
+        assert not state.noise.any()
+        state, _ = method.step(problem, state)
+    np.testing.assert_allclose(state.noise / clean.row_change, share, rtol=0.25, atol=0.01)
 
 
 def test_noise_is_a_share_of_the_change_from_row_to_row_at_any_rate():
@@ -140,7 +152,6 @@ def test_too_few_readings_for_the_states_are_refused(log):
     ("wrong", "sentence"),
     [
         ({"window": 0}, "window"),
-        ({"window": 2, "starts": "replay"}, "expected window 1 or none, got 2"),
         ({"sensor_noise": -0.1}, "expected sensor_noise of Madoc to be greater than or equal to 0, got -0.1"),
     ],
 )

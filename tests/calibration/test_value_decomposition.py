@@ -4,15 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from scipy import stats
 
-from madoc.calibration.madoc.value_decomposition import (
-    GroupCritics,
-    counterfactual_loss,
-    set_back,
-    total_value,
-    value_loss,
-)
+from madoc.calibration.madoc.value_decomposition import GroupCritics, total_value, value_loss
 from madoc.learning.networks import descend
 
 VALUES = jnp.array([[1.0, 2.0], [3.0, -1.0]])
@@ -175,41 +168,3 @@ def test_a_baseline_takes_what_it_says_of_each_row_and_the_papers_takes_nothing(
     constant = eqx.tree_at(lambda made: made.baseline.layers[-1].weight, made, jnp.zeros((1, 16)))
     constant = eqx.tree_at(lambda made: made.baseline.layers[-1].bias, constant, jnp.array([0.5]))
     np.testing.assert_allclose(constant.less_baseline(REWARD, pair), [1.5, -0.5])
-
-
-def test_one_group_of_each_row_is_set_back_to_its_centre(compiled):
-    drawn, centre = parameters(2000), jnp.array([0.1, 0.2, 0.3, 0.4])
-    group, without = compiled(set_back)(drawn, centre, MEMBERS, jax.random.key(3))
-    own = np.asarray(MEMBERS)[np.asarray(group)]
-    np.testing.assert_array_equal(without, np.where(own, centre, drawn))
-    # the first group has two of four parameters, the others one each: shares of a half and two quarters
-    np.testing.assert_allclose(np.bincount(group, minlength=3) / 2000, [0.5, 0.25, 0.25], atol=0.04)
-
-
-def test_counterfactual_loss_by_hand(compiled):
-    # own differences: 2 - 0.5 = 1.5 and 3 - 1 = 2, less D of 1 and 4: errors 0.5 and -2, at shares 1.5 and 0.5
-    at_centre = jnp.array([[1.0, 0.5]])
-    loss = compiled(counterfactual_loss)(
-        VALUES, at_centre, jnp.array([1, 0]), jnp.array([1.0, 4.0]), jnp.array([1.5, 0.5])
-    )
-    assert loss == pytest.approx((1.5 * 0.25 + 0.5 * 4.0) / 4)
-
-
-def test_counterfactual_credit_is_that_of_dop_where_rows_cannot_be_redrawn():
-    terms = VALUES, jnp.array([-0.5, 2.0]), jnp.asarray(0.25), REWARD, EVEN
-    assert value_loss(*terms, "counterfactual") == value_loss(*terms, "dop")
-
-
-def test_differences_tell_of_a_weak_parameter_what_draws_do_not():
-    # parameter 3 earns 0.1 ξ_3, and 0.3 ξ_0 ξ_3 with another; (s, a) alone earn fifty times as much
-    drawn = parameters(4000)
-    of_row = 5.0 * jax.random.normal(jax.random.key(5), (4000,))
-    group, without = set_back(drawn, jnp.full(4, 0.2), MEMBERS, jax.random.key(6))
-    reward, less = (
-        np.asarray(of_row + each[:, 0] + 0.1 * each[:, 3] + 0.3 * each[:, 0] * each[:, 3]) for each in (drawn, without)
-    )
-    own = np.asarray(group) == 2
-    moved = np.asarray(drawn[:, 3])[own]
-    by_difference, by_draw = (stats.linregress(moved, earned[own]) for earned in (reward - less, reward))
-    assert by_difference.slope == pytest.approx(0.1, abs=3 * by_difference.stderr)
-    assert by_difference.stderr < 0.02 < 10 * by_difference.stderr < by_draw.stderr

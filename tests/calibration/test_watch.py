@@ -9,10 +9,10 @@ from madoc.calibration.madoc.watch import (
     SATURATED,
     SETTLING,
     SMOOTHING,
-    begin_again,
+    beats_mid_range,
     begin_watch,
+    compare,
     observe,
-    overlaps,
     stalled,
     warnings,
 )
@@ -24,10 +24,11 @@ def actors(value):
     return Actors(np.full(2, value, np.float32), np.zeros(2, np.float32))
 
 
-def watched(watch, epochs, *, blur=None, size=1.0, at_bound=0.0, estimate=0.0, steered_to=1.0):
+def watched(watch, epochs, *, blur=None, size=1.0, at_bound=0.0, estimate=0.0, steered_to=1.0, gain=1.0):
     metrics = {"reward_size": size, "reward_at_bound": at_bound, "overlap": 0.5}
     metrics |= {} if blur is None else {"blur": blur}
     for _ in range(epochs):
+        watch = compare(watch, gain)
         watch = observe(watch, metrics, actors(estimate), steered_to=steered_to, blur_range=(SMALLEST, LARGEST))
     return watch
 
@@ -163,25 +164,21 @@ def test_warnings_add_up():
     assert len(warned(watched(begun(), 3, blur=0.1, at_bound=1.0), unit=(1.0, 0.0))) == 3
 
 
-def test_where_features_change_earlier_mismatches_do_not_compare():
-    watch = watched(settled(blur=0.02, estimate=0.1), 5, blur=0.02, estimate=0.2)
-    again = begin_again(watch)
-    assert (again.epochs, again.began, again.milestone_epoch) == (SETTLING + 5, SETTLING + 5, SETTLING + 5)
-    later = watched(again, 1, blur=0.3, estimate=0.7)  # a mismatch fifteen times as large, of other features
-    assert float(later.best.mean[0]) == pytest.approx(0.7)
-    assert later.mismatch == pytest.approx(0.3)
-    (warning,) = warned(later)
-    assert "1 epochs of calibration with innovations are fewer" in warning
-    assert warned(watched(later, SETTLING, blur=0.3)) == ()
+def scattered(mean, seed, epochs=400):
+    """A watch of gains over mid-range that scatter by 1 about their mean."""
+    watch = settled(blur=0.1)
+    for gain in np.random.default_rng(seed).normal(mean, 1.0, epochs):
+        watch = watched(watch, 1, blur=0.1, gain=float(gain))
+    return watch
 
 
-def test_rows_overlap_only_once_discriminators_have_settled():
-    assert not overlaps(watched(begun(), SETTLING - 1, blur=0.2), 0.4)
-    assert overlaps(settled(blur=0.2), 0.4)
-    assert not overlaps(settled(blur=0.2), 0.6)
+def test_an_estimate_that_gains_nothing_over_mid_range_is_told():
+    # 2 standard errors of an average with the rate 0.02: a mean of 0 is beyond them in 2 %, one of 0.5 in all but few.
+    assert sum(beats_mid_range(scattered(0.0, seed)) for seed in range(30)) <= 3
+    assert sum(beats_mid_range(scattered(0.5, seed)) for seed in range(30)) >= 27
+    (warning,) = warned(watched(settled(blur=0.1), 1, blur=0.1, gain=-9.0))
+    assert warning.startswith("rows simulated at the estimate do not look more like the log's than rows at mid-range")
 
 
-def test_the_unit_of_the_blur_scales_the_mismatch():
-    metrics = {"blur": 0.2, "reward_size": 1.0, "reward_at_bound": 0.0, "overlap": 0.5}
-    watch = observe(begun(), metrics, actors(0.0), steered_to=1.0, blur_range=(SMALLEST, LARGEST), unit=0.1)
-    assert watch.mismatch == pytest.approx(0.02)
+def test_gains_before_the_discriminators_have_settled_are_forgotten():
+    assert beats_mid_range(watched(watched(begun(), SETTLING, blur=0.1, gain=-9.0), 2, blur=0.1, gain=0.1))

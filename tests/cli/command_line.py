@@ -11,10 +11,13 @@ from madoc.commands.main import main
 
 SOURCE = Path(__file__).parents[2] / "src"
 
-HYPERPARAMETERS = ["updates=2", "epoch_steps=500", "replay_capacity=2000", "hidden=[16,16]"]
+HYPERPARAMETERS = [
+    *("updates=2", "epoch_steps=500", "replay_capacity=2000", "hidden=[16,16]", "cloning_epochs=2"),
+    *("regression_hidden=[16]", "regression_epochs=2", "regression_updates=20"),
+]
 
 CALIBRATION = [
-    *("--method", "madoc-s", "--starts", "replay", "--budget", "2000", "--quiet"),
+    *("--method", "madoc-s", "--budget", "2000", "--quiet"),
     *("--set", *HYPERPARAMETERS, "--set", "agents.hidden=[16]", "agents.batch=32"),
 ]
 

@@ -7,6 +7,7 @@ from command_line import arguments
 from madoc.commands.main import main
 
 CALIBRATE = "calibrate hopper --data {data} --out {out} "
+MADOC = CALIBRATE + "--method madoc "
 
 
 @pytest.fixture
@@ -62,7 +63,7 @@ def places(recorded, whole, tmp_path):
         ("run hopper-medium --out {out} --policy-budget soon", "expected a budget such as 300000, 300s"),
         ("run hopper-medium --out {out} --episodes 0", "episode"),
         ("run hopper-medium --out {out} --transitions -1", "transition"),
-        ("run hopper-medium --out {out} --set colour=1", "unknown hyperparameter of madoc 'colour'"),
+        ("run hopper-medium --out {out} --method madoc --set colour=1", "unknown hyperparameter of madoc 'colour'"),
         ("run hopper-medium --out {out} --parameters torso", "did you mean body_mass.torso?"),
         ("run hopper-medium --out {out} --level hrad", "no range level 'hrad' for hopper"),
         ("run hopper-medium --out {out} --truth {strange}", "did you mean gravity?"),
@@ -96,13 +97,13 @@ def places(recorded, whole, tmp_path):
         (CALIBRATE + "--parameters torso", "did you mean body_mass.torso?"),
         (CALIBRATE + "--parameters --seed 1", "expected the names of parameters to calibrate, got none"),
         (CALIBRATE + "--parameters gravity gravity", "the parameter gravity is named twice; keep one"),
-        (CALIBRATE + "--set updats=2", "did you mean updates?"),
-        (CALIBRATE + "--set bound=2", "did you mean agents.bound?"),
-        (CALIBRATE + "--set updates=few", "hyperparameter updates of madoc is int, got 'few'"),
-        (CALIBRATE + "--set learning_rate=NaN", "learning_rate"),
+        (MADOC + "--set updats=2", "did you mean updates?"),
+        (MADOC + "--set bound=2", "did you mean agents.bound?"),
+        (MADOC + "--set updates=few", "hyperparameter updates of madoc is int, got 'few'"),
+        (MADOC + "--set learning_rate=NaN", "learning_rate"),
         (CALIBRATE + "--set updates", "name=value"),
         (CALIBRATE + "--set updates=1 updates=2", "twice"),
-        (CALIBRATE + "--starts replay --set starts=logged", "twice"),
+        (CALIBRATE + "--starts replay", "--starts"),
         (CALIBRATE + "--resume", "cannot resume"),
         ("calibrate hopper --data {data} --out {used}/calibration", "already holds a run"),
         (CALIBRATE + "--truth {out}.json", "could not read"),

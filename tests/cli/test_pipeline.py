@@ -2,25 +2,25 @@ import json
 import warnings
 from pathlib import Path
 
+import jax
 import pytest
 
 from madoc import tasks
-from madoc.calibration import CALIBRATORS, CalibrationResult, ParameterEstimate
-from madoc.calibration.holdout import AgainstChance, Area, ToldApart, Verdict
+from madoc.calibration import CALIBRATORS, CalibrationProblem
 from madoc.commands.main import _parse
-from madoc.data import Disturbance
+from madoc.data import Disturbance, disturb
 from madoc.errors import MadocError
 from madoc.pipeline import CalibrationOrder, Reading, Search, Source, fingerprint, split_name
 from madoc.pipeline.data_stage import Machine
 from madoc.pipeline.folders import ended, working_folder
 from madoc.pipeline.keys import seed_key, stage_key
-from madoc.pipeline.methods import hyperparameters, make_method
+from madoc.pipeline.methods import candidates_for, choose, hyperparameters, make_method
 from madoc.pipeline.orders import parse_settings
 from madoc.pipeline.preparation import prepare
-from madoc.pipeline.priors import prior_for, stored
 from madoc.report.records import restored_path, stored_path
 from madoc.simulation import make
-from madoc.verdict import Assessment
+from robots import SPRING_TRUTH, spring
+from robots import recorded as log_of
 
 
 def test_a_name_is_a_task_and_a_quality():
@@ -30,11 +30,11 @@ def test_a_name_is_a_task_and_a_quality():
 
 def test_hyperparameters_are_read_as_what_they_are():
     changes = parse_settings(
-        (("updates=3e2", "hidden=[64, 32]", "mixing=sum"), ("group-count=null", "agents.bound=3")), starts="replay"
+        (("updates=3e2", "hidden=[64, 32]", "mixing=sum"), ("group-count=null", "agents.bound=3", "features=raw"))
     )
     method = make_method(CALIBRATORS, "madoc", changes)
     assert (method.updates, method.hidden, method.mixing, method.group_count) == (300, (64, 32), "sum", None)
-    assert method.starts == "replay"
+    assert method.features == "raw"
     assert method.agents.bound == 3.0
     assert hyperparameters(method)["agents"]["bound"] == 3.0
 
@@ -54,7 +54,7 @@ def test_what_the_command_line_reads_is_the_order_that_the_pipeline_carries_out(
 def test_a_preset_keeps_its_own_values():
     paper, changed = (make_method(CALIBRATORS, "madoc-paper", {**change}) for change in ({}, {"updates": 7}))
     assert changed.updates == 7
-    assert changed.starts == paper.starts == "policy"
+    assert changed.features == paper.features == "raw"
 
 
 def test_stages_have_streams_of_their_own():
@@ -125,45 +125,44 @@ def test_few_rows_step_like_many():
     assert (system.step(state[:, :3], action[:, :3]) == many[:, :3]).all()
 
 
-def first_candidate(area, *, settled=True):
-    """Least squares' result of a mass of 2 kg with an interval of 1.8 to 2.1, and its area on a hold-out."""
-    row = ParameterEstimate(2.0, 0.1, 1.0, 3.0, "kg", [1.8, 2.1])
-    result = CalibrationResult(
-        "least-squares", "cart", "converged", "", 1, 0.0, 0, [["mass"]], {"mass": row}, settled=settled
-    )
-    holdout = ToldApart(
-        split="",
-        rows=400,
-        episodes=1,
-        estimate={"mass": 0.0},
-        interval_shares={"mass": 0.1},
-        against_chance=(AgainstChance("the simulator", 0.9, 0.01),),
-        noise={},
-        control_steps=0,
-        area_at_mid_range=Area(0.9, (0.87, 0.93), 400),
-        area_at_estimate=area,
-    )
-    return {"least-squares": (result, Assessment(Verdict("MODEL_MISMATCH", ""), holdout, result))}
+KEY = jax.random.key(0)
 
 
-def test_what_least_squares_leaves_to_the_next_candidate(tmp_path):
-    good, bad = Area(0.7, (0.67, 0.73), 400), Area(0.88, (0.85, 0.91), 400)
-    prior = prior_for(tmp_path, first_candidate(good))
-    assert (prior.mean.tolist(), prior.origin) == ([2.0], "the estimate of least squares")
-    assert prior.std == pytest.approx([0.2 / 1.959964])  # the farther end of the interval counts
-    assert prior_for(tmp_path, {}) is None
-    assert prior_for(tmp_path, first_candidate(good, settled=False)) is None
-    assert prior_for(tmp_path, first_candidate(bad)) is None
+def spring_log(**disturbance):
+    """A problem of the spring, and its log disturbed."""
+    task = spring(max_episode_steps=100)
+    log = disturb(log_of(task, SPRING_TRUTH, 300, KEY), Disturbance(**disturbance), task, KEY)
+    return CalibrationProblem(log, make(task, threads=1))
 
 
-def test_a_run_goes_on_with_the_prior_that_it_began_at(tmp_path):
-    prior = prior_for(tmp_path, first_candidate(Area(0.7, (0.67, 0.73), 400)))
-    (tmp_path / "spec.json").write_text(json.dumps(stored(prior)))
-    again = prior_for(tmp_path, {})
-    assert (again.mean.tolist(), again.std.tolist(), again.origin) == (
-        prior.mean.tolist(),
-        prior.std.tolist(),
-        prior.origin,
-    )
-    (tmp_path / "spec.json").write_text("{}")
-    assert prior_for(tmp_path, first_candidate(Area(0.7, (0.67, 0.73), 400))) is None
+def test_auto_takes_least_squares_where_it_can():
+    name, why = choose(candidates_for({}), spring_log(), KEY)
+    assert name == "least-squares"
+    assert why == "auto took least-squares: the robot's states can be had from the log or fitted to it"
+
+
+def test_auto_takes_madoc_where_least_squares_refuses_and_says_why():
+    methods, problem = candidates_for({}), spring_log(shuffled="next_observations")
+    with pytest.raises(MadocError) as refusal:
+        methods["least-squares"].init(problem, KEY)
+    assert choose(methods, problem, KEY) == ("madoc", f"auto took madoc: least-squares refuses: {refusal.value}")
+
+
+def test_a_method_that_was_named_is_taken_as_it_is():
+    assert choose({"oted": make_method(CALIBRATORS, "oted")}, spring_log(), KEY) == ("oted", None)
+
+
+def test_where_every_method_refuses_each_says_why():
+    methods = {name: make_method(CALIBRATORS, name) for name in ("least-squares", "dropo")}
+    with pytest.raises(MadocError, match=r"^least-squares refuses: .*; dropo refuses: .*shuffled"):
+        choose(methods, spring_log(shuffled="next_observations"), KEY)
+
+
+def test_what_auto_takes_has_its_usual_budget_unless_one_is_given(recorded):
+    source = Source((str(recorded),))
+    prepared = prepare(CalibrationOrder("hopper", source))
+    assert (prepared.method, prepared.budget, prepared.holdout) == ("auto", None, 0.2)
+    taken = prepared.by("madoc")
+    assert (taken.method, taken.budget) == ("madoc", 300_000)
+    given = prepare(CalibrationOrder("hopper", source, Search(budget=5)))
+    assert given.by("least-squares").budget == 5

@@ -48,7 +48,7 @@ SMALL = {
     "transitions=20_000": "transitions=500",
     "budget=100_000": "budget=1_000",
     "budget=50_000": "budget=1_000",
-    "madoc.Madoc()": 'madoc.Madoc(groups="one", starts="replay", updates=2, epoch_steps=500)',
+    "madoc.Madoc()": 'madoc.Madoc(groups="one", cloning_epochs=1, regression_epochs=1, updates=2, epoch_steps=500)',
     "madoc.SAC()": "madoc.SAC(warmup_steps=500, updates_per_step=0.01, epoch_steps=500, hidden=(16, 16))",
     "key=jax.random.key(3))": "key=jax.random.key(3), episodes=2)",
 }

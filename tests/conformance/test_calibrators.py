@@ -17,7 +17,6 @@ from madoc.calibration import (
     Droid,
     Dropo,
     LeastSquares,
-    Madoc,
     Oted,
     Uncalibrated,
     calibrate,
@@ -35,19 +34,18 @@ BUDGET = 400
 PROBING = 64 * 11  # rows x (2 d + 1): what finding parameters that change nothing costs
 
 
-def small(name, **changes):
+def small(name):
     """A Madoc whose epochs take milliseconds."""
     method = CALIBRATORS[name].make()
     agents = replace(method.agents, hidden=(8,), critic_hidden=(8,), batch=16, actor_batch=8)
     tiny = {"hidden": (8,), "cloning_epochs": 2, "cloning_updates": 3, "grouping_epochs": 2, "grouping_updates": 3}
+    tiny |= {"regression_hidden": (8,), "regression_epochs": 2, "regression_updates": 3, "horizon": 5}
     tiny |= {"epoch_steps": 80, "updates": 3, "draws": 4, "batch": 16, "replay_capacity": 300, "agents": agents}
-    tiny["horizon"] = None if changes.get("starts", method.starts) == "replay" else 5
-    return replace(method, **(tiny | changes))
+    return replace(method, **tiny)
 
 
 METHODS = {
     **{name: small(name) for name in CALIBRATORS if name.startswith("madoc")},
-    "madoc, replaying": small("madoc", starts="replay"),
     "least-squares": LeastSquares(windows=6, search_windows=3, searches=2, search_epochs=2, tolerance=0.0),
     "least-squares, windows": LeastSquares(horizon=3, windows=4, search_windows=2, search_epochs=1, tolerance=0.0),
     "least-squares, estimating": LeastSquares(
@@ -97,7 +95,6 @@ def problem(dataset, simulator):
 
 QUICK = (
     "madoc",
-    "madoc-local",
     "least-squares",
     "oted",
     "dropo",
@@ -106,7 +103,11 @@ QUICK = (
 )  # the others differ by a value; `make test-slow` holds them to every rule too
 
 
-@pytest.fixture(params=[pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in METHODS])
+def quick_and_slow(names):
+    return [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in names]
+
+
+@pytest.fixture(params=quick_and_slow(METHODS))
 def method(request):
     return METHODS[request.param]
 
@@ -284,20 +285,26 @@ def test_data_of_another_robot_is_refused(dataset, simulator):
         CalibrationProblem(replace(dataset, task_name="hopper"), simulator)
 
 
-@pytest.mark.parametrize("starts", ["logged", "replay"])
-def test_logged_starts_without_states_are_refused(method, dataset, starts):
-    if isinstance(method, Madoc):
-        method = replace(method, starts=starts, horizon=None)
-    elif isinstance(method, Oted | CmaEs):
+@pytest.fixture
+def blind(dataset):
+    return CalibrationProblem(dataset, simulation.make(replace(two_link_arm(), state_from_observation=None), threads=1))
+
+
+@pytest.mark.parametrize("name", quick_and_slow(name for name in METHODS if not name.startswith("madoc")))
+def test_logged_starts_without_states_are_refused(name, blind):
+    method = METHODS[name]
+    if isinstance(method, Oted | CmaEs):
         method = replace(method, starts="logged")
-    blind = replace(two_link_arm(), state_from_observation=None)
-    problem = CalibrationProblem(dataset, simulation.make(blind, threads=1))
     with pytest.raises(MadocError, match="does not determine its state, so nothing can start at logged states"):
-        calibrate(method, problem, key=KEY, budget=BUDGET)
+        calibrate(method, blind, key=KEY, budget=BUDGET)
+
+
+def test_madoc_needs_no_states(blind):
+    assert calibrate(METHODS["madoc"], blind, key=KEY, budget=BUDGET).status == "finished"
 
 
 UNSEEING = (
-    *("madoc", "madoc-local", "least-squares", "least-squares, estimating", "oted, free running"),
+    *("madoc", "least-squares", "least-squares, estimating", "oted, free running"),
     *("cma-es, acting", "nominal", "uniform"),
 )
 
@@ -354,5 +361,5 @@ def test_no_budget_is_refused(method, problem):
 def test_one_parameter_can_be_calibrated_alone(dataset):
     task = two_link_arm().with_parameters(["dof_damping.elbow"])
     problem = CalibrationProblem(replace(dataset, true_parameters=None), simulation.make(task, threads=1))
-    result = calibrate(METHODS["madoc, replaying"], problem, key=KEY, budget=BUDGET)
+    result = calibrate(METHODS["madoc"], problem, key=KEY, budget=BUDGET)
     assert result.groups == [["dof_damping.elbow"]]

@@ -11,7 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from madoc.commands.answer import EXIT_CODES
+
 TESTS = Path(__file__).parents[1]
+SMALL = [
+    *("updates=5", "epoch_steps=500", "hidden=[16]", "agents.hidden=[16]", "patience=0", "cloning_epochs=5"),
+    *("regression_hidden=[16]", "regression_epochs=5", "regression_updates=20"),
+]
 
 
 def start(words, **environment):
@@ -25,10 +31,10 @@ def start(words, **environment):
     )
 
 
-def ended(process):
+def ended(process, code=0):
     """Wait for a process that nobody kills."""
     _, err = process.communicate(timeout=250)
-    assert process.returncode == 0, err
+    assert process.returncode == code, err
 
 
 def epochs(folder):
@@ -76,12 +82,14 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path, kills):
 
 @pytest.mark.slow
 def test_the_command_line_too(tmp_path):
-    data = tmp_path / "hopper.npz"
+    """With `auto`, which takes Madoc where next observations are shuffled, and a verdict in the end."""
+    data, rejected = tmp_path / "hopper.npz", EXIT_CODES["DATA_REJECTED"]
     ended(start(["-m", "madoc", "record", "hopper-medium", "--transitions", 2000, "--out", data, "--quiet"]))
-    words = ["-m", "madoc", "calibrate", "hopper", "--data", data, "--budget", 60_000, "--quiet", "--set"]
-    words += ["updates=5", "epoch_steps=500", "hidden=[16]", "agents.hidden=[16]", "patience=0", "cloning_epochs=5"]
-    ended(start([*words, "--out", tmp_path / "whole"]))
+    words = ["-m", "madoc", "calibrate", "hopper", "--data", data, "--budget", 60_000, "--quiet"]
+    words += ["--shuffle", "next_observations", "--set", *(f"madoc.{setting}" for setting in SMALL)]
+    ended(start([*words, "--out", tmp_path / "whole"]), rejected)
     process = start([*words, "--out", tmp_path / "run"])
     kill_after(process, folder=tmp_path / "run", more=20, seconds=0.1)
-    ended(start([*words, "--out", tmp_path / "run", "--resume"]))
+    ended(start([*words, "--out", tmp_path / "run", "--resume"]), rejected)
     assert told(tmp_path / "run") == told(tmp_path / "whole")
+    assert told(tmp_path / "run")[0]["chosen"].startswith("auto took madoc")

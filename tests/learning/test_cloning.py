@@ -7,16 +7,12 @@ import pytest
 from affine import affine
 from madoc.learning.cloning import cloning_epoch, cloning_loss, continue_cloning, fresh_clone
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
-from madoc.types import Transitions
 
 FEW = {"learning_rate": 1e-3, "batch": 16, "updates": 3}
 
 
 def fresh(logged, hidden, learning_rate):
-    observation, action = (np.asarray(part) for part in logged)
-    none = np.zeros(len(observation))
-    rows = Transitions(observation, action, none, observation, none > 0, none > 0)
-    return fresh_clone(rows, hidden, learning_rate=learning_rate, key=jax.random.key(0))
+    return fresh_clone(logged, hidden, learning_rate=learning_rate, key=jax.random.key(0))
 
 
 def behaviour(observation):

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from madoc.learning.features import (
+    LoggedFeatures,
     Scaling,
     WindowScaling,
     change_of_motion,
@@ -37,6 +38,20 @@ def test_windows_end_in_rows_of_their_own_episode():
     np.testing.assert_array_equal(log.episode_starts, [0, 4])
     np.testing.assert_array_equal(last_rows(log, 3), [2, 3])
     np.testing.assert_array_equal(last_rows(log, 1), np.arange(6))
+
+
+def test_a_clone_learns_from_as_many_earlier_rows_as_it_will_recall():
+    log = recorded(spring(max_episode_steps=4), SPRING_TRUTH, 6, jax.random.key(0))
+    features, rows = LoggedFeatures(log), log.transitions
+    seen, action = features.pairs()
+    np.testing.assert_allclose(seen, rows.observation, rtol=1e-6)
+    np.testing.assert_allclose(action, rows.action, rtol=1e-6)
+    step = np.concatenate([rows.next_observation - rows.observation, rows.action], axis=1)
+    none = np.zeros(3)
+    one = np.stack([none, step[0], step[1], step[2], none, step[4]])  # the second episode begins with the fifth row
+    two = np.stack([none, none, step[0], step[1], none, none])
+    recalled = features.pairs(2)[0]
+    np.testing.assert_allclose(recalled, np.concatenate([rows.observation, one, two], axis=1), rtol=1e-4, atol=1e-7)
 
 
 def test_a_window_holds_the_rows_up_to_its_last():
@@ -119,3 +134,9 @@ def test_features_take_any_leading_axes():
     for shaped, straight in zip(scaling.features(seen), scaling.features(flat), strict=True):
         assert shaped.shape[:2] == (4, 5)
         np.testing.assert_array_equal(shaped.reshape(20, -1), straight)
+
+
+def test_raw_features_of_the_next_state_become_those_of_its_change():
+    window = rows([[1.0, 2.0], [3.0, 5.0]], [[0.5], [0.5]], [[3.0, 5.0], [7.0, 7.0]])
+    scaling = WindowScaling(Scaling.raw(window), 2, np.ones(2))
+    np.testing.assert_array_equal(scaling.changes(*scaling.features(window)), [4.0, 2.0])

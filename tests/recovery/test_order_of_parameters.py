@@ -17,7 +17,7 @@ UNMOVED = ("nominal", "uniform")
 """They estimate nothing: the middle of the box, in whatever order."""
 QUICK = {"least-squares": 1e-6, "droid": 0.1, "cma-es": 0.1, "dropo": 5.0}
 """% of its range that each parameter may be off."""
-MADOC = ("madoc", "madoc-local", "madoc-s", "madoc-vdn", "madoc-isac", "madoc-grouped")
+MADOC = ("madoc", "madoc-s", "madoc-vdn", "madoc-isac", "madoc-grouped")
 SLOW = {"e-dropo": 5.0, "oted": 20.0, "cma-es-distribution": 10.0} | dict.fromkeys(MADOC, 15.0)
 SAME_CODE = ("madoc-paper",)
 """Other constants of a method that is here, too slow for a spring."""
@@ -35,7 +35,7 @@ def estimated(name, task, truth, *, budget):
     if name == "oted":
         method = QUICK_OTED
     elif name in MADOC:
-        method = replace(quick(name), patience=0, starts="logged")
+        method = replace(quick(name), patience=0)
     logged = recorded(task, {parameter: truth[parameter] for parameter in task.parameters.names}, 5000, KEY)
     result = calibrate(method, CalibrationProblem(logged, simulation.make(task, threads=1)), key=KEY, budget=budget)
     return {parameter: row.estimate for parameter, row in result.parameters.items()}

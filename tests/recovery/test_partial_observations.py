@@ -111,7 +111,7 @@ def test_a_search_that_the_budget_ends_says_so(arm):
 
 @pytest.mark.slow
 def test_madoc_compares_windows_of_encoders(arm):
-    method = quick("madoc-local", patience=0)
+    method = quick("madoc", patience=0)
     result = calibrate(method, problem_of(arm, ARM, rows=5000), key=jax.random.key(0), budget=80_000)
     assert (off(result, arm, ARM) < NEAR).all(), off(result, arm, ARM)
     assert any("windows of 3 rows" in warning for warning in result.warnings)

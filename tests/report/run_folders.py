@@ -6,15 +6,7 @@ from dataclasses import asdict
 import numpy as np
 from pydantic import TypeAdapter
 
-from madoc.calibration.holdout import (
-    AgainstChance,
-    Area,
-    NotRun,
-    Predicted,
-    PredictionError,
-    PredictionErrors,
-    Tried,
-)
+from madoc.calibration.holdout import AgainstChance, Area, Predicted, PredictionError, PredictionErrors
 from madoc.identification.combinations import Combination
 from madoc.identification.term_tests import Alternative, MissingTerm
 
@@ -59,10 +51,6 @@ def result(**changes):
     correlation = np.eye(4)
     correlation[1, 2] = correlation[2, 1] = -0.9
     errors = tuple(PredictionError(steps, at, (at / 2, at * 2), {}) for steps, at in ((1, 0.01), (5, 0.1)))
-    compared = (
-        Tried("madoc", 0.04, (0.03, 0.05), "CALIBRATED", 3128, 83.4),
-        NotRun("oted", "the budget is spent"),
-    )
     holdout = Predicted(
         split="1 of 5 episodes is held out",
         rows=1000,
@@ -77,7 +65,6 @@ def result(**changes):
             MissingTerm("a spring", "jnt_stiffness.hip", 1.0, 0.4, "N·m/rad", 0.01, 2.5, {"gravity": 0.5}),
         ),
         alternatives=(Alternative(("a spring (jnt_stiffness.hip)",), True, {"gravity": 0.5}, {"gravity": 0.4}),),
-        candidates=compared,
         errors=PredictionErrors(errors, errors, errors, errors, 0.04, (0.03, 0.05), 0.04, 100, 0),
         explained=0.0,
         autocorrelation=0.0,

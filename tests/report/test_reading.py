@@ -1,5 +1,3 @@
-import json
-
 import numpy as np
 import pytest
 from run_folders import write_json
@@ -19,15 +17,6 @@ def test_a_whole_run_is_read_from_its_calibration(whole):
     assert run.log.metrics["accuracy_sas"].tolist()[-3:] == [0.7, 0.7, 0.7]
     assert np.isnan(run.log.metrics["accuracy_sas"][:2]).all()
     assert run.embeddings.vectors.shape == (4, 16)
-
-
-def test_of_several_methods_the_log_of_the_kept_one_is_read(whole):
-    folder = whole / "calibration"
-    (folder / "oted").mkdir()
-    (folder / "metrics.jsonl").rename(folder / "oted" / "metrics.jsonl")
-    result = json.loads((folder / "result.json").read_text())
-    write_json(folder / "result.json", result | {"holdout": result["holdout"] | {"chosen": "oted"}})
-    assert len(read_run(whole).log) == 5
 
 
 def test_a_whole_run_is_read_before_its_calibration_begins(tmp_path):

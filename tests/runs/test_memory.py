@@ -56,13 +56,3 @@ def test_a_system_that_tells_nothing_is_no_mistake(tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "_PROCESS", tmp_path / "nothing")
     assert not memory.forget_peak()
     assert memory.peak_memory() is None
-
-
-def test_a_peak_of_several_methods_is_known_if_each_is(tmp_path):
-    for method, peak in (("first", 3000), ("second", 2000)):
-        (tmp_path / method).mkdir()
-        (tmp_path / method / "result.json").write_text("{}")
-        memory.write_peak(tmp_path / method, peak)
-    assert memory.read_peak(tmp_path) == 3000
-    memory.write_peak(tmp_path / "first", None)
-    assert memory.read_peak(tmp_path) is None

@@ -93,6 +93,24 @@ def test_two_halves_are_one_rollout(spring_task):
     np.testing.assert_array_equal(last.state, end.state)
 
 
+def test_a_policy_recalls_the_changes_and_actions_of_earlier_steps_of_its_episode(spring_task):
+    task, saw = spring_task(), []
+
+    def looking(observation, key=None):
+        jax.debug.callback(lambda seen: saw.append(np.asarray(seen)[0, 0]), observation, ordered=True)
+        return jnp.full((*observation.shape[:-1], 1), 0.3)
+
+    system, starts = Script(1, lambda state, step: state + 1.0 + step), chosen_states(np.zeros((1, 2)))
+    walkers = begin(starts, KEY, systems=1, rows=1, recalled=6)
+    _, end = roll(system, task, looking, walkers, steps=4, starts=starts, key=None, restart_key=OTHER)
+    jax.effects_barrier()
+    # x = 0, 1, 3, and beyond 3 the episode ends: each step recalls (Δx, Δẋ, a) of the last two, the latest first.
+    expected = [[0, 0], [0, 0, 0], [0, 0, 0]], [[1, 1], [1, 1, 0.3], [0, 0, 0]], [[3, 3], [2, 2, 0.3], [1, 1, 0.3]]
+    for seen, parts in zip(saw, (*expected, expected[0]), strict=True):
+        np.testing.assert_allclose(seen, np.concatenate(parts), rtol=1e-6)
+    assert not end.recalled.any()  # the fourth step ended at x = 4
+
+
 def test_the_time_limit_truncates_and_restarts(spring_task):
     task = spring_task()
     simulator = CpuSimulator(task, threads=1)

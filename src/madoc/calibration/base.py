@@ -19,49 +19,17 @@ from madoc.types import Method, State
 
 
 @dataclass(frozen=True)
-class Prior:
-    """What is known of the parameters before a method looks at the log: independent normal distributions.
-
-    Attributes:
-        mean: Mean of each parameter, in physical units.
-        std: Standard deviation of each, in physical units.
-        origin: Whose estimate it is, as words for sentences.
-
-    Raises:
-        MadocError: A number is not finite, a deviation is negative, or there are not as many means as deviations.
-    """
-
-    mean: Float[np.ndarray, " d"]
-    std: Float[np.ndarray, " d"]
-    origin: str
-
-    def __post_init__(self) -> None:
-        if len(self.mean) != len(self.std):
-            raise MadocError(
-                f"the prior has {len(self.mean)} means and {len(self.std)} standard deviations; give one of each"
-            )
-        if not (np.isfinite(self.mean).all() and np.isfinite(self.std).all() and (self.std >= 0.0).all()):
-            raise MadocError(
-                f"expected a prior of finite means and finite deviations of at least 0, got {self.mean} and "
-                f"{self.std}; where nothing is known, give a deviation as wide as the range"
-            )
-
-
-@dataclass(frozen=True)
 class CalibrationProblem:
     """A log and the simulator whose parameters are to be estimated from it.
 
-    The data's true parameters, if it has any, are dropped here, so that no method can read them. Only Madoc and its
-    variants begin at the prior, if there is one; other methods do not look at it.
+    The data's true parameters, if it has any, are dropped here, so that no method can read them.
 
     Raises:
-        MadocError: The data belongs to another task, its observations differ from those of the simulator, or the prior
-            is not of as many parameters.
+        MadocError: The data belongs to another task, or its observations differ from those of the simulator.
     """
 
     dataset: Dataset
     simulator: Simulator
-    prior: Prior | None = None
 
     def __post_init__(self) -> None:
         task = self.simulator.task
@@ -73,9 +41,6 @@ class CalibrationProblem:
                 f"the data has {logged} values per observation, the simulator's {task.name} shows "
                 f"{shown}; where the data hides velocities, make the simulator of data.observed_task(task, dataset)"
             )
-        known, count = 0 if self.prior is None else len(self.prior.mean), len(self.simulator.parameters)
-        if self.prior is not None and known != count:
-            raise MadocError(f"the prior is of {known} parameters, the simulator has {count}; give one of each")
         object.__setattr__(self, "dataset", replace(self.dataset, true_parameters=None))
 
     @cached_property
@@ -153,7 +118,6 @@ class Estimate:
             log, and the intervals do not count that. False where the method does not estimate the noise.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
-        began: Where the search began, in a sentence, if that was at the problem's prior; else None.
     """
 
     mean: Float[np.ndarray, " d"]
@@ -167,7 +131,6 @@ class Estimate:
     settled: bool = True
     long_tails: bool = False
     group_stability: float | None = None
-    began: str | None = None
 
 
 @runtime_checkable

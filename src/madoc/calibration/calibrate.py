@@ -85,7 +85,6 @@ def calibrate(
         settled=estimate.settled,
         long_tails=estimate.long_tails,
         group_stability=estimate.group_stability,
-        began=estimate.began,
         problem=problem,
     )
     if folder is not None:

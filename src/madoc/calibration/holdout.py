@@ -100,26 +100,6 @@ class AgainstChance:
     p_value: float
 
 
-@dataclass(frozen=True)
-class Tried:
-    """A method that was run and judged on the hold-out: its `score` (smaller is better), verdict and cost."""
-
-    method: str
-    score: float
-    interval: tuple[float, float]
-    verdict: Word
-    control_steps: int
-    seconds: float
-
-
-@dataclass(frozen=True)
-class NotRun:
-    """A method that was not run, and why."""
-
-    method: str
-    not_run: str
-
-
 @dataclass(frozen=True, kw_only=True)
 class Judged:
     """The fields that all three records have in common.
@@ -143,8 +123,6 @@ class Judged:
             steps of a quarter of the length, the median over signals; 0 for a robot without a spec.
         finer: Whether other terms than the error of the integration step were tested with steps of a quarter of the
             length, as that error explains much and would hide them.
-        candidates: The methods that were compared on this hold-out; None where only one was run.
-        chosen: The name of the method among them whose estimate was kept.
     """
 
     split: str
@@ -163,8 +141,6 @@ class Judged:
     contradictions: tuple[str, ...] = ()
     coarseness: float = 0.0
     finer: bool = False
-    candidates: tuple[Tried | NotRun, ...] | None = None
-    chosen: str | None = None
 
     @property
     def clearest(self) -> AgainstChance:

@@ -9,8 +9,7 @@ from madoc.calibration.baselines.dropo.calibrator import ENTROPY_WEIGHT, Dropo
 from madoc.calibration.baselines.oted.calibrator import Oted
 from madoc.calibration.baselines.uncalibrated import Uncalibrated
 from madoc.calibration.least_squares.calibrator import LeastSquares
-from madoc.calibration.madoc.calibrator import Madoc
-from madoc.calibration.madoc.paper import PAPER
+from madoc.calibration.madoc.calibrator import PAPER, Madoc
 from madoc.types import MethodEntry
 
 _SHOWN: dict[type, tuple[str, ...]] = {
@@ -54,11 +53,10 @@ def _entry(
 
 _ENTRIES = (
     _entry("madoc", Madoc, "one agent a parameter; needs no states", _MADOC, 2024),
-    _entry("madoc-local", Madoc, "the same, from logged states where known", _MADOC, 2024, {"starts": None}),
     _entry("madoc-s", Madoc, "one agent for all parameters", _MADOC, 2024, {"groups": "one"}),
     _entry("madoc-vdn", Madoc, "credit by a plain sum (VDN)", _MADOC, 2024, {"mixing": "sum"}),
     _entry("madoc-isac", Madoc, "agents share one reward, no credit", _MADOC, 2024, {"mixing": "independent"}),
-    _entry("madoc-grouped", Madoc, "one agent a group, by physics", _MADOC, 2024, {"groups": "physics"}),
+    _entry("madoc-grouped", Madoc, "one agent a group, learned by the VAE", _MADOC, 2024, {"groups": "learned"}),
     _entry(
         "madoc-paper", Madoc, "Madoc with the paper's own constants", _MADOC, 2024, PAPER, ("features", "keep_cloning")
     ),

@@ -14,7 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from madoc.calibration.base import CalibrationProblem, Prior
+from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.holdout import HoldOut, Verdict
 from madoc.errors import MadocError
 from madoc.identification.combinations import Combination
@@ -65,7 +65,7 @@ class CalibrationResult:
         long_tails: Whether residuals have longer tails than noise has, which intervals do not count.
         group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
             groups, 0 for chance; None where the method did not find groups.
-        began: Where the search began, in a sentence, if another method's estimate was its prior; else None.
+        chosen: Why `auto` took this method, in a sentence; None where the method was named.
         verdict: The judgement on held-out rows; None where none were held out.
         holdout: The numbers behind the verdict.
         problem: The data and the simulator; None in a result that was read from a file.
@@ -89,7 +89,7 @@ class CalibrationResult:
     settled: bool = True
     long_tails: bool = False
     group_stability: float | None = None
-    began: str | None = None
+    chosen: str | None = None
     verdict: Verdict | None = None
     holdout: HoldOut | None = None
     problem: Annotated[CalibrationProblem | None, GetPydanticSchema(lambda kind, handler: core_schema.any_schema())] = (
@@ -111,11 +111,6 @@ class CalibrationResult:
     def mean(self) -> np.ndarray:
         """Estimates (d,) in physical units, in the task's order."""
         return np.array([parameter.estimate for parameter in self.parameters.values()])
-
-    def as_prior(self, origin: str) -> Prior:
-        """The estimate as a prior for another method, its deviations read from the 95 % intervals where it has them."""
-        widths = [row.half_width for row in self.parameters.values()]
-        return Prior(self.mean, np.array(widths) / NORMAL_95, origin)
 
     @property
     def interval(self) -> np.ndarray | None:
@@ -193,8 +188,8 @@ class CalibrationResult:
                 f"mean absolute error {self.error['mean_absolute']:.4g}, "
                 f"{self.error['mean_percent_of_range']:.2f} % of range"
             )
-        if self.began is not None:
-            lines.append(self.began)
+        if self.chosen is not None:
+            lines.append(self.chosen)
         if self.group_stability is not None:
             lines.append(
                 f"{len(self.groups)} groups; adjusted Rand index with those found again {self.group_stability:.2f}"

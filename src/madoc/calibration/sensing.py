@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.learning.features import HIDDEN_WINDOW, last_rows
+from madoc.learning.expectation import Expectation, noise_of_log
+from madoc.learning.features import HIDDEN_WINDOW, WindowScaling, last_rows
 from madoc.simulation.rollout import Rollout
 from madoc.types import NotNegative, named_key
 
@@ -35,6 +36,30 @@ def noise_deviation(problem: CalibrationProblem, share: SensorNoise) -> Float[np
         return np.zeros(problem.dataset.transitions.observation.shape[-1])
     # The logged change holds the noise of two readings; the share is that of the change without noise.
     return share / np.sqrt(1.0 + 2.0 * share**2) * problem.row_change
+
+
+def numbers_recalled(problem: CalibrationProblem, rows: int) -> int:
+    """How many numbers a clone sees of earlier rows where `rows` are compared: it has to tell the state as they do."""
+    return (rows - 1) * (problem.simulator.task.observation_size + problem.simulator.action_size)
+
+
+def log_noise(
+    problem: CalibrationProblem, expectation: Expectation, scaling: WindowScaling
+) -> Float[np.ndarray, " observation"]:
+    """Standard deviation of the noise of observations, estimated from the log alone; see `noise_of_log`.
+
+    Where one row does not tell the state, the regression's residuals say little of the sensors, and the motion is taken
+    to be smooth, as `difference_noise` has it.
+    """
+    if scaling.length > 1:
+        return problem.noise_by_differences
+    dataset, rows = problem.dataset, scaling.scaling
+    consecutive = np.ones(len(dataset), dtype=bool)
+    consecutive[dataset.episode_starts] = False
+    channels = len(rows.next_scale)
+    by_reading = rows.next_scale / rows.pair_scale[:channels]
+    logged = problem.features.windows("standardised", 1)[1]
+    return noise_of_log(expectation, logged, consecutive, by_reading) * rows.next_scale
 
 
 def with_sensor_noise(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:

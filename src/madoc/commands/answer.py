@@ -10,7 +10,6 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from madoc.calibration import CalibrationResult
-    from madoc.calibration.holdout import HoldOut
     from madoc.policies import ErrorCost
     from madoc.report.records import EvaluationRecord
 
@@ -134,35 +133,9 @@ def _costs_table(name: str, costs: "Mapping[str, ErrorCost]") -> Table:
 
 
 def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
-    """The verdict, the table of estimates, the comparison of methods, and a summary."""
+    """The verdict, the table of estimates, and a summary."""
     verdict = (str(result.verdict),) if result.verdict else ()
-    compared = (candidates_table(result.holdout),) if result.holdout and result.holdout.candidates else ()
-    return (*verdict, result.table(), *compared, result.summary())
-
-
-def candidates_table(holdout: "HoldOut") -> Table:
-    """The methods that `auto` has compared, a row each; those it did not run with the reason."""
-    from madoc.calibration.holdout import NotRun
-
-    measure = "area - ½" if holdout.measure == "told apart" else "error / mid-range's"
-    table = Table(title="methods compared on the hold-out", title_justify="left")
-    table.add_column("method", no_wrap=True)
-    for heading in (measure, "95 %", "control steps", "s"):
-        table.add_column(heading, justify="right")
-    table.add_column("verdict")
-    for row in holdout.candidates or ():
-        if isinstance(row, NotRun):
-            table.add_row(row.method, "", "", "", "", row.not_run)
-            continue
-        table.add_row(
-            row.method,
-            f"{row.score:.3g}",
-            "[{:.3g}, {:.3g}]".format(*row.interval),
-            f"{row.control_steps:,}",
-            f"{row.seconds:.0f}",
-            row.verdict + (" (kept)" if row.method == holdout.chosen else ""),
-        )
-    return table
+    return (*verdict, result.table(), result.summary())
 
 
 def calibration_status(result: "CalibrationResult") -> str:

@@ -10,10 +10,10 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from madoc.learning.networks import Actions, Observations, Scalar, adam, minimise
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy, log_density
-from madoc.types import Epoch, Metrics, Transitions
+from madoc.types import Epoch, Metrics
 
 Pairs = tuple[Observations, Actions]
-"""Logged observations and actions on the device, float32."""
+"""What a policy saw in the log, observations or more, and its actions, on the device, float32."""
 
 
 @jax.tree_util.register_dataclass
@@ -26,16 +26,16 @@ class Clone:
     epochs: int
 
 
-def fresh_clone(logged: Transitions, hidden: tuple[int, ...], *, learning_rate: float, key: PRNGKeyArray) -> Clone:
-    """An untrained clone that standardises observations by their logged mean and standard deviation, at least 0.001."""
-    observation = np.asarray(logged.observation)
+def fresh_clone(logged: Pairs, hidden: tuple[int, ...], *, learning_rate: float, key: PRNGKeyArray) -> Clone:
+    """An untrained clone that standardises what it sees by the logged mean and standard deviation, at least 0.001."""
+    seen = np.asarray(logged[0], np.float64)
     policy = TanhGaussianPolicy(
-        observation.shape[-1],
-        logged.action.shape[-1],
+        seen.shape[-1],
+        logged[1].shape[-1],
         hidden,
         key=key,
-        offset=observation.mean(0),
-        scale=np.maximum(observation.std(0), 1e-3),
+        offset=seen.mean(0),
+        scale=np.maximum(seen.std(0), 1e-3),
     )
     return Clone(policy, adam(learning_rate).init(eqx.filter(policy, eqx.is_array)), 0)
 

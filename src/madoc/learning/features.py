@@ -5,6 +5,7 @@ are hidden or actions late, (s, a) does not determine s', so `WindowScaling` des
 place of one. The paper has no windows: its robots show their whole state.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -130,10 +131,12 @@ class WindowScaling:
         """Number of features of a window, and of the observation after it."""
         return self.length * len(self.scaling.pair_offset), len(self.next_scale)
 
-    @property
-    def last_row(self) -> int:
-        """Place of the last row's features in those of a window of raw features, in which rows follow one another."""
-        return (self.length - 1) * len(self.scaling.pair_offset)
+    def changes(
+        self, window: Float[np.ndarray, "*rows window"], following: Float[np.ndarray, "*rows observation"]
+    ) -> Float[np.ndarray, "*rows observation"]:
+        """The features of s' as those of a change: raw ones less s, which stands in the last row of a raw window."""
+        first = (self.length - 1) * len(self.scaling.pair_offset)
+        return following if self.scaling.difference else following - window[..., first : first + following.shape[-1]]
 
     def features(
         self, windows: Transitions
@@ -157,12 +160,27 @@ class LoggedFeatures:
         """Features of this log."""
         self._dataset = dataset
         self._windows: dict[tuple[str, int], tuple[WindowScaling, tuple[Array, Array]]] = {}
+        self._pairs: dict[int, Pairs] = {}
 
-    @cached_property
-    def pairs(self) -> Pairs:
-        """Observations and actions, neither scaled, in float32 on the device."""
-        logged = self._dataset.transitions
-        return jnp.asarray(logged.observation, jnp.float32), jnp.asarray(logged.action, jnp.float32)
+    def pairs(self, recalled: int = 0) -> Pairs:
+        """What the policy of the log saw, with so many earlier rows, and its actions; neither scaled, on the device.
+
+        Earlier rows are recalled as `simulation.rollout.Walkers` have them.
+        """
+        if recalled not in self._pairs:
+            rows = self._dataset.transitions
+            seen = [np.asarray(rows.observation), *self._earlier(recalled)]
+            pairs = np.concatenate(seen, axis=-1), np.asarray(rows.action)
+            self._pairs[recalled] = (jnp.asarray(pairs[0], jnp.float32), jnp.asarray(pairs[1], jnp.float32))
+        return self._pairs[recalled]
+
+    def _earlier(self, count: int) -> Iterator[Float[np.ndarray, "rows values"]]:
+        """(s' - s, a) of the row before each row, of the one before that, and so on; 0 before an episode."""
+        dataset = self._dataset
+        row, first = np.arange(len(dataset)), dataset.episode_starts[dataset.episode_of(np.arange(len(dataset)))]
+        step = np.concatenate([_change(dataset.transitions), np.asarray(dataset.transitions.action)], axis=-1)
+        for back in range(1, count + 1):
+            yield np.where((row - back >= first)[:, None], step[np.maximum(row - back, 0)], 0.0)
 
     @cached_property
     def standardised(self) -> Scaling:

@@ -12,9 +12,9 @@ from madoc.diagnosis import Diagnosis, check
 from madoc.diagnosis.channels import signal_names
 from madoc.errors import MadocError
 from madoc.parameters import ParameterSpace
-from madoc.pipeline.calibration_stage import methods_for
 from madoc.pipeline.forecast import Forecast, forecast
 from madoc.pipeline.keys import check_seed, stage_key
+from madoc.pipeline.methods import methods_for
 from madoc.pipeline.orders import CalibrationOrder, CheckOrder, SelftestOrder
 from madoc.pipeline.preparation import prepare
 from madoc.pipeline.refusals import check_order

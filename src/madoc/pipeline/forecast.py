@@ -57,10 +57,11 @@ def _least_squares(problem: CalibrationProblem) -> Forecast:
 
 
 def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
-    method = Madoc(starts=None, cloning_epochs=0)
-    name = "madoc-local"
+    method = Madoc(cloning_epochs=0, regression_epochs=1, regression_updates=1)
+    name = "madoc"
     try:
         state = method.init(problem, jax.random.key(0))
+        state, _ = method.step(problem, state)
         times = []
         for _ in range(2):
             started = time.monotonic()

@@ -6,19 +6,19 @@ from dataclasses import asdict, fields, is_dataclass, replace
 from functools import partial
 from typing import Any, TypeVar, get_type_hints
 
+from jaxtyping import PRNGKeyArray
 from pydantic import TypeAdapter, ValidationError
 
-from madoc.calibration import CALIBRATORS, Calibrator
+from madoc.calibration import CALIBRATORS, CalibrationProblem, Calibrator
 from madoc.errors import MadocError, unknown_name
+from madoc.pipeline.orders import AUTO, CalibrationOrder
+from madoc.pipeline.refusals import method_of
 from madoc.types import MethodEntry
 
 Made = TypeVar("Made")
 
-CANDIDATES = {"least-squares": 2 / 3, "madoc-local": 1 / 2}
-"""The methods that `auto` tries, in this order (seconds before minutes), with the largest share of the budget of each.
-
-What a method does not spend is left to those after it, which may begin at its estimate (`pipeline/priors.py`).
-"""
+CANDIDATES = ("least-squares", "madoc")
+"""The methods of which `auto` takes the first that does not refuse the data."""
 
 
 def make_method(
@@ -51,7 +51,7 @@ def make_method(
 
 
 def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator]:
-    """The candidates of `auto` by name; a hyperparameter is changed under a name such as `madoc-local.updates`.
+    """The methods that `auto` may take, by name; a hyperparameter is changed under a name such as `madoc.updates`.
 
     Raises:
         MadocError: A hyperparameter is named otherwise, or as `make_method`.
@@ -64,6 +64,38 @@ def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator]:
             raise unknown_name("hyperparameter of auto", setting, [f"{candidate}.NAME" for candidate in CANDIDATES])
         changed[name][part] = value
     return {name: make_method(CALIBRATORS, name, changed[name]) for name in CANDIDATES}
+
+
+def methods_for(order: CalibrationOrder) -> dict[str, Calibrator]:
+    """The methods of an order by name: one, or those that `auto` may take.
+
+    Raises:
+        MadocError: As `make_method` or `candidates_for`.
+    """
+    name = method_of(order)
+    if name == AUTO:
+        return candidates_for(order.search.changes)
+    return {name: make_method(CALIBRATORS, name, order.search.changes)}
+
+
+def choose(methods: Mapping[str, Calibrator], problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[str, str | None]:
+    """The name of the first method that takes the problem, and why the ones before it refuse; None for the only one.
+
+    Raises:
+        MadocError: Every method refuses it.
+    """
+    if len(methods) == 1:
+        return next(iter(methods)), None
+    refusals = []
+    for name, method in methods.items():
+        try:
+            method.init(problem, key)
+        except MadocError as error:
+            refusals.append(f"{name} refuses: {error}")
+            continue
+        why = "; ".join(refusals) or "the robot's states can be had from the log or fitted to it"
+        return name, f"auto took {name}: {why}"
+    raise MadocError("; ".join(refusals))
 
 
 def hyperparameters(method: object) -> dict[str, object]:

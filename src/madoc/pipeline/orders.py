@@ -75,23 +75,20 @@ class Search:
     parameters: tuple[str, ...] | None = None
     """Calibrate only these; the others stay at the model's own values. Default: all of the robot's."""
     method: str | None = None
-    """A calibrator, as `madoc methods` lists it, or auto: what the data allows, compared on a hold-out. Default: auto
-    for a robot of your own, else madoc."""
-    starts: Literal["policy", "logged", "replay"] | None = None
-    """Where rollouts start: free running from resets, short ones from logged states, or one step of the log."""
+    """A calibrator, as `madoc methods` lists it. Default: auto, which takes least-squares wherever the robot's states
+    can be had or fitted, else madoc."""
     set: Settings = ()
-    """Hyperparameters of the method as name=value; of a method that auto tries as least-squares.name=value."""
+    """Hyperparameters of the method as name=value; of a method that auto may take as least-squares.name=value."""
     budget: int | str | None = None
     """Simulated control steps, or a time, as 300s or 15min. Default: 300s for least-squares, which settles by itself
-    and mostly much sooner, 300000 control steps for the others. Of a budget for auto least squares may have two thirds
-    and Madoc half."""
+    and mostly much sooner, 300000 control steps for the others."""
     seed: int = 0
     """Seed of all random numbers."""
 
     @property
     def changes(self) -> dict[str, str]:
         """Hyperparameters that differ from the method's defaults, as `parse_settings` reads them."""
-        return parse_settings(self.set, starts=self.starts)
+        return parse_settings(self.set)
 
 
 @dataclass(frozen=True)
@@ -251,8 +248,8 @@ class RunOrder:
         return Drawing(self.policy_share, self.policy_width)
 
 
-def parse_settings(settings: tuple[tuple[str, ...], ...], *, starts: str | None = None) -> dict[str, str]:
-    """`(("updates=2", "hidden=[64,64]"),)` as a dictionary of texts, with `starts` where it is an option of its own.
+def parse_settings(settings: tuple[tuple[str, ...], ...]) -> dict[str, str]:
+    """`(("updates=2", "hidden=[64,64]"),)` as a dictionary of texts.
 
     Raises:
         MadocError: One is not `name=value`, or a name comes twice.
@@ -266,8 +263,4 @@ def parse_settings(settings: tuple[tuple[str, ...], ...], *, starts: str | None 
         if name in changes:
             raise MadocError(f"hyperparameter {name} is given twice: {changes[name]!r} and {value!r}")
         changes[name] = value
-    if starts is None:
-        return changes
-    if "starts" in changes:
-        raise MadocError(f"starts is given twice: --starts {starts} and --set starts={changes['starts']}")
-    return changes | {"starts": starts}
+    return changes

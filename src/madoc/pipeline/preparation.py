@@ -6,14 +6,13 @@ from functools import cached_property
 from pathlib import Path
 
 from madoc import simulation
-from madoc.calibration import CALIBRATORS, CalibrationProblem, Prior
+from madoc.calibration import CALIBRATORS, CalibrationProblem
 from madoc.data import Dataset, observed_task
 from madoc.data.split import hold_out
 from madoc.diagnosis import check, refuse_fatal
 from madoc.pipeline.data_stage import Machine, fingerprint, load_source, read_truth
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import AUTO, CalibrationOrder
-from madoc.pipeline.priors import stored
 from madoc.pipeline.refusals import check_search, method_of
 from madoc.report.records import DataRecord, stored_path
 from madoc.runs.budget import Budget, Seconds, read_budget
@@ -31,14 +30,13 @@ class Prepared:
 
     Attributes:
         order: What was asked.
-        method: Name of the calibrator, or `auto`.
-        budget: A count of control steps, or a time; None for `auto` where every candidate has its usual one.
+        method: Name of the calibrator; `auto` until one is chosen.
+        budget: A count of control steps, or a time; None for `auto` until a method is chosen, if the order has none.
         holdout: Share of the rows that no method sees; None where nothing is judged.
         machine: The robot with all of its parameters at their normal ranges.
         dataset: All rows.
         simulator: Simulator of the parameters, ranges and physics that the order names.
         truth: True values by name, from the order or else from the data.
-        prior: What a candidate of `auto` begins at, if another has left it an estimate.
     """
 
     order: CalibrationOrder
@@ -49,7 +47,11 @@ class Prepared:
     dataset: Dataset
     simulator: Simulator
     truth: dict[str, float] | None
-    prior: Prior | None = None
+
+    def by(self, method: str) -> "Prepared":
+        """The same for the method of this name, with the budget it usually has where the order has none."""
+        budget = read_budget(CALIBRATORS[method].usual_budget) if self.budget is None else self.budget
+        return replace(self, method=method, budget=budget)
 
     @property
     def seed(self) -> int:
@@ -66,8 +68,7 @@ class Prepared:
     @cached_property
     def problem(self) -> CalibrationProblem:
         """What methods are given: all rows but those that are held out."""
-        whole = CalibrationProblem(self.dataset, self.simulator) if self.holdout is None else self.bench.problem
-        return whole if self.prior is None else replace(whole, prior=self.prior)
+        return CalibrationProblem(self.dataset, self.simulator) if self.holdout is None else self.bench.problem
 
     @property
     def calibrated_truth(self) -> dict[str, float] | None:
@@ -101,7 +102,7 @@ class Prepared:
             "budget": str(self.budget) if isinstance(self.budget, Seconds) else self.budget,
             "truth": self.truth,
         }
-        return asked | held | stored(self.prior) | self.machine.stored()
+        return asked | held | self.machine.stored()
 
 
 def prepare(order: CalibrationOrder, *, allow_code: bool = False) -> Prepared:
@@ -111,10 +112,7 @@ def prepare(order: CalibrationOrder, *, allow_code: bool = False) -> Prepared:
         MadocError: The robot, the data or the truth is refused, or the check finds the data to be useless.
     """
     method = method_of(order)
-    given = order.search.budget
-    if given is None and method != AUTO:
-        given = CALIBRATORS[method].usual_budget if method in CALIBRATORS else None
-    budget = None if given is None else read_budget(given)
+    budget = None if order.search.budget is None else read_budget(order.search.budget)
     holdout = HOLDOUT if method == AUTO and order.holdout is None else order.holdout
     truth = read_truth(order.truth)
     machine, dataset, task = _read(order, allow_code=allow_code)

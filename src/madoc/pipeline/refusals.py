@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from madoc import robots
 from madoc.data.split import check_share
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.keys import check_seed
@@ -13,8 +12,8 @@ from madoc.tasks import Task
 
 
 def method_of(order: CalibrationOrder) -> str:
-    """The calibrator of an order; by default `auto` for a user's own robot, else `madoc`."""
-    return order.search.method or (AUTO if robots.is_spec_path(order.task) else "madoc")
+    """The calibrator of an order, `auto` by default."""
+    return order.search.method or AUTO
 
 
 def check_order(order: CalibrationOrder, out: Path | None = None) -> None:

@@ -7,13 +7,13 @@ from madoc import data
 from madoc.calibration import CalibrationResult
 from madoc.errors import MadocError
 from madoc.pipeline.calibrated import Calibrated, calibration_ended, read_calibration
-from madoc.pipeline.calibration_stage import calibrate_in, methods_for
+from madoc.pipeline.calibration_stage import calibrate_in
 from madoc.pipeline.data_stage import Machine, load_source, read_truth, record_named, split_name
 from madoc.pipeline.evaluation_stage import evaluate_folder
 from madoc.pipeline.export_stage import export_run
 from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
 from madoc.pipeline.learning_stage import learn_in, require_no_goals, require_velocities
-from madoc.pipeline.methods import hyperparameters, make_method
+from madoc.pipeline.methods import hyperparameters, make_method, methods_for
 from madoc.pipeline.orders import (
     CalibrationOrder,
     Drawing,
@@ -121,7 +121,7 @@ def _spec(order: RunOrder, machine: Machine, out: Path) -> dict[str, object]:
         "hyperparameters": {name: hyperparameters(method) for name, method in methods_for(asked).items()},
         "policy_hyperparameters": hyperparameters(learner),
     }
-    plain = replace(order, search=replace(order.search, set=(), starts=None), policy_set=())
+    plain = replace(order, search=replace(order.search, set=()), policy_set=())
     return asdict(plain) | resolved | machine.stored()
 
 

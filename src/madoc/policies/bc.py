@@ -45,9 +45,9 @@ class BC:
         Raises:
             MadocError: No data, or too little.
         """
-        dataset = require_data(problem, rows=self.batch, outcomes=False)
+        require_data(problem, rows=self.batch, outcomes=False)
         of_policy, key = jax.random.split(key)
-        logged = dataset.transitions
+        logged = problem.logged["observation"], problem.logged["action"]
         clone = fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy)
         return BCState(clone, key)
 

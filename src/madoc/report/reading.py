@@ -195,7 +195,6 @@ def read_run(path: Path) -> Run:
     asked = read_object(folder / "spec.json").items()
     ended = read_object(folder / "result.json") if (folder / "result.json").exists() else {}
     result = CalibrationResult.from_json(ended) if "parameters" in ended else None
-    method = _folder_of_method(folder, result.holdout.chosen if result and result.holdout else None)
     evaluation = path / "evaluation.json"
     return Run(
         name=path.resolve().name,
@@ -206,9 +205,9 @@ def read_run(path: Path) -> Run:
         result=result,
         status=str(ended["status"]) if "status" in ended else None,
         sentence=str(ended.get("sentence", "")),
-        log=read_metrics(method / "metrics.jsonl"),
+        log=read_metrics(folder / "metrics.jsonl"),
         evidence=_read_evidence(folder / "evidence.npz"),
-        embeddings=_read_embeddings(method / "embeddings.npz"),
+        embeddings=_read_embeddings(folder / "embeddings.npz"),
         evaluation=read_record(EvaluationRecord, evaluation) if evaluation.exists() else None,
         peak_memory=read_peak(folder),
     )
@@ -262,14 +261,6 @@ def _read_embeddings(path: Path) -> Embeddings | None:
     if arrays is None:
         return None
     return Embeddings(tuple(map(str, arrays["names"])), np.asarray(arrays["vectors"], float))
-
-
-def _folder_of_method(folder: Path, chosen: str | None) -> Path:
-    """The folder of the method's log; of several methods, that of the one that was kept, else of the latest."""
-    if chosen is not None:
-        return folder / chosen
-    logs = [folder / "metrics.jsonl", *folder.glob("*/metrics.jsonl")]
-    return max((log for log in logs if log.exists()), key=lambda log: log.stat().st_mtime, default=logs[0]).parent
 
 
 def read_arrays(path: Path, *needed: str) -> dict[str, np.ndarray] | None:

@@ -21,10 +21,15 @@ Starts = Callable[[PRNGKeyArray, int], Float[np.ndarray, "count state"]]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Walkers:
-    """Rows of a rollout: their states, and the control steps since each started."""
+    """Rows of a rollout: their states, the control steps since each started, and what a policy recalls of those.
+
+    A policy that recalls m rows sees, behind the observation s, the changes and actions (s - s₋₁, a₋₁), (s₋₁ - s₋₂,
+    a₋₂), ... of the last m steps, the latest first, and 0 for steps before the start. It recalls none by default.
+    """
 
     state: Float[np.ndarray, "systems rows state"]
     age: Int[np.ndarray, "systems rows"]
+    recalled: Float[np.ndarray, "systems rows recalled"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,11 @@ class Rollout:
     def failures(self) -> int:
         """Number of rows whose simulation failed."""
         return int((~self.valid).sum())
+
+    def of_systems(self, systems: slice) -> "Rollout":
+        """The rows of some of the systems."""
+        transitions = jax.tree.map(lambda column: column[:, systems], self.transitions)
+        return Rollout(transitions, self.valid[:, systems])
 
 
 def reset_states(simulator: Simulator) -> Starts:
@@ -70,10 +80,10 @@ def unbiased_starts(system: System, starts: Starts) -> Starts:
     return draw
 
 
-def begin(starts: Starts, key: PRNGKeyArray, *, systems: int, rows: int) -> Walkers:
-    """Rows at fresh starts."""
+def begin(starts: Starts, key: PRNGKeyArray, *, systems: int, rows: int, recalled: int = 0) -> Walkers:
+    """Rows at fresh starts, for a policy that recalls so many numbers of earlier steps."""
     state = starts(key, systems * rows).reshape(systems, rows, -1)
-    return Walkers(state, np.zeros((systems, rows), dtype=np.int64))
+    return Walkers(state, np.zeros((systems, rows), dtype=np.int64), np.zeros((systems, rows, recalled)))
 
 
 def out_of_step(walkers: Walkers, time_limit: int) -> Walkers:
@@ -101,11 +111,12 @@ def roll(
     Returns:
         Transitions with axes (steps, systems, rows), and the states of the rows afterwards.
     """
-    state, age = walkers.state, walkers.age
+    state, age, recalled = walkers.state, walkers.age, walkers.recalled
     observation = system.observe(state)
     frames = []
     for step in range(steps):
-        action = np.asarray(act(policy, observation, key, np.int32(step)), dtype=np.float64)
+        seen = np.concatenate([observation, recalled], axis=-1) if recalled.shape[-1] else observation
+        action = np.asarray(act(policy, seen, key, np.int32(step)), dtype=np.float64)
         next_state = system.step(state, action)
         valid = np.isfinite(next_state).all(-1)
         safe = np.where(valid[..., None], next_state, state)
@@ -114,15 +125,16 @@ def roll(
         following = system.observe(safe)
         reward = task.reward(state, action, safe)
         frames.append((observation, action, reward, following, terminated, truncated, valid))
-        state, age, observation = safe, age + 1, following
+        latest = np.concatenate([following - observation, action, recalled], axis=-1)
+        state, age, observation, recalled = safe, age + 1, following, latest[..., : recalled.shape[-1]]
         ended = terminated | truncated | ~valid
         if ended.any():
             fresh = starts(jax.random.fold_in(restart_key, step), ended.size)
             state = np.where(ended[..., None], fresh.reshape(state.shape), state)
-            age = np.where(ended, 0, age)
+            age, recalled = np.where(ended, 0, age), np.where(ended[..., None], 0.0, recalled)
             observation = system.observe(state)
     *columns, valid = (np.stack(column) for column in zip(*frames, strict=True))
-    return Rollout(Transitions(*columns), valid), Walkers(state, age)
+    return Rollout(Transitions(*columns), valid), Walkers(state, age, recalled)
 
 
 @eqx.filter_jit

@@ -69,9 +69,9 @@ def check_calibration(order: CalibrationOrder, *, recorded: bool, allow_code: bo
         _ranges(order.task, search.physics, search.parameters, search.level, allow_code)
     method = method_of(order)
     with under("method"):
-        _calibrator(method, (), None)
-    with under("starts" if search.starts and not search.set else "set"):
-        _calibrator(method, search.set, search.starts)
+        _calibrator(method, ())
+    with under("set"):
+        _calibrator(method, search.set)
     with under("seed"):
         check_seed(search.seed)
     with under("holdout" if order.holdout is not None and not 0 < order.holdout < 1 else "budget"):
@@ -290,8 +290,8 @@ def _may_tell_truth(paths: tuple[str, ...]) -> bool:
 
 
 @cache
-def _calibrator(method: str, settings: Settings, starts: str | None) -> None:
-    changes = parse_settings(settings, starts=starts)
+def _calibrator(method: str, settings: Settings) -> None:
+    changes = parse_settings(settings)
     if method == AUTO:
         candidates_for(changes)
     else:

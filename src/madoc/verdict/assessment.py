@@ -15,8 +15,10 @@ from madoc.simulation.base import Simulator
 from madoc.verdict.adequacy import about_imitated, with_widened_intervals
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.fitted import fitted
-from madoc.verdict.judge import judge
+from madoc.verdict.judge import beats_mid_range, explains_all, judge
 from madoc.verdict.predicted import noise_hides_gain, predicted
+
+NO_BETTER = "the estimate predicts the rows held out no better than mid-range does, so it is not settled"
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,10 @@ def assess(
     holdout = measured(bench, result.mean, result.interval)
     widened = with_widened_intervals(result, holdout)
     verdict = judge(holdout, settled=result.settled, long_tails=result.long_tails, combinations=widened.combinations)
-    warnings = [*widened.warnings, *about_imitated(holdout)]
-    widened = replace(widened, verdict=verdict, holdout=holdout, warnings=warnings)
+    better = beats_mid_range(holdout) or explains_all(holdout)
+    warnings = [*widened.warnings, *about_imitated(holdout), *([] if better else [NO_BETTER])]
+    settled = result.settled and better
+    widened = replace(widened, verdict=verdict, holdout=holdout, warnings=warnings, settled=settled)
     return Assessment(verdict, holdout, widened)
 
 

@@ -106,8 +106,8 @@ def behaviour(kept: Dataset, key: PRNGKeyArray) -> TanhGaussianPolicy:
     """A clone of the policy that acted in the log, to act in the simulator where states cannot be rebuilt."""
     epochs, updates, batch, rate = CLONING
     of_policy, of_batches = jax.random.split(key)
-    clone = fresh_clone(kept.transitions, (64, 64), learning_rate=rate, key=of_policy)
-    pairs = LoggedFeatures(kept).pairs
+    pairs = LoggedFeatures(kept).pairs()
+    clone = fresh_clone(pairs, (64, 64), learning_rate=rate, key=of_policy)
     for epoch in range(epochs):
         of_epoch = jax.random.fold_in(of_batches, epoch)
         clone, _ = continue_cloning(clone, pairs, of_epoch, learning_rate=rate, batch=batch, updates=updates)

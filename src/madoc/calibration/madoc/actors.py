@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from madoc.learning.networks import PerRow, Scalar
 from madoc.learning.tanh_gaussian import sample
@@ -53,22 +53,6 @@ def divergence(actors: Actors, prior: Actors) -> Float[Array, " d"]:
 def prior_weight(updates: Int[Array, ""], *, time_constant: float, largest: float) -> Scalar:
     """λ_t = min(largest, exp(t / time_constant)) (appendix C: 10 and 2e5)."""
     return jnp.minimum(largest, jnp.exp(updates / time_constant))
-
-
-def value_weight(
-    members: Bool[Array, "groups d"], told: Bool[Array, " d"] | None, shared_by: float
-) -> Float[Array, " groups"]:
-    """The weight w of each group's value in Eq. (13), whatever its credit: d / `shared_by`, at least the paper's 1.
-
-    The blur holds the mean |reward| of a row at a set value, whatever the number d of parameters, so that each earns
-    about 1/d of it. Entropy and KL are not shared: each parameter has its own. With many parameters these outweigh what
-    it earns, and hold its actor wide and near the middle of its range. Where a prior has told something of a parameter,
-    and is thus no moving average of its actor, w of its group is 1: what it was told has its own weight.
-    """
-    weight = max(1.0, members.shape[1] / shared_by)
-    if told is None:
-        return jnp.full(len(members), weight)
-    return jnp.where((members & told[None]).any(-1), 1.0, weight)
 
 
 def actor_loss(

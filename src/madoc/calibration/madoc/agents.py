@@ -1,6 +1,5 @@
 """The networks and distributions that Madoc trains, and the updates that train them."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -9,22 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from madoc.calibration.madoc.actors import (
-    Actors,
-    actor_loss,
-    divergence,
-    draw_parameters,
-    prior_weight,
-    value_weight,
-)
-from madoc.calibration.madoc.slopes import Slopes, redrawn
-from madoc.calibration.madoc.value_decomposition import (
-    GroupCritics,
-    Mixing,
-    counterfactual_loss,
-    set_back,
-    value_loss,
-)
+from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_parameters, initial_actors, prior_weight
+from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
+from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
 from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend, moving_average, scan_updates
@@ -32,37 +18,6 @@ from madoc.types import BelowOne, Count, Layers, NotNegative, Positive, Share, c
 
 AT_BOUND = 0.95
 """Share of the reward's bound above which a reward counts as saturated."""
-
-
-@dataclass(frozen=True)
-class Resolution:
-    """Constants that follow from how discriminators see s'.
-
-    Attributes:
-        blur: The first blur, in units of the features of s'.
-        smallest: Lower limit of the blur, below which networks cannot resolve differences in s'.
-        largest: Upper limit of the blur.
-        entropy_weight: α of Eq. (13). The entropy holds a parameter of small effect at the middle of its range where
-            the reward is too blunt to move it; where the reward is sharp, less of it will do.
-        prior_rate: Rate of the prior's moving average. The actors move as fast as the prior follows them, so it is
-            slow where their steps are noisy.
-        shared_by: Number of parameters that may share the reward before values weigh more in Eq. (13).
-    """
-
-    blur: float
-    smallest: float
-    largest: float
-    entropy_weight: float
-    prior_rate: float
-    shared_by: float
-
-
-OF_CHANGES = Resolution(
-    blur=0.3, smallest=0.01, largest=0.3, entropy_weight=0.05, prior_rate=0.1, shared_by=float("inf")
-)
-"""Where s' is described by its change or as it is; the entropy's weight is the paper's."""
-OF_INNOVATIONS = Resolution(blur=2.0, smallest=0.01, largest=10.0, entropy_weight=0.01, prior_rate=0.3, shared_by=4.0)
-"""Where s' is described by its innovation in multiples of the spread that the actors leave."""
 
 
 @jax.tree_util.register_dataclass
@@ -75,7 +30,7 @@ class Agents:
         judges: Moving average of the discriminators, which gives the reward: that of the latest networks is noisier.
         critics: One critic for each group.
         actors: The calibration distribution.
-        prior: The p of Eq. (13): a moving average of the actors, or what was told of the parameters beforehand.
+        prior: The p of Eq. (13): a moving average of the actors.
         average: Moving average of the actors from which the estimate is read.
         log_blur: Logarithm of the deviation of the noise on s' features that both discriminators see.
         updates: Number of updates so far.
@@ -112,15 +67,18 @@ class AgentSettings:
         actor_rate: Adam's learning rate of the actors.
         judge_rate: Rate of the judges' moving average; with 1 the discriminators themselves give the reward, as in the
             paper.
-        entropy_weight: α of Eq. (13); None takes that of the `Resolution`.
+        entropy_weight: α of Eq. (13).
         prior_time: Number of updates in which λ of Eq. (13) grows by the factor e.
         prior_largest: Largest λ of Eq. (13).
-        prior_rate: Rate of the prior's moving average; None takes that of the `Resolution`.
+        prior_rate: Rate of the prior's moving average. The actors move as fast as the prior follows them.
         prior_every: Updates between two moves of the prior.
         average_rate: Rate of the moving average from which the estimate is read.
         baseline: Whether b of Eq. (11) depends on (s, a), wherever credit is that of DOP; in the paper it does not.
         reward_size: Mean |reward| to which the blur is steered; 0 for no blur, as in the paper.
         blur_rate: Change of the logarithm of the blur in an update, for an error of the mean |reward| of 1.
+        first_blur: The first blur, in units of the features of s'.
+        smallest_blur: Lower limit of the blur, below which networks cannot resolve differences in s'.
+        largest_blur: Upper limit of the blur.
     """
 
     hidden: Layers = (128, 128)
@@ -135,38 +93,43 @@ class AgentSettings:
     critic_rate: NotNegative = 1e-3
     actor_rate: NotNegative = 3e-3
     judge_rate: Share = 0.01
-    entropy_weight: NotNegative | None = None
+    entropy_weight: NotNegative = 0.01
     prior_time: Positive = 2e5
     prior_largest: NotNegative = 10.0
-    prior_rate: Share | None = None
+    prior_rate: Share = 0.3
     prior_every: Count = 10
-    average_rate: Share = 1e-3
+    average_rate: Share = 3e-4
     baseline: bool = True
     reward_size: NotNegative = 1.0
     blur_rate: NotNegative = 3e-3
+    first_blur: Positive = 10.0
+    smallest_blur: Positive = 0.3
+    largest_blur: Positive = 30.0
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
+        if not self.smallest_blur <= self.first_blur <= self.largest_blur:
+            raise MadocError(
+                f"expected agents.smallest_blur ≤ agents.first_blur ≤ agents.largest_blur, got {self.smallest_blur}, "
+                f"{self.first_blur} and {self.largest_blur}"
+            )
 
     def init(
         self,
         *,
         window: int,
         observation: int,
-        actors: Actors,
+        parameters: int,
         groups: int,
-        resolution: Resolution = OF_CHANGES,
         key: PRNGKeyArray,
     ) -> Agents:
-        """Fresh networks, with actors, prior and average at `actors`.
-
-        `window` is the number of features in the place of (s, a).
-        """
+        """Fresh networks; actors, prior and average at N(0, 1). `window` is the number of features of (s, a)."""
         of_discriminators, of_critics = jax.random.split(key)
         bounds = {"bound": self.bound, "pair_bound": self.pair_bound, "dropout": self.dropout}
         discriminators = Discriminators(observation, window - observation, self.hidden, key=of_discriminators, **bounds)
         size = window if self.baseline else 0
-        critics = GroupCritics(groups, len(actors.mean), self.critic_hidden, window=size, key=of_critics)
+        critics = GroupCritics(groups, parameters, self.critic_hidden, window=size, key=of_critics)
+        actors = initial_actors(parameters)
         return Agents(
             discriminators=discriminators,
             judges=jax.tree.map(lambda leaf: leaf.copy() if eqx.is_array(leaf) else leaf, discriminators),
@@ -174,7 +137,7 @@ class AgentSettings:
             actors=actors,
             prior=actors,
             average=actors,
-            log_blur=jnp.full((), np.log(resolution.blur), jnp.float32),
+            log_blur=jnp.full((), np.log(self.first_blur), jnp.float32),
             updates=jnp.zeros((), jnp.int32),
             discriminator_optimiser=adam(self.discriminator_rate).init(eqx.filter(discriminators, eqx.is_array)),
             critic_optimiser=adam(self.critic_rate).init(eqx.filter(critics, eqx.is_array)),
@@ -191,40 +154,30 @@ class AgentSettings:
         key: PRNGKeyArray,
         *,
         mixing: Mixing,
-        resolution: Resolution,
         count: int,
-        told: Bool[Array, " d"] | None = None,
-        slopes: Slopes | None = None,
     ) -> tuple[Agents, dict[str, Array]]:
         """`count` updates, Algorithm 1, lines 13 to 19, and the mean of each metric.
 
-        The prior of parameters that are `told`, by the problem's own prior, stays where it began.
-
         The discriminators learn from blurred s'; the reward is computed at s' without blur, where it is least noisy.
         Simulated rows are columns `pair`, `following` and `parameters` (in [-1, 1]), logged rows are (pair, following).
-        With `slopes`, each simulated row is seen as under a fresh draw of the actors, and credit can be counterfactual.
         """
 
         def update(agents: Agents, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
-            of_logged, of_simulated, of_blur, of_dropout, of_actors, of_draws, of_group = jax.random.split(key, 7)
+            of_logged, of_simulated, of_blur, of_dropout, of_actors = jax.random.split(key, 5)
             rows = jax.random.randint(of_logged, (self.batch,), 0, len(logged[0]))
             drawn = replay.sample(simulated, of_simulated, self.batch)
-            if slopes is not None:
-                drawn = redrawn(slopes, drawn, draw_parameters(agents.actors, of_draws, self.batch)[0])
-            scale = jnp.exp(agents.log_blur) if self.reward_size else 0.0
-            target, source = blur((logged[1][rows], drawn["following"]), scale, of_blur)
+            scale = jnp.exp(agents.log_blur) if self.reward_size else jnp.zeros(())
+            unit = jnp.sqrt(1.0 + scale**2)  # of s' with its blur, so that networks see numbers of order one
+            target, source = (part / unit for part in blur((logged[1][rows], drawn["following"]), scale, of_blur))
             agents, metrics = self._update_discriminators(
                 agents, (logged[0][rows], target), (drawn["pair"], source), of_dropout
             )
-            reward = log_dynamics_ratio(agents.judges, drawn["pair"], drawn["following"])
+            reward = log_dynamics_ratio(agents.judges, drawn["pair"], drawn["following"] / unit)
             common = overlap(agents.judges, drawn["pair"])
             share = common / common.mean() if self.weigh_overlap else jnp.ones_like(reward)
-            agents, reward_metrics = self._steer_blur(agents, reward, share, resolution)
-            loss_of = self.loss_of_critics(
-                agents, drawn, reward, share, members=members, mixing=mixing, slopes=slopes, key=of_group
-            )
-            agents, value_metrics = self._update_critics(agents, loss_of)
-            agents, actor_metrics = self._update_actors(agents, members, resolution, told, of_actors)
+            agents, reward_metrics = self._steer_blur(agents, reward, share)
+            agents, value_metrics = self._update_critics(agents, drawn, reward, share, members, mixing)
+            agents, actor_metrics = self._update_actors(agents, members, of_actors)
             return agents, metrics | reward_metrics | value_metrics | actor_metrics | {"overlap": common.mean()}
 
         return scan_updates(update, agents, key, count)
@@ -241,9 +194,7 @@ class AgentSettings:
         judges = moving_average(agents.judges, discriminators, self.judge_rate)
         return replace(agents, discriminators=discriminators, judges=judges, discriminator_optimiser=optimiser), metrics
 
-    def _steer_blur(
-        self, agents: Agents, reward: PerRow, share: PerRow, resolution: Resolution
-    ) -> tuple[Agents, dict[str, Array]]:
+    def _steer_blur(self, agents: Agents, reward: PerRow, share: PerRow) -> tuple[Agents, dict[str, Array]]:
         """Widen the blur where the mean |reward| is above `reward_size`, and narrow it where it is below.
 
         Without a blur, with `reward_size` 0, nothing is steered.
@@ -257,80 +208,48 @@ class AgentSettings:
         if not self.reward_size:
             return agents, metrics
         surplus = jnp.clip(size - self.reward_size, -1.0, 1.0)
-        limits = np.log([resolution.smallest, resolution.largest])
+        limits = np.log([self.smallest_blur, self.largest_blur])
         log_blur = jnp.clip(agents.log_blur + self.blur_rate * surplus, *limits)
         return replace(agents, log_blur=log_blur), metrics | {"blur": jnp.exp(log_blur)}
 
-    def loss_of_critics(
+    def _update_critics(
         self,
         agents: Agents,
         rows: dict[str, Array],
         reward: PerRow,
         share: PerRow,
-        *,
         members: Bool[Array, "groups d"],
         mixing: Mixing,
-        slopes: Slopes | None,
-        key: PRNGKeyArray,
-    ) -> Callable[[GroupCritics], Scalar]:
-        """The loss of the critics, as a function of them.
-
-        It is Eq. (12); if `mixing` is `counterfactual` and there are slopes, the error of differences of rewards, of
-        which the second is that of the row redrawn, to first order, with one group at its actors' centre.
-        """
-        parameters = rows["parameters"]
-        if mixing != "counterfactual" or slopes is None:
-
-            def of_draws(critics: GroupCritics) -> Scalar:
-                left = reward if mixing in ("sum", "independent") else critics.less_baseline(reward, rows["pair"])
-                values = critics.values(parameters, members)
-                return value_loss(values, critics.weight, critics.bias, left, share, mixing)
-
-            return of_draws
-        centre = jnp.tanh(jnp.asarray(agents.actors.mean))
-        group, without = set_back(parameters, centre, members, key)
-        following = redrawn(slopes, rows, without)["following"]
-        difference = reward - log_dynamics_ratio(agents.judges, rows["pair"], following)
-
-        def of_differences(critics: GroupCritics) -> Scalar:
-            values, at_centre = (critics.values(each, members) for each in (parameters, centre[None]))
-            return counterfactual_loss(values, at_centre, group, difference, share)
-
-        return of_differences
-
-    def _update_critics(
-        self, agents: Agents, loss_of: Callable[[GroupCritics], Scalar]
     ) -> tuple[Agents, dict[str, Array]]:
+        def loss_of(critics: GroupCritics) -> Scalar:
+            left = critics.less_baseline(reward, rows["pair"]) if mixing == "dop" else reward
+            values = critics.values(rows["parameters"], members)
+            return value_loss(values, critics.weight, critics.bias, left, share, mixing)
+
         loss, gradients = eqx.filter_value_and_grad(loss_of)(agents.critics)
         critics, optimiser = descend(adam(self.critic_rate), gradients, agents.critic_optimiser, agents.critics)
         return replace(agents, critics=critics, critic_optimiser=optimiser), {"value_loss": loss}
 
-    def _update_actors(
-        self, agents: Agents, members: Array, resolution: Resolution, told: Array | None, key: PRNGKeyArray
-    ) -> tuple[Agents, dict[str, Array]]:
-        entropy_weight = resolution.entropy_weight if self.entropy_weight is None else self.entropy_weight
+    def _update_actors(self, agents: Agents, members: Array, key: PRNGKeyArray) -> tuple[Agents, dict[str, Array]]:
         of_prior = prior_weight(agents.updates, time_constant=self.prior_time, largest=self.prior_largest)
-        of_values = value_weight(members, told, resolution.shared_by)
 
         def loss_of(actors: Actors) -> Array:
             draws, density = draw_parameters(actors, key, self.actor_batch)
             return actor_loss(
-                (agents.critics.values(draws, members) * of_values[None]).sum(-1),
+                agents.critics.values(draws, members).sum(-1),
                 density,
                 divergence(actors, agents.prior).sum(),
-                entropy_weight=entropy_weight,
+                entropy_weight=self.entropy_weight,
                 prior_weight=of_prior,
             )
 
         loss, gradients = jax.value_and_grad(loss_of)(agents.actors)
         actors, optimiser = descend(adam(self.actor_rate), gradients, agents.actor_optimiser, agents.actors)
         due = (agents.updates + 1) % self.prior_every == 0
-        prior_rate = jnp.where(due, resolution.prior_rate if self.prior_rate is None else self.prior_rate, 0.0)
-        prior_rate = prior_rate if told is None else jnp.where(told, 0.0, prior_rate)
         following = replace(
             agents,
             actors=actors,
-            prior=moving_average(agents.prior, actors, prior_rate),
+            prior=moving_average(agents.prior, actors, jnp.where(due, self.prior_rate, 0.0)),
             average=moving_average(agents.average, actors, self.average_rate),
             actor_optimiser=optimiser,
             updates=agents.updates + 1,

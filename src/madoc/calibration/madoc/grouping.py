@@ -88,11 +88,10 @@ def learn_votes(
     updates: int,
     groups: int | None,
     seed: int,
-    state_at: int | None,
 ) -> tuple[Votes, float]:
     """An epoch of the VAE on simulated rows, and its mean loss; `VOTES` times in it a vote, unless `groups` is None.
 
-    While groups are voted on, updates are rounded up to as many for each vote. `state_at` is that of `train`.
+    While groups are voted on, updates are rounded up to as many for each vote.
     """
     parts, losses = VOTES if groups else 1, []
     for key_of_part in jax.random.split(key, parts):
@@ -104,7 +103,6 @@ def learn_votes(
             optimiser=adam(learning_rate),
             batch=batch,
             count=-(-updates // parts),
-            state_at=state_at,
         )
         votes = replace(votes, vae=vae, optimiser=optimiser)
         losses.append(loss)
@@ -131,21 +129,14 @@ def train(
     optimiser: optax.GradientTransformation,
     batch: int,
     count: int,
-    state_at: int | None = None,
 ) -> tuple[GroupingVAE, PyTree, Scalar]:
-    """`count` updates on simulated rows; also the mean loss.
-
-    `state_at` is the place of s in the features of (s, a) where those of s' are s' itself; None where they are s' - s.
-    """
+    """`count` updates on simulated rows, whose s' is described by s' - s; also the mean loss."""
 
     def loss_of(vae: GroupingVAE, key: PRNGKeyArray) -> Scalar:
         drawn = replay.sample(rows, key, batch)
         identity = drawn["identity"].astype(jnp.int32)
         value = jnp.take_along_axis(drawn["parameters"], identity[:, None], axis=1)[:, 0]
-        change = drawn["following"]
-        if state_at is not None:
-            change = change - drawn["pair"][:, state_at : state_at + change.shape[1]]
-        return reconstruction_loss(vae, drawn["pair"], change, value, identity)
+        return reconstruction_loss(vae, drawn["pair"], drawn["following"], value, identity)
 
     return minimise(loss_of, vae, optimiser_state, key, optimiser=optimiser, count=count)
 

@@ -1,7 +1,6 @@
-"""Credit of each group: a critic for each, and what its value is learnt from.
+"""Credit of each group: a critic for each, whose values are mixed into that of a draw.
 
-Values are mixed into that of a draw (DOP, VDN), independent of each other (ISAC), or learnt from what the reward
-differs by where that group alone is set back (counterfactual).
+They are mixed by learnt weights (DOP), by a plain sum (VDN), or not at all (ISAC).
 """
 
 from typing import Literal
@@ -9,11 +8,11 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from madoc.learning.networks import Network, PerRow, Scalar, stack
 
-Mixing = Literal["counterfactual", "dop", "sum", "independent"]
+Mixing = Literal["dop", "sum", "independent"]
 
 
 class GroupCritics(eqx.Module):
@@ -71,44 +70,9 @@ def value_loss(
     """Eq. (12): half the mean of (V_tot - R)². A bandit: there is no next value.
 
     Rows are weighted by `share`, whose mean is 1; in the paper every share is 1.
-    `counterfactual` is as `dop` here, where rows cannot be had under other draws.
     `sum` (VDN) has k = 1 and b = 0; `independent` (ISAC) regresses every critic on the shared reward alone.
     """
     if mixing == "independent":
         return 0.5 * (share[:, None] * (values - reward[:, None]) ** 2).mean(0).sum()
     total = values.sum(-1) if mixing == "sum" else total_value(values, weight, bias)
     return 0.5 * (share * (total - reward) ** 2).mean()
-
-
-def set_back(
-    parameters: Float[Array, "rows d"], centre: Float[Array, " d"], members: Bool[Array, "groups d"], key: PRNGKeyArray
-) -> tuple[Int[Array, " rows"], Float[Array, "rows d"]]:
-    """One group of each row, drawn in proportion to its size, and the parameters with that group at its centre."""
-    chosen = jax.random.randint(key, (len(parameters),), 0, members.shape[1])
-    group = jnp.argmax(members[:, chosen], axis=0)
-    return group, jnp.where(members[group], centre[None], parameters)
-
-
-def counterfactual_loss(
-    values: Float[Array, "rows groups"],
-    at_centre: Float[Array, "1 groups"],
-    group: Int[Array, " rows"],
-    difference: PerRow,
-    share: PerRow,
-) -> Scalar:
-    """Half the mean of (v_g(ξ^g) - v_g(μ^g) - D_g)², D_g = R(ξ) - R(ξ with ξ^g = μ^g); not in the paper.
-
-    μ^g is a fixed point, the centre of the actor of group g; which one does not matter to the expected slope of v_g.
-    D_g is the difference reward of Wolpert and Tumer (2002; compare COMA, Foerster et al. 2018). In it cancels what the
-    other groups earn by themselves, and what depends on (s, a) alone; what g earns together with others stays, and is
-    averaged over their draws. Critics are weighted by the rows of their group.
-
-    Args:
-        values: v_g(ξ^g) of every group.
-        at_centre: v_g(μ^g) of every group.
-        group: The group of each row that was set back.
-        difference: D_g of that group.
-        share: Weight of each row, 1 on average.
-    """
-    own = jnp.take_along_axis(values - at_centre, group[:, None], axis=1)[:, 0]
-    return 0.5 * (share * (own - difference) ** 2).mean()

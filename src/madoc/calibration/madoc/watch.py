@@ -1,5 +1,6 @@
 """Monitoring of Madoc without the truth: the best estimate so far, a stopping rule, and warnings."""
 
+import math
 from dataclasses import dataclass, replace
 
 import jax
@@ -17,10 +18,14 @@ SETTLING = 30
 """Number of epochs in which discriminators and blur settle; mismatches of those epochs are not compared."""
 LEAST_REWARD = 0.7
 """Smallest ratio of the mean |reward| to its set value at which the mismatch of an epoch is used."""
-CLOSE = 0.25
+CLOSE = 0.1
 """Relative excess over the lowest mismatch up to which an estimate is as good as the best; the latest one is kept."""
 AT_END = 0.95
 """Absolute value in [-1, 1] above which a warning names the parameter; entropy keeps estimates below 1."""
+GAIN_SMOOTHING = 0.02
+"""Weight of the newest epoch in the averages of what the estimate gains over mid-range: that of about 100 epochs."""
+SURE = 2.0
+"""Standard errors by which the estimate must gain over mid-range."""
 SATURATED = 0.5
 """Share of rows whose reward is at its bound above which a warning is given."""
 
@@ -32,41 +37,33 @@ class Watch:
 
     Attributes:
         epochs: Number of calibration epochs so far.
-        mismatch: Distance of simulated from logged rows in typical changes of a signal: the blur times the mean
+        mismatch: Distance of simulated from logged rows in units of the features of s': the blur times the mean
             |reward| over its set value. Without a blur it is the mean |reward|.
-        began: Epoch from which mismatches are of the same features of s'.
         overlap: Mean overlap of logged and simulated (s, a).
         at_bound: Share of rows whose reward is at its bound.
         best_mismatch: The lowest mismatch since they are compared.
         milestone: The mismatch at the last progress.
         milestone_epoch: The epoch of the last progress.
         best: The actors' moving average when the mismatch was last close to its lowest.
+        gain: By how much rows at the actors' mean look more like logged ones than rows at mid-range do, on average.
+        gain_squared: Average square of that.
     """
 
     epochs: int
     mismatch: float
-    began: int
     overlap: float
     at_bound: float
     best_mismatch: float
     milestone: float
     milestone_epoch: int
     best: Actors
+    gain: float
+    gain_squared: float
 
 
 def begin_watch(actors: Actors) -> Watch:
     """The watch before the first epoch."""
-    return Watch(0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0, actors)
-
-
-def begin_again(watch: Watch) -> Watch:
-    """The watch where discriminators go on to other features of s', with which earlier mismatches do not compare."""
-    return _mark(replace(watch, began=watch.epochs))
-
-
-def overlaps(watch: Watch, least: float) -> bool:
-    """Whether discriminators have settled, and simulated rows are where logged ones are."""
-    return settled(watch) and watch.overlap >= least
+    return Watch(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, actors, 0.0, 0.0)
 
 
 def observe(
@@ -76,20 +73,19 @@ def observe(
     *,
     steered_to: float,
     blur_range: tuple[float, float],
-    unit: float = 1.0,
 ) -> Watch:
     """The watch after one more epoch, whose estimate is kept unless an earlier mismatch was clearly lower.
 
-    `unit` is the unit of the blur in typical changes of a signal. Without a blur, `metrics` need not have any.
+    Without a blur, `metrics` need not have any.
 
     Mismatches are compared once the discriminators have settled, provided that the mean |reward| is near `steered_to`,
     its set value, or the blur is at its lower limit. Before that, without a blur (`steered_to` is then 0), and while
     rewards are at their bound under the largest blur, the latest estimate is kept.
     """
     size, at_bound = metrics["reward_size"], metrics["reward_at_bound"]
-    mismatch = unit * metrics["blur"] * size / steered_to if steered_to else size
+    mismatch = metrics["blur"] * size / steered_to if steered_to else size
     overlap = metrics["overlap"]
-    if watch.epochs > watch.began:
+    if watch.epochs:
         mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
         overlap = watch.overlap + SMOOTHING * (overlap - watch.overlap)
@@ -98,7 +94,7 @@ def observe(
     if not steered_to:
         return latest
     (smallest, largest), blur = blur_range, metrics["blur"]
-    if watch.epochs - watch.began <= SETTLING or (blur > 0.99 * largest and at_bound > SATURATED):
+    if watch.epochs <= SETTLING or (blur > 0.99 * largest and at_bound > SATURATED):
         return latest
     if size < LEAST_REWARD * steered_to and blur > 1.01 * smallest:
         return watch
@@ -120,27 +116,50 @@ def stalled(watch: Watch, patience: int) -> str | None:
     return f"the mismatch of simulated and logged rows has stayed at {watch.best_mismatch:.3g} for {waited} epochs"
 
 
-def settled(watch: Watch) -> bool:
-    """Whether the discriminators, which begin anew with other features of s', have had the epochs that they need."""
-    return watch.epochs - watch.began >= SETTLING
+def compare(watch: Watch, gain: float) -> Watch:
+    """The watch after one more epoch in which rows at the actors' mean were compared with rows at mid-range.
 
-
-def warnings(
-    watch: Watch, scaled: np.ndarray, names: tuple[str, ...], *, may_start_logged: bool = False
-) -> tuple[str, ...]:
-    """Warnings about the estimate `scaled` (d,) in [-1, 1], one sentence each.
-
-    `may_start_logged` says that rollouts start at resets and could start at logged states.
+    Epochs before the discriminators have settled do not count.
     """
+    if watch.epochs <= SETTLING:
+        return replace(watch, gain=gain, gain_squared=gain**2)
+    return replace(
+        watch,
+        gain=watch.gain + GAIN_SMOOTHING * (gain - watch.gain),
+        gain_squared=watch.gain_squared + GAIN_SMOOTHING * (gain**2 - watch.gain_squared),
+    )
+
+
+def beats_mid_range(watch: Watch) -> bool:
+    """Whether rows at the estimate look more like logged ones than rows at mid-range, beyond what chance may do.
+
+    An exponential average with the rate r has the variance r / (2 - r) of one term.
+    """
+    variance = max(0.0, watch.gain_squared - watch.gain**2) * GAIN_SMOOTHING / (2.0 - GAIN_SMOOTHING)
+    return watch.gain > SURE * math.sqrt(variance)
+
+
+def settled(watch: Watch) -> bool:
+    """Whether the discriminators have had the epochs that they need, and the estimate is better than mid-range."""
+    return watch.epochs >= SETTLING and beats_mid_range(watch)
+
+
+def warnings(watch: Watch, scaled: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Warnings about the estimate `scaled` (d,) in [-1, 1], one sentence each."""
     sentences = []
-    if not settled(watch):
+    if watch.epochs < SETTLING:
         sentences.append(
-            f"{watch.epochs - watch.began} epochs of calibration {'with innovations ' * (watch.began > 0)}are fewer "
-            f"than the {SETTLING} in which the discriminators settle; give it a larger budget"
+            f"{watch.epochs} epochs of calibration are fewer than the {SETTLING} in which the discriminators settle; "
+            "give it a larger budget"
+        )
+    elif not beats_mid_range(watch):
+        sentences.append(
+            "rows simulated at the estimate do not look more like the log's than rows at mid-range do, so it is no "
+            "better than mid-range as far as can be told"
         )
     if watch.at_bound > SATURATED:
         sentences.append(
             f"the discriminators are sure of {watch.at_bound:.0%} of the simulated rows (reward at its bound), "
-            f"so the reward has no slope; {'start rollouts at logged states, or ' * may_start_logged}narrow the ranges"
+            "so the reward has no slope; narrow the ranges"
         )
     return *sentences, *at_end_of_range(scaled, names, beyond=AT_END)

@@ -9,7 +9,7 @@ from madoc.report.reading import Run
 from madoc.report.sections.adequacy import lacks, together
 from madoc.report.sections.course import curves, trace
 from madoc.report.sections.estimates import correlations, estimates, grouping
-from madoc.report.sections.holdout import holdout, methods, residuals, signals
+from madoc.report.sections.holdout import holdout, residuals, signals
 from madoc.report.sections.outcome import asked, cost, policies
 from madoc.report.sections.robustness import film, robustness
 
@@ -24,7 +24,6 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Run], dict[str, object] | str]]] = {
     "curves": ("While it learnt", curves),
     "together": ("Told in combination", together),
     "correlations": ("What makes up for what", correlations),
-    "methods": ("Methods compared", methods),
     "policies": ("Policies in the target", policies),
     "film": ("Policies at work", film),
     "robustness": ("Where the estimate is not sure", robustness),

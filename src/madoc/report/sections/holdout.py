@@ -1,4 +1,4 @@
-"""The estimate on held-out data: the verdict's numbers, replays, residuals, and the methods compared."""
+"""The estimate on held-out data: the verdict's numbers, replays and residuals."""
 
 from collections.abc import Sequence
 
@@ -143,12 +143,3 @@ def _factor(before: float, after: float) -> str:
     if 0.95 < ratio < 1.05:
         return "no change"
     return f"{number(ratio, 2)} times less" if ratio >= 1 else f"{number(1 / max(ratio, 1e-12), 2)} times more"
-
-
-def methods(run: Run) -> dict[str, object] | str:
-    """The methods that were tried before the best was kept."""
-    if run.holdout is None or not run.holdout.candidates:
-        return "One method was asked for, so none were compared."
-    by_area = isinstance(run.holdout, ToldApart)
-    measure = "area of a classifier, less ½" if by_area else "error, as a share of mid-range's"
-    return {"held": run.holdout, "measure": measure}

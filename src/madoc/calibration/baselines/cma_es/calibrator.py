@@ -24,7 +24,7 @@ from madoc.calibration.baselines.population_search import (
     next_generation,
     replay_residuals,
 )
-from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
+from madoc.calibration.sensing import noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
 from madoc.errors import MadocError
 from madoc.identification.windows import first_rows
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
@@ -185,16 +185,19 @@ class CmaEs:
 
     def _begin_actor(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Actor:
         of_policy, of_start = jax.random.split(key)
-        simulator, logged = problem.simulator, problem.dataset.transitions
-        clone = fresh_clone(logged, self.hidden, learning_rate=self.learning_rate, key=of_policy)
+        simulator, window = problem.simulator, self._window(problem)
+        clone = fresh_clone(
+            problem.features.pairs(window - 1), self.hidden, learning_rate=self.learning_rate, key=of_policy
+        )
         rows = self.rows or ROWS["policy"]
-        walkers = begin(reset_states(simulator), of_start, systems=1, rows=rows)
+        recalled = numbers_recalled(problem, window)
+        walkers = begin(reset_states(simulator), of_start, systems=1, rows=rows, recalled=recalled)
         return Actor(clone, out_of_step(walkers, simulator.task.max_episode_steps))
 
     def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Epoch]:
         clone, key, epoch = cloning_epoch(
             actor.clone,
-            problem.features.pairs,
+            problem.features.pairs(self._window(problem) - 1),
             state.inner.key,
             learning_rate=self.learning_rate,
             batch=self.batch,

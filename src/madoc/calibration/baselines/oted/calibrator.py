@@ -25,7 +25,7 @@ from madoc.calibration.baselines.oted.bandit import (
 )
 from madoc.calibration.baselines.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
 from madoc.calibration.baselines.population_search import independent_estimate
-from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
+from madoc.calibration.sensing import noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
 from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
@@ -108,7 +108,8 @@ class Oted:
         task, simulator = problem.simulator.task, problem.simulator
         observation, action, count = task.observation_size, simulator.action_size, len(simulator.parameters)
         of_policy, of_discriminator, of_start, key = jax.random.split(key, 4)
-        clone = fresh_clone(problem.dataset.transitions, self.hidden, learning_rate=self.learning_rate, key=of_policy)
+        pairs = problem.features.pairs(self._window(problem) - 1)
+        clone = fresh_clone(pairs, self.hidden, learning_rate=self.learning_rate, key=of_policy)
         pair = self._window(problem) * (observation + action)
         discriminator = Network(pair, 1, self.hidden, key=of_discriminator)
         distribution = Distribution(np.zeros(count), np.full(count, np.log(self.first_std)))
@@ -117,7 +118,7 @@ class Oted:
             discriminator=discriminator,
             discriminator_optimiser=adam(self.learning_rate).init(eqx.filter(discriminator, eqx.is_array)),
             rows=replay.empty(self.replay_capacity, pair=(pair,)),
-            walkers=begin(self._starts(problem)[0], of_start, systems=self._systems, rows=self.rows),
+            walkers=self._begin(problem, self._starts(problem)[0], of_start),
             distribution=distribution,
             average=distribution,
             key=key,
@@ -157,7 +158,7 @@ class Oted:
     def _clone(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         clone, key, epoch = cloning_epoch(
             state.clone,
-            problem.features.pairs,
+            problem.features.pairs(self._window(problem) - 1),
             state.key,
             learning_rate=self.learning_rate,
             batch=self.batch,
@@ -165,6 +166,10 @@ class Oted:
             epochs=self.cloning_epochs,
         )
         return replace(state, clone=clone, key=key), epoch
+
+    def _begin(self, problem: CalibrationProblem, starts: Starts, key: PRNGKeyArray) -> Walkers:
+        recalled = numbers_recalled(problem, self._window(problem))
+        return begin(starts, key, systems=self._systems, rows=self.rows, recalled=recalled)
 
     def _calibrate(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
@@ -175,7 +180,7 @@ class Oted:
         starts, reached = self._starts(problem)
         walkers = state.walkers
         if anew:
-            fresh = begin(starts, of_start, systems=self._systems, rows=self.rows)
+            fresh = self._begin(problem, starts, of_start)
             starts, walkers = unbiased_starts(system, starts), replace(fresh, state=system.unbiased(fresh.state))
         rollout, following = roll(
             system,
