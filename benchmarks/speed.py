@@ -1,17 +1,15 @@
 """How fast, against the floor, all in one run: updates against their matrix products, steps against bare MuJoCo.
 
-    python benchmarks/speed.py            # prints, and writes results/speed.json
+    python benchmarks/speed.py            # prints, and adds a row to results/speed.jsonl
 
 Single-core figures pin the process to one core (`taskset -c 0`), as the row says.
 """
 
-import argparse
 import json
 import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -19,6 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
+from kept import RESULTS, Study
 
 from madoc import tasks
 from madoc.calibration import CalibrationProblem, LeastSquares, Madoc, calibrate
@@ -31,16 +30,13 @@ from madoc.policies import LEARNERS, FastSAC, PolicyProblem
 from madoc.policies.behaviours import record_quality
 from madoc.simulation.cpu import CpuSimulator
 
-RESULTS = Path(__file__).parent / "results"
+STUDY = Study(RESULTS / "speed.jsonl", ())
 SYSTEMS, ROWS, STEPS = 10, 100, 50
 PRODUCTS = 300 * 2 * 256**3
 """Floating point operations of a run of `products`."""
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--out", type=Path, default=RESULTS / "speed.json")
-    arguments = parser.parse_args()
     rows = {"cores": len(os.sched_getaffinity(0))}
     rows["calibration_update"] = {
         name: against_floor(*calibration_update(method), calibration_flops(method.agents, 17, 6, 14))
@@ -49,10 +45,8 @@ def main() -> None:
     rows["learner_updates"] = {name: learner_updates(name) for name in FLOPS}
     rows["least_squares_hopper_1000_rows"] = least_squares(1000)
     rows["control_steps"] = {robot: stepping(robot) for robot in tasks.TASKS}
-    text = json.dumps(rows, indent=1)
-    print(text)
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(text + "\n")
+    print(json.dumps(rows, indent=1))
+    STUDY.add(rows)
 
 
 def best_of(*runs: Callable[[], object], times: int = 3) -> list[float]:
