@@ -4,10 +4,11 @@
     python benchmarks/calibration.py --tasks hopper-medium --methods oted --data-is noise-1 hidden shuffled-rows
     python benchmarks/calibration.py --tasks halfcheetah-medium --methods madoc-paper --budget 1000000
 
-Log 0 has the paper's truth. Every other log has a truth of its own, uniform over the middle 80 % of each range, masses
-over the middle 80 % of what is positive of it; how it is recorded, how it is disturbed and where the method begins are
-drawn anew for each log as well. A method that refuses the data leaves its sentence. A cell that another process is
-running is skipped, so the same command may be given several times at once. `python benchmarks/tables.py` shows them.
+Log 0 has the paper's truth. Every other log of a task has a truth of its own, uniform over the middle 80 % of each
+range, masses over the middle 80 % of what is positive of it; how it is recorded, how it is disturbed and where the
+method begins are drawn anew for each log as well. A method that refuses the data leaves its sentence. A cell that
+another process is running is skipped, so the same command may be given several times at once. `python
+benchmarks/tables.py` shows them.
 """
 
 import argparse
@@ -152,9 +153,9 @@ def run(
     return found | {"mid_range": middle, "wall_seconds": round(time.monotonic() - started, 1)}
 
 
-def planted_truth(task: Task, log: int) -> dict[str, float]:
+def planted_truth(task: Task, quality: str, log: int) -> dict[str, float]:
     """The truth of a log but the first, uniform over the middle of each range, of a mass over its positive part."""
-    space, random = task.parameters, np.random.default_rng([log, *task.name.encode()])
+    space, random = task.parameters, np.random.default_rng([log, *f"{task.name}-{quality}".encode()])
     low = np.array([max(row.low, 0.0) if row.field == "body_mass" else row.low for row in space.parameters])
     share = random.uniform(0.5 - MIDDLE / 2, 0.5 + MIDDLE / 2, len(space))
     return dict(zip(space.names, (low + share * (space.high - low)).tolist(), strict=True))
@@ -182,7 +183,7 @@ def recorded(
         if not path.exists():
             target = tasks.make(task.name, kind.physics)
             target = target if friction == 1.0 else target.with_friction(friction)
-            truth = planted_truth(task, log) if log else None
+            truth = planted_truth(task, quality, log) if log else None
             simulator, key = CpuSimulator(target, threads=threads), jax.random.key(log)
             save(record_quality(simulator, quality, transitions=transitions, key=key, truth=truth), path)
     return disturb(load(path, task), kind.disturbance, task, jax.random.key(1 + 1000 * log))

@@ -7,7 +7,7 @@ from itertools import chain
 import numpy as np
 from kept import CALIBRATIONS, commits, is_time
 from paper_cells import asked, chain_of, command, planned, printed, wanted
-from pooling import OUR_LOGS, Rows, by_log, label, logs, order
+from pooling import OUR_LOGS, Rows, by_log, label, logs, order, ratio
 
 from madoc import tasks
 from madoc.suites.cells import Cell, Kind
@@ -54,6 +54,10 @@ def table_of_errors(name: str) -> str:
     if name in PRINTED:
         over = [_over_tasks([found.get((row, column), []) for row in rows]) for column in columns]
         lines.append(f"| mean over the tasks run | {' | '.join(over)} | |")
+    by_column = [[each for row in rows for each in found.get((row, column), [])] for column in columns]
+    ratios = [_ratio(of_column, by_column[0]) for of_column in by_column[1:]]
+    if any(ratios):
+        lines.append(f"| error over that of {columns[0]} (95 % over logs) | | {' | '.join(ratios)} | |")
     return "\n".join(lines) + "\n"
 
 
@@ -112,6 +116,12 @@ def _over_tasks(cells: Sequence[Rows]) -> str:
     if commits([row for rows in run for row in rows]).startswith("mixed"):
         return "several commits"
     return f"{np.mean([np.mean(list(by_log(rows).values())) for rows in run]):.2g} ({len(run)} tasks)"
+
+
+def _ratio(ours: Rows, theirs: Rows) -> str:
+    """The ratio of the errors of two methods on the logs that both have, if all are of one commit."""
+    told = ratio(*(by_log(rows, "mean_percent_of_range") for rows in (ours, theirs)))
+    return "several commits" if told and commits([*ours, *theirs]).startswith("mixed") else told
 
 
 def in_words(count: int) -> str:

@@ -89,7 +89,8 @@ def calibrations(tmp_path, monkeypatch):
         common |= {"commit": "a", "control_steps": 1}
         with study.file.open("a") as lines:
             for method, log, seed, error, other in rows:
-                row = common | {"method": method, "log": log, "seed": seed, "error": {"mean_absolute": error}} | other
+                measured = {"mean_absolute": error, "mean_percent_of_range": error}
+                row = common | {"method": method, "log": log, "seed": seed, "error": measured} | other
                 print(json.dumps(row), file=lines)
 
     return keep
@@ -123,6 +124,14 @@ def test_a_mean_over_tasks_is_of_one_commit(calibrations):
     (last,) = [line for line in paper_errors.table_of_errors("table-10").splitlines() if line.startswith("| mean over")]
     assert "| 0.2 (2 tasks) |" in last
     assert "| several commits |" in last
+
+
+def test_the_kinds_of_credit_are_compared_over_logs(calibrations):
+    robot = {"robot": "halfcheetah"}
+    for method, errors in (("madoc", (0.2, 0.2, 0.2)), ("madoc-vdn", (0.1, 0.2, 0.4))):
+        calibrations(*((method, log, log, error, robot) for log, error in enumerate(errors)))
+    told = paper_errors.table_of_errors("table-12")
+    assert "| error over that of madoc (95 % over logs) | | 1.00 (0.18 to 5.59, 3 logs) |  |  | |" in told
 
 
 def test_a_budget_that_was_run_last_is_shown(calibrations):

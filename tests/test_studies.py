@@ -1,8 +1,8 @@
 """Tables of results: appended whole by several processes, read as what they are, never pooled over methods or seeds."""
 
 import json
-import multiprocessing
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -51,20 +51,23 @@ def test_the_last_row_of_a_cell_counts_and_gone_methods_are_not_shown(study):
     assert not study.has({"method": "old", "seed": 0})
 
 
-def _append(study, worker):
-    for seed in range(20):
-        study.add({"method": f"worker {worker}", "seed": seed, "bulk": "x" * 5000})
+APPEND = """
+import sys
+from pathlib import Path
+import kept
+kept.stamp = dict
+study = kept.Study(Path(sys.argv[1]), ("method", "seed"))
+for seed in range(50):
+    study.add({"method": sys.argv[2], "seed": seed, "bulk": "x" * 100_000})
+"""
 
 
-def test_processes_that_append_at_once_leave_whole_rows(study, monkeypatch):
-    monkeypatch.setattr(kept, "stamp", dict)
-    context = multiprocessing.get_context("fork")
-    workers = [context.Process(target=_append, args=(study, worker)) for worker in range(3)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    assert len(study.rows()) == 60
+def test_processes_that_append_at_once_leave_whole_rows(study):
+    words = [sys.executable, "-c", APPEND, str(study.file)]
+    place = Path(kept.__file__).parent
+    workers = [subprocess.Popen([*words, worker], cwd=place) for worker in ("a", "b", "c")]
+    assert [worker.wait() for worker in workers] == [0, 0, 0]
+    assert len(study.rows()) == 150
 
 
 def test_a_cell_that_another_process_runs_is_not_run(study):
@@ -120,7 +123,7 @@ def test_rows_of_several_commits_say_so():
 def test_logs_have_truths_of_their_own_in_the_middle_of_the_ranges(robot):
     task = tasks.make(robot, "legacy")
     space = task.parameters
-    truths = np.array([list(calibration.planted_truth(task, log).values()) for log in range(1, 200)])
+    truths = np.array([list(calibration.planted_truth(task, "medium", log).values()) for log in range(1, 200)])
     share = (truths - space.low) / (space.high - space.low)
     assert 0.1 <= share.min() < 0.15
     assert 0.85 < share.max() <= 0.9
@@ -151,7 +154,7 @@ def test_a_cell_is_run_once_and_kept_beside_mid_range(tmp_path, monkeypatch, cap
         calibration.main()
     nominal, refused = [json.loads(line) for line in results.read_text().splitlines()]
     assert nominal["error"]["mean_absolute"] == nominal["mid_range"]["mean_absolute"]
-    assert nominal["truth"] == calibration.planted_truth(tasks.make("hopper", "legacy"), 1)
+    assert nominal["truth"] == calibration.planted_truth(tasks.make("hopper", "legacy"), "medium", 1)
     assert (nominal["log"], nominal["seed"], nominal["budget"]) == (1, 1, 300_000)
     assert "shuffled" in refused["refusal"]
     assert len(capsys.readouterr().out.splitlines()) == 2
