@@ -5,7 +5,6 @@ python benchmarks/tables.py            # prints, and writes results/README.md an
 `make figures` writes all that is made of kept results.
 """
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any
@@ -218,10 +217,20 @@ def fuzz() -> str:
 
 def speed() -> str:
     """What `speed.py` found last."""
-    rows = SINGLE["speed"].rows()
-    return (
-        f"## Speed\n\n`python benchmarks/speed.py`\n\n```json\n{json.dumps(rows[0], indent=1)}\n```\n" if rows else ""
-    )
+    (told,) = SINGLE["speed"].rows()
+    lines = [
+        f"## Speed\n\n`python benchmarks/speed.py` ({told['commit']}, {told['cores']} cores): updates of a learner at "
+        "batch 256 by the width of its networks, in brackets the time as a multiple of that of its matrix products; "
+        "and control steps, in brackets the share of the speed of bare `mujoco.rollout`.\n",
+        "| | 256 units, a second | 128 units |",
+        "|---|---|---|",
+    ]
+    for name, by_width in told["learner_updates"].items():
+        cells = (f"{found['per_second']:.0f} ({found['times_floor']})" for found in by_width.values())
+        lines.append(f"| updates of {name} | {' | '.join(cells)} |")
+    for robot, found in told["control_steps"].items():
+        lines.append(f"| control steps of {robot} | {found['system_step']:,} ({found['ratio']}) | |")
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":
