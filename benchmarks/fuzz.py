@@ -97,8 +97,9 @@ def main() -> None:
                 if word == "crashed":
                     arguments.keep.mkdir(parents=True, exist_ok=True)
                     (arguments.keep / f"{kind}-{sum(counts.values())}").write_bytes(content)
-    STUDY.add({"minutes": arguments.minutes, "seed": arguments.seed} | dict(sorted(counts.items())))
-    print(json.dumps(found))
+    found = {"minutes": arguments.minutes, "seed": arguments.seed} | dict(sorted(counts.items()))
+    STUDY.add(found)
+    print(found)
     raise SystemExit(any(name.endswith("crashed") for name in counts))
 
 
