@@ -1,7 +1,7 @@
 """The paper's tables of calibration errors: all that was kept, wherever it was run, beside what the paper prints."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 
 import numpy as np
@@ -109,19 +109,24 @@ def error_cell(rows: Rows, paper: tuple[float, float] | None, measure: str = "me
 
 
 def _over_tasks(cells: Sequence[Rows]) -> str:
-    """The mean of one method over the tasks on which it was run, if all are of one commit."""
-    run = [rows for rows in cells if by_log(rows)]
-    if not run:
-        return ""
-    if commits([row for rows in run for row in rows]).startswith("mixed"):
-        return "several commits"
-    return f"{np.mean([np.mean(list(by_log(rows).values())) for rows in run]):.2g} ({len(run)} tasks)"
+    """The mean of one method over the tasks on which it was run, if all are of one commit and budget."""
+    run = [list(by_log(rows).values()) for rows in cells if by_log(rows)]
+    told = f"{np.mean([np.mean(errors) for errors in run]):.2g} ({len(run)} tasks)" if run else ""
+    return told and (_mixed(chain.from_iterable(cells)) or told)
 
 
 def _ratio(ours: Rows, theirs: Rows) -> str:
-    """The ratio of the errors of two methods on the logs that both have, if all are of one commit."""
+    """The ratio of the errors of two methods on the logs that both have, if all are of one commit and budget."""
     told = ratio(*(by_log(rows, "mean_percent_of_range") for rows in (ours, theirs)))
-    return "several commits" if told and commits([*ours, *theirs]).startswith("mixed") else told
+    return told and (_mixed([*ours, *theirs]) or told)
+
+
+def _mixed(rows: Iterable[Mapping]) -> str:
+    """Why rows are not put together, or nothing."""
+    listed = list(rows)
+    if commits(listed).startswith("mixed"):
+        return "several commits"
+    return "several budgets" if len({row["budget"] for row in listed}) > 1 else ""
 
 
 def in_words(count: int) -> str:

@@ -2,11 +2,12 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from kept import POLICIES
+from kept import POLICIES, commits
 from paper_cells import printed
 from paper_errors import calibrations, error_cell
 from pooling import OUR_LOGS
@@ -33,32 +34,35 @@ def rewritten(text: str) -> str:
 def errors() -> str:
     """Error on medium data by method, beside what the paper prints of its own."""
     found = calibrations("table-10")
-    lines = [f"| robot | {' | '.join(COLUMNS)} | paper's Madoc |", "|---" * (len(COLUMNS) + 2) + "|"]
+    lines = [f"| robot | {' | '.join(COLUMNS)} | paper's Madoc | commits |", "|---" * (len(COLUMNS) + 3) + "|"]
     for robot, name in NAMES.items():
         task = f"{robot}-medium"
-        ours = [error_cell(found.get((task, column), []), None) for column in COLUMNS]
+        rows = [found.get((task, column), []) for column in COLUMNS]
+        cells = [error_cell(each, None) for each in rows]
         theirs = printed("table-10", task, "madoc")
-        lines.append(f"| {name} | {' | '.join(ours)} | {'' if theirs is None else f'{theirs[0]:g}'} |")
+        cells += ["" if theirs is None else f"{theirs[0]:g}", commits(chain.from_iterable(rows))]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join([*lines, "", f"{OUR_LOGS} Means over logs, in raw units.", ""])
 
 
 def minutes() -> str:
     """Median return of the default learner after the longest wall time it was given, by where it learnt."""
-    cells = defaultdict[tuple[str, str], defaultdict[float, list[float]]](lambda: defaultdict(list))
+    cells = defaultdict[tuple[str, str], defaultdict[float, list[Mapping]]](lambda: defaultdict(list))
     rows = [row for row in POLICIES.rows() if (row["method"], row["set"]) == ("fast-sac", [])]
     whose = [row["calibrator"] for row in rows if row["at"] == "calibrated"][-1]
     for row in rows:
         if row["calibrator"] in (whose, None):
-            cells[row["robot"], row["at"]][float(row["budget"].removesuffix("s"))].append(row["return"])
+            cells[row["robot"], row["at"]][float(row["budget"].removesuffix("s"))].append(row)
     lines = [
         f"| robot | wall time | learnt at the estimate of `{whose.partition('-logged')[0]}` | at the truth "
-        "| at mid-range |",
-        "|---|---|---|---|---|",
+        "| at mid-range | commits |",
+        "|---" * 6 + "|",
     ]
     for robot, name in NAMES.items():
         longest = max(cells[robot, "calibrated"])
-        ours = " | ".join(_earned(cells[robot, place][longest]) for place in PLACES)
-        lines.append(f"| {name} | {longest:.0f} s | {ours} |")
+        found = [cells[robot, place][longest] for place in PLACES]
+        earned = " | ".join(_earned([row["return"] for row in each]) for each in found)
+        lines.append(f"| {name} | {longest:.0f} s | {earned} | {commits(chain.from_iterable(found))} |")
     return "\n".join(lines) + "\n"
 
 
