@@ -7,14 +7,18 @@
 Log 0 has the paper's truth. Every other log of a task has a truth of its own, uniform over the middle 80 % of each
 range, masses over the middle 80 % of what is positive of it; how it is recorded, how it is disturbed and where the
 method begins are drawn anew for each log as well. A method that refuses the data leaves its sentence. A cell that
-another process is running is skipped, so the same command may be given several times at once. `python
-benchmarks/tables.py` shows them.
+another process is running is skipped, so the same command may be given several times at once; one that was killed goes
+on where it was. `python benchmarks/tables.py` shows them.
 """
 
 import argparse
+import hashlib
+import json
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -33,6 +37,7 @@ from madoc.evaluation import calibration_error
 from madoc.pipeline.methods import make_method
 from madoc.pipeline.orders import parse_settings
 from madoc.policies.behaviours import record_quality
+from madoc.runs.run_folder import RunFolder
 from madoc.simulation.cpu import CpuSimulator
 from madoc.tasks import Task
 
@@ -95,29 +100,28 @@ def main() -> None:
     parser.add_argument("--transitions", type=int, default=200_000)
     parser.add_argument("--threads", type=int, default=None)
     parser.add_argument("--anew", action="store_true", help="run cells again whose row is of another commit")
-    parser.add_argument("--folder", type=Path, default=Path("runs/benchmark-data"), help="where recorded data is kept")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("runs/benchmark-data"), help="where logs and unfinished runs are"
+    )
     parser.add_argument("--results", type=Path, default=CALIBRATIONS.file)
     arguments = parser.parse_args()
     study, revision = replace(CALIBRATIONS, file=arguments.results), commit()
-    methods = {
-        name: make_method(CALIBRATORS, name, parse_settings((tuple(arguments.set),))) for name in arguments.methods
-    }
+    settings = parse_settings((tuple(arguments.set),))
+    methods = {name: make_method(CALIBRATORS, name, settings) for name in arguments.methods}
     for log, name, data_is in product(arguments.logs, arguments.tasks, arguments.data_is):
         robot, _, quality = name.partition("-")
         asked = {"robot": robot, "quality": quality, "data": data_is, "transitions": arguments.transitions, "log": log}
         asked |= {"seed": log, "budget": arguments.budget} | ({"set": arguments.set} if arguments.set else {})
-        problem = truth = None
+        given = cache(lambda asked=asked: posed(asked, arguments.folder, arguments.threads))
         for called, method in methods.items():
-            cell = asked | {"method": called}
+            cell = {"commit": revision} | asked | {"method": called}
             with study.claimed(cell, revision if arguments.anew else None) as ours:
                 if not ours:
                     continue
-                if problem is None:
-                    problem, truth = posed(asked, arguments.folder, arguments.threads)
-                found = run(method, problem, truth, seed=log, budget=arguments.budget)
+                found = run(method, *given(), cell=cell, place=arguments.folder / "runs")
                 if found.get("status") == "interrupted":
                     return
-                study.add({"commit": revision} | cell | found | {"method": called, "truth": truth})
+                study.add(found | cell)
             told = f"{found['error']['mean_absolute']:.3g}" if "error" in found else found["refusal"]
             print(name, data_is, f"log {log}", called, told, f"{found['wall_seconds']:.0f} s", flush=True)
 
@@ -139,18 +143,29 @@ def posed(asked: Mapping[str, Any], folder: Path, threads: int | None) -> tuple[
 
 
 def run(
-    method: Calibrator, problem: CalibrationProblem, truth: Mapping[str, float], *, seed: int, budget: int | str
+    method: Calibrator, problem: CalibrationProblem, truth: Mapping[str, float], *, cell: Mapping[str, Any], place: Path
 ) -> dict[str, Any]:
-    """What one calibration found, beside the error of mid-range; or the sentence it is refused with."""
-    started, space = time.monotonic(), problem.simulator.parameters
-    try:
-        key = jax.random.key(seed)
-        found = calibrate(method, problem, key=key, budget=budget, truth=truth, quiet=True).to_json()
-    except MadocError as refusal:
-        found = {"refusal": str(refusal)}
+    """What one calibration found, beside the truth and the error of mid-range; or the sentence it is refused with.
+
+    Where a process was killed at the same commit, it goes on from the last checkpoint, which is kept at the place.
+    """
+    started, space, key = time.monotonic(), problem.simulator.parameters, jax.random.key(cell["seed"])
+    path = place / hashlib.sha256(json.dumps(cell, sort_keys=True).encode()).hexdigest()[:16]
+    if cell["commit"].endswith("+"):  # nobody knows whether the sources are still those of the checkpoint
+        shutil.rmtree(path, ignore_errors=True)
+    resume = (path / "spec.json").exists()
+    with RunFolder.open(path, cell) if resume else RunFolder.create(path, cell) as folder:
+        try:
+            known = {"budget": cell["budget"], "truth": truth, "quiet": True}
+            found = calibrate(method, problem, key=key, folder=folder, resume=resume, **known).to_json()
+        except MadocError as refusal:
+            found = {"refusal": str(refusal)}
+    if found.get("status") != "interrupted":
+        shutil.rmtree(path)
     error = calibration_error(space.middle, space.vector(truth), space)
     middle = {name: error[name] for name in ("mean_absolute", "mean_percent_of_range")}
-    return found | {"mid_range": middle, "wall_seconds": round(time.monotonic() - started, 1)}
+    spent = {"wall_seconds": round(time.monotonic() - started, 1)} | ({"resumed": True} if resume else {})
+    return found | {"truth": truth, "mid_range": middle} | spent
 
 
 def planted_truth(task: Task, quality: str, log: int) -> dict[str, float]:
