@@ -2,36 +2,34 @@
 
     python benchmarks/adversary.py --robots pendulum arm --seeds 0 1
     python benchmarks/adversary.py --only honest --limit 120
-    python benchmarks/adversary.py --table
+    python benchmarks/adversary.py --table                  # of the commit with the most problems; or --commit
 
-One JSON file for each case and seed; those already there are skipped. The tool runs in a process of its own, with its
-defaults, and is the one that Python imports: PYTHONPATH of another checkout measures that checkout.
+A row of results/adversary.jsonl for each case and seed; those already there are skipped. The tool runs in a process of
+its own, with its defaults, and is the one that Python imports: PYTHONPATH of another checkout measures that checkout.
 """
 
 import argparse
 import json
-import re
 import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
-from collections.abc import Iterable
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 from adversary_cases import CASES, Case, Problem, write
+from adversary_table import outcome, table
+from kept import RESULTS, Study, commit
 
-RESULTS = Path(__file__).parent / "results" / "adversary"
+STUDY = Study(RESULTS / "adversary.jsonl", ("case", "seed"))
 LIMIT = 300.0
 """s, of one command of the tool; it is stopped beyond that, and what its first method said is kept."""
 PATIENCE = 5.0
 """s, that a command may still take after its first method's answer, where only that is asked for."""
-HARMLESS = 0.005
-"""Share of a parameter's range; an interval that misses the truth by less is counted, and marked as a near miss."""
 
 
 def main() -> None:
@@ -44,24 +42,29 @@ def main() -> None:
     parser.add_argument("--only", choices=["deceptions", "honest"])
     parser.add_argument("--limit", type=float, default=LIMIT, help="s, for one command of the tool")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--results", type=Path, default=STUDY.file)
+    parser.add_argument("--anew", action="store_true", help="run cases again whose row is of another commit")
+    parser.add_argument("--commit", help="whose problems the table shows; default: the one that has most of them")
     parser.add_argument("--without-check", action="store_true", help="run `madoc calibrate` alone")
     parser.add_argument(
         "--first-answer", action="store_true", help="stop where the tool goes on to a second, much slower method"
     )
     parser.add_argument("--table", action="store_true", help="print the summary of what is there, and run nothing")
     arguments = parser.parse_args()
+    study = replace(STUDY, file=arguments.results)
     if arguments.table:
-        print(table([json.loads(path.read_text()) for path in sorted(arguments.results.glob("*.json"))]))
+        rows = study.rows()
+        shown = arguments.commit or Counter(row["commit"] for row in rows).most_common(1)[0][0]
+        print(table([row for row in rows if row["commit"] == shown]))
         return
-    arguments.results.mkdir(parents=True, exist_ok=True)
     cells = [
         (case, seed) for seed in arguments.seeds for case in chosen(arguments.cases, arguments.robots, arguments.only)
     ]
     work = partial(
         cell,
-        folder=arguments.results,
-        commit=measured_commit(),
+        study=study,
+        revision=commit(),
+        anew=arguments.anew,
         limit=arguments.limit,
         check=not arguments.without_check,
         first_answer=arguments.first_answer,
@@ -89,18 +92,25 @@ def begins_with(key: str, name: str) -> bool:
 
 
 def cell(
-    case: Case, seed: int, *, folder: Path, commit: str, limit: float, check: bool, first_answer: bool = False
+    case: Case,
+    seed: int,
+    *,
+    study: Study,
+    revision: str,
+    limit: float,
+    check: bool,
+    anew: bool = False,
+    first_answer: bool = False,
 ) -> str:
-    """Run one case unless its file is there; a line of what came out."""
-    path = folder / f"{case.key}-{seed}.json"
-    if path.exists():
-        return ""
-    with tempfile.TemporaryDirectory() as temporary:
+    """Run one case unless its row is there; a line of what came out."""
+    known = {"case": case.key, "robot": case.robot.name, "kind": case.kind, "seed": seed, "commit": revision}
+    known |= {"honest": case.honest, "invisible": case.invisible, "cause": case.cause}
+    with study.claimed(known, revision if anew else None) as ours, tempfile.TemporaryDirectory() as temporary:
+        if not ours:
+            return ""
         problem = write(case, seed, Path(temporary))
         answer = run(problem, limit=limit, check=check, first_answer=first_answer)
-    known = {"case": case.key, "robot": case.robot.name, "kind": case.kind, "seed": seed, "commit": commit}
-    known |= {"honest": case.honest, "invisible": case.invisible, "cause": case.cause}
-    path.write_text(json.dumps(known | answer, indent=1, ensure_ascii=False) + "\n")
+        study.add(known | answer)
     return f"{case.key} {seed}: {outcome(known | answer)}, {answer['seconds']} s"
 
 
@@ -172,138 +182,6 @@ def compared(row: dict[str, Any], truth: tuple[float, float]) -> dict[str, Any]:
         low, high = interval
         miss = max(low - truth[0], truth[1] - high, 0.0) / (row["high"] - row["low"])
     return {"truth": truth, "estimate": row.get("estimate"), "interval": interval, "miss": miss}
-
-
-def measured_commit() -> str:
-    """The commit of the checkout that Python imports the tool from; `+` marks changes to its tracked files."""
-    place = subprocess.run(
-        [sys.executable, "-c", "import madoc; print(*madoc.__path__)"], capture_output=True, text=True, check=True
-    ).stdout.strip()
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", place, *words], capture_output=True, text=True, check=True).stdout.strip()
-
-    return git("rev-parse", "--short", "HEAD") + "+" * bool(git("status", "--porcelain", "-uno", "--", "."))
-
-
-def misses(result: dict[str, Any]) -> list[str]:
-    """Parameters whose interval does not hold the truth."""
-    return [name for name, row in result["parameters"].items() if row["miss"]]
-
-
-def outcome(result: dict[str, Any]) -> str:
-    """`false CALIBRATED`, `false alarm`, `unnamed` (invisible and not named), or what was said rightly."""
-    word = result["verdict"]
-    if result["verdict"] == "TIME_LIMIT":
-        return word
-    if result["invisible"]:
-        return f"{word}, named" if named(result, everything=True) else "unnamed"
-    if result["honest"]:
-        return word if word == "CALIBRATED" else f"false alarm ({word})"
-    return "false CALIBRATED" if word == "CALIBRATED" and misses(result) else word
-
-
-def named(result: dict[str, Any], *, everything: bool = False) -> bool:
-    """Whether the verdict's sentence (or everything that is said, warnings and `check` too) names the cause."""
-    said = [result["sentence"], *map(str, result["causes"])]
-    if everything:
-        said += [*result["warnings"], *(result["check"] or [])]
-    text = " ".join(said).lower()
-    for name in sorted(result["parameters"], key=len, reverse=True):
-        text = re.sub(rf"\b{re.escape(name)}\b", "", text)
-    return re.search(result["cause"], text) is not None
-
-
-def summary(results: list[dict[str, Any]]) -> str:
-    """What went wrong how often, in Markdown."""
-    deceptions = [result for result in results if not result["honest"] and not result["invisible"]]
-    invisible = [result for result in results if result["invisible"]]
-    honest = [result for result in results if result["honest"]]
-    false = [result for result in deceptions if outcome(result) == "false CALIBRATED"]
-    alarms = [result for result in honest if outcome(result) != "CALIBRATED"]
-    near = [result for result in false if largest_miss(result) < HARMLESS]
-    lines = [
-        "| what | count | of |",
-        "|---|---|---|",
-        f"| false CALIBRATED | {len(false)} | {len(deceptions)} |",
-        f"| of these by less than {100 * HARMLESS:g} % of the range | {len(near)} | {len(false)} |",
-        f"| cause named in the verdict's sentence | {sum(map(named, deceptions))} | {len(deceptions)} |",
-        f"| invisible, and not named anywhere | {count(invisible, 'unnamed')} | {len(invisible)} |",
-        f"| false alarms | {len(alarms)} | {len(honest)} |",
-        f"| stopped in a second method or at the limit | {sum(r['stopped'] for r in results)} | {len(results)} |",
-        f"| refusals of deceptions | {refusals(deceptions)} | {len(deceptions)} |",
-        f"| refusals of honest cases | {refusals(honest)} | {len(honest)} |",
-        f"| intervals that hold, honest cases | {coverage(honest)} |",
-        f"| seconds, median and largest | {seconds(results)} |",
-    ]
-    return "\n".join(lines)
-
-
-def table(results: list[dict[str, Any]]) -> str:
-    """The summary, and every case, in Markdown."""
-    deceptions = [result for result in results if not result["honest"] and not result["invisible"]]
-    invisible = [result for result in results if result["invisible"]]
-    honest = [result for result in results if result["honest"]]
-    lines = [
-        f"Commits: {', '.join(sorted({result['commit'] for result in results}))}",
-        "",
-        summary(results),
-        "",
-        "| deception | seeds | verdicts | false CALIBRATED | largest miss, share of range | cause named | anywhere |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for case, group in grouped([*deceptions, *invisible], "case").items():
-        lines.append(
-            f"| {case} | {len(group)} | {words(group)} | {count(group, 'false CALIBRATED')} "
-            f"| {max(map(largest_miss, group)):.3f} | {sum(map(named, group))} "
-            f"| {sum(named(result, everything=True) for result in group)} |"
-        )
-    lines += ["", "| kind of deception | cases | false CALIBRATED |", "|---|---|---|"]
-    lines += [f"| {k} | {len(v)} | {count(v, 'false CALIBRATED')} |" for k, v in grouped(deceptions, "kind").items()]
-    lines += ["", "| honest | seeds | verdicts | intervals that hold, of |", "|---|---|---|---|"]
-    for case, group in grouped(honest, "case").items():
-        lines.append(f"| {case} | {len(group)} | {words(group)} | {coverage(group).replace(' | ', ', ')} |")
-    return "\n".join(lines)
-
-
-def grouped(results: Iterable[dict[str, Any]], key: str) -> dict[str, list[dict[str, Any]]]:
-    """Results by what a key of theirs holds."""
-    groups = defaultdict(list)
-    for result in results:
-        groups[result[key]].append(result)
-    return dict(groups)
-
-
-def count(results: Iterable[dict[str, Any]], what: str) -> int:
-    """How many have an outcome."""
-    return sum(outcome(result) == what for result in results)
-
-
-def refusals(results: Iterable[dict[str, Any]]) -> int:
-    """How many the tool refused to calibrate."""
-    return sum(result["verdict"] == "REFUSED" for result in results)
-
-
-def largest_miss(result: dict[str, Any]) -> float:
-    """The largest miss of a result's intervals, as a share of the range."""
-    return max((row["miss"] or 0.0 for row in result["parameters"].values()), default=0.0)
-
-
-def coverage(results: Iterable[dict[str, Any]]) -> str:
-    """Intervals that hold the truth, and all intervals."""
-    missed = [row["miss"] for result in results for row in result["parameters"].values() if row["miss"] is not None]
-    return f"{sum(miss == 0.0 for miss in missed)} | {len(missed)}"
-
-
-def seconds(results: list[dict[str, Any]]) -> str:
-    """Median and largest wall time of a calibration."""
-    every = [result["seconds"] for result in results]
-    return f"{median(every):.0f} | {max(every):.0f}" if every else "- | -"
-
-
-def words(results: Iterable[dict[str, Any]]) -> str:
-    """The verdicts of several seeds; a `…` marks those of a first method, where a second was stopped."""
-    return ", ".join(sorted({result["verdict"] + " …" * result["stopped"] for result in results}))
 
 
 if __name__ == "__main__":

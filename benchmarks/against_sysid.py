@@ -1,8 +1,8 @@
 """Least squares beside MuJoCo's own system identification, `mujoco.sysid`, on the same planted problems.
 
-    python benchmarks/against_sysid.py                              # 2 robots in 2 situations, one JSON file each
+    python benchmarks/against_sysid.py                              # 2 robots in 2 situations
 
-Both get the logs, the ranges and the middle of them to start from; files already there are skipped. `mujoco.sysid` has
+Both get the logs, the ranges and the middle of them to start from; rows already there are skipped. `mujoco.sysid` has
 its default optimizer, residuals and intervals, and runs both whole and in stretches; counted is what leaves the smaller
 residual, and only the seconds that this took. The tools take turns, and times are medians of those after the first, in
 which Python loads what they need. Madoc's are of the whole order, which checks the log and leaves a run folder, and of
@@ -11,7 +11,6 @@ both tools together, had not brought its first problem to an end when it was sto
 """
 
 import argparse
-import json
 import logging
 import tempfile
 import time
@@ -21,10 +20,10 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from kept import SYSID
 from mujoco import sysid
 from planted import NOISE, TRUTHS, base, compared, record, write
 
-from calibration import commit
 from madoc import robots
 from madoc.pipeline import CalibrationOrder, Search, Source, calibrate_in
 from madoc.tasks import Task
@@ -32,7 +31,6 @@ from madoc.tasks import Task
 if not hasattr(sysid, "optimize"):
     raise SystemExit('mujoco.sysid lacks packages that it needs; pip install "mujoco[sysid]" brings them')
 
-RESULTS = Path(__file__).parent / "results" / "sysid"
 BUDGET = 1_000_000
 REPEATS = 3
 """Runs of each tool whose times count."""
@@ -52,17 +50,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     logging.getLogger("absl").setLevel("ERROR")  # it warns of every piece that its signals are no sensors
-    RESULTS.mkdir(parents=True, exist_ok=True)
     for robot in arguments.robots:
         for situation in arguments.situations:
-            path = RESULTS / f"{robot}-{situation}-{arguments.seed}.json"
-            if path.exists():
-                continue
-            with tempfile.TemporaryDirectory() as folder:
+            asked = {"robot": robot, "situation": situation, "seed": arguments.seed}
+            with SYSID.claimed(asked) as ours, tempfile.TemporaryDirectory() as folder:
+                if not ours:
+                    continue
                 row = both(Path(folder), robot, situation, arguments.seed)
-            path.write_text(json.dumps(row, indent=1) + "\n")
+                SYSID.add(asked | row)
             for tool in ("madoc", "sysid"):
-                print(path.name, tool, f"{row[tool]['seconds']:.0f} s, worst {row[tool]['worst']:.2g} %", flush=True)
+                worst = f"worst {row[tool]['worst']:.2g} %"
+                print(robot, situation, tool, f"{row[tool]['seconds']:.0f} s, {worst}", flush=True)
 
 
 def both(folder: Path, robot: str, situation: str, seed: int) -> dict:
@@ -85,7 +83,7 @@ def both(folder: Path, robot: str, situation: str, seed: int) -> dict:
     tried = {"whole runs": whole, f"stretches of {STRETCH} control steps": cut}
     better = list(tried)[cut["residual"] < CLEARLY * whole["residual"]]
     found = {"madoc": timed(ours), "sysid": {"cut": better, **tried.pop(better)}}
-    return {"robot": robot, "situation": situation, "seed": seed, "commit": commit(), **found, "not_counted": tried}
+    return {**found, "not_counted": tried}
 
 
 def timed(rows: list[dict]) -> dict:

@@ -1,11 +1,12 @@
 """Fingerprints of every method's result with fixed seeds, to hold one commit against another bit by bit.
 
-    python benchmarks/bits.py --out results/bits/after.json
-    PYTHONPATH=/tmp/before/src python benchmarks/bits.py --out results/bits/before.json   # another checkout's code
-    python benchmarks/bits.py --compare results/bits/before.json results/bits/after.json
+    python benchmarks/bits.py
+    PYTHONPATH=../before/src python benchmarks/bits.py     # the code of another checkout
+    python benchmarks/bits.py --compare 22cb0ce bcde2ba
 
-Everything goes through the command line, whose options are the same on both commits. A cell that is in the file already
-is not run again. Estimates are compared with all their digits, policies weight by weight; seconds are not compared.
+Everything goes through the command line, whose options are the same on both commits. A cell that has a row of the
+commit in results/bits.jsonl is not run again. Estimates are compared with all their digits, policies weight by weight;
+seconds are not compared.
 """
 
 import argparse
@@ -17,7 +18,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from kept import RESULTS, Study, commit
 
+STUDY = Study(RESULTS / "bits.jsonl", ("cell", "commit"))
 MADOC = [sys.executable, "-m", "madoc"]
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ROWS = 4000
@@ -35,12 +38,10 @@ RECORDED = {
 CALIBRATIONS = {
     **{
         f"{method} clean": ("clean", method, 15_000, SMALL)
-        for method in ("madoc", "madoc-local", "madoc-s", "madoc-vdn")
+        for method in ("madoc", "madoc-s", "madoc-vdn", "madoc-isac", "madoc-grouped")
     },
-    **{f"{method} clean": ("clean", method, 15_000, SMALL) for method in ("madoc-isac", "madoc-grouped")},
     "madoc-paper clean": ("clean", "madoc-paper", 8_000, ["--set", "grouping_epochs=2", "cloning_epochs=2"]),
-    "madoc replay": ("clean", "madoc", 15_000, ["--starts", "replay", *SMALL]),
-    "madoc hidden": ("hidden", "madoc", 15_000, ["--starts", "policy", *SMALL]),
+    "madoc hidden": ("hidden", "madoc", 15_000, SMALL),
     "madoc noisy": ("noisy", "madoc", 15_000, SMALL),
     "madoc shuffled": ("shuffled", "madoc", 15_000, SMALL),
     **{
@@ -60,7 +61,7 @@ CALIBRATIONS = {
     },
     "least-squares horizon 5": ("clean", "least-squares", 150_000, ["--set", "horizon=5", "loss=huber"]),
     "oted clean": ("clean", "oted", 30_000, []),
-    "oted policy": ("clean", "oted", 30_000, ["--starts", "policy"]),
+    "oted policy": ("clean", "oted", 30_000, ["--set", "starts=policy"]),
     "least-squares arm": ("arm", "least-squares", 600_000, ["--holdout", "0.2"]),
     "auto arm": ("arm", "auto", 600_000, []),
     "least-squares spring": ("spring", "least-squares", 300_000, ["--holdout", "0.2"]),
@@ -87,21 +88,20 @@ POLICIES = {
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--compare", type=Path, nargs=2, metavar=("BEFORE", "AFTER"))
+    parser.add_argument("--compare", nargs=2, metavar=("BEFORE", "AFTER"), help="commits; runs nothing")
     parser.add_argument("--only", nargs="+", default=[], help="cells whose name has one of these words")
     parser.add_argument("--folder", type=Path, help="keep data and run folders here instead of a temporary folder")
     arguments = parser.parse_args()
     if arguments.compare:
-        sys.exit(compare(*(json.loads(path.read_text()) for path in arguments.compare)))
+        sys.exit(compare(*map(digests, arguments.compare)))
     with tempfile.TemporaryDirectory() as temporary:
-        run(arguments.out, arguments.folder or Path(temporary), arguments.only)
+        run(arguments.folder or Path(temporary), arguments.only)
 
 
-def run(out: Path, folder: Path, only: list[str]) -> None:
-    """Run every cell that `out` does not have yet."""
-    done = json.loads(out.read_text()) if out.exists() else {}
-    out.parent.mkdir(parents=True, exist_ok=True)
+def run(folder: Path, only: list[str]) -> None:
+    """Run every cell that has no row of this commit; where sources have changed since, every cell."""
+    revision = commit()
+    done = {} if revision.endswith("+") else digests(revision)
     cells = {
         **{f"calibrate: {name}": calibration for name in CALIBRATIONS},
         **{f"learn: {name}": policy for name in POLICIES},
@@ -109,9 +109,14 @@ def run(out: Path, folder: Path, only: list[str]) -> None:
     for cell, fingerprint in cells.items():
         if cell in done or not any(word in cell for word in only or [""]):
             continue
-        done[cell] = fingerprint(cell.split(": ")[1], folder)
-        print(cell, done[cell], flush=True)
-        out.write_text(json.dumps(done, indent=1) + "\n")
+        found = fingerprint(cell.split(": ")[1], folder)
+        print(cell, found, flush=True)
+        STUDY.add({"cell": cell, "commit": revision, "digest": found})
+
+
+def digests(revision: str) -> dict[str, str]:
+    """What was found at a commit, by cell."""
+    return {row["cell"]: row["digest"] for row in STUDY.rows() if row["commit"] == revision}
 
 
 def calibration(name: str, folder: Path) -> str:

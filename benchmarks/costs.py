@@ -4,7 +4,8 @@
     python benchmarks/paper.py --collect runs/costs
 
 `madoc suite` does the same cells with a few processes. What one has compiled for a cell it keeps, so the memory of its
-later cells is only known to be at most what they tell. To collect a cell again, delete its line in results/paper.
+later cells is only known to be at most what they tell. To collect a cell again, delete its line in
+results/table-3.jsonl.
 """
 
 import argparse
@@ -22,6 +23,7 @@ from madoc.suites.claims import outcome_of
 from madoc.suites.planning import Plan
 from madoc.suites.results import Result
 
+TITLE = "Tables 3 and 4: memory, and time by stage"
 PRINTED = {"cloning": "", "calibrating": "calibration", "exploring": "", "fitting": "", "opposing": "dynamics reward"}
 """What the paper calls a stage, and nothing where it tells no time of it; all others have our name there too."""
 

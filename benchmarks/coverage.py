@@ -3,7 +3,7 @@
     python benchmarks/coverage.py --conditions process-little --seeds 0 100 --results runs/coverage
     python benchmarks/coverage.py --table
 
-Every problem is a line of a file for its condition; those already there are skipped. Least squares calibrates in this
+A row of results/coverage.jsonl for each problem; those already there are skipped. Least squares calibrates in this
 process, as `madoc calibrate --method least-squares --holdout 0.2` does, and the intervals are those that it tells.
 """
 
@@ -13,15 +13,18 @@ import io
 import json
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from adversary import compared, measured_commit
+from adversary import compared
 from adversary_cases import CASES, write
+from kept import RESULTS, Study, commit, commits
 from scipy.stats import binomtest
 
 from madoc.commands.main import main as madoc
 
-RESULTS = Path(__file__).parent / "results" / "coverage"
+STUDY = Study(RESULTS / "coverage.jsonl", ("condition", "seed"))
 CONDITIONS = {
     "process-little": ("pendulum.process-little", "cart.process-little"),
     "process-much": ("pendulum.process-much", "cart.process-much"),
@@ -36,32 +39,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--conditions", nargs="+", default=list(CONDITIONS), choices=list(CONDITIONS))
     parser.add_argument("--seeds", nargs=2, type=int, default=(0, 100), help="the first, and the one after the last")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--results", type=Path, default=STUDY.file)
+    parser.add_argument("--anew", action="store_true", help="run problems again whose row is of another commit")
     parser.add_argument("--table", action="store_true", help="print the summary of what is there, and run nothing")
     arguments = parser.parse_args()
-    if not arguments.table:
-        arguments.results.mkdir(parents=True, exist_ok=True)
-        commit = measured_commit()
-        for seed in range(*arguments.seeds):
-            for condition in arguments.conditions:
-                solve(arguments.results / f"{condition}.jsonl", CONDITIONS[condition], seed, commit)
-    print(table(arguments.results))
+    study, revision = replace(STUDY, file=arguments.results), commit()
+    for seed in range(*arguments.seeds) if not arguments.table else ():
+        for condition in arguments.conditions:
+            asked = {"condition": condition, "seed": seed, "commit": revision}
+            with study.claimed(asked, revision if arguments.anew else None) as ours:
+                if ours:
+                    study.add(asked | solve(CONDITIONS[condition], seed))
+    print(table(study.rows()))
 
 
-def solve(file: Path, cases: tuple[str, ...], seed: int, commit: str) -> None:
-    """Add one problem's line to the file, unless it is there."""
-    if file.exists() and any(json.loads(line)["seed"] == seed for line in file.read_text().splitlines()):
-        return
+def solve(cases: Sequence[str], seed: int) -> dict:
+    """What comes out of one problem."""
     case, started = CASES[cases[seed % len(cases)]], time.monotonic()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()) as told:
         problem = write(case, seed, Path(folder))
         words = ["calibrate", str(problem.spec), "--data", str(problem.logs), "--method", "least-squares"]
         madoc([*words, "--holdout", "0.2", "--json", "--quiet", "--out", str(Path(folder) / "out")])
     result = json.loads(told.getvalue())
-    row = {
+    return {
         "case": case.key,
-        "seed": seed,
-        "commit": commit,
         "seconds": round(time.monotonic() - started, 1),
         "verdict": (result.get("verdict") or {}).get("word", "REFUSED"),
         "widened": any("intervals were widened" in warning for warning in result.get("warnings", [])),
@@ -69,19 +70,16 @@ def solve(file: Path, cases: tuple[str, ...], seed: int, commit: str) -> None:
             name: compared(result.get("parameters", {}).get(name, {}), truth) for name, truth in problem.truth.items()
         },
     }
-    with file.open("a") as lines:
-        lines.write(json.dumps(row, ensure_ascii=False) + "\n")
 
 
-def table(results: Path) -> str:
+def table(results: Sequence[dict]) -> str:
     """Coverage by condition, with its own 95 % interval, as Markdown."""
     lines = [
         "| condition | problems | intervals | hold the truth | 95 % interval | CALIBRATED | widened | commits |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for condition in CONDITIONS:
-        file = results / f"{condition}.jsonl"
-        rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+        rows = [row for row in results if row["condition"] == condition]
         misses = [one["miss"] for row in rows for one in row["parameters"].values() if one["miss"] is not None]
         if not misses:
             lines.append(f"| {condition} | not run |  |  |  |  |  |  |")
@@ -91,7 +89,7 @@ def table(results: Path) -> str:
         lines.append(
             f"| {condition} | {len(rows)} | {len(misses)} | {100 * held / len(misses):.1f} % "
             f"| {100 * low:.1f} to {100 * high:.1f} % | {sum(row['verdict'] == 'CALIBRATED' for row in rows)} "
-            f"| {sum(row['widened'] for row in rows)} | {', '.join(sorted({row['commit'] for row in rows}))} |"
+            f"| {sum(row['widened'] for row in rows)} | {commits(rows)} |"
         )
     return "\n".join(lines)
 

@@ -1,47 +1,62 @@
-"""The table of calibration methods under disturbances of the data, each with the same wall time."""
+"""The table of calibration methods under disturbances of the data, and that of what settled where it should not."""
 
 from collections import defaultdict
 
 import numpy as np
-from kept import calibrations, is_time, shown
-
-from calibration import usual_starts
-
-DISTURBED = ("noise-1", "noise-10", "modern", "friction-20", "hidden", "shuffled-rows", "shuffled-next")
+from kept import CALIBRATIONS, commits, is_time
+from pooling import Rows, by_log, label, order
 
 
 def disturbed() -> str:
-    """Error of every method on every kind of data with the same wall time, or that it refuses."""
-    cells, methods, robots = defaultdict(list), set(), set()
-    for row in calibrations():
-        if is_time(row["budget"]):
-            cells[row["robot"], row["data"], row["budget"], label(row)].append(row)
-            if row["data"] != "clean":
-                methods.add(label(row))
-                robots.add(row["robot"])
-    methods = sorted(methods, key=lambda name: (name not in ("least-squares", "madoc"), name == "nominal", name))
-    head = ("robot", "data", "budget", "seeds", "what the data tells, %", *methods)
+    """Error of every method on every kind of data with the same budget, or that it refuses."""
+    cells: dict[tuple[str, str, str], dict[str, list]] = defaultdict(lambda: defaultdict(list))
+    kinds = {(row["robot"], row["quality"]) for row in CALIBRATIONS.rows() if row["data"] != "clean"}
+    for row in CALIBRATIONS.rows():
+        if (row["robot"], row["quality"]) in kinds and (is_time(row["budget"]) or row["data"] != "clean"):
+            steps = row["budget"] if is_time(row["budget"]) else f"{row['budget']:,} steps"
+            cells[f"{row['robot']}-{row['quality']}", row["data"], steps][label(row)].append(row)
+    methods = sorted({name for found in cells.values() for name in found}, key=order)
     lines = [
-        "## Under disturbances\n\n`python benchmarks/calibration.py --budget 60s --threads 1 --data-is ...`, with "
-        "`--starts policy` for Madoc. Median of the mean absolute error over seeds, and in brackets in % of the range. "
-        "*refuses*: with a sentence, kept in the result. Empty: not run. What the data tells: the median over "
-        "parameters of half the width of least squares' 95 % intervals, in % of the range. *nominal* is mid-range.\n",
-        f"| {' | '.join(head)} |",
-        "|---" * len(head) + "|",
+        "## Under disturbances\n\n`python benchmarks/calibration.py --methods ... --data-is ... --logs ...`, with "
+        "`--budget 60s --threads 1` where the budget is a time. Mean absolute error, the mean over logs (seeds of a "
+        "log are averaged first), and in brackets in % of the range. *refuses*: with a sentence, kept in the row. "
+        "Empty: not run. What the data tells: the median over parameters of half the width of least squares' 95 % "
+        "intervals, in % of the range.\n",
+        f"| data | kind | budget | logs | what the data tells, % | {' | '.join(methods)} | commits |",
+        "|---" * (len(methods) + 6) + "|",
     ]
-    for robot, data, budget in sorted({cell[:3] for cell in cells if cell[0] in robots}):
-        columns = [cells.get((robot, data, budget, method), []) for method in methods]
-        seeds = sorted(
-            {len(column) for column, method in zip(columns, methods, strict=True) if column and method != "nominal"}
-        )
-        told = _half_width(cells.get((robot, data, budget, "least-squares"), []))
-        words = (robot, data, budget, " to ".join(map(str, seeds[:: max(1, len(seeds) - 1)])), told)
-        lines.append(f"| {' | '.join((*words, *map(_cell, columns)))} |")
+    for place, found in sorted(cells.items()):
+        every = [row for rows in found.values() for row in rows]
+        counts = sorted({len(by_log(rows)) for rows in found.values()} - {0})
+        count = " to ".join(map(str, counts[:: max(1, len(counts) - 1)]))
+        told = _half_width(found.get("least-squares", []))
+        words = (*place, count, told, *(_cell(found.get(method, [])) for method in methods), commits(every))
+        lines.append(f"| {' | '.join(words)} |")
     return "\n".join(lines) + "\n"
 
 
-def _half_width(rows: list[dict]) -> str:
-    """Half the width of intervals in % of the range, the median over parameters and seeds; empty without intervals."""
+def settled_wrongly() -> str:
+    """Estimates that call themselves settled and are no better than mid-range."""
+    rows = [row for row in CALIBRATIONS.rows() if "mid_range" in row and "error" in row]
+    measure = "mean_percent_of_range"
+    wrong = [
+        row
+        for row in rows
+        if row["status"] == "converged" and row["settled"] and row["error"][measure] >= row["mid_range"][measure]
+    ]
+    lines = [
+        "## Settled, and no better than mid-range\n\n"
+        f"{len(wrong)} of the {len(rows)} calibrations that were kept with the error of mid-range.\n"
+    ]
+    for row in wrong:
+        told = f"{row['error'][measure]:.2g} % of the range, mid-range {row['mid_range'][measure]:.2g} %"
+        place = f"{row['robot']}-{row['quality']} {row['data']} log {row['log']}"
+        lines.append(f"- {label(row)} on {place}: {told} ({row['commit']})")
+    return "\n".join(lines) + "\n"
+
+
+def _half_width(rows: Rows) -> str:
+    """Half the width of intervals in % of the range, the median over parameters and rows; empty without intervals."""
     found = [
         50.0 * (part["interval"][1] - part["interval"][0]) / (part["high"] - part["low"])
         for row in rows
@@ -51,15 +66,8 @@ def _half_width(rows: list[dict]) -> str:
     return f"{np.median(found):.2g}" if found else ""
 
 
-def _cell(rows: list[dict]) -> str:
-    errors = [row["error"] for row in rows if "error" in row]
+def _cell(rows: Rows) -> str:
+    errors, percent = by_log(rows), by_log(rows, "mean_percent_of_range")
     if not errors:
         return "refuses" if rows else ""
-    percent = np.median([error["mean_percent_of_range"] for error in errors])
-    return f"{shown([error['mean_absolute'] for error in errors]).partition(' ')[0]} ({percent:.2g})"
-
-
-def label(row: dict) -> str:
-    """A method and where its rollouts start, if that is not where they usually do on such data."""
-    usual = "policy" if row["method"] == "madoc" else usual_starts(row["data"])
-    return row["method"] if row["starts"] in ("-", usual) else f"{row['method']}, {row['starts']}"
+    return f"{np.mean(list(errors.values())):.2g} ({np.mean(list(percent.values())):.2g})"

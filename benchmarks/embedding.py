@@ -1,8 +1,8 @@
 """Figure 3a: groups of Hopper's parameters on the robot, and in the plane of their embeddings.
 
 madoc suite benchmarks/suites/figure-3a.yaml --out runs/paper      # minutes
-python benchmarks/embedding.py --collect runs/paper                # keeps groups and embeddings in results/paper
-python benchmarks/embedding.py                                     # draws docs/concepts/groups.svg from them
+python benchmarks/embedding.py --collect runs/paper                # keeps groups and embeddings in results
+python benchmarks/embedding.py                                     # draws docs/concepts/groups.svg from the last ones
 """
 
 import argparse
@@ -13,9 +13,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from paper_cells import RESULTS, asked, planned
+from kept import RESULTS, Study
+from paper_cells import planned
 
-from calibration import commit
 from madoc import tasks
 from madoc.report.charts import scatter_chart
 from madoc.report.reading import read_arrays
@@ -27,13 +27,8 @@ from madoc.tasks import Task
 
 SUITE = "figure-3a"
 PICTURE = Path(__file__).parents[1] / "docs" / "concepts" / "groups.svg"
-TITLES = {
-    "learned": "Learned by the VAE, as in the paper",
-    "physics": "By what they move in the simulator",
-}
-"""By the hyperparameter `groups`, in the order in which they are drawn."""
-STABILITIES = {"learned": "of its votes", "physics": "of resampled states"}
-"""What the stability of the groups is of: both are mean adjusted Rand indices."""
+STUDY = Study(RESULTS / "figure-3a.jsonl", ("groups_by",))
+TITLE = "Learned by the VAE, as in the paper"
 ROBOT, PLANE, HEIGHT, HEAD = 330, 560, 330, 34
 """Widths of both panels, the height of a row, and that of its title."""
 STYLE = """
@@ -55,53 +50,44 @@ def main() -> None:
     if arguments.collect:
         print(f"{SUITE}: {collect(arguments.collect)} cells kept")
     else:
-        PICTURE.write_text(picture(kept()))
+        PICTURE.write_text(picture(STUDY.rows()[-1]))
         print(PICTURE)
 
 
 def collect(folder: Path) -> int:
-    """Keep groups, their stability and the embeddings of the cells that have ended: how many."""
-    found = kept()
-    for cell in planned(SUITE).cells:
-        place = cell.folder(folder)
-        embeddings = read_arrays(place / "embeddings.npz", "names", "vectors")
-        if cell.kind != "calibrate" or embeddings is None or not (place / "outcome.json").exists():
-            continue
-        result = json.loads((place / "result.json").read_text())
-        (setting,) = asked(cell)["set"][0]
-        found[setting.partition("=")[2]] = {
+    """Keep groups, their stability and the embeddings of the cell, if it has ended: how many were kept."""
+    (cell,) = [each for each in planned(SUITE).cells if each.kind == "calibrate"]
+    place = cell.folder(folder)
+    embeddings = read_arrays(place / "embeddings.npz", "names", "vectors")
+    if embeddings is None or not (place / "outcome.json").exists():
+        return 0
+    result = json.loads((place / "result.json").read_text())
+    STUDY.add(
+        {
+            "groups_by": "learned",
             "cell": cell.name,
-            "commit": commit(),
             "groups": result["groups"],
             "stability": result["group_stability"],
             "names": embeddings["names"].tolist(),
             "vectors": np.round(embeddings["vectors"], 6).tolist(),
         }
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / f"{SUITE}.json").write_text(json.dumps(found) + "\n")
-    return len(found)
+    )
+    return 1
 
 
-def kept() -> dict[str, dict]:
-    """What was collected, by the kind of grouping."""
-    file = RESULTS / f"{SUITE}.json"
-    return json.loads(file.read_text()) if file.exists() else {}
-
-
-def picture(found: Mapping[str, Mapping]) -> str:
-    """An SVG with a row for each kind of grouping: the robot, and the plane of the embeddings."""
-    shown = [kind for kind in TITLES if kind in found]
-    rows = [_row(tasks.make("hopper"), kind, found[kind], (HEIGHT + HEAD) * at) for at, kind in enumerate(shown)]
-    size = f"{ROBOT + PLANE} {(HEIGHT + HEAD) * len(shown)}"
+def picture(found: Mapping) -> str:
+    """An SVG: the robot, and the plane of the embeddings."""
+    size = f"{ROBOT + PLANE} {HEIGHT + HEAD}"
     label = "Groups of Hopper's parameters, on the robot and in the plane of their embeddings"
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" role="img" aria-label="{label}">\n'
-        f'<style>{STYLE}</style>\n<rect width="100%" height="100%" fill="#fff"/>\n{"".join(rows)}</svg>\n'
+        f'<style>{STYLE}</style>\n<rect width="100%" height="100%" fill="#fff"/>\n'
+        f"{_drawn(tasks.make('hopper'), found)}</svg>\n"
     )
 
 
-def _row(task: Task, kind: str, found: Mapping, top: float) -> str:
-    """One kind of grouping."""
+def _drawn(task: Task, found: Mapping) -> str:
+    """The robot with its parameters, and their plane."""
     colour = {name: f"g{group}" for group, names in enumerate(found["groups"]) for name in names}
     points, shares = plane_of(np.array(found["vectors"]))
     chart = scatter_chart(
@@ -114,10 +100,9 @@ def _row(task: Task, kind: str, found: Mapping, top: float) -> str:
         height=HEIGHT,
     )
     placed = str(chart).replace("<svg ", f'<svg x="{ROBOT}" y="{HEAD}" width="{PLANE}" height="{HEIGHT}" ', 1)
-    stability = f"adjusted Rand index {STABILITIES[kind]} {found['stability']:.2f}"
     return (
-        f'<g transform="translate(0 {top})">\n<text class="title" x="12" y="22">{TITLES[kind]}: '
-        f"{len(found['groups'])} groups, {stability}</text>\n{robot(task, colour)}{placed}</g>\n"
+        f'<g>\n<text class="title" x="12" y="22">{TITLE}: {len(found["groups"])} groups, '
+        f"adjusted Rand index of its votes {found['stability']:.2f}</text>\n{robot(task, colour)}{placed}</g>\n"
     )
 
 

@@ -23,6 +23,7 @@ from madoc.suites.cells import Cell
 from madoc.suites.planning import Plan
 from madoc.suites.results import Result
 
+TITLE = "Figure 2: correlation of the critic's value with the absolute error of gravity"
 PARAMETER = "gravity"
 COUNT = 2000
 """Draws that are correlated."""

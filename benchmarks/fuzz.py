@@ -3,11 +3,10 @@
     python benchmarks/fuzz.py --minutes 10
 
 A good file is cut, doubled, spliced, and sprinkled with what is known to hurt. What is neither read nor refused is
-left in `--keep`, and ends the run with exit code 1. Leaves `results/fuzz.json`.
+left in `--keep`, and ends the run with exit code 1. Leaves a row of `results/fuzz.jsonl`.
 """
 
 import argparse
-import json
 import tempfile
 import time
 import traceback
@@ -15,13 +14,13 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from kept import RESULTS, Study
 
-from calibration import commit
 from madoc import robots
 from madoc.data import logs
 from madoc.errors import MadocError
 
-RESULT = Path(__file__).parent / "results" / "fuzz.json"
+STUDY = Study(RESULTS / "fuzz.jsonl", ())
 EXAMPLES = Path(__file__).parents[1] / "examples"
 HURTFUL = (
     *(
@@ -98,9 +97,9 @@ def main() -> None:
                 if word == "crashed":
                     arguments.keep.mkdir(parents=True, exist_ok=True)
                     (arguments.keep / f"{kind}-{sum(counts.values())}").write_bytes(content)
-    found = {"minutes": arguments.minutes, "seed": arguments.seed, "commit": commit()} | dict(sorted(counts.items()))
-    RESULT.write_text(json.dumps(found, indent=1))
-    print(json.dumps(found))
+    found = {"minutes": arguments.minutes, "seed": arguments.seed} | dict(sorted(counts.items()))
+    STUDY.add(found)
+    print(found)
     raise SystemExit(any(name.endswith("crashed") for name in counts))
 
 

@@ -1,66 +1,43 @@
-"""The paper's tables and figures: what their suites have found, beside what the paper prints.
+"""The paper's tables and figures: what was found, beside what the paper prints.
 
-    madoc suite benchmarks/suites/table-10.yaml --out runs/paper       # hours to weeks; may be stopped at any time
-    python benchmarks/paper.py --collect runs/paper                    # keeps what has ended in results/paper
+    python benchmarks/calibration.py --tasks ... --methods ...         # any cell of the tables of errors
+    madoc suite benchmarks/suites/table-10.yaml --out runs/paper       # or as a suite, which may be stopped at any time
+    python benchmarks/paper.py --collect runs/paper                    # keeps what has ended of all suites there
     python benchmarks/paper.py                                         # prints the tables, and writes results/paper.md
 
-Suites share their cells: what table 10 has calibrated, table 1 learns policies at.
+Tables of errors show every calibration that was kept, wherever it was run. Suites share their cells: what table 10 has
+calibrated, table 1 learns policies at.
 """
 
 import argparse
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import costs
 import figure_2
 import numpy as np
-import paper_cells
-from jaxtyping import Float
-from paper_cells import asked, chain_of, how_far, keep, kept, planned, printed, wanted
-from scipy import stats
+from kept import CALIBRATIONS, RESULTS, Study, commits
+from paper_cells import STUDIES, asked, chain_of, how_far, kept, planned, printed, wanted
+from paper_errors import ERRORS, Place, as_asked, in_words, table_of_errors
+from pooling import OUR_LOGS
 
-from calibration import commit
-from madoc import tasks
 from madoc.suites.cells import Cell, Kind
-from madoc.suites.planning import Plan
 from madoc.suites.results import Result, results_of
 from madoc.suites.standing import Standing
 
-RESAMPLES = 2000
-"""Of the bootstrap."""
-TITLES = {
-    "table-10": "Table 10: mean absolute calibration error, D4RL's qualities",
-    "table-11": "Table 11: mean absolute calibration error, NeoRL's qualities",
+PAGE = RESULTS / "paper.md"
+RETURNS = {
     "table-1": "Table 1: normalized return, D4RL's qualities",
     "table-2": "Table 2: normalized return, NeoRL's qualities",
-    "table-12": "Table 12: normalized return by the kind of credit",
     "table-13": "Table 13: normalized return with cloning",
-    "table-3": "Tables 3 and 4: memory, and time by stage",
-    "figure-2": "Figure 2: correlation of the critic's value with the absolute error of gravity",
     "figure-3b": "Figure 3b: normalized return by the number of calibrated parameters",
-    "figure-3b-errors": "Figure 3b: mean calibration error by the number of parameters, in % of their ranges",
-    "groups": "Groups, one agent, and one agent a parameter: mean absolute calibration error",
     "figure-4": "Figures 4 and 8: normalized return by rows and ranges",
     "figure-6": "Figure 6: normalized return with groups and without",
-    "figure-7": "Figure 7: normalized return by the number of groups and α",
 }
 OWN = {"table-3": costs, "figure-2": figure_2}
-"""Modules of what is no table of scores; each has `cells`, `told` and `table`."""
-
-MEASURES = {"figure-3b-errors": "percent_of_range"}
-"""What is shown of a cell's result, where that is not its `value`: a mean over other parameters has other units."""
-
-
-@dataclass(frozen=True)
-class Score:
-    """What a cell of a suite found, and where it stands in its table."""
-
-    row: str
-    column: str
-    value: float | None
-    refused: bool
+"""Modules of what is no table of scores; each has `TITLE`, `cells`, `told` and `table`."""
+TITLES = ERRORS | RETURNS | {name: module.TITLE for name, module in OWN.items()}
 
 
 def main() -> None:
@@ -71,168 +48,105 @@ def main() -> None:
         for name in TITLES:
             print(f"{name}: {collect(name, arguments.collect)} cells kept")
     else:
-        (paper_cells.RESULTS.parent / "paper.md").write_text(tables())
+        PAGE.write_text(tables())
         print(tables())
 
 
 def collect(name: str, folder: Path) -> int:
-    """Keep what the cells of a suite have found, those of earlier calls included: how many."""
-    own, plan, earlier = OWN.get(name), planned(name), kept(name)
-    cells = [cell for cell in (own.cells if own else wanted)(plan) if cell.name not in earlier]
-    found = {
-        result.cell.name: (own.told(result, folder) if own else told(result)) | {"commit": commit()}
-        for result in results_of(Standing(folder, cells, workers=1), folder)
-        if result.status not in ("not run", "failed")
-    }
-    if found:
-        keep(name, found)
-    return len((earlier | found).keys() & {cell.name for cell in (own.cells if own else wanted)(plan)})
+    """Keep what the cells of a suite have found and no earlier call has kept: how many."""
+    plan, own = planned(name), OWN.get(name)
+    count = 0
+    for result in results_of(Standing(folder, list(plan.cells), workers=1), folder):
+        if result.status in ("not run", "failed"):
+            continue
+        if result.cell.kind == "calibrate":
+            row = as_asked(chain_of(result.cell, plan))
+            count += keep(CALIBRATIONS, row, lambda result=result: of_calibration(result))
+        if result.cell.kind == "evaluate":
+            count += keep(STUDIES["returns"], {"cell": result.cell.name}, lambda result=result: of_policy(result))
+        if own and result.cell in own.cells(plan):
+            of_own = lambda result=result: own.told(result, folder)  # noqa: E731
+            count += keep(STUDIES[name], {"cell": result.cell.name}, of_own)
+    return count
 
 
-def told(result: Result) -> dict:
-    """What is kept of a result: a number or the sentence of a refusal, and its cost."""
-    if result.calibration is not None:
-        error = result.error.get("mean_absolute")
-        percent = result.error.get("mean_percent_of_range")
-        cost = {"control_steps": result.calibration.control_steps, "seconds": result.calibration.seconds}
-        return {"value": error, "percent_of_range": percent} | cost
-    if result.evaluation is not None:
-        (returns,) = result.evaluation.policies.values()
-        return {"value": returns["normalized"], "return": returns["return"]}
-    return {"value": None, "refusal": result.sentence}
+def keep(study: Study, cell: Mapping, found: Callable[[], Mapping]) -> bool:
+    """Add what was found of a cell to a study, unless it has a row: whether it was added."""
+    if study.has(cell):
+        return False
+    study.add({**found(), **cell})
+    return True
+
+
+def of_calibration(result: Result) -> dict:
+    """What is kept of a calibration: the whole result, or the sentence of a refusal."""
+    return {"refusal": result.sentence} if result.calibration is None else result.calibration.to_json()
+
+
+def of_policy(result: Result) -> dict:
+    """What is kept of an evaluation: a return, or the sentence of a refusal."""
+    if result.evaluation is None:
+        return {"value": None, "refusal": result.sentence}
+    (returns,) = result.evaluation.policies.values()
+    return {"value": returns["normalized"], "return": returns["return"]}
 
 
 def tables() -> str:
     """All tables, as Markdown."""
     head = (
         "# The paper's tables\n\nMade by `python benchmarks/paper.py`; in brackets, as printed. "
-        "A calibration here learns from at most 300,000 control steps, the paper's from 1,000,000; grouping, "
-        "where there is any, takes up to 60,000 more. [Figure 3a](../../docs/concepts/groups.svg) is by "
-        "`benchmarks/embedding.py`.\n"
+        "Errors are means over logs, where seeds of a log are averaged first; of several budgets the one that was run "
+        "last is shown, with its number where it is not 300,000 control steps. "
+        "[Figure 3a](../../docs/concepts/groups.svg) is by `benchmarks/embedding.py`.\n"
     )
     return "\n".join([head, *(f"## {TITLES[name]}\n\n{table(name)}" for name in TITLES)])
 
 
-def beside_printed(column: str) -> list[tuple[str, float, float, int]]:
-    """Of each task of tables 10 and 11: its name, our mean error over the seeds run, the printed one, and our seeds."""
-    found = []
-    for name in ("table-10", "table-11"):
-        for (row, system), values in by_seed(name).items():
-            if system == column and values:
-                theirs = printed(name, row, column)
-                assert theirs is not None
-                found.append((row, float(np.mean(list(values.values()))), theirs[0], len(values)))
-    return found
-
-
-def by_seed(name: str) -> dict[tuple[str, str], dict[int, float]]:
-    """Values of a suite by row and column, those of each seed; empty where none was run."""
-    plan, found = planned(name), kept(name)
-    values = defaultdict[tuple[str, str], dict[int, float]](dict)
-    for cell in wanted(plan):
-        known = values[place(chain_of(cell, plan))]
-        if found.get(cell.name, {}).get("value") is not None:
-            known[asked(cell).get("seed", 0)] = found[cell.name]["value"]
-    return dict(values)
-
-
 def table(name: str) -> str:
-    """One table without its title: ours beside the printed value, cells that were not run, and their command."""
+    """One table without its title."""
     if name in OWN:
         return OWN[name].table(name)
-    plan = planned(name)
-    scores = scores_of(plan, kept(name))
-    rows = list(dict.fromkeys(score.row for score in scores))
-    columns = list(dict.fromkeys(score.column for score in scores))
-    by_cell = defaultdict[tuple[str, str], list[Score]](list)
-    for score in scores:
-        by_cell[score.row, score.column].append(score)
-    lines = [f"{how_far(name, wanted(plan))}. Interquartile mean over seeds (the paper's mean, over 6 seeds).\n"]
-    lines += [f"| task | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
+    return table_of_errors(name) if name in ERRORS else table_of_returns(name)
+
+
+def table_of_returns(name: str) -> str:
+    """Normalized returns by task and system, the mean over seeds, beside the printed ones."""
+    plan, found = planned(name), kept(name)
+    told = how_far(name, wanted(plan))
+    values = defaultdict[Place, list](list)
+    for cell in wanted(plan):
+        values[place(chain_of(cell, plan))].append(found.get(cell.name, {}))
+    if not any(each for rows in values.values() for each in rows):
+        return f"{told}.\n"
+    rows, columns = (list(dict.fromkeys(each[index] for each in values)) for index in (0, 1))
+    lines = [f"{told}. Mean over seeds. {OUR_LOGS}\n", f"| task | {' | '.join(columns)} | commits |"]
+    lines.append("|---" * (2 + len(columns)) + "|")
     for row in rows:
-        cells = [_shown(by_cell[row, column], printed(name, row, column)) for column in columns]
-        lines.append(f"| {row} | {' | '.join(cells)} |")
-    over = [_over_tasks([by_cell[row, column] for row in rows]) for column in columns]
-    if any(over):
-        lines.append(f"| interquartile mean [95 %] | {' | '.join(over)} |")
+        cells = [_returned(values.get((row, column), []), printed(name, row, column)) for column in columns]
+        measured = [each for column in columns for each in values.get((row, column), []) if each]
+        lines.append(f"| {row} | {' | '.join(cells)} | {commits(measured)} |")
     return "\n".join(lines) + "\n"
 
 
-def scores_of(plan: Plan, found: Mapping[str, Mapping]) -> list[Score]:
-    """Every cell that a suite asks for, with its place in the table and what it found."""
-    counted = any("parameters" in asked(cell) for cell in plan.cells if cell.kind == "calibrate")
-    measure = MEASURES.get(plan.name, "value")
-    scores = []
-    for cell in wanted(plan):
-        chain = chain_of(cell, plan)
-        known = found.get(cell.name, {})
-        row, column = place(chain)
-        count = parameters(chain["calibrate"])
-        row += f", {count} parameter{'s' * (count > 1)}" if counted else ""
-        scores.append(Score(row, column, known.get(measure), "refusal" in known))
-    return scores
-
-
-def place(chain: Mapping[Kind, Cell]) -> tuple[str, str]:
-    """Row and column of a cell: the data with what differs in it, and the system of calibrator and learner."""
-    calibration, record = asked(chain["calibrate"]), asked(chain["record"])
-    row = str(record["name"])
-    if "transitions" in record:
-        row += f", {int(record['transitions']):,} rows"
-    if "level" in calibration:
-        row += f", {calibration['level']} ranges"
-    method = str(calibration["method"])
-    column = " ".join([method, *(text for group in calibration.get("set", []) for text in group)])
-    if "learn" not in chain:
-        return row, column
-    policy = asked(chain["learn"])
-    learner, at = str(policy["method"]), str(policy.get("at", "calibrated"))
-    if method != "nominal":
-        return row, column if learner == "sac" else f"{column} + {learner}"
-    return row, (at if at != "calibrated" else method) if learner == "sac" else learner
-
-
-def parameters(calibration: Cell) -> int:
-    """How many parameters a cell calibrates: those that it names, or all of the robot's."""
-    told = asked(calibration)
-    return len(told.get("parameters") or tasks.make(told["task"]).parameters)
-
-
-def interquartile_mean(*rows: Float[np.ndarray, "*resamples seeds"], axis: int = -1) -> Float[np.ndarray, "*resamples"]:
-    """Mean of the middle half of all values of several tasks."""
-    return stats.trim_mean(np.concatenate(rows, axis=axis), 0.25, axis=axis)
-
-
-def stratified_interval(tasks: Sequence[Sequence[float]]) -> tuple[float, float]:
-    """95 % interval of the interquartile mean: seeds are drawn with replacement within each task (a stratum)."""
-    drawn = stats.bootstrap(
-        [np.asarray(values) for values in tasks],
-        interquartile_mean,
-        n_resamples=RESAMPLES,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    )
-    return float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
-
-
-def _shown(scores: Iterable[Score], paper: tuple[float, float] | None) -> str:
-    """A cell of a table: ours, of fewer seeds than asked with their number, and in brackets what is printed."""
-    listed = list(scores)
-    values = [score.value for score in listed if score.value is not None]
-    told = "" if not listed else "refuses" if all(score.refused for score in listed) else "not run"
-    if values:
-        told = f"{float(interquartile_mean(np.array(values))):.3g}"
-        told += "" if len(values) == len(listed) else f" ({len(values)} of {len(listed)} seeds)"
+def _returned(rows: Sequence[Mapping], paper: tuple[float, float] | None) -> str:
+    values = [row["value"] for row in rows if row.get("value") is not None]
+    told = "refuses" if any("refusal" in row for row in rows) else "not run" if rows else ""
+    told = f"{np.mean(values):.1f} ({len(values)} of {len(rows)} seeds)" if values else told
     return told + (f" [{paper[0]:g} ± {paper[1]:g}]" if paper else "")
 
 
-def _over_tasks(cells: Sequence[Sequence[Score]]) -> str:
-    """The interquartile mean over all tasks, once each has at least two seeds."""
-    tasks = [[score.value for score in scores if score.value is not None] for scores in cells if scores]
-    if not tasks or min(map(len, tasks)) < 2:
-        return ""
-    low, high = stratified_interval(tasks)
-    return f"{float(interquartile_mean(*map(np.asarray, tasks))):.3g} [{low:.3g}, {high:.3g}]"
+def place(chain: Mapping[Kind, Cell]) -> Place:
+    """Row and column of a policy: the data with what differs in it, and the system of calibrator and learner."""
+    calibration, record = asked(chain["calibrate"]), asked(chain["record"])
+    row = str(record["name"])
+    row += f", {int(record['transitions']):,} rows" if "transitions" in record else ""
+    row += f", {calibration['level']} ranges" if "level" in calibration else ""
+    row += f", {in_words(len(calibration['parameters']))}" if calibration.get("parameters") else ""
+    method, policy = str(calibration["method"]), asked(chain["learn"])
+    learner, at = str(policy["method"]), str(policy.get("at", "calibrated"))
+    if method != "nominal":
+        return row, method if learner == "sac" else f"{method} + {learner}"
+    return row, (at if at != "calibrated" else "mid-range") if learner == "sac" else learner
 
 
 if __name__ == "__main__":

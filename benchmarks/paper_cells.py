@@ -2,19 +2,22 @@
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
+
+from kept import RESULTS, Study
 
 from madoc.suites.cells import KINDS, Cell, Kind
 from madoc.suites.options import flat
 from madoc.suites.planning import Plan, plan_of
 
 SUITES = Path(__file__).parent / "suites"
-RESULTS = Path(__file__).parent / "results" / "paper"
 OUT = "runs/paper"
-NO_SCORES = ("table-3", "figure-2")
-"""What keeps more than a score of a cell, each in a file of its own; suites of scores share their cells and a file."""
+STUDIES = {name: Study(RESULTS / f"{name}.jsonl", ("cell",)) for name in ("returns", "table-3", "figure-2")}
+"""What was collected of suites, by cell: returns of policies, which tables share, and what is no score. Calibrations
+are rows of `kept.CALIBRATIONS`, beside those that were run without a suite."""
 
 
 @cache
@@ -43,31 +46,22 @@ def asked(cell: Cell) -> dict:
     return flat(KINDS[cell.kind], cell.order)
 
 
-def file_of(name: str) -> Path:
-    """Where what a suite has found is kept."""
-    return RESULTS / f"{name if name in NO_SCORES else 'scores'}.json"
+def kept(name: str) -> dict[str, dict[str, Any]]:
+    """What was collected for a table whose cells have a study of their own, by cell."""
+    return {row["cell"]: row for row in STUDIES.get(name, STUDIES["returns"]).rows()}
 
 
-def kept(name: str) -> dict[str, dict]:
-    """What was collected of a suite, by cell, with the cells of all suites that share its file."""
-    file = file_of(name)
-    return json.loads(file.read_text()) if file.exists() else {}
-
-
-def keep(name: str, found: Mapping[str, Mapping]) -> None:
-    """Keep what was collected of a suite, a cell a line, beside what its file holds."""
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    lines = ",\n".join(f' "{cell}": {json.dumps(row)}' for cell, row in sorted((kept(name) | dict(found)).items()))
-    file_of(name).write_text(f"{{\n{lines}\n}}\n")
+def command(name: str) -> str:
+    """How the cells of a suite are run."""
+    return f"`madoc suite benchmarks/suites/{name}.yaml --out {OUT}`"
 
 
 def how_far(name: str, cells: Sequence[Cell]) -> str:
     """How many of a suite's cells are not run, the command that runs them, and at which commits they were collected."""
     found = kept(name)
     commits = Counter(found[cell.name]["commit"] for cell in cells if cell.name in found)
-    command = f"`madoc suite benchmarks/suites/{name}.yaml --out {OUT}`"
     missing = len(cells) - commits.total()
-    told = f"{missing} of {len(cells)} cells are not run: {command}" if missing else f"All cells are run by {command}"
+    told = f"{missing} of {len(cells)} cells are not run: {command(name)}" if missing else f"All run by {command(name)}"
     collected = ", ".join(f"{count} at {each}" for each, count in commits.most_common())
     return f"{told}; collected {collected}" if collected else told
 

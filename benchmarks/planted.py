@@ -1,9 +1,9 @@
 """Planted truths in robots of one's own: what `madoc calibrate` finds, how sure it is, and its verdict.
 
-    python benchmarks/planted.py                                    # 3 robots in 5 situations, one JSON file each
+    python benchmarks/planted.py                                    # 3 robots in 5 situations
     python benchmarks/planted.py --coverage 100                     # how often 95 % intervals cover, on the pendulum
 
-Robots and logs are those of `examples/`: spec files, and CSV files a run. Runs already there are skipped. Noise is a
+Robots and logs are those of `examples/`: spec files, and CSV files a run. Rows already there are skipped. Noise is a
 share of each signal's spread; a situation's specs differ from the robot's own by what the situation is about.
 """
 
@@ -13,19 +13,21 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
 
 import gymnasium
 import numpy as np
+from kept import RESULTS, Study, commit, commits
 from ruamel.yaml import YAML
 
-from calibration import commit
 from madoc import robots
 from madoc.pipeline import CalibrationOrder, Search, Source, calibrate_in
 from madoc.robots.document import yaml_text
 
-RESULTS = Path(__file__).parent / "results" / "planted"
+STUDY = Study(RESULTS / "planted.jsonl", ("robot", "situation", "seed"))
+COVERAGE = Study(RESULTS / "planted-coverage.jsonl", ("robot", "problem"))
 EXAMPLES = Path(__file__).parents[1] / "examples"
 HOPPER = {
     "madoc": 1,
@@ -83,20 +85,18 @@ def main() -> None:
         "--budget", default=None, help="of a calibration, such as 300000 or 60s; as `madoc calibrate` by default"
     )
     arguments = parser.parse_args()
-    RESULTS.mkdir(parents=True, exist_ok=True)
     if arguments.coverage:
         cover(arguments.coverage, arguments.budget)
         return
     for robot in arguments.robots:
         for situation in arguments.situations:
             for seed in arguments.seeds:
-                path = RESULTS / f"{robot}-{situation}-{seed}.json"
-                if path.exists():
-                    continue
-                with tempfile.TemporaryDirectory() as folder:
-                    row = planted(Path(folder), robot, situation, seed, arguments.budget)
-                path.write_text(json.dumps(row, indent=1))
-                print(path.name, row["verdict"]["word"], f"{row['seconds']:.0f} s", flush=True)
+                asked = {"robot": robot, "situation": situation, "seed": seed}
+                with STUDY.claimed(asked) as ours, tempfile.TemporaryDirectory() as folder:
+                    if ours:
+                        row = planted(Path(folder), robot, situation, seed, arguments.budget)
+                        STUDY.add(row)
+                        print(*asked.values(), row["verdict"]["word"], f"{row['seconds']:.0f} s", flush=True)
 
 
 def planted(folder: Path, robot: str, situation: str, seed: int, budget: str | None) -> dict:
@@ -134,13 +134,13 @@ def planted(folder: Path, robot: str, situation: str, seed: int, budget: str | N
 
 def cover(problems: int, budget: str | None) -> None:
     """How often 95 % intervals of least squares cover the truth: a new truth, new commands and new noise each time."""
-    path = RESULTS / f"pendulum-coverage-{problems}.json"
-    rows = json.loads(path.read_text())["rows"] if path.exists() else []
     machine = base("pendulum")
-    for problem in range(len(rows), problems):
-        random = np.random.default_rng(problem)
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
+    for problem in range(problems):
+        asked = {"robot": "pendulum", "problem": problem, "noise": NOISE}
+        with COVERAGE.claimed(asked) as ours, tempfile.TemporaryDirectory() as name:
+            if not ours:
+                continue
+            folder, random = Path(name), np.random.default_rng(problem)
             space = robots.load(write(folder / "known.yaml", machine)).task.parameters
             drawn = space.low + random.uniform(0.15, 0.85, len(space)) * (space.high - space.low)
             truth = dict(zip(space.names, drawn.tolist(), strict=True))
@@ -148,16 +148,17 @@ def cover(problems: int, budget: str | None) -> None:
             search = Search(method="least-squares", budget=budget, seed=problem)
             order = CalibrationOrder(str(folder / "known.yaml"), Source((str(logs),)), search)
             result = calibrate_in(folder / "run", order).to_json()
-        rows.append({"status": result["status"], "commit": commit(), "parameters": compared(result, truth)})
-        covered = [row["covered"] for said in rows for row in said["parameters"].values()]
-        summary = {
-            "covered": sum(covered) / len(covered),
-            "problems": len(rows),
-            "noise": NOISE,
-            "commit": ", ".join(sorted({said["commit"] for said in rows})),
-        }
-        path.write_text(json.dumps(summary | {"rows": rows}, indent=1))
-        print(problem, f"{100 * summary['covered']:.1f} % of {len(covered)} intervals cover", flush=True)
+            COVERAGE.add(asked | {"status": result["status"], "parameters": compared(result, truth)})
+    print(covered(COVERAGE.rows()))
+
+
+def covered(rows: Sequence[dict]) -> str:
+    """How many intervals hold the truth, in a sentence."""
+    held = [part["covered"] for row in rows for part in row["parameters"].values()]
+    return (
+        f"Of {len(rows)} problems planted on the pendulum (least squares, noise of {NOISE:g} of each signal's spread), "
+        f"{100 * np.mean(held):.1f} % of 95 % intervals cover the truth ({commits(rows)})."
+    )
 
 
 def compared(result: dict, truth: dict[str, float]) -> dict[str, dict]:

@@ -10,7 +10,6 @@ runs, over windows of 0.5 s, as are mid-range and values 5 % off the truth, as a
 """
 
 import argparse
-import json
 import tempfile
 import time
 from dataclasses import replace
@@ -21,13 +20,14 @@ from typing import Any
 import mujoco
 import numpy as np
 import yaml
-from adversary import compared, madoc, measured_commit
+from adversary import compared, madoc
 from adversary_cases.case import ENCODER, Case, Log, Spec
 from adversary_cases.plant import Run, record_run, truth_of
 from adversary_cases.robots import ARM
 from adversary_cases.write import limits, write
+from kept import RESULTS, Study, commit, commits
 
-RESULTS = Path(__file__).parent / "results" / "rates"
+STUDY = Study(RESULTS / "rates.jsonl", ("seed",))
 RATES = (500, 100, 50)
 """Rows per second. All are calibrated with a physics step of 2 ms."""
 FREE = ("mass_upper", "mass_fore", "damping_shoulder", "damping_elbow", "friction_shoulder", "friction_elbow")
@@ -48,21 +48,20 @@ LIMIT = 300.0
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--results", type=Path, default=STUDY.file)
     parser.add_argument("--table", action="store_true", help="print the summary of what is there, and run nothing")
     arguments = parser.parse_args()
-    if not arguments.table:
-        arguments.results.mkdir(parents=True, exist_ok=True)
-        for seed in arguments.seeds:
-            path = arguments.results / f"{seed}.json"
-            if not path.exists():
-                path.write_text(json.dumps(solve(seed), indent=1, ensure_ascii=False) + "\n")
-    print(table([json.loads(path.read_text()) for path in sorted(arguments.results.glob("*.json"))]))
+    study = replace(STUDY, file=arguments.results)
+    for seed in arguments.seeds if not arguments.table else ():
+        with study.claimed({"seed": seed}) as ours:
+            if ours:
+                study.add(solve(seed))
+    print(table(study.rows()))
 
 
 def solve(seed: int) -> dict[str, Any]:
     """Calibrate to the same runs at every rate."""
-    row: dict[str, Any] = {"seed": seed, "commit": measured_commit(), "rates": {}}
+    row: dict[str, Any] = {"seed": seed, "commit": commit(), "rates": {}}
     truth, random = truth_of(CASE, seed), np.random.default_rng([seed, 1])
     exact = replace(CASE, log=Log(seconds=6.0, noise=0.0))
     apart = [record_run(exact, truth, 0.0, random) for _ in range(2)]
@@ -123,8 +122,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     """Verdicts, errors, and how far estimates at two rates are apart, as Markdown."""
     lines = [
         "| rows a second | seeds | CALIBRATED | intervals that hold the truth | s | error after 0.5 s, rad "
-        "| error over the data sheet's | over mid-range's | half-widths from 500 Hz, median (largest) |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| error over the data sheet's | over mid-range's | half-widths from 500 Hz, median (largest) | commits |",
+        "|---" * 10 + "|",
     ]
     for rate in map(str, RATES):
         all_of = [row["rates"][rate] for row in rows]
@@ -139,7 +138,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             if one["interval"] and other["interval"]
         ]
         if not solved:
-            lines.append(f"| {rate} | {len(all_of)} | 0 | not run |  |  |  |  |  |")
+            lines.append(f"| {rate} | {len(all_of)} | 0 | not run |  |  |  |  |  | {commits(rows)} |")
             continue
         ratio = {
             name: median(each["error"] / row["errors"][name] for row, each in solved)
@@ -150,7 +149,8 @@ def table(rows: list[dict[str, Any]]) -> str:
             f"| {sum(one['miss'] == 0.0 for one in found)} of {len(found)} "
             f"| {median(each['seconds'] for each in all_of):.0f} "
             f"| {median(each['error'] for _, each in solved):.2g} | {ratio['data sheet']:.2f} "
-            f"| {ratio['mid-range']:.3f} | {f'{median(apart):.2f} ({max(apart):.2f})' if apart else ''} |"
+            f"| {ratio['mid-range']:.3f} | {f'{median(apart):.2f} ({max(apart):.2f})' if apart else ''} "
+            f"| {commits(rows)} |"
         )
     return "\n".join(lines)
 

@@ -16,13 +16,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from kept import RESULTS, Study
 from ruamel.yaml import YAML
 
-from calibration import commit
 from madoc import pipeline, robots, simulation
 from madoc.data import Dataset, logs
 
 ROOT = Path(__file__).parent
+STUDY = Study(RESULTS / "real_arm.jsonl", ())
+"""One row for each time that it was run."""
 ARM = ROOT.parent / "examples" / "so101" / "so101.yaml"
 HELD_OUT = ("pick_place", "random_waypoints")
 PUBLISHED_MODEL = "so101_new_calib.xml"
@@ -47,10 +49,9 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--thirds", action="store_true", help="calibrate to each third of the motions as well")
-    parser.add_argument("--results", type=Path, default=ROOT / "results" / "real_arm.json")
     arguments = parser.parse_args()
     found = compare(arguments.data, thirds=arguments.thirds)
-    arguments.results.write_text(json.dumps({"commit": commit(), **found}, indent=1) + "\n")
+    STUDY.add(found)
     print(json.dumps(found, indent=1))
 
 

@@ -14,9 +14,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from kept import RESULTS, Study
 from ruamel.yaml import YAML
 
-from calibration import commit
 from madoc import pipeline, robots, simulation
 from madoc.data import Dataset, logs
 from madoc.identification.replay import window_residuals
@@ -24,6 +24,8 @@ from madoc.identification.states import logged_states
 from madoc.identification.windows import first_rows, windows_at
 
 ROOT = Path(__file__).parent
+STUDY = Study(RESULTS / "real_pendulum.jsonl", ())
+"""One row for each time that it was run."""
 PENDULUM = ROOT.parent / "examples" / "pendulum"
 CALIBRATED_TO, HELD_OUT = "ilqr", ("ddp", "energy_shaping", "sac")
 HORIZON = 20
@@ -33,10 +35,9 @@ SETTINGS = ("horizon=10", "windows=400")
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--results", type=Path, default=ROOT / "results" / "real_pendulum.json")
     arguments = parser.parse_args()
     found = compare(arguments.data)
-    arguments.results.write_text(json.dumps({"commit": commit(), **found}, indent=1) + "\n")
+    STUDY.add(found)
     print(json.dumps(found, indent=1))
 
 

@@ -1,17 +1,15 @@
 """How fast, against the floor, all in one run: updates against their matrix products, steps against bare MuJoCo.
 
-    python benchmarks/speed.py            # prints, and writes results/speed.json
+    python benchmarks/speed.py            # prints, and adds a row to results/speed.jsonl
 
 Single-core figures pin the process to one core (`taskset -c 0`), as the row says.
 """
 
-import argparse
 import json
 import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -19,11 +17,10 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
+from kept import RESULTS, Study
 
 from madoc import tasks
 from madoc.calibration import CalibrationProblem, LeastSquares, Madoc, calibrate
-from madoc.calibration.madoc import grouping
-from madoc.calibration.madoc.agents import OF_CHANGES, AgentSettings
 from madoc.data.targets import paper_truth
 from madoc.learning import replay
 from madoc.learning.cloning import continue_cloning
@@ -31,28 +28,22 @@ from madoc.policies import LEARNERS, FastSAC, PolicyProblem
 from madoc.policies.behaviours import record_quality
 from madoc.simulation.cpu import CpuSimulator
 
-RESULTS = Path(__file__).parent / "results"
+STUDY = Study(RESULTS / "speed.jsonl", ())
 SYSTEMS, ROWS, STEPS = 10, 100, 50
+EPOCHS = 10
+"""Of a calibration, that are timed."""
 PRODUCTS = 300 * 2 * 256**3
 """Floating point operations of a run of `products`."""
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--out", type=Path, default=RESULTS / "speed.json")
-    arguments = parser.parse_args()
     rows = {"cores": len(os.sched_getaffinity(0))}
-    rows["calibration_update"] = {
-        name: against_floor(*calibration_update(method), calibration_flops(method.agents, 17, 6, 14))
-        for name, method in {"paper": Madoc.paper(), "default": Madoc()}.items()
-    }
+    rows["calibration_epoch"] = calibration_epoch(Madoc())
     rows["learner_updates"] = {name: learner_updates(name) for name in FLOPS}
     rows["least_squares_hopper_1000_rows"] = least_squares(1000)
     rows["control_steps"] = {robot: stepping(robot) for robot in tasks.TASKS}
-    text = json.dumps(rows, indent=1)
-    print(text)
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(text + "\n")
+    print(json.dumps(rows, indent=1))
+    STUDY.add(rows)
 
 
 def best_of(*runs: Callable[[], object], times: int = 3) -> list[float]:
@@ -87,14 +78,6 @@ def against_floor(run: Callable[[], object], count: int, flops: float) -> dict[s
         "gflops": round(speed / 1e9, 1),
         "times_floor": round(seconds * speed / flops, 2),
     }
-
-
-def calibration_flops(settings: AgentSettings, observation: int, action: int, parameters: int) -> float:
-    """Operations of a calibration update of six groups: the discriminators learn and are read, then critics, actors."""
-    width, critic = settings.hidden[0], settings.critic_hidden[0]
-    both = mlp(observation + action, width, 2) + mlp(2 * observation + action, width, 2)
-    groups = 6 * mlp(parameters, critic, 1)
-    return settings.batch * ((2 * 3 + 1) * both + 3 * groups) + settings.actor_batch * 2 * groups
 
 
 def sac_flops(width: int, observation: int, action: int, batch: int = 256) -> float:
@@ -196,31 +179,19 @@ def learner_update(name: str, problem: PolicyProblem, width: int) -> tuple[Calla
     return lambda: jax.block_until_ready([leaf for leaf in jax.tree.leaves(run()) if eqx.is_array(leaf)]), count
 
 
-def calibration_update(method: Madoc) -> tuple[Callable[[], object], int]:
-    """Some calibration updates on HalfCheetah's data, and their number."""
+def calibration_epoch(method: Madoc) -> dict[str, float]:
+    """Median cost of an epoch of calibrating to HalfCheetah's data: seconds and control steps."""
     simulator = CpuSimulator(tasks.half_cheetah())
     dataset = record_quality(simulator, "medium", transitions=5000, key=jax.random.key(0))
     problem = CalibrationProblem(dataset, simulator)
-    state = method.init(problem, jax.random.key(0))
-    groups, parameters = len(state.agents.critics.weight), len(simulator.parameters)
-    members = jnp.asarray(grouping.members(np.arange(parameters) % groups, groups))
-    count = 50
-
-    def run() -> object:
-        return jax.block_until_ready(
-            method.agents.update(
-                state.agents,
-                state.rows,
-                method.collection(problem).logged,
-                members,
-                jax.random.key(1),
-                mixing=method.mixing,
-                resolution=OF_CHANGES,
-                count=count,
-            )[1]
-        )
-
-    return run, count
+    state, epochs = method.init(problem, jax.random.key(0)), []
+    while len(epochs) <= EPOCHS:
+        started = time.perf_counter()
+        state, epoch = method.step(problem, state)
+        if epoch.stage == "calibrating":
+            epochs.append((time.perf_counter() - started, epoch.control_steps))
+    seconds, steps = np.median(epochs[1:], axis=0).tolist()  # the first compiles
+    return {"seconds": round(seconds, 3), "control_steps": steps}
 
 
 def least_squares(transitions: int) -> dict[str, float]:

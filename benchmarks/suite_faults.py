@@ -18,14 +18,15 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-
-from calibration import commit
+from kept import RESULTS, Study
 
 ROOT = Path(__file__).parents[1]
-RESULTS = Path(__file__).parent / "results" / "suite"
+STUDY = Study(RESULTS / "suite.jsonl", ("what",))
+"""What suites have shown: one row for each way to look at them, by the three benchmarks of their name."""
 SUITE = """\
 madoc: 1
 cells:
@@ -45,7 +46,7 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=40)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--results", type=Path, default=STUDY.file)
     parser.add_argument("--undisturbed", type=Path, help="folder of an undisturbed run, made there if it is missing")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -61,11 +62,9 @@ def main() -> None:
             "seconds_undisturbed": undisturbed,
             "seconds_disturbed": round(time.monotonic() - started, 1),
             "load": round(os.getloadavg()[1], 1),
-            "commit": commit(),
             "command": " ".join(["python benchmarks/suite_faults.py", *sys.argv[1:]]),
         } | compared(whole, folder / "killed")
-    arguments.results.mkdir(parents=True, exist_ok=True)
-    (arguments.results / f"faults-{arguments.executor}.json").write_text(json.dumps(told, indent=1) + "\n")
+    replace(STUDY, file=arguments.results).add({"what": f"faults-{arguments.executor}"} | told)
     print(json.dumps(told, indent=1))
 
 

@@ -13,12 +13,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from suite_faults import RESULTS, ROOT
+from suite_faults import ROOT, STUDY
 
-from calibration import commit
 from madoc import robots
 
 sys.path.insert(0, str(ROOT / "examples"))
@@ -44,18 +44,16 @@ cells:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--robots", type=int, default=200)
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--results", type=Path, default=STUDY.file)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         told = calibrated(Path(temporary), arguments.robots)
     told |= {
         "robots": arguments.robots,
         "load": round(os.getloadavg()[1], 1),
-        "commit": commit(),
         "command": " ".join(["python benchmarks/suite_fleet.py", *sys.argv[1:]]),
     }
-    arguments.results.mkdir(parents=True, exist_ok=True)
-    (arguments.results / "fleet.json").write_text(json.dumps(told, indent=1) + "\n")
+    replace(STUDY, file=arguments.results).add({"what": "fleet"} | told)
     print(json.dumps(told, indent=1))
 
 

@@ -12,13 +12,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from statistics import median
 
-from suite_faults import RESULTS, written
+from suite_faults import STUDY, written
 
-from calibration import commit
 from madoc.suites.cells import Cell, read_plans, write_plan
 from madoc.suites.claims import Outcome, claimed
 from madoc.suites.planning import plan_of
@@ -31,17 +30,15 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=["plan", "efficiency"])
     parser.add_argument("--cells", type=int, default=12, help="of the efficiency")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--results", type=Path, default=STUDY.file)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         told = plan(Path(temporary)) if arguments.what == "plan" else efficiency(Path(temporary), arguments.cells)
         told |= {
             "load": round(os.getloadavg()[1], 1),
-            "commit": commit(),
             "command": f"python benchmarks/suite_scale.py {arguments.what}",
         }
-        arguments.results.mkdir(parents=True, exist_ok=True)
-        (arguments.results / f"{arguments.what}.json").write_text(json.dumps(told, indent=1) + "\n")
+        replace(STUDY, file=arguments.results).add({"what": arguments.what} | told)
         print(json.dumps(told, indent=1), flush=True)
 
 

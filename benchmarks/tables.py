@@ -1,108 +1,99 @@
-"""Medians of what was measured, as Markdown, beside the paper's figures where it prints them.
+"""What was measured, as Markdown.
 
 python benchmarks/tables.py            # prints, and writes results/README.md and the tables of the README
 
-`make figures` writes all that is made of committed results.
+`make figures` writes all that is made of kept results.
 """
 
-import json
 from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any
 
 import adversary
+import adversary_table
 import coverage
 import numpy as np
-import paper
+import planted
 import rates
 import readme
-from disturbances import disturbed
-from kept import RESULTS, calibrations, is_time, learnt, shown
-from not_run import not_run
+from disturbances import disturbed, settled_wrongly
+from kept import CALIBRATIONS, POLICIES, RESULTS, SYSID, Study, commits, is_time
+from pooling import by_log, label, order, shown
 
-SETS = ("adversary", "rates")
-"""Folders of results of one JSON file each that are shown together."""
+PAGE = RESULTS / "README.md"
+SINGLE = {name: Study(RESULTS / f"{name}.jsonl", ()) for name in ("real_pendulum", "fuzz", "speed")}
+"""Studies of which the last row counts."""
 
 
 def main() -> None:
     text = measured()
-    (RESULTS / "README.md").write_text(text)
-    readme.README.write_text(readme.rewritten(readme.README.read_text(), learnt()))
+    PAGE.write_text(text)
+    readme.README.write_text(readme.rewritten(readme.README.read_text()))
     print(text)
 
 
 def measured() -> str:
     """All tables but the paper's, as Markdown."""
-    parts = ["# Measured\n\nMade by `python benchmarks/tables.py` from the files beside it.\n"]
-    parts += [
+    parts = [
+        "# Measured\n\nMade by `python benchmarks/tables.py` from the tables beside it, one line of JSON a cell. "
+        "Commits are those of the code that was measured; where a row has cells of several it says *mixed*.\n",
         calibration(),
-        groups(),
         disturbed(),
+        settled_wrongly(),
         policies(),
-        planted(),
+        planted_truths(),
         verdicts(),
         sysid(),
         pendulum(),
+        suites(),
         fuzz(),
         speed(),
-        not_run(),
     ]
     return "\n".join(part for part in parts if part)
 
 
 def calibration() -> str:
-    """Error of every (robot, method, starts, budget) on clean data, median over seeds."""
+    """Error of every task, method and budget of control steps on clean data."""
     cells = defaultdict(list)
-    for row in calibrations():
-        if row["data"] == "clean" and "error" in row and not is_time(row["budget"]):
-            cells[row["robot"], row["quality"], row["method"], row["starts"], row["budget"]].append(row)
-    if not cells:
-        return ""
+    for row in CALIBRATIONS.rows():
+        if row["data"] == "clean" and not is_time(row["budget"]) and "calibrated" not in row and "level" not in row:
+            cells[f"{row['robot']}-{row['quality']}", order(label(row)), row["transitions"], row["budget"]].append(row)
     lines = [
-        "## Calibration\n\n`python benchmarks/calibration.py` (see its options). Recorded legacy data, 200 000 rows. "
-        "Mean absolute error in raw units, median (lowest to highest) over seeds; the paper's took 1e6 control steps. "
-        "Seconds are of one core, shared with other work where a method's vary.\n",
-        "| robot | data | method | starts | control steps | seeds | error | % of range | paper | seconds | commit |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "## Calibration\n\n`python benchmarks/calibration.py --tasks ... --methods ... --logs ...`. Recorded legacy "
+        "data. Mean absolute error in raw units, the mean over logs (lowest to highest), where seeds of a log are "
+        "averaged first. Seconds are of one core, shared with other work where a method's vary.\n",
+        "| task | method | control steps | logs | runs | error | % of range | s | commits |",
+        "|---" * 9 + "|",
     ]
-    for (robot, quality, method, starts, _), rows in sorted(cells.items()):
-        errors = [row["error"]["mean_absolute"] for row in rows]
-        percent = np.median([row["error"]["mean_percent_of_range"] for row in rows])
-        steps = int(np.median([row["control_steps"] for row in rows]))
-        seconds = np.median([row["wall_seconds"] for row in rows])
-        printed = paper.printed("table-10", f"{robot}-{quality}", method)
-        commits = ", ".join(sorted({row["commit"] for row in rows}))
+    for (task, (_, method), _, _), rows in sorted(cells.items()):
+        ended = [row for row in rows if "error" in row]
+        if not ended:
+            lines.append(f"| {task} | {method} | | | {len(rows)} | refuses | | | {commits(rows)} |")
+            continue
+        errors, percent = by_log(ended), by_log(ended, "mean_percent_of_range")
+        steps, seconds = (np.median([row[name] for row in ended]) for name in ("control_steps", "seconds"))
         lines.append(
-            f"| {robot} | {quality} | {method} | {starts} | {steps:,} | {len(rows)} | {shown(errors)} "
-            f"| {percent:.2f} | {printed[0] if printed else ''} | {seconds:.0f} | {commits} |"
+            f"| {task} | {method} | {steps:,.0f} | {len(errors)} | {len(ended)} | {shown(errors)} "
+            f"| {np.mean(list(percent.values())):.2g} | {seconds:.0f} | {commits(rows)} |"
         )
     return "\n".join(lines) + "\n"
-
-
-def groups() -> str:
-    """Error of groups, one agent and one agent a parameter: on the four robots, and by parameters and draws."""
-    return (
-        "## Groups or one agent\n\n`madoc suite benchmarks/suites/groups.yaml` (each seed is in `paper/scores.json`). "
-        "Mean absolute error on medium data after 300,000 control steps, mean over seeds.\n\n"
-        + readme.errors()
-        + readme.study()
-    )
 
 
 def policies() -> str:
     """Return in the target of every learner, where it learnt and how, over seeds."""
     cells = defaultdict(list)
-    for row in learnt():
+    for row in POLICIES.rows():
         budget = row["budget"] if is_time(row["budget"]) else f"{row['budget']:,} {row['unit']}"
-        cells[row["robot"], row["method"], row["at"], budget, " ".join(row["set"])].append(row)
-    if not cells:
-        return ""
+        cells[row["robot"], row["method"], place(row), budget, " ".join(row["set"])].append(row)
     lines = [
         "## Policies\n\n`python benchmarks/policies.py` (see its options). Deterministic, in the target; medium data "
-        "where a learner takes data. Budgets are a fraction of the paper's, 1e6 control steps or updates on D4RL's own "
-        "data: none has converged. What is handed back is the policy that did best in the learner's own simulator, "
-        "which costs up to as many control steps again, or in MOREC's models; of CQL and BC, and of H2O and MOREC in "
-        "rows whose budget is no time, it is the last.\n",
-        "| robot | learner | learnt at | budget | settings | seeds | return | normalized (mean ± std) | paper | s |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "where a learner takes data. *madoc-vae-changes* is an earlier Madoc that is no longer there. Budgets are a "
+        "fraction of the paper's, 1e6 control steps or updates, and networks are smaller where settings say `hidden`: "
+        "none has converged, and none is comparable to a printed figure. What is handed back is the policy "
+        "that did best in the learner's own simulator, which costs up to as many control steps again, or in MOREC's "
+        "models; of CQL and BC, and of H2O and MOREC in rows whose budget is no time, it is the last.\n",
+        "| robot | learner | learnt at | budget | settings | seeds | return | normalized (mean ± std) | s | commits |",
+        "|---" * 10 + "|",
     ]
     for (robot, method, at, budget, settings), rows in sorted(cells.items()):
         returns = [row["return"] for row in rows]
@@ -111,77 +102,53 @@ def policies() -> str:
         lines.append(
             f"| {robot} | {method} | {at} | {budget} | {settings} | {len(rows)} | {np.median(returns):.0f} "
             f"({min(returns):.0f} to {max(returns):.0f}) | {np.mean(normalized):.1f}{spread} "
-            f"| {_printed_return(robot, method, at)} | {np.median([row['seconds'] for row in rows]):.0f} |"
+            f"| {np.median([row['seconds'] for row in rows]):.0f} | {commits(rows)} |"
         )
     return "\n".join(lines) + "\n"
 
 
-def _printed_return(robot: str, method: str, at: str) -> str:
-    """The normalized return that the paper prints for a learner on medium data."""
-    system = "madoc" if (method, at) == ("sac", "calibrated") else method
-    printed = paper.printed("table-1", f"{robot}-medium", system) if system != "sac" else None
-    return f"{printed[0]:.1f} ± {printed[1]:.1f}" if printed else ""
+def place(row: Mapping[str, Any]) -> str:
+    """Where a policy was learnt: at an estimate, with whose it is."""
+    return row["at"] if row["calibrator"] is None else f"{row['at']} ({row['calibrator'].partition('-logged')[0]})"
 
 
-def speed() -> str:
-    """What `speed.py` wrote."""
-    path = RESULTS / "speed.json"
-    if not path.exists():
-        return ""
-    return f"## Speed\n\n`python benchmarks/speed.py`\n\n```json\n{path.read_text()}```\n"
-
-
-def planted() -> str:
+def planted_truths() -> str:
     """What `planted.py` found: a verdict and the estimates of each robot and situation, and how intervals cover."""
-    rows = [json.loads(path.read_text()) for path in sorted((RESULTS / "planted").glob("*-[0-9].json"))]
-    if not rows:
-        return ""
     lines = [
         "## Planted truths in robots of one's own\n",
         "`python benchmarks/planted.py`. `madoc calibrate SPEC --data LOGS`, all defaults. Covered: 95 % intervals "
         "that hold the truth; where readings are exact these are as narrow as rounding. Worst: % of its range that a "
         "parameter is off.\n",
         "| robot | situation | verdict | expected | method | covered | worst, % | s | commit |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "|---" * 9 + "|",
     ]
-    for row in rows:
+    for row in planted.STUDY.rows():
         found = list(row["parameters"].values())
         covered = f"{sum(part['covered'] for part in found)} of {len(found)}" if found[0]["interval"] else "-"
         worst = max(part["percent_of_range"] for part in found)
         cells = (row["robot"], row["situation"], row["verdict"]["word"], row["expected"], row["method"])
         lines.append(f"| {' | '.join(cells)} | {covered} | {worst:.2g} | {row['seconds']:.0f} | {row['commit']} |")
-    for path in sorted((RESULTS / "planted").glob("*-coverage-*.json")):
-        told = json.loads(path.read_text())
-        lines.append(
-            f"\nOf {told['problems']} problems planted on the pendulum (least squares, noise of {told['noise']:g} of "
-            f"each signal's spread), {100 * told['covered']:.1f} % of 95 % intervals cover the truth "
-            f"({told['commit']})."
-        )
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "", planted.covered(planted.COVERAGE.rows())]) + "\n"
 
 
 def verdicts() -> str:
     """What `adversary.py`, `coverage.py` and `rates.py` found."""
-    cases, logs = ([json.loads(path.read_text()) for path in sorted((RESULTS / name).glob("*.json"))] for name in SETS)
-    seeds = ", ".join(map(str, sorted({case["seed"] for case in cases})))
+    cases = adversary.STUDY.rows()
     return (
         "## Verdicts and intervals\n\n"
-        f"`python benchmarks/adversary.py`: {len(cases)} problems of seven robots, seeds {seeds}; each with `--table`. "
-        "Invisible deceptions are those that no data can show; `madoc check` names them.\n\n"
-        f"{adversary.summary(cases)}\n\n"
+        "`python benchmarks/adversary.py`: problems of seven robots, by the commit of the tool; each problem with "
+        "`--table --commit`. Invisible deceptions are those that no data can show; `madoc check` names them.\n\n"
+        f"{adversary_table.summary(cases)}\n\n"
         "`python benchmarks/coverage.py`: honest problems, least squares, 95 % intervals.\n\n"
-        f"{coverage.table(coverage.RESULTS)}\n\n"
+        f"{coverage.table(coverage.STUDY.rows())}\n\n"
         "`python benchmarks/rates.py`: one log of a double pendulum with coarse encoders at three rates, all defaults. "
         "Windows of 0.5 s are simulated from true states; values 5 % off the truth stand for a data sheet's.\n\n"
-        f"{rates.table(logs)}\n"
+        f"{rates.table(rates.STUDY.rows())}\n"
     )
 
 
 def sysid() -> str:
     """What `against_sysid.py` found: both tools on every robot and situation."""
-    rows = [json.loads(path.read_text()) for path in sorted((RESULTS / "sysid").glob("*.json"))]
-    if not rows:
-        return ""
     lines = [
         "## Against mujoco.sysid\n",
         "`python benchmarks/against_sysid.py`. The planted truths above; `--method least-squares` beside MuJoCo's own "
@@ -193,7 +160,7 @@ def sysid() -> str:
         "| commit |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for row in rows:
+    for row in SYSID.rows():
         for name, told in (("madoc", row["madoc"]), ("mujoco.sysid", row["sysid"])):
             figures = " | ".join(f"{told[part]:.2g}" for part in ("worst", "mean"))
             solving = told.get("solving", told["seconds"])
@@ -208,10 +175,7 @@ def sysid() -> str:
 
 def pendulum() -> str:
     """What `real_pendulum.py` found."""
-    path = RESULTS / "real_pendulum.json"
-    if not path.exists():
-        return ""
-    told = json.loads(path.read_text())
+    (told,) = SINGLE["real_pendulum"].rows()
     lines = [
         "## A pendulum of hardware\n",
         f"`python benchmarks/real_pendulum.py --data FOLDER`; {told['unit']}. Calibrated to the run under iLQR; commit "
@@ -227,14 +191,46 @@ def pendulum() -> str:
     return "\n".join(lines) + "\n"
 
 
+def suites() -> str:
+    """What the three benchmarks of suites have shown, each as it was kept."""
+    rows = Study(RESULTS / "suite.jsonl", ("what",)).rows()
+    lines = [
+        "## Suites\n",
+        "Workers and suites killed at random (`faults`), ten thousand planned cells (`plan`), two workers beside runs "
+        "by hand (`efficiency`), many robots of one kind (`fleet`). Other work shared the machine, so that seconds say "
+        "little; bits and counts do not depend on it.\n",
+        "| what | command | found | commit |",
+        "|---" * 4 + "|",
+    ]
+    for row in rows:
+        found = ", ".join(f"{name} {value:g}" for name, value in row.items() if isinstance(value, int | float))
+        lines.append(f"| {row['what']} | `{row['command']}` | {found} | {row['commit']} |")
+    return "\n".join(lines) + "\n"
+
+
 def fuzz() -> str:
     """What `fuzz.py` found."""
-    path = RESULTS / "fuzz.json"
-    if not path.exists():
-        return ""
-    told = json.loads(path.read_text())
-    counts = ", ".join(f"{name} {count:,}" for name, count in told.items() if isinstance(count, int) and name != "seed")
+    (told,) = SINGLE["fuzz"].rows()
+    counts = ", ".join(f"{name} {count:,}" for name, count in told.items() if name.endswith(("read", "refused")))
     return f"## Fuzzing\n\n`python benchmarks/fuzz.py --minutes {told['minutes']:g}`: {counts} ({told['commit']}).\n"
+
+
+def speed() -> str:
+    """What `speed.py` found last."""
+    (told,) = SINGLE["speed"].rows()
+    lines = [
+        f"## Speed\n\n`python benchmarks/speed.py` ({told['commit']}, {told['cores']} cores): updates of a learner at "
+        "batch 256 by the width of its networks, in brackets the time as a multiple of that of its matrix products; "
+        "and control steps, in brackets the share of the speed of bare `mujoco.rollout`.\n",
+        "| | 256 units, a second | 128 units |",
+        "|---|---|---|",
+    ]
+    for name, by_width in told["learner_updates"].items():
+        cells = (f"{found['per_second']:.0f} ({found['times_floor']})" for found in by_width.values())
+        lines.append(f"| updates of {name} | {' | '.join(cells)} |")
+    for robot, found in told["control_steps"].items():
+        lines.append(f"| control steps of {robot} | {found['system_step']:,} ({found['ratio']}) | |")
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

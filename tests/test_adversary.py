@@ -13,6 +13,7 @@ from madoc.data import logs
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import adversary
+import adversary_table as counted
 from adversary_cases import CASES, DECEPTIONS, HONEST, write
 from adversary_cases.case import Case, Log, Plant
 from adversary_cases.plant import late, truth_of
@@ -26,7 +27,7 @@ def short(case):
 
 def answer(case, word, *, miss=0.0, sentence="", check=()):
     return {
-        **{"case": case.key, "robot": case.robot.name, "kind": case.kind, "commit": "0", "seconds": 1.0},
+        **{"case": case.key, "robot": case.robot.name, "kind": case.kind, "commit": "0", "seconds": 1.0, "seed": 0},
         **{"honest": case.honest, "invisible": case.invisible, "cause": case.cause, "verdict": word, "stopped": False},
         **{"sentence": sentence, "causes": [], "warnings": [], "check": list(check)},
         "parameters": {"friction_elbow": {"miss": miss}},
@@ -108,18 +109,18 @@ def test_a_miss_is_a_share_of_the_range():
 
 def test_outcomes():
     deception, invisible = CASES["arm.friction-0.2"], CASES["arm.gear-invisible"]
-    assert adversary.outcome(answer(deception, "CALIBRATED", miss=0.1)) == "false CALIBRATED"
-    assert adversary.outcome(answer(deception, "CALIBRATED")) == "CALIBRATED"
-    assert adversary.outcome(answer(deception, "MODEL_MISMATCH", miss=0.1)) == "MODEL_MISMATCH"
-    assert adversary.outcome(answer(CASES["arm.plain"], "MODEL_MISMATCH")).startswith("false alarm")
-    assert adversary.outcome(answer(invisible, "CALIBRATED", miss=0.1)) == "unnamed"
-    assert adversary.outcome(answer(invisible, "CALIBRATED", check=["the gear cannot be told"])) == "CALIBRATED, named"
+    assert counted.outcome(answer(deception, "CALIBRATED", miss=0.1)) == "false CALIBRATED"
+    assert counted.outcome(answer(deception, "CALIBRATED")) == "CALIBRATED"
+    assert counted.outcome(answer(deception, "MODEL_MISMATCH", miss=0.1)) == "MODEL_MISMATCH"
+    assert counted.outcome(answer(CASES["arm.plain"], "MODEL_MISMATCH")).startswith("false alarm")
+    assert counted.outcome(answer(invisible, "CALIBRATED", miss=0.1)) == "unnamed"
+    assert counted.outcome(answer(invisible, "CALIBRATED", check=["the gear cannot be told"])) == "CALIBRATED, named"
 
 
 def test_a_parameter_that_is_named_does_not_name_the_cause():
     case = CASES["arm.friction-0.2"]
-    assert not adversary.named(answer(case, "MODEL_MISMATCH", sentence="friction_elbow is at 0.2"))
-    assert adversary.named(answer(case, "MODEL_MISMATCH", sentence="friction_elbow is at 0.2: Coulomb friction"))
+    assert not counted.named(answer(case, "MODEL_MISMATCH", sentence="friction_elbow is at 0.2"))
+    assert counted.named(answer(case, "MODEL_MISMATCH", sentence="friction_elbow is at 0.2: Coulomb friction"))
 
 
 def test_the_table_counts():
@@ -128,18 +129,28 @@ def test_the_table_counts():
         answer(CASES["arm.friction-0.05"], "CALIBRATED", miss=0.001),
         answer(CASES["arm.plain"], "CALIBRATED"),
     ]
-    printed = adversary.table(json.loads(json.dumps(results)))
-    assert "| false CALIBRATED | 2 | 2 |" in printed
-    assert "| of these by less than 0.5 % of the range | 1 | 2 |" in printed
-    assert "| false alarms | 0 | 1 |" in printed
+    printed = counted.table(json.loads(json.dumps(results)))
+    # deceptions, false ones, near misses, named, refused; invisible; honest, false alarms, refused; intervals that hold
+    assert "| 0 | 1 | 2 | 2 | 1 | 0 | 0 | 0 of 0 | 1 | 0 | 0 | 1 of 1 | 0 |" in printed
     assert "| friction | 2 | 2 |" in printed
+
+
+def test_problems_of_two_commits_are_never_counted_together():
+    results = [answer(CASES["arm.plain"], "CALIBRATED") | {"commit": name} for name in "aab"]
+    summary = counted.summary(results, fewest=2)
+    assert "| a | 1 |" in summary
+    assert "| b |" not in summary
+    assert summary.endswith("Not shown: 1 problems at 1 commits with few of them.")
+    with pytest.raises(ValueError, match="one commit, got those of a, b"):
+        counted.table(results)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("key", ["pendulum.plain", "cart.plain"])
 def test_the_tool_is_run_and_its_answer_kept(key, tmp_path):
-    line = adversary.cell(CASES[key], 0, folder=tmp_path, commit="0", limit=200.0, check=True)
-    kept = json.loads((tmp_path / f"{key}-0.json").read_text())
+    study = replace(adversary.STUDY, file=tmp_path / "adversary.jsonl")
+    line = adversary.cell(CASES[key], 0, study=study, revision="0", limit=200.0, check=True)
+    (kept,) = study.rows()
     assert key in line
     assert (kept["exit_code"], kept["verdict"]) == (0, "CALIBRATED")
-    assert adversary.cell(CASES[key], 0, folder=tmp_path, commit="0", limit=200.0, check=True) == ""
+    assert adversary.cell(CASES[key], 0, study=study, revision="0", limit=200.0, check=True) == ""

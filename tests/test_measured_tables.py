@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from xml.etree import ElementTree
@@ -18,6 +19,8 @@ import figure_2
 import kept
 import paper
 import paper_cells
+import paper_errors
+import pooling
 import readme
 import tables
 
@@ -29,28 +32,28 @@ STALE = "stale: run make figures"
 
 def test_the_readme_says_what_was_measured():
     text = readme.README.read_text()
-    assert text.count("<!-- measured: ") == 4
-    assert readme.rewritten(text, kept.learnt()) == text, STALE
+    assert text.count("<!-- measured: ") == 2
+    assert readme.rewritten(text) == text, STALE
 
 
 def test_the_tables_say_what_was_measured():
-    assert tables.measured() == (kept.RESULTS / "README.md").read_text(), STALE
+    assert tables.measured() == tables.PAGE.read_text(), STALE
 
 
 @pytest.mark.slow
 def test_the_papers_tables_say_what_was_measured():
-    assert paper.tables() == (kept.RESULTS / "paper.md").read_text(), STALE
+    assert paper.tables() == paper.PAGE.read_text(), STALE
 
 
 def test_the_picture_of_groups_says_what_was_measured():
-    assert embedding.picture(embedding.kept()) == embedding.PICTURE.read_text(), STALE
+    assert embedding.picture(embedding.STUDY.rows()[-1]) == embedding.PICTURE.read_text(), STALE
 
 
 def test_every_parameter_is_on_the_robot_and_in_the_plane_in_the_colour_of_its_group():
     names = embedding.tasks.make("hopper").parameters.names
     vectors = np.random.default_rng(0).normal(size=(8, 4))
     found = {"groups": [names[:3], names[3:]], "stability": 0.5, "names": names, "vectors": vectors}
-    drawn = embedding.picture({"physics": found})
+    drawn = embedding.picture(found)
     xml = ElementTree.fromstring(drawn)
     points = [each.get("class") for each in xml.iter("{http://www.w3.org/2000/svg}circle")]
     points = [each for each in points if each.startswith("dot")]
@@ -67,98 +70,90 @@ def _height(drawn, name):
 
 
 def test_figure_3b_says_how_many_parameters_and_shares_the_cells_of_all():
-    plan = paper.planned("figure-3b-errors")
-    rows = dict.fromkeys(score.row for score in paper.scores_of(plan, {}))
+    rows = dict.fromkeys(row for row, _ in paper_errors.places("figure-3b-errors"))
     assert list(rows) == ["ant-medium, 1 parameter", *(f"ant-medium, {count} parameters" for count in (2, 4, 8, 12))]
-    errors, returns = ({cell.name for cell in each.cells} for each in (plan, paper.planned("figure-3b")))
-    assert errors < returns
-    of_table_10 = {cell.name for cell in paper.planned("table-10").cells}
-    assert len(errors & of_table_10) == 1 + 3 * 3  # the recording, and three methods at three seeds
+    errors, of_table_10 = (
+        {cell.name for cell in paper_cells.planned(name).cells} for name in ("figure-3b-errors", "table-10")
+    )
+    assert len(errors & of_table_10) == 1 + 3  # the recording, and three methods
 
 
-def test_what_was_measured_is_in_a_table_whatever_options_were_added_since():
-    assert set(paper_cells.NO_SCORES) == paper.OWN.keys()
-    every = {cell.name for name in paper.TITLES for cell in paper.planned(name).cells}
-    assert paper.kept("table-10").keys() <= every
+@pytest.fixture
+def calibrations(tmp_path, monkeypatch):
+    """A function that keeps calibrations of hopper-medium for the tables of errors."""
+    study = replace(kept.CALIBRATIONS, file=tmp_path / "calibration.jsonl")
+    monkeypatch.setattr(paper_errors, "CALIBRATIONS", study)
+
+    def keep(*rows):
+        common = {"robot": "hopper", "quality": "medium", "data": "clean", "transitions": 200_000, "budget": 300_000}
+        common |= {"commit": "a", "control_steps": 1}
+        with study.file.open("a") as lines:
+            for method, log, seed, error, other in rows:
+                measured = {"mean_absolute": error, "mean_percent_of_range": error}
+                row = common | {"method": method, "log": log, "seed": seed, "error": measured} | other
+                print(json.dumps(row), file=lines)
+
+    return keep
 
 
-def test_figure_3b_shows_errors_in_percent_of_the_ranges():
-    plan = paper.planned("figure-3b-errors")
-    cell = next(cell for cell in plan.cells if cell.kind == "calibrate")
-    score = paper.scores_of(plan, {cell.name: {"value": 3.0, "percent_of_range": 10.0}})[0]
-    assert (score.column, score.value) == ("madoc", 10.0)
+def test_a_table_of_errors_shows_logs_what_is_printed_and_what_was_not_run(calibrations):
+    calibrations(
+        ("madoc", 0, 0, 0.1, {}),
+        ("madoc", 1, 1, 0.3, {}),
+        ("droid", 0, 0, 0.5, {"budget": 1_000_000, "commit": "b"}),
+        ("npe", 0, 0, 0.7, {}),
+        ("least-squares", 0, 0, 0.9, {"data": "hidden"}),
+    )
+    told = paper_errors.table_of_errors("table-10")
+    assert pooling.OUR_LOGS in told
+    header, row = (
+        next(line for line in told.splitlines() if line.startswith(f"| {name} |")) for name in ("task", "hopper-medium")
+    )
+    cells = dict(zip(header.split(" | "), row.split(" | "), strict=True))
+    assert cells["madoc"] == "0.2 (2 logs) [0.33 ± 0.06]"
+    assert cells["droid"] == "0.5 (1 log, 1,000,000 steps) [0.74 ± 0.29]"
+    assert cells["npe"] == "0.7 (1 log)"  # no suite asks for it
+    assert cells["least-squares"] == "not run"
+    assert cells["commits |"] == "mixed: a, b |"
 
 
-def test_agents_are_compared_in_pairs_of_the_same_log_and_seed(monkeypatch):
-    tasks = [f"{robot}-medium" for robot in readme.NAMES]
-    found = {(task, method): {} for task in tasks for method in readme.COLUMNS}
-    found["hopper-medium", "madoc"] = {0: 0.01, 1: 0.02, 5: 0.3}
-    found["hopper-medium", "madoc-s"] = {0: 0.02, 1: 0.16}
-    for method, error in (("madoc", 0.01), ("madoc-s", 0.04)):
-        found["ant-medium", method] = dict.fromkeys(range(4), error)
-    found["ant-medium", "madoc-grouped"] = dict.fromkeys(range(5), 0.01)  # too few pairs to be compared
-    monkeypatch.setattr(paper, "by_seed", lambda name: found)
-    told = readme.errors()
-    assert "| Hopper | 0.11 (3 seeds) | not run | 0.09 (2 seeds) | 0.33 | 0.34 |" in told
-    assert "| `madoc` against `madoc-s` | 6 | 6 | 0.25 (0.1" in told
-    assert "| 0.25 |  |  | 0.25 |" in told  # of Hopper's pairs √(1/2 · 1/8), of Ant's 1/4, and of two robots none
-    assert "against `madoc-grouped`" not in told
+def test_a_mean_over_tasks_is_of_one_commit(calibrations):
+    walker = {"robot": "walker2d"}
+    calibrations(("madoc", 0, 0, 0.1, {}), ("madoc", 0, 0, 0.3, walker), ("oted", 0, 0, 0.1, {}))
+    calibrations(("oted", 0, 0, 0.3, walker | {"commit": "b"}))
+    (last,) = [line for line in paper_errors.table_of_errors("table-10").splitlines() if line.startswith("| mean over")]
+    assert "| 0.2 (2 tasks) |" in last
+    assert "| several commits |" in last
 
 
-def test_the_study_compares_agents_by_seed(monkeypatch, tmp_path):
-    monkeypatch.setattr(readme, "STUDY", tmp_path)
-    errors = {"each": (4.0, 1.0, 1.0), "physics": (2.0, 0.5, 0.4), "one": (7.0,)}
-    for groups, found in errors.items():
-        for seed, error in enumerate(found):
-            row = {"parameters": 12, "draws": 10, "groups": groups, "seed": seed, "error": error}
-            (tmp_path / f"{groups}-{seed}.json").write_text(json.dumps(row))
-    told = readme.study()
-    assert "| parameters | draws an epoch | one agent | groups by physics | one agent a parameter |" in told
-    assert "| 12 | 10 | 7.00 (1 seed) | 0.97 (3 seeds): 0.46 (0.34 to 0.64) | 2.00 (3 seeds) |" in told
+def test_the_kinds_of_credit_are_compared_over_logs(calibrations):
+    robot = {"robot": "halfcheetah"}
+    for method, errors in (("madoc", (0.2, 0.2, 0.2)), ("madoc-vdn", (0.1, 0.2, 0.4))):
+        calibrations(*((method, log, log, error, robot) for log, error in enumerate(errors)))
+    told = paper_errors.table_of_errors("table-12")
+    assert "| error over that of madoc (95 % over logs) | | 1.00 (0.18 to 5.59, 3 logs) |  |  | |" in told
 
 
-def test_tasks_that_are_worse_than_printed_are_named(monkeypatch):
-    rows = [("a-low", 0.1, 0.2, 1), ("b-low", 0.5, 0.4, 2)]
-    monkeypatch.setattr(paper, "beside_printed", lambda column: rows)
-    told = readme.tasks()
-    assert "On 2 of the paper's 21 tasks, 1 to 2 seeds each, `madoc` errs by 0.3 on average" in told
-    assert "where the paper prints 0.30,\nand by no more than printed in 1, all but b-low." in told
-    monkeypatch.setattr(paper, "beside_printed", lambda column: rows[:1])
-    assert "by no more than printed in each of them." in readme.tasks()
+def test_a_budget_that_was_run_last_is_shown(calibrations):
+    calibrations(("droid", 0, 0, 0.5, {"budget": 1_000_000}), ("droid", 1, 1, 0.1, {}))
+    assert (
+        paper_errors.error_cell(paper_errors.calibrations("table-10")["hopper-medium", "droid"], None) == "0.1 (1 log)"
+    )
 
 
-def test_a_cell_shows_seeds_refusals_what_was_not_run_and_what_is_printed():
-    def cell(*values, refused=False):
-        return [paper.Score("row", "column", value, refused) for value in values]
-
-    assert paper._shown(cell(1.0, 2.0, 6.0), (0.06, 0.01)) == "3 [0.06 ± 0.01]"  # a quarter of 3 is nobody: the mean
-    assert paper._shown(cell(2.0, None), None) == "2 (1 of 2 seeds)"
-    assert paper._shown(cell(None, None), (1.5, 0.25)) == "not run [1.5 ± 0.25]"
-    assert paper._shown(cell(None, None, refused=True), None) == "refuses"
-
-
-def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
-    assert paper.interquartile_mean(np.array([1.0, 2, 3, 4]), np.array([5.0, 6, 7, 100])) == pytest.approx(4.5)
-
-
-def test_resampling_stays_within_tasks():
-    """Tasks without spread of their own leave no doubt, however far apart they are."""
-    low, high = paper.stratified_interval([[1.0, 1.0], [50.0, 50.0], [100.0, 100.0]])
-    assert low == high == pytest.approx(50.25)  # of six values one at each end is left out
-
-
-@pytest.mark.parametrize(("name", "whole"), [("table-3", "table-1"), ("figure-2", "table-10")])
-def test_suites_share_their_cells(name, whole):
-    """What one table has run the other takes, but for the evaluations that it does not ask for."""
-    shared = {cell.name for cell in paper_cells.planned(whole).cells}
-    assert {cell.name for cell in paper_cells.planned(name).cells} <= shared
+def test_returns_show_seeds_refusals_and_what_is_printed():
+    values = [{"value": 1.0}, {"value": 3.0}, {}]
+    assert paper._returned(values, (76.0, 13.9)) == "2.0 (2 of 3 seeds) [76 ± 13.9]"
+    assert paper._returned([{"value": None, "refusal": "no"}], None) == "refuses"
+    assert paper._returned([{}], None) == "not run"
 
 
 @pytest.fixture
 def collected(tmp_path, monkeypatch):
     """A function that collects a suite from a folder where some of its cells have left their files: its table."""
-    monkeypatch.setattr(paper_cells, "RESULTS", tmp_path / "results")
-    monkeypatch.setattr(paper, "commit", lambda: "0")
+    for name, study in paper_cells.STUDIES.items():
+        monkeypatch.setitem(paper_cells.STUDIES, name, replace(study, file=tmp_path / f"{name}.jsonl"))
+    monkeypatch.setattr(paper, "CALIBRATIONS", replace(kept.CALIBRATIONS, file=tmp_path / "calibration.jsonl"))
 
     def collect(name, left):
         for cell, files in left:
@@ -208,7 +203,7 @@ def test_costs_are_those_of_a_method_by_stage(collected):
         ("learn", "cql"): files_of_a_run({"seconds": 16.0}, "updates", of_cql),
     }
     count, told = collected("table-3", [(cells[which], files) for which, files in left.items()])
-    assert count == 3
+    assert count == 3 + 1  # and the calibration, beside all others
     assert "9 of 12 cells are not run" in told
     rows = [line for line in told.splitlines() if line.startswith("| ")]
     assert rows[1:4] == [
@@ -235,9 +230,12 @@ def test_what_was_collected_once_is_not_read_again(collected, monkeypatch):
     answers = iter(found)
     monkeypatch.setattr(figure_2, "told", lambda result, folder: next(answers))
     files = files_of_a_run(CALIBRATION, "control_steps", [("calibrating", 1000, 1.0)])
-    assert collected("figure-2", [(cell, files)])[0] == 1
+    assert collected("figure-2", [(cell, files)])[0] == 1 + 1
+    (row,) = paper.CALIBRATIONS.rows()
+    assert (row["robot"], row["quality"], row["data"], row["log"]) == ("halfcheetah", "medium", "clean", "suite 0")
+    assert (row["method"], row["seed"], row["control_steps"]) == ("madoc-grouped", 0, 2000)
     count, told = collected("figure-2", [(others[0], files)])
-    assert (count, next(answers, None)) == (2, None)
+    assert (count, next(answers, None)) == (1 + 1, None)
     assert "| madoc-grouped | drawn from the actors | -0.90 | -0.70 | not run | -0.80 | 300 |" in told
     assert "| madoc-s | uniform over the ranges | not run | not run | not run |  |  |" in told
 

@@ -7,7 +7,7 @@ one stage or several in equal shares: D4RL's `medium` (a third of expert), `medi
 
 import importlib.resources
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import jax
@@ -60,11 +60,13 @@ def record_quality(
     *,
     transitions: int,
     key: PRNGKeyArray,
+    truth: Mapping[str, float] | None = None,
     advance: Callable[[int], None] = lambda rows: None,
 ) -> Dataset:
-    """Record one of the paper's datasets, of one of the `QUALITIES`, in the target with the paper's true parameters.
+    """Record one of the paper's datasets, of one of the `QUALITIES`, in the target.
 
-    `advance` is called with the number of further rows.
+    `truth` is what its parameters truly are, physical values by name, by default the paper's. `advance` is called with
+    the number of further rows.
 
     Raises:
         MadocError: The quality is unknown, or nothing is shipped for the robot.
@@ -80,7 +82,7 @@ def record_quality(
         record(
             policy_of(rungs.saved[index]),
             simulator,
-            paper_truth(task.name),
+            paper_truth(task.name) if truth is None else dict(truth),
             transitions=int(count),
             key=jax.random.fold_in(key, index),
             origin=origin,
