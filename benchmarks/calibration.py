@@ -56,6 +56,29 @@ def undeclared(task: Task, dataset: Dataset) -> tuple[Task, Dataset]:
     return as_observed(task, replace(dataset, disturbance=replace(dataset.disturbance, noise=0.0)))
 
 
+def by_encoders(task: Task, dataset: Dataset) -> tuple[Task, Dataset]:
+    """What joint encoders and an IMU show of a walking robot: neither its height nor its linear velocity.
+
+    The first position of the four robots is the height; of what is behind the positions the first two values, of Ant
+    the first three, are the linear velocity. No state can be rebuilt or fitted.
+    """
+    positions = task.observation_size - task.velocities
+    unseen = [0, *(positions + axis for axis in range(3 if task.name == "ant" else 2))]
+    seen = np.setdiff1d(np.arange(task.observation_size), unseen)
+    rows, observe = dataset.transitions, task.observe
+    shown = replace(
+        task,
+        observation_size=len(seen),
+        observe=lambda state: observe(state)[..., seen],
+        velocities=0,
+        state_from_observation=None,
+        rebuildable=None,
+        posture=None,
+    )
+    fewer = replace(rows, observation=rows.observation[:, seen], next_observation=rows.next_observation[:, seen])
+    return shown, replace(dataset, transitions=fewer)
+
+
 @dataclass(frozen=True)
 class Kind:
     """How the data of a cell differs from a clean log of the simulator itself.
@@ -80,6 +103,7 @@ KINDS = {
     "modern": Kind(physics="modern"),
     "friction-20": Kind(Disturbance(friction=1.2)),
     "hidden": Kind(Disturbance(hidden_velocities=True)),
+    "encoders": Kind(view=by_encoders),
     "shuffled-rows": Kind(Disturbance(shuffled="rows")),
     "shuffled-next": Kind(Disturbance(shuffled="next_observations")),
 }

@@ -14,7 +14,8 @@ import kept
 import pooling
 
 import calibration
-from madoc import tasks
+from madoc import simulation, tasks
+from madoc.identification.states import states_of
 
 
 @pytest.fixture
@@ -158,3 +159,14 @@ def test_a_cell_is_run_once_and_kept_beside_mid_range(tmp_path, monkeypatch, cap
     assert (nominal["log"], nominal["seed"], nominal["budget"]) == (1, 1, 300_000)
     assert "shuffled" in refused["refusal"]
     assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+@pytest.mark.parametrize(("robot", "shown", "first"), [("hopper", 8, 1), ("ant", 23, 1)])
+def test_encoders_and_an_imu_show_neither_height_nor_linear_velocity(robot, shown, first, tmp_path):
+    task = tasks.make(robot, "legacy")
+    whole = calibration.recorded(task, "medium", 100, tmp_path, data_is="encoders", log=1)
+    seen, log = calibration.KINDS["encoders"].view(task, whole)
+    rows, every = log.transitions.observation, np.asarray(whole.transitions.observation)
+    assert seen.observation_size == rows.shape[1] == shown
+    assert (rows[:, 0] == every[:, first]).all()  # the attitude comes first, the height is gone
+    assert states_of(log, simulation.make(seen)).kind == "unknown"

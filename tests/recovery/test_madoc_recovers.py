@@ -13,6 +13,7 @@ from robots import ARM_TRUTH, SPRING_TRUTH, recorded, spring, two_link_arm
 
 TOLERANCE = 5.0
 """% of its range that each parameter may be off."""
+SLOW = ("madoc-s", "madoc-vdn")
 
 
 def quick(name, **changes):
@@ -35,21 +36,19 @@ def off(result, task, truth):
     return 100.0 * np.abs(result.mean - space.vector(truth)) / (space.high - space.low)
 
 
-pytestmark = pytest.mark.slow  # of the spring, `tests/test_examples.py` is the quick one
-
-
-@pytest.mark.parametrize("name", ["madoc", "madoc-s", "madoc-vdn"])
+@pytest.mark.parametrize("name", ["madoc", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
 def test_a_spring_is_recovered(name):
     task = spring(max_episode_steps=100)
-    result = calibrate(quick(name), problem_of(task, SPRING_TRUTH), key=jax.random.key(0), budget=120_000)
+    result = calibrate(quick(name), problem_of(task, SPRING_TRUTH), key=jax.random.key(0), budget=60_000)
     assert (off(result, task, SPRING_TRUTH) < TOLERANCE).all(), off(result, task, SPRING_TRUTH)
     assert not result.warnings
 
 
+@pytest.mark.slow
 def test_a_two_link_arm_is_recovered():
     task = two_link_arm()
     method = quick("madoc", patience=0)
-    result = calibrate(method, problem_of(task, ARM_TRUTH), key=jax.random.key(0), budget=60_000)
+    result = calibrate(method, problem_of(task, ARM_TRUTH), key=jax.random.key(0), budget=120_000)
     assert (off(result, task, ARM_TRUTH) < TOLERANCE).all(), off(result, task, ARM_TRUTH)
 
 
@@ -58,6 +57,7 @@ def stiffness(low, high):
     return spring(Parameter("jnt_stiffness", "slide", low, high), max_episode_steps=100)
 
 
+@pytest.mark.slow
 def test_it_stops_by_itself_once_nothing_is_left_to_learn():
     task, truth = stiffness(1.0, 9.0), {"jnt_stiffness.slide": 4.0}
     method = quick("madoc-s", patience=40)
@@ -67,11 +67,12 @@ def test_it_stops_by_itself_once_nothing_is_left_to_learn():
     assert (off(result, task, truth) < TOLERANCE).all(), off(result, task, truth)
 
 
+@pytest.mark.slow
 def test_a_truth_outside_the_range_is_found_at_its_end_and_told():
     target = stiffness(1.0, 9.0)
     log = recorded(target, {"jnt_stiffness.slide": 8.0}, 5000, jax.random.key(100))
     problem = CalibrationProblem(log, simulation.make(stiffness(1.0, 5.0), threads=1))
     method = quick("madoc-s", patience=0)
-    result = calibrate(method, problem, key=jax.random.key(0), budget=30_000)
+    result = calibrate(method, problem, key=jax.random.key(0), budget=60_000)
     assert result.mean == pytest.approx(5.0, abs=0.1)
     assert any("at the end of its range: jnt_stiffness.slide" in warning for warning in result.warnings)

@@ -162,8 +162,9 @@ class Madoc:
         """Fresh networks, empty buffers, rows at the task's resets.
 
         Raises:
-            MadocError: No episode of the log is as long as a window.
+            MadocError: Next observations are shuffled, or no episode of the log is as long as a window.
         """
+        problem.require_pairs()
         count, groups = len(problem.simulator.parameters), self._group_count(problem)
         noise = noise_deviation(problem, self.sensor_noise or 0.0)
         collection = self._collection(problem, noise)
