@@ -41,7 +41,7 @@ class Worker:
         prepare(self.folder)
         from madoc.suites.worker import work  # computes numbers, on the core that was taken
 
-        done = work(self.folder, plan=self.plan, allow_code=self.permission.allow_code)
+        done = work(self.folder, plan=self.plan, permission=self.permission)
         if done is None:
             return Answer({"status": "interrupted"}, ("interrupted; the next worker goes on",), "interrupted")
         counts = Counter(outcome.status for outcome in done)

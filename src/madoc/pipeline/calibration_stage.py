@@ -10,7 +10,7 @@ from madoc.errors import MadocError
 from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
 from madoc.pipeline.keys import seed_key
 from madoc.pipeline.methods import CANDIDATES, candidates_for, hyperparameters, make_method
-from madoc.pipeline.orders import AUTO, CalibrationOrder
+from madoc.pipeline.orders import AUTO, NO_PERMISSION, CalibrationOrder, Permission
 from madoc.pipeline.preparation import Prepared, prepare
 from madoc.pipeline.priors import prior_for
 from madoc.pipeline.refusals import check_order, method_of
@@ -31,7 +31,7 @@ def calibrate_in(
     *,
     resume: bool = False,
     quiet: bool = False,
-    allow_code: bool = False,
+    permission: Permission = NO_PERMISSION,
 ) -> CalibrationResult:
     """Calibrate, judge the result where rows are held out, and leave a run folder.
 
@@ -41,9 +41,9 @@ def calibrate_in(
     out = Path(out)
     check_order(order, out)
     if method_of(order) == AUTO:
-        return _calibrate_auto(out, prepare(order, allow_code=allow_code), resume=resume, quiet=quiet)
+        return _calibrate_auto(out, prepare(order, permission=permission), resume=resume, quiet=quiet)
     (method,) = methods_for(order).values()
-    return _calibrate_by(method, out, prepare(order, allow_code=allow_code), resume=resume, quiet=quiet)[0]
+    return _calibrate_by(method, out, prepare(order, permission=permission), resume=resume, quiet=quiet)[0]
 
 
 def default_folder(order: CalibrationOrder) -> Path:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from madoc.errors import MadocError
+from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.runs.interruption import interruptible
 from madoc.runs.progress import display
 from madoc.suites.cells import Cell
@@ -43,7 +44,7 @@ def run_on_ray(
     workers: int | None,
     address: str | None,
     quiet: bool = False,
-    allow_code: bool = False,
+    permission: Permission = NO_PERMISSION,
 ) -> bool:
     """Do what is left of a suite on a Ray cluster.
 
@@ -54,7 +55,7 @@ def run_on_ray(
         workers: How many cells are done at a time, where the cluster is started for this suite.
         address: An existing cluster; None starts one on this machine and ends it afterwards.
         quiet: Show no progress.
-        allow_code: Tasks may run the Python files that specs of robots name.
+        permission: What specs of robots may ask for.
 
     Returns:
         Whether all was done; False where it was interrupted.
@@ -67,7 +68,7 @@ def run_on_ray(
         _cluster(workers, address) as ray,
         display(f"{suite.name} on Ray", unit="cells", quiet=quiet) as show,
     ):
-        tasks = _Tasks(ray, suite.resolve(), plan, allow_code=allow_code)
+        tasks = _Tasks(ray, suite.resolve(), plan, permission=permission)
         while standing.runnable:
             show(standing.moment())
             if interruption.asked:
@@ -80,7 +81,7 @@ def run_on_ray(
     return True
 
 
-def do_cell(suite: str, name: str, plan: str, allow_code: bool = False) -> str:
+def do_cell(suite: str, name: str, plan: str, permission: Permission = NO_PERMISSION) -> str:
     """One task: do a cell of a suite, in a process of the cluster.
 
     Returns:
@@ -93,7 +94,7 @@ def do_cell(suite: str, name: str, plan: str, allow_code: bool = False) -> str:
 
     until = time.monotonic() + _WAIT
     while time.monotonic() < until:
-        done = work(Path(suite), [name], plan=plan, allow_code=allow_code)
+        done = work(Path(suite), [name], plan=plan, permission=permission)
         if done is None:
             return "interrupted"
         if done:
@@ -107,8 +108,8 @@ def do_cell(suite: str, name: str, plan: str, allow_code: bool = False) -> str:
 class _Tasks:
     """The tasks of a suite that Ray has been given."""
 
-    def __init__(self, ray: "ModuleType", suite: Path, plan: str, *, allow_code: bool = False) -> None:
-        self._ray, self._suite, self._plan, self._allow_code = ray, str(suite), plan, allow_code
+    def __init__(self, ray: "ModuleType", suite: Path, plan: str, *, permission: Permission = NO_PERMISSION) -> None:
+        self._ray, self._suite, self._plan, self._permission = ray, str(suite), plan, permission
         self._do = ray.remote(num_cpus=1, max_retries=MOST_ATTEMPTS)(do_cell)
         self._given: dict[str, Any] = {}
 
@@ -116,7 +117,7 @@ class _Tasks:
         """Give Ray every cell that can start, and again one whose task ended without an end of the cell."""
         for cell in standing.runnable:
             if cell.name not in self._given and _can_start(cell, standing):
-                self._given[cell.name] = self._do.remote(self._suite, cell.name, self._plan, self._allow_code)
+                self._given[cell.name] = self._do.remote(self._suite, cell.name, self._plan, self._permission)
         if not self._given:
             time.sleep(_LOOK)
             return
