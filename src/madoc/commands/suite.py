@@ -45,14 +45,14 @@ class Suite:
 
     def run(self) -> Answer:
         """Plan the suite, and do what is left of it."""
-        from madoc.suites.local import usual_workers
+        from madoc.runs.machine import usable_cores
         from madoc.suites.planning import plan_of
         from madoc.suites.standing import Standing
 
         self._check()
         plan = plan_of(self.file, permission=self.permission)
         out = self.out or Path("runs") / plan.name
-        workers = usual_workers() if self.workers is None else self.workers
+        workers = usable_cores() if self.workers is None else self.workers
         standing = Standing(out, plan.cells, workers=max(1, workers))
         if self.dry_run:
             return _listed(standing, out, max(1, workers))

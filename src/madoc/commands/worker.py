@@ -38,7 +38,7 @@ class Worker:
 
         if self.attached:
             threading.Thread(target=_stop_at_end_of_input, daemon=True).start()
-        prepare(self.folder)
+        prepare()
         from madoc.suites.worker import work  # computes numbers, on the core that was taken
 
         done = work(self.folder, plan=self.plan, permission=self.permission)

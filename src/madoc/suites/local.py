@@ -1,6 +1,5 @@
 """The worker processes of this machine: started, started again where one is killed, and ended with the suite."""
 
-import os
 import subprocess
 import sys
 import time
@@ -20,11 +19,6 @@ _MANY = 5000
 """Number of cells for which that time is twice as long: looking should not take a core from the workers."""
 _FUTILE = 5
 """How many workers in a row may end with an error before any cell has ended: then something is wrong with all."""
-
-
-def usual_workers() -> int:
-    """One worker for each core that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_locally(

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 from madoc.errors import MadocError
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.runs.interruption import interruptible
+from madoc.runs.machine import usable_cores
 from madoc.runs.progress import display
 from madoc.suites.cells import Cell
 from madoc.suites.claims import MOST_ATTEMPTS
-from madoc.suites.local import usual_workers
 from madoc.suites.standing import Standing
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ _LOOK = 0.5
 """Time in s between two looks at the disk."""
 _WAIT = 30.0
 """Time in s that a task waits for a cell whose earlier process has not quite ended."""
+_LONGEST_PATH = 18
+"""Longest path of a temporary directory in which Ray's sockets can be made."""
 _OBJECT_STORE = 80 * 2**20
 """Memory for Ray's object store in bytes: only names of cells pass through it."""
 
@@ -89,7 +91,7 @@ def do_cell(suite: str, name: str, plan: str, permission: Permission = NO_PERMIS
     """
     from madoc.suites.process import prepare
 
-    prepare(Path(suite))
+    prepare()
     from madoc.suites.worker import work  # computes numbers, on the core that was taken
 
     until = time.monotonic() + _WAIT
@@ -151,10 +153,12 @@ def _cluster(workers: int | None, address: str | None) -> Iterator["ModuleType"]
     """Ray, connected to a cluster for a block."""
     if address is not None:
         _look_for(address)
-    temporary = Path(tempfile.mkdtemp(prefix="madoc-ray-"))
+    temporary = Path(tempfile.mkdtemp(prefix="madoc-ray-", dir=_short_folder()))  # of mode 0700
     # Read by Ray when it is imported and by all processes it starts. A cluster of one's own lets in only who knows its
-    # token, which stands in no file.
+    # token, which stands in no file, and listens to this machine alone: on Linux, Ray takes an address that others
+    # reach for a loopback address, unless it is told as on other systems that there are no others.
     own = {
+        "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
         "RAY_USAGE_STATS_ENABLED": "0",
         "RAY_AUTH_MODE": "token",
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
@@ -168,11 +172,11 @@ def _cluster(workers: int | None, address: str | None) -> Iterator["ModuleType"]
         common: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR, "configure_logging": False}
         if address is None:
             common |= {
-                "num_cpus": workers or usual_workers(),
+                "num_cpus": workers or usable_cores(),
                 "include_dashboard": False,
-                "_node_ip_address": "127.0.0.1",  # nobody outside this machine is spoken to
+                "_node_ip_address": "127.0.0.1",
                 "object_store_memory": _OBJECT_STORE,
-                "_temp_dir": str(temporary),
+                "_temp_dir": str(temporary / "r"),  # which Ray opens to all users
             }
         try:
             ray.init(address=address, **common)
@@ -187,6 +191,11 @@ def _cluster(workers: int | None, address: str | None) -> Iterator["ModuleType"]
         for name, value in before.items():
             os.environ.pop(name, None) if value is None else os.environ.update({name: value})
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _short_folder() -> str | None:
+    """Where Ray's files may lie: a socket's path has at most 103 characters, of which Ray needs 67; None is usual."""
+    return "/tmp" if len(tempfile.gettempdir()) > _LONGEST_PATH and os.path.isdir("/tmp") else None
 
 
 def _look_for(address: str) -> None:
