@@ -27,7 +27,7 @@ def opened(path: Path, remedy: str) -> Iterator[h5py.File]:
             yield file
     except MadocError:
         raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, SystemError) as error:
         raise MadocError(f"cannot read {path} as HDF5 ({' '.join(str(error).split())}); {remedy}") from error
 
 

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 
 from madoc.errors import MadocError
 
-LARGEST = 400_000_000
+LARGEST = 150_000_000
 """Largest size of a file that is read whole, bytes, where nothing else is said; a larger one is refused."""
 
 
@@ -26,7 +26,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("wb") as stream:
+        temporary.unlink(missing_ok=True)
+        with temporary.open("xb") as stream:  # never through a link that another user has put there
             yield stream
             stream.flush()
             os.fsync(stream.fileno())

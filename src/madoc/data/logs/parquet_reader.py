@@ -1,6 +1,6 @@
 """Parquet; a column of lists becomes one column for each element."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +10,9 @@ import numpy as np
 from madoc.data.logs.tables import Run, is_asked, tables_of
 from madoc.data.sizes import LARGEST, check_size
 from madoc.errors import MadocError
+
+_ROWS = 20_000
+"""Rows that are read at a time."""
 
 if TYPE_CHECKING:
     import pyarrow
@@ -44,13 +47,15 @@ def read_columns(path: Path, wanted: Collection[str]) -> tuple[dict[str, np.ndar
             texts = [name for name in used if _is_text(kinds[name])]
             opened = pyarrow.parquet.ParquetFile(file, read_dictionary=texts)  # which holds each text once
             what = f"the columns of {path.name} that are asked for"
-            check_size(_size(opened.metadata, used), what, LARGEST)
-            table = opened.read(columns=used)
+            check_size(opened.metadata.num_rows * sum(_width(kinds[name]) for name in used), what, LARGEST)
+            table = _read_in_parts(opened, used, what)
         check_size(sum(_size_of_text(table.column(name)) for name in texts), what, LARGEST)
         columns = {
             name: _column(table.column(name), path) if name in used else np.zeros(0, dtype="V1") for name in asked
         }
-    except (pyarrow.ArrowException, OSError) as error:
+    except MadocError:
+        raise
+    except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise MadocError(
             f"cannot read {path.name} as Parquet ({' '.join(str(error).split())}); it is damaged or was cut short, "
             "copy or record it again"
@@ -58,16 +63,24 @@ def read_columns(path: Path, wanted: Collection[str]) -> tuple[dict[str, np.ndar
     return columns, [name for name in kinds if name not in columns and _is_readable(kinds[name])]
 
 
-def _size(metadata: "pyarrow.parquet.FileMetaData", names: Collection[str]) -> int:
-    """Size in memory of columns in bytes, as the file tells it: eight for each value, as a number needs."""
-    size = 0
-    for group in range(metadata.num_row_groups):
-        parts = metadata.row_group(group)
-        for index in range(parts.num_columns):
-            column = parts.column(index)
-            if any(f"{column.path_in_schema}.".startswith(f"{name}.") for name in names):  # of a list, of its elements
-                size += max(8 * column.num_values, column.total_uncompressed_size)
-    return size
+def _width(kind: "pyarrow.DataType") -> int:
+    """Size in memory of a row of a column, bytes; of a list of any length, that of one element."""
+    from pyarrow import types
+
+    return 8 * (kind.list_size if types.is_fixed_size_list(kind) else 1)
+
+
+def _read_in_parts(file: "pyarrow.parquet.ParquetFile", names: Sequence[str], what: str) -> "pyarrow.Table":
+    """Columns of a file, whose size is looked at after each part, as it does not say how long lists are."""
+    import pyarrow
+
+    parts, size = [], 0
+    for part in file.iter_batches(_ROWS, columns=names):
+        parts.append(part)
+        size += part.nbytes
+        check_size(size, what, LARGEST)
+    schema = pyarrow.schema([file.schema_arrow.field(name) for name in names])
+    return pyarrow.Table.from_batches(parts, schema if not parts else None)
 
 
 def _size_of_text(column: "pyarrow.ChunkedArray") -> int:
