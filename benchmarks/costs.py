@@ -32,7 +32,7 @@ import sys
 from pathlib import Path
 from madoc.suites.process import prepare
 suite, name = Path(sys.argv[1]), sys.argv[2]
-prepare(suite)
+prepare()
 from madoc.suites.worker import work
 work(suite, [name])
 """

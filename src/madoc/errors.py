@@ -1,7 +1,12 @@
 """The exception for a user's mistakes, and sentences that its messages have in common."""
 
 import difflib
+import re
 from collections.abc import Iterable
+
+UNPRINTABLE = r"\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
+"""Characters, as in a class of a regular expression, that move a cursor or turn the direction of text around them."""
+_HIDDEN = re.compile(f"[{UNPRINTABLE}]")
 
 
 class MadocError(ValueError):
@@ -9,7 +14,12 @@ class MadocError(ValueError):
 
 
 class NotAllowed(MadocError):
-    """What was asked would run code of a user's file, and nobody has allowed that."""
+    """What was asked would run code of a user's file, or read files elsewhere, and nobody has allowed that."""
+
+
+def printable(text: str, *, kept: str = "\n\t") -> str:
+    """A text whose control characters and those that turn its direction are written as numbers, but for some."""
+    return _HIDDEN.sub(lambda found: found[0] if found[0] in kept else f"\\u{ord(found[0]):04x}", text)
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> MadocError:

@@ -19,17 +19,19 @@ class Field:
         element: `body`, `joint`, `geom`, `actuator` or `signal`; None for a parameter of the whole robot.
         unit: The unit for a hinge joint; for a slide joint N takes the place of N·m, and m that of rad.
         minimum: Smallest value that is physically possible.
+        maximum: Largest size of a value that any robot may have.
         in_model: Whether the value is written into the MuJoCo model; if not, the simulator applies it around the model.
     """
 
     element: str | None
     unit: str
     minimum: float = -np.inf
+    maximum: float = 1e12
     in_model: bool = True
 
 
 FIELDS: dict[str, Field] = {
-    "gravity": Field(None, "m/s²"),
+    "gravity": Field(None, "m/s²", maximum=1e4),
     "body_mass": Field("body", "kg", 0.0),
     "body_mass_and_inertia": Field("body", "kg", 0.0),
     "body_inertia": Field("body", "kg·m²", 0.0),
@@ -43,7 +45,7 @@ FIELDS: dict[str, Field] = {
     "geom_friction": Field("geom", "1", 0.0),
     "actuator_gain": Field("actuator", "1"),
     "actuator_kv": Field("actuator", "N·m·s/rad", 0.0),
-    "action_delay": Field(None, "s", 0.0, in_model=False),
+    "action_delay": Field(None, "s", 0.0, 10.0, in_model=False),
     "signal_bias": Field("signal", "1", in_model=False),
 }
 """Every field a parameter can name.
@@ -93,6 +95,11 @@ class Parameter:
         if self.low < kind.minimum:
             raise MadocError(
                 f"range of {self.name} starts at {self.low} {self.unit}, below its physical bound {kind.minimum}"
+            )
+        if max(-self.low, self.high) > kind.maximum:
+            raise MadocError(
+                f"range of {self.name} reaches {max(-self.low, self.high):g} {self.unit}, beyond its physical bound "
+                f"{kind.maximum:g}"
             )
 
     @property

@@ -143,15 +143,16 @@ def test_parquet_of_lists_and_dates(columns, tmp_path):
 def test_parquet_of_lists_with_missing_rows(tmp_path, kind):
     file = tmp_path / "log.parquet"
     pq.write_table(pa.table({"pair": pa.array([[1.0, 2.0], None, [3.0, 4.0]], kind)}), file, row_group_size=1)
-    np.testing.assert_array_equal(parquet_reader.read_columns(file)["pair"], [[1, 2], [np.nan, np.nan], [3, 4]])
+    read, _ = parquet_reader.read_columns(file, {"pair"})
+    np.testing.assert_array_equal(read["pair"], [[1, 2], [np.nan, np.nan], [3, 4]])
     pq.write_table(pa.table({"pair": pa.array([], kind)}), file)
-    assert parquet_reader.read_columns(file)["pair"].size == 0
+    assert parquet_reader.read_columns(file, {"pair"})[0]["pair"].size == 0
 
 
 def test_parquet_of_lists_of_unequal_lengths(tmp_path):
     pq.write_table(pa.table({"pair": [[1.0, 2.0], [3.0]]}), tmp_path / "log.parquet")
     with pytest.raises(MadocError, match=r"as many values in every row of a list column of log.parquet, got 1 and 2"):
-        parquet_reader.read_columns(tmp_path / "log.parquet")
+        parquet_reader.read_columns(tmp_path / "log.parquet", {"pair"})
 
 
 def lerobot(folder, columns, *, together):

@@ -122,9 +122,11 @@ def test_broken_episodes_are_refused(hopper, tmp_path):
 def test_damage_is_refused(hopper, tmp_path):
     folder = write_minari(tmp_path / "made", make_dataset(hopper))
     data = folder / "data" / "main_data.hdf5"
-    data.write_bytes(data.read_bytes()[:3000])
-    with pytest.raises(MadocError, match=r"cannot read the Minari dataset in .*damaged"):
+    whole = data.read_bytes()
+    data.write_bytes(whole[:3000])
+    with pytest.raises(MadocError, match=r"cannot read .*main_data.hdf5 as HDF5 .*damaged"):
         load(folder, hopper)
+    data.write_bytes(whole)
     (folder / "data" / "metadata.json").write_text("{")
     with pytest.raises(MadocError, match=r"cannot read the Minari dataset in .*JSONDecodeError"):
         load(folder, hopper)

@@ -39,7 +39,7 @@ def off(result, task, truth):
 @pytest.mark.parametrize("name", ["madoc", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
 def test_a_spring_is_recovered(name):
     task = spring(max_episode_steps=100)
-    result = calibrate(quick(name), problem_of(task, SPRING_TRUTH), key=jax.random.key(0), budget=60_000)
+    result = calibrate(quick(name), problem_of(task, SPRING_TRUTH), key=jax.random.key(0), budget=45_000)
     assert (off(result, task, SPRING_TRUTH) < TOLERANCE).all(), off(result, task, SPRING_TRUTH)
     assert not result.warnings
 

@@ -52,7 +52,7 @@ def test_counts_keep_thousands_apart():
         ("dof_damping.left+right", "left+right damping"),
         ("dof_drag.knee", "knee drag"),
         ("knee_damping", "knee damping"),
-        ("site_size.tip", "tip site size"),
+        ("left.knee", "left.knee"),
     ],
 )
 def test_parameters_are_called_by_element_and_quantity(name, title):

@@ -14,7 +14,7 @@ import madoc.simulation
 import madoc.tasks
 from madoc import robots
 from madoc.data import Dataset
-from madoc.errors import MadocError
+from madoc.errors import MadocError, NotAllowed
 from madoc.identification.states import logged_states
 from madoc.simulation.cpu import CpuSimulator
 from madoc.simulation.sensitivity import insensitive
@@ -357,7 +357,9 @@ def test_a_urdf_finds_meshes_in_its_package(tmp_path):
     mesh = '<collision><geometry><mesh filename="package://arm_description/meshes/rod.obj"/></geometry></collision>'
     text = URDF.replace("</inertial>", f"</inertial>{mesh}")
     path = write_robot(package / "urdf", URDF_SPEC, pendulum=text)
-    assert robots.load(path).task.compile().nmesh == 1
+    with pytest.raises(NotAllowed, match=r"robot.yaml, line 3: .*package://arm_description/meshes/rod.obj, outside"):
+        robots.load(path)
+    assert robots.load(path, allow_outside=True).task.compile().nmesh == 1
     (package / "meshes" / "rod.obj").unlink()
     with pytest.raises(
         MadocError, match=r"robot.yaml, line 3: pendulum.xml refers to package://arm_description/meshes/rod"

@@ -2,7 +2,7 @@
 
 from madoc.suites.cells import Cell
 from madoc.suites.report import _line, groups
-from madoc.suites.results import NOT_RUN, Result
+from madoc.suites.results import COLUMNS, NOT_RUN, Result, write_csv
 
 
 def chain(robot, method, seed):
@@ -54,3 +54,10 @@ def test_a_line_names_the_robot_once():
     of_log = "robot=arm-1 task=robots/arm.yaml data=logs/arm-1"
     assert _line(Result(calibration, NOT_RUN), cells)["asks"] == of_log
     assert _line(Result(policy, NOT_RUN), cells)["asks"] == f"{of_log}; method=bc"
+
+
+def test_no_cell_of_the_table_is_a_formula(tmp_path):
+    names = list(COLUMNS)[:3]
+    write_csv(tmp_path / "suite.csv", [dict(zip(names, ('=HYPERLINK("x")', "@a\u202eb", "knee"), strict=True))])
+    written = (tmp_path / "suite.csv").read_text().splitlines()[1]
+    assert written.startswith('"\'=HYPERLINK(""x"")",\'@a\\u202eb,knee,')

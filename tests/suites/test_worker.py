@@ -8,6 +8,7 @@ import pytest
 from suite_files import CELL
 
 from madoc.errors import MadocError, NotAllowed
+from madoc.pipeline.orders import Permission
 from madoc.runs.checkpoint import OtherState
 from madoc.suites import process, stages
 from madoc.suites.cells import Cell, write_plan
@@ -189,13 +190,13 @@ def test_a_worker_leaves_code_to_those_that_are_allowed_to_run_it(planned, place
     with pytest.raises(MadocError, match=r"the spec names the Python file task.py"):
         planned(CELL)
     other = CELL.replace("spring.yaml", "plain.yaml")
-    out, (cell, plain) = planned(CELL + other, allow_code=True)
+    out, (cell, plain) = planned(CELL + other, permission=Permission(allow_code=True))
     with pytest.raises(NotAllowed, match="pass --allow-code"):
         work(out)
     assert outcome_of(cell, out) is None
     assert attempts_of(cell, out) == 0
     assert outcome_of(plain, out).usable  # what needs no code is done all the same
-    assert [outcome.status for outcome in work(out, allow_code=True)] == ["finished"]
+    assert [outcome.status for outcome in work(out, permission=Permission(allow_code=True))] == ["finished"]
 
 
 def test_a_worker_of_one_plan_leaves_the_cells_of_the_others(planned, place, monkeypatch):

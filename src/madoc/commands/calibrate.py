@@ -36,7 +36,6 @@ class Calibrate:
         if split_name(self.order.task)[1]:
             raise MadocError(f"expected the name of a robot, got {self.order.task!r}; the data is given with --data")
         out = self.out or default_folder(self.order)
-        allow_code = self.permission.allow_code
-        result = calibrate_in(out, self.order, resume=self.resume, quiet=self.output.quiet, allow_code=allow_code)
+        result = calibrate_in(out, self.order, resume=self.resume, quiet=self.output.quiet, permission=self.permission)
         lines = (*calibration_text(result), f"run folder: {out}", *page_line(leave_report(out)))
         return Answer(result.to_json(), lines, calibration_status(result))

@@ -25,7 +25,7 @@ class Check:
         from madoc.diagnosis import tables, to_json
         from madoc.pipeline import check_logs
 
-        checked = check_logs(self.order, allow_code=self.permission.allow_code)
+        checked = check_logs(self.order, permission=self.permission)
         status = "rejected" if checked.fatal else "finished"
         if checked.diagnosis is None:
             assert checked.refusal is not None

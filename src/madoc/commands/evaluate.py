@@ -24,8 +24,6 @@ class Evaluate:
         """Evaluate, and leave evaluation.json."""
         from madoc.pipeline import evaluate_folder
 
-        evaluation = evaluate_folder(
-            self.folder, self.order, quiet=self.output.quiet, allow_code=self.permission.allow_code
-        )
+        evaluation = evaluate_folder(self.folder, self.order, quiet=self.output.quiet, permission=self.permission)
         lines = (*evaluation_text(evaluation), f"evaluation: {self.folder / 'evaluation.json'}")
         return Answer(evaluation.to_json(), lines)

@@ -31,6 +31,6 @@ class Export:
         """Write the files."""
         from madoc.pipeline import export_run
 
-        files = export_run(self.folder, self.out, onnx=self.onnx, allow_code=self.permission.allow_code)
+        files = export_run(self.folder, self.out, onnx=self.onnx, permission=self.permission)
         lines = tuple(f"{what}: {path}" for what, path in files.items())
         return Answer({"files": {what: str(path) for what, path in files.items()}}, lines)

@@ -34,8 +34,8 @@ class Learn:
         """Learn, and leave the run folder."""
         from madoc.pipeline import learn_in, policy_folder_name, read_calibration
 
-        order, allow_code = self.order, self.permission.allow_code
-        calibrated = read_calibration(self.calibration, physics=self.physics, allow_code=allow_code)
+        order = self.order
+        calibrated = read_calibration(self.calibration, physics=self.physics, permission=self.permission)
         place = self.calibration if self.calibration.is_dir() else self.calibration.parent
         out = self.out or place / policy_folder_name(order.at, order.method)
         learnt = learn_in(out, calibrated, order, resume=self.resume, quiet=self.output.quiet)

@@ -24,7 +24,7 @@ from madoc.commands.selftest import Selftest
 from madoc.commands.spec import Init, Spec
 from madoc.commands.suite import Suite
 from madoc.commands.worker import Worker
-from madoc.errors import MadocError
+from madoc.errors import MadocError, printable
 from madoc.runs.files import json_text
 
 WIDTH = 110
@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _refused(sentence: str) -> int:
     """Print why a command was refused; the exit code of a user's mistake."""
-    print(f"madoc: {sentence}", file=sys.stderr)
+    print(f"madoc: {printable(sentence)}", file=sys.stderr)
     return EXIT_CODES["rejected"]
 
 
@@ -127,7 +127,7 @@ def _calm() -> Iterator[None]:
     """Print each warning of a block as one line."""
 
     def show(message: Warning | str, *where: object, **options: object) -> None:
-        print(f"madoc: warning: {message}", file=sys.stderr)
+        print(f"madoc: warning: {printable(str(message))}", file=sys.stderr)
 
     with warnings.catch_warnings():
         warnings.showwarning = show
@@ -138,12 +138,17 @@ def _print(answer: Answer, *, as_json: bool) -> None:
     """Print an answer on standard output."""
     if as_json:
         ascii_only = (sys.stdout.encoding or "utf-8").lower() not in ("utf-8", "utf8")
-        print(json_text(dict(answer.json), what="the answer", ascii_only=ascii_only), flush=True)
+        print(printable(json_text(dict(answer.json), what="the answer", ascii_only=ascii_only)), flush=True)
         return
     from rich.console import Console
+    from rich.segment import Segment, Segments
 
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
     with console.capture() as capture:  # printed by hand: Rich would exit at a closed pipe
         for part in answer.text:
-            console.print(part, markup=False, highlight=False, soft_wrap=isinstance(part, str))
+            if isinstance(part, str):
+                console.print(printable(part), markup=False, highlight=False, soft_wrap=True)
+                continue
+            shown = [Segment(printable(segment.text), segment.style) for segment in console.render(part)]
+            console.print(Segments(shown), end="")
     print(capture.get(), end="", flush=True)

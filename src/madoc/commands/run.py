@@ -41,8 +41,7 @@ class Run:
         out = self.out or Path("runs") / (
             Path(self.order.name).stem if is_spec_path(self.order.name) else self.order.name
         )
-        allow_code = self.permission.allow_code
-        summary = run_all(self.order, out, resume=self.resume, quiet=self.output.quiet, allow_code=allow_code)
+        summary = run_all(self.order, out, resume=self.resume, quiet=self.output.quiet, permission=self.permission)
         result = CalibrationResult.from_json(summary.calibration)
         lines = (*calibration_text(result), *_rest(summary, out), *page_line(leave_report(out)))
         status = calibration_status(result) if summary.status == "finished" else summary.status

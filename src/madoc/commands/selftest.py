@@ -28,7 +28,7 @@ class Selftest:
         """Plant truths, calibrate, and compare."""
         from madoc.pipeline import selftest_of
 
-        outcome = selftest_of(self.order, quiet=self.output.quiet, allow_code=self.permission.allow_code)
+        outcome = selftest_of(self.order, quiet=self.output.quiet, permission=self.permission)
         status = "finished" if outcome.passed else "NOT_RECOVERABLE"
         return Answer(outcome.to_json(), (outcome.sentence, _table(outcome, self.order.task)), status)
 

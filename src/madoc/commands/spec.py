@@ -9,7 +9,7 @@ from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output
-from madoc.errors import MadocError
+from madoc.errors import MadocError, listed
 from madoc.pipeline.orders import Permission
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ class Init:
     """MJCF or URDF."""
     out: Path | None = None
     """The spec file. Default: beside the model, as robot.yaml for robot.xml."""
+    allow_outside: bool = False
+    """Read files outside the folder of the model that it names, as ../meshes."""
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
     def run(self) -> Answer:
@@ -32,8 +34,8 @@ class Init:
         from madoc.robots.init import write_spec
 
         out = self.out or self.model.parent / f"{self.model.stem or 'robot'}.yaml"
-        write_spec(self.model, out)
-        robot = robots.load(out)
+        write_spec(self.model, out, allow_outside=self.allow_outside)
+        robot = robots.load(out, allow_outside=self.allow_outside)
         counts = {
             "signals": len(robot.signals),
             "actions": len(robot.actions),
@@ -65,7 +67,7 @@ class Spec:
             return Answer(schema, (json_text(schema, what="the schema", indent=2),))
         if not self.spec:
             raise MadocError("expected the spec file of a robot, as madoc spec robot.yaml; madoc init MODEL writes one")
-        robot = robots.load(self.spec, allow_code=self.permission.allow_code)
+        robot = robots.load(self.spec, **vars(self.permission))
         return Answer(describe(robot), (*_tables(robot), *_sentences(robot)))
 
 
@@ -78,6 +80,7 @@ def describe(robot: "Robot") -> dict[str, object]:
         "name": task.name,
         "spec": str(robot.path),
         "model": robot.spec.model,
+        "model_files": list(robot.model_files),
         "control_step": robot.spec.control_step,
         "timestep": float(model.opt.timestep),
         "physics_steps": task.frame_skip,
@@ -119,6 +122,7 @@ def _sentences(robot: "Robot") -> list[str]:
         )
     if task.pending:
         sentences.append(f"a state carries the last {task.pending} action{'s' * (task.pending > 1)}")
+    sentences.append(f"a run folder keeps these files of the model: {listed(robot.model_files)}")
     if not task.rewarded:
         sentences.append("no reward: madoc learn refuses this robot until the spec has one")
     return [*sentences, *robot.notes]

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -45,14 +45,14 @@ class Suite:
 
     def run(self) -> Answer:
         """Plan the suite, and do what is left of it."""
-        from madoc.suites.local import usual_workers
+        from madoc.runs.machine import usable_cores
         from madoc.suites.planning import plan_of
         from madoc.suites.standing import Standing
 
         self._check()
-        plan = plan_of(self.file, allow_code=self.permission.allow_code)
+        plan = plan_of(self.file, permission=self.permission)
         out = self.out or Path("runs") / plan.name
-        workers = usual_workers() if self.workers is None else self.workers
+        workers = usable_cores() if self.workers is None else self.workers
         standing = Standing(out, plan.cells, workers=max(1, workers))
         if self.dry_run:
             return _listed(standing, out, max(1, workers))
@@ -86,24 +86,24 @@ class Suite:
         if any([try_again(cell, out) for cell in plan.cells]):
             standing = type(standing)(out, plan.cells, workers=max(1, workers))
         if workers == 0:
-            flag = " --allow-code" if self.permission.allow_code else ""
+            flag = "".join(f" {word}" for word in self.permission.words)
             lines = (f"{len(standing.runnable):,} cells to do, by: madoc worker {out}{flag}",)
             return Answer({"folder": str(out), "cells": len(plan.cells), "left": len(standing.runnable)}, lines)
-        options = {"quiet": self.output.quiet, "allow_code": self.permission.allow_code}
+        options: dict[str, Any] = {"quiet": self.output.quiet, "permission": self.permission}
         if self.executor == "ray":
             from madoc.suites.on_ray import run_on_ray
 
             whole = run_on_ray(out, standing, plan=plan.name, workers=self.workers, address=self.address, **options)
         else:
             whole = run_locally(out, standing, plan=plan.name, workers=workers, **options)
-        return _told(standing, plan, out, whole=whole, allow_code=self.permission.allow_code)
+        return _told(standing, plan, out, whole=whole, permission=self.permission)
 
     def _reported(self, plan: "Plan", standing: "Standing", out: Path) -> Answer:
         """Leave the page and the tables."""
         from madoc.suites.report import write_report
 
         command = f"madoc suite {self.file}" + ("" if self.out is None else f" --out {out}")
-        command += " --allow-code" if self.permission.allow_code else ""
+        command += "".join(f" {word}" for word in self.permission.words)
         files = write_report(plan, standing, out, command=command, parquet=self.parquet)
         lines = tuple(f"{what}: {file}" for what, file in files.items())
         counts = dict(standing.counts)
@@ -126,7 +126,7 @@ def _listed(standing: "Standing", out: Path, workers: int) -> Answer:
     return Answer(answer, (*lines(listed), told.sentence(workers)))
 
 
-def _told(standing: "Standing", plan: "Plan", out: Path, *, whole: bool, allow_code: bool) -> Answer:
+def _told(standing: "Standing", plan: "Plan", out: Path, *, whole: bool, permission: Permission) -> Answer:
     """How the suite ended."""
     counts = dict(standing.counts)
     status = "finished" if whole else "interrupted"
@@ -137,7 +137,7 @@ def _told(standing: "Standing", plan: "Plan", out: Path, *, whole: bool, allow_c
     )
     shown = reasons[:10] + ((f"and {len(reasons) - 10} more",) if len(reasons) > 10 else ())
     told = ", ".join(f"{count:,} {name}" for name, count in counts.items())
-    report = f"report: madoc suite {plan.file} --out {out} --report{' --allow-code' if allow_code else ''}"
+    report = f"report: madoc suite {plan.file} --out {out} --report{''.join(f' {word}' for word in permission.words)}"
     end = report if whole else "go on with the same command"
     lines = (*shown, f"{len(standing.cells):,} cells: {told}", end)
     answer = {"status": status, "folder": str(out), "cells": len(standing.cells), "ended": counts}

@@ -38,10 +38,10 @@ class Worker:
 
         if self.attached:
             threading.Thread(target=_stop_at_end_of_input, daemon=True).start()
-        prepare(self.folder)
+        prepare()
         from madoc.suites.worker import work  # computes numbers, on the core that was taken
 
-        done = work(self.folder, plan=self.plan, allow_code=self.permission.allow_code)
+        done = work(self.folder, plan=self.plan, permission=self.permission)
         if done is None:
             return Answer({"status": "interrupted"}, ("interrupted; the next worker goes on",), "interrupted")
         counts = Counter(outcome.status for outcome in done)

@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from madoc.data.dataset import Dataset, close_episodes, starts_after
-from madoc.data.validation import as_matrix, as_transitions, require_arrays, require_file, validate
+from madoc.data.hdf5 import opened, size_of
+from madoc.data.sizes import LARGEST_DATASET, check_size
+from madoc.data.validation import as_matrix, as_transitions, require_arrays, validate
 from madoc.errors import MadocError
 from madoc.tasks import Task
 
@@ -93,16 +95,10 @@ def _observation(values: np.ndarray, name: str, task: Task) -> Float[np.ndarray,
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    require_file(path)
-    try:
-        with h5py.File(path, "r") as file:
-            present = [name for name in NAMES_HERE.values() if isinstance(file.get(name), h5py.Dataset)]
-            arrays = {name: np.atleast_1d(file[name][()]) for name in present}
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise MadocError(
-            f"cannot read {path} as HDF5 ({error}); it is damaged, was cut short or has another format, "
-            "copy or download it again"
-        ) from error
+    with opened(path, "it is damaged, was cut short or has another format, copy or download it again") as file:
+        present = [name for name in NAMES_HERE.values() if isinstance(file.get(name), h5py.Dataset)]
+        check_size(sum(size_of(file[name]) for name in present), f"the arrays of {path}", LARGEST_DATASET)
+        arrays = {name: np.atleast_1d(file[name][()]) for name in present}
     required = [name for name in NAMES_HERE.values() if name not in OPTIONAL]
     require_arrays(arrays, required, path, "if it is a Minari file, pass its directory instead")
     return arrays

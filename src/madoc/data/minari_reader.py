@@ -8,9 +8,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+import h5py
 import numpy as np
 
 from madoc.data.dataset import Dataset, close_episodes, join
+from madoc.data.hdf5 import opened, size_of
+from madoc.data.sizes import LARGEST_DATASET, check_size
 from madoc.data.validation import as_matrix, as_transitions, validate
 from madoc.errors import MadocError
 from madoc.tasks import Task
@@ -96,6 +99,11 @@ def local_directory(path: Path) -> Path:
 def read_episodes(directory: Path) -> tuple[list["EpisodeData"], str]:
     """All episodes, and the id of their environment (empty if not recorded)."""
     minari = _import_minari()
+    for file in directory.rglob("*.hdf5"):
+        with opened(file, "it is damaged or was cut short, download or record it again") as held:
+            sizes: list[int] = []
+            held.visititems(lambda _, item, told=sizes: told.append(size_of(item)) if _is_values(item) else None)
+        check_size(sum(sizes), f"the Minari dataset in {directory}", LARGEST_DATASET)
     try:
         with warnings.catch_warnings():
             # Minari warns about packages its environment would need; the environment is never made here.
@@ -108,6 +116,11 @@ def read_episodes(directory: Path) -> tuple[list["EpisodeData"], str]:
             f"cannot read the Minari dataset in {directory} ({type(error).__name__}: {error}); it is damaged "
             "or was cut short, download or record it again"
         ) from error
+
+
+def _is_values(item: object) -> bool:
+    """Whether an item of an HDF5 file has values."""
+    return isinstance(item, h5py.Dataset)
 
 
 def _import_minari() -> ModuleType:

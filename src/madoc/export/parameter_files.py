@@ -8,7 +8,7 @@ from madoc.calibration.result import ParameterEstimate
 from madoc.identification.information import NORMAL_95
 from madoc.parameters import FIELDS, Parameter
 from madoc.robots.document import yaml_text
-from madoc.runs.files import replacing
+from madoc.runs.files import read_bytes, replacing
 from madoc.simulation.mjcf import Change
 
 OF_PATCH = "What a calibration changed in the model, and how sure it is."
@@ -57,8 +57,8 @@ def save_patch(
 def is_patch(path: Path) -> bool:
     """Whether a file is one that `save_patch` wrote."""
     try:
-        return path.read_text(encoding="utf-8").startswith(f"# {OF_PATCH}")
-    except (OSError, UnicodeDecodeError):
+        return read_bytes(path).decode().startswith(f"# {OF_PATCH}")
+    except ValueError:  # it cannot be read, or is no text
         return False
 
 

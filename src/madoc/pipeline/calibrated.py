@@ -12,7 +12,7 @@ from madoc.identification.information import NORMAL_95
 from madoc.parameters import Parameter, ParameterSpace
 from madoc.pipeline.data_stage import Machine
 from madoc.pipeline.folders import ENDED
-from madoc.pipeline.orders import Drawing, Reading, Source
+from madoc.pipeline.orders import NO_PERMISSION, Drawing, Permission, Reading, Source
 from madoc.policies import NormalParameters
 from madoc.report.records import SpecRecord, read_spec, restored_path
 from madoc.runs.files import read_json
@@ -69,13 +69,15 @@ class Calibrated:
         return np.array([row.half_width for row in self.result.parameters.values()])
 
 
-def read_calibration(path: str | Path, *, physics: str | None = None, allow_code: bool = False) -> Calibrated:
+def read_calibration(
+    path: str | Path, *, physics: str | None = None, permission: Permission = NO_PERMISSION
+) -> Calibrated:
     """A finished calibration: a run folder of `madoc calibrate` or `madoc run`, or a `result.json` alone.
 
     Args:
         path: The folder or file.
         physics: Physics of the simulator, for a result outside its run folder; None is `legacy`.
-        allow_code: Run the Python file of the robot's spec, if it has one; else such a run is refused.
+        permission: Whether the Python file of the robot's spec may be run, if it has one; else such a run is refused.
 
     Raises:
         MadocError: There is no calibration, it has not ended, or it is of other physics.
@@ -95,7 +97,7 @@ def read_calibration(path: str | Path, *, physics: str | None = None, allow_code
             f"the calibration in {folder} is of {spec.physics} physics, not {physics}; leave --physics out"
         )
     result = CalibrationResult.from_json(read_json(file))
-    machine = Machine.restored(replace(spec, task=result.task, physics=spec.physics or physics), allow_code=allow_code)
+    machine = Machine.restored(replace(spec, task=result.task, physics=spec.physics or physics), permission=permission)
     task = replace(machine.task, parameters=_calibrated_space(result, machine.task.parameters))
     return Calibrated(machine, task, result, spec, folder)
 

@@ -7,7 +7,7 @@ from madoc.calibration import CalibrationResult, calibrate
 from madoc.pipeline.folders import ENDED, working_folder
 from madoc.pipeline.keys import seed_key
 from madoc.pipeline.methods import choose, hyperparameters, methods_for
-from madoc.pipeline.orders import CalibrationOrder
+from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, Permission
 from madoc.pipeline.preparation import Prepared, prepare
 from madoc.pipeline.refusals import check_order, method_of
 from madoc.runs.progress import waiting
@@ -21,7 +21,7 @@ def calibrate_in(
     *,
     resume: bool = False,
     quiet: bool = False,
-    allow_code: bool = False,
+    permission: Permission = NO_PERMISSION,
 ) -> CalibrationResult:
     """Calibrate, judge the result where rows are held out, and leave a run folder.
 
@@ -31,7 +31,7 @@ def calibrate_in(
     out = Path(out)
     check_order(order, out)
     methods = methods_for(order)
-    prepared = prepare(order, allow_code=allow_code)
+    prepared = prepare(order, permission=permission)
     key = seed_key(prepared.seed)
     name, why = choose(methods, prepared.problem, key)
     prepared, method = prepared.by(name), methods[name]

@@ -15,7 +15,7 @@ from madoc.parameters import ParameterSpace
 from madoc.pipeline.forecast import Forecast, forecast
 from madoc.pipeline.keys import check_seed, stage_key
 from madoc.pipeline.methods import methods_for
-from madoc.pipeline.orders import CalibrationOrder, CheckOrder, SelftestOrder
+from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, CheckOrder, Permission, SelftestOrder
 from madoc.pipeline.preparation import prepare
 from madoc.pipeline.refusals import check_order
 from madoc.runs.budget import read_budget
@@ -45,7 +45,7 @@ class Checked:
         return self.diagnosis is None or self.diagnosis.fatal
 
 
-def check_logs(order: CheckOrder, *, allow_code: bool = False) -> Checked:
+def check_logs(order: CheckOrder, *, permission: Permission = NO_PERMISSION) -> Checked:
     """Read logs of a user's own robot, with velocities put in if asked, and diagnose them.
 
     Raises:
@@ -53,7 +53,7 @@ def check_logs(order: CheckOrder, *, allow_code: bool = False) -> Checked:
     """
     check_seed(order.seed)
     read_budget(order.budget)
-    robot = robots.load(order.spec, allow_code=allow_code)
+    robot = robots.load(order.spec, **vars(permission))
     task = robot.task
     try:
         dataset = logs.read(order.paths, robot, clip_actions=order.clip_actions)
@@ -71,7 +71,7 @@ def check_logs(order: CheckOrder, *, allow_code: bool = False) -> Checked:
     return Checked(task.parameters, diagnosis, forecasts)
 
 
-def selftest_of(order: SelftestOrder, *, quiet: bool = False, allow_code: bool = False) -> Selftest:
+def selftest_of(order: SelftestOrder, *, quiet: bool = False, permission: Permission = NO_PERMISSION) -> Selftest:
     """Plant truths in the order's robot, replay the logged actions, and calibrate to each replay.
 
     The method is the order's; of `auto`, the first candidate that does not refuse.
@@ -83,7 +83,7 @@ def selftest_of(order: SelftestOrder, *, quiet: bool = False, allow_code: bool =
     check_order(calibration)
     if order.truths < 1:
         raise MadocError(f"expected at least 1 truth to plant, got {order.truths}")
-    prepared = prepare(calibration, allow_code=allow_code)
+    prepared = prepare(calibration, permission=permission)
     methods = list(methods_for(calibration).values())
     key = stage_key(order.search.seed, "selftest")
     return selftest(

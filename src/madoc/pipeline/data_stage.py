@@ -13,7 +13,7 @@ from madoc.data import Dataset, logs
 from madoc.data.native import recognises as is_recorded
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.keys import stage_key
-from madoc.pipeline.orders import RecordOrder, Source
+from madoc.pipeline.orders import NO_PERMISSION, Permission, RecordOrder, Source
 from madoc.policies.behaviours import QUALITIES, record_quality
 from madoc.report.records import SpecRecord
 from madoc.robots import Robot
@@ -31,26 +31,26 @@ class Machine:
     robot: Robot | None = None
 
     @classmethod
-    def named(cls, name: str, physics: str | None = None, *, allow_code: bool = False) -> "Machine":
+    def named(cls, name: str, physics: str | None = None, *, permission: Permission = NO_PERMISSION) -> "Machine":
         """The robot that a command names: one of Madoc's, or the path of a spec file.
 
         Raises:
             MadocError: There is no such robot, or its spec is refused.
         """
         if robots.is_spec_path(name) and physics != "legacy":
-            robot = robots.load(name, allow_code=allow_code)
+            robot = robots.load(name, **vars(permission))
             return cls(robot.task, robot)
         return cls(robots.resolve(name, physics))
 
     @classmethod
-    def restored(cls, spec: SpecRecord, *, allow_code: bool = False) -> "Machine":
+    def restored(cls, spec: SpecRecord, *, permission: Permission = NO_PERMISSION) -> "Machine":
         """The robot of a run, from its `spec.json` alone.
 
         Raises:
             MadocError: The spec names no robot, or keeps one that cannot be made.
         """
         if spec.robot is not None:
-            robot = robots.restore(spec.robot, allow_code=allow_code)
+            robot = robots.restore(spec.robot, allow_code=permission.allow_code)
             return cls(robot.task, robot)
         return cls(tasks.make(spec.task, spec.physics or "legacy"))
 

@@ -13,7 +13,7 @@ from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.data_stage import Machine, read_truth
 from madoc.pipeline.film_stage import leave_film
 from madoc.pipeline.keys import stage_key
-from madoc.pipeline.orders import EvaluationOrder
+from madoc.pipeline.orders import NO_PERMISSION, EvaluationOrder, Permission
 from madoc.pipeline.refusals import check_counts
 from madoc.policies import ErrorCost, OverDraws, costs_of_errors, load_policy, over_draws
 from madoc.report.records import EvaluationRecord, SpecRecord, read_spec
@@ -34,7 +34,7 @@ def evaluate_folder(
     calibration: Path | None = None,
     out: Path | None = None,
     quiet: bool = False,
-    allow_code: bool = False,
+    permission: Permission = NO_PERMISSION,
 ) -> EvaluationRecord:
     """Evaluate policies of a run on the same starts, and leave `evaluation.json` and `film.npz` there, or in `out`.
 
@@ -52,7 +52,7 @@ def evaluate_folder(
     policies = {name: load_policy(found[name]) for name in names or found}
     spec = _spec_with_truth(folder, found)
     truth = read_truth(order.truth) or spec.truth
-    calibrated = _calibration_of(calibration or folder, allow_code=allow_code)
+    calibrated = _calibration_of(calibration or folder, permission=permission)
     if truth is None and calibrated is None:
         raise MadocError(
             f"the true parameters of {folder} are not known, and it holds no calibration to evaluate at; "
@@ -60,7 +60,7 @@ def evaluate_folder(
         )
     target, estimated = None, None
     if truth is not None:
-        machine = Machine.restored(spec, allow_code=allow_code)
+        machine = Machine.restored(spec, permission=permission)
         machine.check_truth(truth, machine.task.with_parameters(list(spec.parameters)))
         target = machine.at(truth)
     if calibrated is not None:
@@ -72,7 +72,7 @@ def evaluate_folder(
     system = target or estimated
     assert system is not None  # one of them is known
     leave_film(out or folder, policies, *system, key)
-    task = Machine.restored(spec, allow_code=allow_code).task
+    task = Machine.restored(spec, permission=permission).task
     yardsticks = [name for name in policies if read_spec(found[name].parent).at in YARDSTICKS]
     evaluation = EvaluationRecord(
         task.name,
@@ -135,10 +135,10 @@ def _where_not_sure(
     return drawn, costs
 
 
-def _calibration_of(folder: Path, *, allow_code: bool) -> Calibrated | None:
+def _calibration_of(folder: Path, *, permission: Permission) -> Calibrated | None:
     """The calibration that a run folder holds, or is; None of the folder of a policy."""
     held = (folder / "calibration" / "spec.json").exists() or read_spec(folder).command == "calibrate"
-    return read_calibration(folder, allow_code=allow_code) if held else None
+    return read_calibration(folder, permission=permission) if held else None
 
 
 def find_policies(folder: Path) -> dict[str, Path]:

@@ -12,12 +12,15 @@ from madoc.export import Exported, is_patch, save_onnx, save_patch, save_randomi
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
+from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.simulation import Simulator
 from madoc.simulation.mjcf import save_mjcf
 from madoc.simulation.write import nominal_values
 
 
-def export_run(run: Path, out: Path | None = None, *, onnx: bool = False, allow_code: bool = False) -> dict[str, Path]:
+def export_run(
+    run: Path, out: Path | None = None, *, onnx: bool = False, permission: Permission = NO_PERMISSION
+) -> dict[str, Path]:
     """Leave a finished calibration as MJCF, patch, randomization ranges and parameters for `mujoco.sysid`.
 
     Policies are written too, as ONNX, if asked. The folder `out` is `export` in the run folder by default.
@@ -28,7 +31,7 @@ def export_run(run: Path, out: Path | None = None, *, onnx: bool = False, allow_
     Raises:
         MadocError: There is no finished calibration, no policy where `onnx` wants one, or a file cannot be written.
     """
-    calibrated = read_calibration(run, allow_code=allow_code)
+    calibrated = read_calibration(run, permission=permission)
     policies = find_policies(run) if onnx else {}
     folder = (out or run / "export").expanduser()
     try:

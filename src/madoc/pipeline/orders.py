@@ -41,6 +41,17 @@ class Permission:
 
     allow_code: bool = False
     """Run the Python file that the spec of a robot names, with its reward, end or reset: only if you trust it."""
+    allow_outside: bool = False
+    """Read files outside the folder of a robot's model that the model names, as ../meshes: a run folder keeps them."""
+
+    @property
+    def words(self) -> list[str]:
+        """The options of a command line that grant the same."""
+        return [f"--{name.replace('_', '-')}" for name, granted in vars(self).items() if granted]
+
+
+NO_PERMISSION = Permission()
+"""What a command may do where nothing is allowed."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from madoc.data.split import hold_out
 from madoc.diagnosis import check, refuse_fatal
 from madoc.pipeline.data_stage import Machine, fingerprint, load_source, read_truth
 from madoc.pipeline.keys import stage_key
-from madoc.pipeline.orders import AUTO, CalibrationOrder
+from madoc.pipeline.orders import AUTO, NO_PERMISSION, CalibrationOrder, Permission
 from madoc.pipeline.refusals import check_search, method_of
 from madoc.report.records import DataRecord, stored_path
 from madoc.runs.budget import Budget, Seconds, read_budget
@@ -105,7 +105,7 @@ class Prepared:
         return asked | held | self.machine.stored()
 
 
-def prepare(order: CalibrationOrder, *, allow_code: bool = False) -> Prepared:
+def prepare(order: CalibrationOrder, *, permission: Permission = NO_PERMISSION) -> Prepared:
     """Read the robot and the data of an order, and check the logs of a user's own robot.
 
     Raises:
@@ -115,7 +115,7 @@ def prepare(order: CalibrationOrder, *, allow_code: bool = False) -> Prepared:
     budget = None if order.search.budget is None else read_budget(order.search.budget)
     holdout = HOLDOUT if method == AUTO and order.holdout is None else order.holdout
     truth = read_truth(order.truth)
-    machine, dataset, task = _read(order, allow_code=allow_code)
+    machine, dataset, task = _read(order, permission=permission)
     truth = dataset.true_parameters if truth is None else truth
     if truth is not None:
         machine.check_truth(truth, task)
@@ -127,10 +127,10 @@ def prepare(order: CalibrationOrder, *, allow_code: bool = False) -> Prepared:
     return Prepared(order, method, budget, holdout, machine, dataset, simulator, truth)
 
 
-def _read(order: CalibrationOrder, *, allow_code: bool) -> tuple[Machine, Dataset, Task]:
+def _read(order: CalibrationOrder, *, permission: Permission) -> tuple[Machine, Dataset, Task]:
     """The robot, its data, and the task with the parameters and ranges that are calibrated."""
     search = order.search
-    machine = Machine.named(order.task, search.physics, allow_code=allow_code)
+    machine = Machine.named(order.task, search.physics, permission=permission)
     check_search(search, machine.task, order.task)
     dataset = load_source(order.source, machine, seed=search.seed)
     recorded = dataset.physics if dataset.physics != "unknown" else None

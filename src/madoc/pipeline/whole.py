@@ -15,9 +15,11 @@ from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
 from madoc.pipeline.learning_stage import learn_in, require_no_goals, require_velocities
 from madoc.pipeline.methods import hyperparameters, make_method, methods_for
 from madoc.pipeline.orders import (
+    NO_PERMISSION,
     CalibrationOrder,
     Drawing,
     EvaluationOrder,
+    Permission,
     Place,
     PolicyOrder,
     RecordOrder,
@@ -34,7 +36,7 @@ from madoc.types import entry_of
 
 
 def run_all(
-    order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = False, allow_code: bool = False
+    order: RunOrder, out: Path, *, resume: bool = False, quiet: bool = False, permission: Permission = NO_PERMISSION
 ) -> Summary:
     """Do all stages, and leave a folder with their files.
 
@@ -50,15 +52,15 @@ def run_all(
     """
     if order.data:
         order = replace(order, data=_source(order).absolute().paths)
-    machine = Machine.named(split_name(order.name)[0], order.search.physics, allow_code=allow_code)
+    machine = Machine.named(split_name(order.name)[0], order.search.physics, permission=permission)
     spec = _spec(order, machine, out)
     with working_folder(out, spec, resume=resume, keep="data.npz") as folder:
         if (out / "summary.json").exists():
             return read_record(Summary, out / "summary.json")
         if not (out / "data.npz").exists():
             data.save(_recorded_or_loaded(order, machine, quiet=quiet), out / "data.npz")
-        result = _calibrate(order, out, quiet=quiet, allow_code=allow_code)
-        calibrated = read_calibration(out / "calibration", allow_code=allow_code)
+        result = _calibrate(order, out, quiet=quiet, permission=permission)
+        calibrated = read_calibration(out / "calibration", permission=permission)
         summary = _beginning(order, calibrated)
         if result.status not in ENDED:
             return replace(summary, status=result.status, sentence=f"calibration: {result.sentence}")
@@ -72,9 +74,9 @@ def run_all(
             if policy["status"] not in ENDED:
                 return replace(summary, status=str(policy["status"]), sentence=f"policy-{at}: {policy['sentence']}")
         asked = EvaluationOrder(order.episodes, order.draws, order.search.seed)
-        evaluation = evaluate_folder(out, asked, names=places, quiet=quiet, allow_code=allow_code)
+        evaluation = evaluate_folder(out, asked, names=places, quiet=quiet, permission=permission)
         summary = replace(summary, evaluation=evaluation)
-        export_run(out, allow_code=allow_code)
+        export_run(out, permission=permission)
         folder.write_json("summary.json", summary.to_json())
         return summary
 
@@ -135,14 +137,14 @@ def _recorded_or_loaded(order: RunOrder, machine: Machine, *, quiet: bool) -> da
     return record_named(asked, quiet=quiet)
 
 
-def _calibrate(order: RunOrder, out: Path, *, quiet: bool, allow_code: bool) -> CalibrationResult:
+def _calibrate(order: RunOrder, out: Path, *, quiet: bool, permission: Permission) -> CalibrationResult:
     """Leave `calibration`."""
     folder = out / "calibration"
     if calibration_ended(folder) and ended(folder):
         return CalibrationResult.from_json(read_json(folder / "result.json"))
     source = Source((str(out / "data.npz"),), max_transitions=None)
     asked = _calibration_order(order, source)
-    return calibrate_in(folder, asked, resume=holds_run(folder), quiet=quiet, allow_code=allow_code)
+    return calibrate_in(folder, asked, resume=holds_run(folder), quiet=quiet, permission=permission)
 
 
 def _learn(order: RunOrder, calibrated: Calibrated, at: Place, folder: Path, *, quiet: bool) -> dict[str, object]:

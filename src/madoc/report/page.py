@@ -118,6 +118,14 @@ def _ended(run: Run) -> str:
     return datetime.datetime.fromtimestamp(file.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
 
 
+def _is_ours(page: Path) -> bool:
+    """Whether a file is a page of this command; a pipe or device is none."""
+    if not page.is_file():
+        return False
+    with page.open("rb") as file:
+        return GENERATOR in file.read(2000).decode("utf-8", "replace")
+
+
 def write_page(page: Path, template: str, context: dict[str, object]) -> None:
     """Render a template into a file, whole or not at all; every word from a run's files is escaped.
 
@@ -126,7 +134,7 @@ def write_page(page: Path, template: str, context: dict[str, object]) -> None:
     """
     if page.is_dir():
         raise MadocError(f"{page} is a folder; name a file for the page, as {page / 'report.html'}")
-    if page.exists() and GENERATOR not in page.read_bytes()[:2000].decode("utf-8", "replace"):
+    if page.exists() and not _is_ours(page):
         raise MadocError(f"{page} exists and is no page of madoc report; choose another --out")
     text = templates().get_template(template).render(context)
     with replacing(page) as stream:

@@ -16,6 +16,7 @@ from madoc.data.npz import unpack
 from madoc.errors import MadocError
 from madoc.report.records import EvaluationRecord, SpecRecord, read_object, read_record, read_spec
 from madoc.robots.document import yaml_text
+from madoc.runs.files import read_bytes
 from madoc.runs.memory import read_peak
 
 
@@ -222,7 +223,7 @@ def read_metrics(path: Path) -> MetricLog | None:
     if not path.exists():
         return None
     lines = []
-    written = path.read_text(encoding="utf-8").splitlines()
+    written = read_bytes(path).decode().splitlines()
     for number, text in enumerate(written, 1):
         try:
             lines.append(json.loads(text))

@@ -5,6 +5,7 @@ import functools
 import jinja2
 from markupsafe import Markup
 
+from madoc.errors import printable
 from madoc.report import words
 
 GENERATOR = "madoc report"
@@ -18,6 +19,7 @@ def templates() -> jinja2.Environment:
         loader=jinja2.PackageLoader("madoc.report"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
+        finalize=_printable,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -26,6 +28,11 @@ def templates() -> jinja2.Environment:
     environment.filters |= {"unit": words.unit_words, "interval": words.interval_words, "px": "{:.1f}".format}
     environment.globals |= {"TONES": words.TONES, "generator": GENERATOR}
     return environment
+
+
+def _printable(value: object) -> object:
+    """A value of a template; text that would turn the direction of what follows is written as numbers."""
+    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 def chart(kind: str, **values: object) -> Markup:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 from madoc.calibration.result import ParameterEstimate
+from madoc.parameters import FIELDS
 
 TONES = {
     "CALIBRATED": "good",
@@ -43,6 +44,8 @@ _METRIC_WORDS = {
 def parameter_title(name: str) -> str:
     """`dof_damping.foot_joint` as `foot_joint damping`."""
     field, _, element = name.partition(".")
+    if element and field not in FIELDS:
+        return name  # a label that a user gave
     word = _FIELD_WORDS.get(field, field.replace("_", " "))
     return f"{element} {word}" if element else word
 

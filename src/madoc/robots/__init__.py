@@ -11,24 +11,26 @@ from pathlib import Path
 from madoc import tasks
 from madoc.errors import MadocError, unknown_name
 from madoc.robots.functions import PythonFile, require_permission
-from madoc.robots.model import ModelFiles, read_bytes
+from madoc.robots.model_files import ModelFiles
 from madoc.robots.spec import RobotSpec, read_spec
 from madoc.robots.task import Robot, Signal, make_robot
+from madoc.runs.files import read_bytes
 from madoc.tasks import TASKS, Task
 
 SUFFIXES = (".yaml", ".yml")
 
 
-def load(path: str | Path, *, allow_code: bool = False) -> Robot:
+def load(path: str | Path, *, allow_code: bool = False, allow_outside: bool = False) -> Robot:
     """Read a spec file and its model. Files whose content has not changed are parsed and compiled once.
 
     Args:
         path: The file.
         allow_code: Run the Python file that the spec names, if it names one; else such a spec is refused.
+        allow_outside: Read files outside the model's folder that the model names; else such a model is refused.
 
     Raises:
         MadocError: A file is missing, or the spec has a mistake; the sentence names its line.
-        NotAllowed: The spec names a Python file, and `allow_code` is not given.
+        NotAllowed: The spec names a Python file, or the model a file elsewhere, and that is not allowed.
     """
     file = Path(path).expanduser()
     if not file.is_file():
@@ -39,7 +41,7 @@ def load(path: str | Path, *, allow_code: bool = False) -> Robot:
     content = read_bytes(file)
     spec, document = read_spec(content, file.name)
     with document.at("model"):
-        model = ModelFiles.read(file.parent / spec.model)
+        model = ModelFiles.read(file.parent / spec.model, allow_outside=allow_outside)
     python = None
     if spec.python is not None:
         names = f"{file.name}, line {document.line(('python',))}: the spec names"
@@ -69,13 +71,16 @@ def restore(source: Mapping[str, object], *, allow_code: bool = False) -> Robot:
     return make_robot(content, file, files, python)
 
 
-def resolve(name: str | Path, physics: str | None = None, *, allow_code: bool = False) -> Task:
+def resolve(
+    name: str | Path, physics: str | None = None, *, allow_code: bool = False, allow_outside: bool = False
+) -> Task:
     """The task of a robot, given by name or by the path of a spec file.
 
     Args:
         name: The name of one of Madoc's robots, as `hopper`, or a path, as `arm.yaml`.
         physics: `legacy` or `modern`; None takes `legacy` for Madoc's robots. A robot of a spec file is `modern`.
         allow_code: As for `load`.
+        allow_outside: As for `load`.
 
     Raises:
         MadocError: There is no such robot, or `load` refuses its file.
@@ -83,7 +88,7 @@ def resolve(name: str | Path, physics: str | None = None, *, allow_code: bool = 
     if is_spec_path(name):
         if physics == "legacy":
             raise MadocError(f"legacy physics exists only for Madoc's own robots; leave it out for {name}")
-        return load(name, allow_code=allow_code).task
+        return load(name, allow_code=allow_code, allow_outside=allow_outside).task
     if str(name) not in TASKS:
         raise MadocError(
             f"{unknown_name('task', str(name), TASKS)}; or give the path of a robot's spec file, as arm.yaml"

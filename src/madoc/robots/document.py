@@ -9,7 +9,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.constructor import RoundTripConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event, NodeEvent
 from ruamel.yaml.nodes import MappingNode, Node
 
 from madoc.errors import MadocError, nearest_hint
@@ -21,6 +21,10 @@ LARGEST = 200_000
 """Largest size of a file in bytes; a larger one is refused. The spec of a robot with a hundred joints has 20,000."""
 DEEPEST = 20
 """Deepest nesting of lists and mappings; anything deeper is refused."""
+MOST_KEYS = 1000
+"""Most keys of one mapping; with more the file is refused before they are looked at."""
+MOST_PARTS = 20_000
+"""Most values, keys, lists and mappings of a file; with more it is refused before it is read further."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Document:
         try:
             yield
         except MadocError as error:
-            raise self.error(place, str(error)) from error
+            raise type(error)(str(self.error(place, str(error)))) from error
 
     def unknown(self, place: Place, what: str, name: str, known: Iterable[str]) -> MadocError:
         """An error about a name that is not among the known ones; it lists the nearest of them."""
@@ -78,10 +82,7 @@ def read_document(
     reader = YAML()
     reader.Constructor = _Constructor
     try:
-        depth = 0
-        for event in YAML().parse(text):
-            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-            _check_event(event, depth)
+        _check_events(YAML(typ="safe", pure=True).parse(text))
         data = reader.load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -109,6 +110,29 @@ def yaml_text(content: object, *, width: int = 110, flow: bool | None = None) ->
 
 class _Refusal(MarkedYAMLError):
     """YAML that is valid and yet not accepted in a spec."""
+
+
+def _check_events(events: Iterable[Event]) -> None:
+    """Refuse what no such file needs as soon as it comes: YAML takes long for files of many parts."""
+    sizes: list[int] = []
+    for count, event in enumerate(events):
+        if isinstance(event, CollectionEndEvent):
+            sizes.pop()
+            continue
+        if sizes:
+            sizes[-1] += 1 if isinstance(event, NodeEvent) else 0
+        problem = ""
+        if sizes and sizes[-1] > 2 * MOST_KEYS:
+            problem = (
+                f"expected at most {MOST_KEYS:,} keys or {2 * MOST_KEYS:,} values in a row, got more; leave some out"
+            )
+        elif count > MOST_PARTS:
+            problem = f"expected at most {MOST_PARTS:,} keys and values in a file, got more; leave some out"
+        if problem:
+            raise _Refusal(problem=problem, problem_mark=event.start_mark)
+        if isinstance(event, CollectionStartEvent):
+            sizes.append(0)
+        _check_event(event, len(sizes))
 
 
 def _check_event(event: Event, depth: int) -> None:

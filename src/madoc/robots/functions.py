@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from madoc.errors import MadocError, NotAllowed, nearest_hint
+from madoc.runs.files import read_bytes
 
 NAMES = ("reward", "end", "reset")
 """The functions that a file may define, each in the place of the spec's key of that name."""
@@ -42,11 +43,7 @@ class PythonFile:
             raise MadocError(f"expected a Python file inside the folder of the spec, got {name}; move it there")
         if path.suffix != ".py" or not path.is_file():
             raise MadocError(f"there is no Python file {name} beside the spec; check the path")
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise MadocError(f"could not read {path}: {error.strerror or error}") from error
-        return cls._checked(name, content)
+        return cls._checked(name, read_bytes(path))
 
     @classmethod
     def from_json(cls, stored: object) -> "PythonFile":

@@ -24,6 +24,8 @@ DRAWS = ("uniform", "normal")
 """Random numbers, by the two values that each takes: low and high, or mean and standard deviation."""
 LONGEST = 500
 """Longest expression in characters; a longer one is refused."""
+LARGEST = 1e15
+"""Largest size of a number in an expression, written or computed, and of a weight; a larger one is refused."""
 
 _BINARY: dict[type, Callable[[Batch, Batch], Batch]] = {
     ast.Add: operator.add,
@@ -81,7 +83,7 @@ def parse(text: str, scope: Scope | None = None) -> Expression:
         reads = tuple(dict.fromkeys(_reads(root)))
         with np.errstate(all="ignore"):
             value = value_of(root, lambda _: np.zeros(1), np)
-        weighted_sum(root)
+        _check_sizes(root, text)
     except MadocError:
         raise
     except SyntaxError as error:
@@ -209,6 +211,17 @@ def _name_in(argument: ast.expr, kind: str) -> str:
         f"expected the name of a {'sensor' if kind == 'sensor' else 'joint'} in {kind}({text}), "
         f'in quotes where it is no plain word, as {kind}("left-knee")'
     )
+
+
+def _check_sizes(node: Node, text: str) -> None:
+    """Refuse a constant or a weight of what is read beyond `LARGEST`, as `1e308 * 10` is."""
+    if isinstance(node, Operation):
+        for argument in node.arguments:
+            _check_sizes(argument, text)
+    weights, constant = weighted_sum(node) or ({}, 0.0)
+    wrong = next((value for value in (*weights.values(), constant) if not abs(value) <= LARGEST), None)
+    if wrong is not None:
+        raise MadocError(f"expected numbers up to {LARGEST:g} in {text!r}, got {wrong:g}; choose another unit")
 
 
 def _reads(node: Node) -> list[Read]:

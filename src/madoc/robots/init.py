@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -12,7 +13,8 @@ from madoc.errors import MadocError
 from madoc.parameters import FIELDS, Parameter
 from madoc.robots.document import yaml_text
 from madoc.robots.expressions import Read
-from madoc.robots.model import ModelFiles, compiled, is_single, is_slide
+from madoc.robots.model import compiled, is_single, is_slide, read_model
+from madoc.robots.model_files import ModelFiles
 from madoc.robots.space import SLIDE_UNITS
 from madoc.runs.files import replacing
 from madoc.simulation.write import OF_A_JOINT, element_names, heavy_bodies, nominal_values
@@ -34,8 +36,8 @@ _REMARKS = {"actuator_gain": "", "geom_friction": "sliding, in contacts; "}
 """What stands in a comment instead of the unit of a field."""
 
 
-def write_spec(model: Path, out: Path) -> None:
-    """Write a first spec for a model to a new file.
+def write_spec(model: Path, out: Path, *, allow_outside: bool = False) -> None:
+    """Write a first spec for a model to a new file; `allow_outside` reads files outside the model's folder too.
 
     Raises:
         MadocError: The file exists already, its folder does not, or the model cannot be used.
@@ -46,20 +48,20 @@ def write_spec(model: Path, out: Path) -> None:
         raise MadocError(f"{out} exists already; choose another --out, or delete it")
     if not out.parent.is_dir():
         raise MadocError(f"there is no folder {out.parent} to write {out.name} into; make it first")
-    text = spec_text(model, out)
+    text = spec_text(model, out, allow_outside=allow_outside)
     with replacing(out) as stream:
         stream.write(text.encode())
     try:
-        load(out)
+        load(out, allow_outside=allow_outside)
     except MadocError as error:
         out.unlink()
         raise MadocError(f"no spec can be made of {model}: {error}") from error
 
 
-def spec_text(model: Path, out: Path) -> str:
+def spec_text(model: Path, out: Path, *, allow_outside: bool = False) -> str:
     """The text of a first spec for a model, with comments, for a file at `out`; a model without names is refused."""
-    files = ModelFiles.read(model)
-    made = compiled(files.spec, files.main)
+    files = ModelFiles.read(model, allow_outside=allow_outside)
+    made = compiled(partial(read_model, files), files.main)
     joints = element_names(made, "joint")
     if not joints:
         raise MadocError(f"no joint of {model} has a name, and a spec reads joints by name; name them in the model")

@@ -6,11 +6,22 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from madoc.errors import nearest_hint
+from madoc.errors import UNPRINTABLE, nearest_hint
 from madoc.parameters import FIELDS, Parameter
 from madoc.robots.document import Document, read_document
 from madoc.robots.validation import Part, refuse, refused_with_line
 from madoc.tasks import TASKS
+
+SHORTEST_TIMESTEP = 1e-6
+"""Shortest timestep in s: contacts of rigid bodies last a thousand times as long."""
+LONGEST_TIMESTEP = 1.0
+"""Longest timestep in s; no robot is stable with one a tenth as long."""
+LONGEST_STEP = 60.0
+"""Longest control step in s."""
+MOST_STEPS = 10_000
+"""Largest number of physics steps of a control step."""
+MOST_PENDING = 1000
+"""Largest number of control steps that an action may be late."""
 
 SCALES: dict[str, float] = {
     **dict.fromkeys(("deg", "deg/s", "°", "°/s"), math.pi / 180.0),
@@ -20,10 +31,15 @@ SCALES: dict[str, float] = {
 }
 """Units that are converted, each as a multiple of its SI unit."""
 
-Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]+$")]
-File = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00-\x1f]+$")]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+LARGEST = 1e12
+"""Largest size of a number, in any unit: no range or limit of a robot reaches further."""
+_PRINTABLE = f"^[^{UNPRINTABLE}]+$"
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=_PRINTABLE)]
+File = Annotated[str, Field(min_length=1, max_length=4096, pattern=_PRINTABLE)]
+Unit = Annotated[str, Field(max_length=40, pattern=f"^[^{UNPRINTABLE}]*$")]
+Finite = Annotated[float, Field(allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=LARGEST)]
+Duration = Annotated[float, Field(allow_inf_nan=False, ge=SHORTEST_TIMESTEP, le=LONGEST_STEP)]
 
 
 class SignalSpec(Part):
@@ -34,7 +50,7 @@ class SignalSpec(Part):
         description="position(JOINT), velocity(JOINT), sensor(NAME), one value of several as sensor(NAME)[2], or an "
         "expression of them: + - * / **, sin cos tan asin acos atan atan2 sqrt abs exp tanh min max where, pi."
     )
-    unit: str | None = Field(None, description="For people. Default: that of the joint, where `reads` is one.")
+    unit: Unit | None = Field(None, description="For people. Default: that of the joint, where `reads` is one.")
 
 
 class ActionSpec(Part):
@@ -51,7 +67,7 @@ class ActionSpec(Part):
     kp: Positive | None = Field(None, description="Stiffness of a position servo, N·m/rad (of a slide, N/m).")
     kd: Finite | None = Field(None, ge=0, description="Damping of a servo, N·m·s/rad (of a slide, N·s/m).")
     limit: Positive | None = Field(None, description="Largest torque or force of a servo, N·m (of a slide, N).")
-    unit: str | None = Field(
+    unit: Unit | None = Field(
         None, description="Of low, high and the log: deg, deg/s, mm, mm/s, cm, mN·m are converted, others are SI's."
     )
 
@@ -136,12 +152,12 @@ class RobotSpec(Part):
         description="Letters, digits, _ . and -."
     )
     model: File = Field(description="MJCF or URDF, relative to this file.")
-    control_step: Positive = Field(description="Time between two actions, s; a whole multiple of the timestep.")
-    timestep: Positive | None = Field(None, description="Of the physics, s. Default: the model's.")
+    control_step: Duration = Field(description="Time between two actions, s; a whole multiple of the timestep.")
+    timestep: Duration | None = Field(None, description="Of the physics, s. Default: the model's.")
     signals: list[SignalSpec] = Field(min_length=1, description="The observation, in this order.")
     actions: list[ActionSpec] = Field(min_length=1, description="The action, in this order.")
     parameters: list[ParameterSpec] = Field(min_length=1, description="What can be calibrated.")
-    groups: Annotated[int, Field(ge=1)] | None = Field(
+    groups: Annotated[int, Field(ge=1, le=1000)] | None = Field(
         None, description="Groups Madoc's VAE forms. Default: min(4, d)."
     )
     log: LogSpec = Field(default_factory=lambda: LogSpec.model_validate({}))
@@ -167,7 +183,9 @@ class RobotSpec(Part):
         description="A Python file in the folder of this one. Its functions reward, end and reset take the place of "
         "these keys. It is run only with --allow-code.",
     )
-    max_episode_steps: Annotated[int, Field(ge=1)] = Field(1000, description="Control steps of a simulated episode.")
+    max_episode_steps: Annotated[int, Field(ge=1, le=10_000_000)] = Field(
+        1000, description="Control steps of a simulated episode."
+    )
 
     @field_validator("name")
     @classmethod

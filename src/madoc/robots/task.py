@@ -15,10 +15,18 @@ from madoc.errors import MadocError
 from madoc.robots.actions import action_channel, added_actuator, idle_actuators
 from madoc.robots.episodes import Episode, no_reward, read_episode
 from madoc.robots.functions import PythonFile
-from madoc.robots.model import Draft, ModelFiles, compiled, make_model
+from madoc.robots.model import Draft, compiled, make_model, read_model
+from madoc.robots.model_files import ModelFiles
 from madoc.robots.signals import quaternion_of, read_signals, signal_unit, turn_of
 from madoc.robots.space import parameter_space
-from madoc.robots.spec import RobotSpec, read_spec
+from madoc.robots.spec import (
+    LONGEST_TIMESTEP,
+    MOST_PENDING,
+    MOST_STEPS,
+    SHORTEST_TIMESTEP,
+    RobotSpec,
+    read_spec,
+)
 from madoc.tasks.base import ActionChannel, Batch, Task, never_terminated
 
 
@@ -48,6 +56,7 @@ class Robot:
         signals: The values of an observation, in order.
         undetermined: Sentences on the positions and velocities that an observation does not determine.
         notes: Sentences on what a user should know of the robot.
+        model_files: Names of the files of its model, all of which a run folder keeps.
     """
 
     path: Path
@@ -56,6 +65,7 @@ class Robot:
     signals: tuple[Signal, ...]
     undetermined: tuple[str, ...]
     notes: tuple[str, ...]
+    model_files: tuple[str, ...]
 
     @property
     def actions(self) -> tuple[ActionChannel, ...]:
@@ -73,7 +83,7 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
     if spec.python is not None and python is None:
         raise document.error(("python",), f"the Python file {spec.python} is missing; restore it")
     with document.at("model"):
-        draft = Draft(spec, document, files.spec(), python)
+        draft = Draft(spec, document, read_model(files), python)
     _check_names(draft)
     try:
         factory, model = _model(draft, files.main)
@@ -86,6 +96,11 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
     space, frame_skip = parameter_space(draft, model), _frame_skip(draft, model)
     delays = [row.high for row in space.parameters if row.field == "action_delay"]
     pending = max([int(np.ceil(high / spec.control_step - 1e-9)) for high in delays], default=0)
+    if pending > MOST_PENDING:
+        raise document.error(
+            ("parameters",),
+            f"expected action_delay of at most {MOST_PENDING:,} control steps, got {pending:,}; is it in seconds?",
+        )
     if signals.read_sensors & signals.layout.accelerating:
         pending = max(pending, 1)  # such a sensor shows the force of the last action
     names, episode = tuple(signal.name for signal in spec.signals), read_episode(draft, signals, actions)
@@ -131,7 +146,8 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
         )
         for index, (given, expression) in enumerate(zip(spec.signals, signals.expressions, strict=True))
     )
-    return Robot(Path(file), spec, task, shown, signals.undetermined(), idle_actuators(model, actions))
+    kept, idle = tuple(name for name, _ in files.files), idle_actuators(model, actions)
+    return Robot(Path(file), spec, task, shown, signals.undetermined(), idle, kept)
 
 
 def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco.MjModel]:
@@ -172,6 +188,17 @@ def _check_names(draft: Draft) -> None:
 def _frame_skip(draft: Draft, model: mujoco.MjModel) -> int:
     """Physics steps of a control step."""
     timestep, wanted = float(model.opt.timestep), draft.spec.control_step
+    if not SHORTEST_TIMESTEP <= timestep <= LONGEST_TIMESTEP:
+        raise draft.document.error(
+            ("model",) if draft.spec.timestep is None else ("timestep",),
+            f"expected a timestep from {SHORTEST_TIMESTEP:g} to {LONGEST_TIMESTEP:g} s, got {timestep:g}; change it",
+        )
+    if wanted > MOST_STEPS * timestep:
+        raise draft.document.error(
+            ("control_step",),
+            f"expected a control_step of at most {MOST_STEPS:,} timesteps of {timestep:g} s, got {wanted:g} s; "
+            "give a longer timestep:",
+        )
     steps = round(wanted / timestep)
     if steps < 1 or abs(steps * timestep - wanted) > 1e-6 * wanted:
         near = max(1, steps) * timestep

@@ -130,6 +130,8 @@ def load(path: Path, like: State) -> tuple[State, dict[str, Any]]:
         OtherState: The file holds the state of another method, setting or version.
         MadocError: It is missing or damaged.
     """
+    if path.exists() and not path.is_file():
+        raise MadocError(f"{path} is no regular file; restore it from a copy or start a new run")
     try:
         with zipfile.ZipFile(path) as archive:
             about = json.loads(archive.read("checkpoint.json"))

@@ -3,12 +3,16 @@
 import json
 import math
 import os
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from madoc.errors import MadocError
+
+LARGEST = 150_000_000
+"""Largest size of a file that is read whole, bytes, where nothing else is said; a larger one is refused."""
 
 
 @contextmanager
@@ -22,7 +26,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("wb") as stream:
+        temporary.unlink(missing_ok=True)
+        with temporary.open("xb") as stream:  # never through a link that another user has put there
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
@@ -66,6 +71,26 @@ def json_text(value: object, *, what: str, indent: int | None = None, ascii_only
         raise MadocError(f"cannot write as JSON: {place}") from error
 
 
+def read_bytes(path: Path, *, most: int = LARGEST) -> bytes:
+    """The content of a regular file of at most so many bytes; a pipe or device is not waited for.
+
+    Raises:
+        MadocError: The file is missing, unreadable, larger, or no regular file.
+    """
+    try:
+        with open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb") as file:
+            state = os.fstat(file.fileno())
+            if not stat.S_ISREG(state.st_mode):
+                raise MadocError(f"could not read {path}: it is no regular file; check the path")
+            if state.st_size > most:
+                raise MadocError(
+                    f"{path} has {state.st_size:,} bytes, more than the {most:,} that such a file may have"
+                )
+            return file.read(most)
+    except OSError as error:
+        raise MadocError(f"could not read {path}: {error.strerror or error}") from error
+
+
 def read_json(path: Path) -> Any:
     """The content of a JSON file.
 
@@ -73,10 +98,10 @@ def read_json(path: Path) -> Any:
         MadocError: The file is missing, unreadable or not JSON.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MadocError(f"could not read {path}: {error.strerror or error}") from error
-    except ValueError as error:
+        return json.loads(read_bytes(path).decode())
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, MadocError):
+            raise
         raise MadocError(f"{path} is not valid JSON ({error}); restore it or delete it") from error
 
 

@@ -1,7 +1,6 @@
 """The CPU backend: MuJoCo's own threaded rollout, all cores, float64."""
 
 import copy
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
@@ -12,6 +11,7 @@ from jaxtyping import Float, Int
 
 from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter
+from madoc.runs.machine import usable_cores
 from madoc.simulation.delay import blend, delay_weights, in_effect
 from madoc.simulation.drives import joint_drives
 from madoc.simulation.write import find_elements, write_parameters
@@ -41,7 +41,7 @@ class CpuSimulator:
 
     def __init__(self, task: Task, *, threads: int | None = None) -> None:
         self.task, self.parameters, self.action_size = task, task.parameters, task.action_size
-        self.threads = threads or len(os.sched_getaffinity(0))
+        self.threads = threads or usable_cores()
         self._model = task.model
         self.control_step = float(self._model.opt.timestep) * task.frame_skip
         if self._model.na or self._model.nmocap:

@@ -160,7 +160,9 @@ def _copied(spec: mujoco.MjSpec, file: str, own_folder: str, folder: Path, copie
     wanted = str(Path(own_folder) / file)
     if wanted not in copies:
         name = Path(file).name
-        inside = spec.assets.get(wanted, spec.assets.get(file, spec.assets.get(name)))
+        alike = [held for held in spec.assets if Path(held).name == name]  # as MuJoCo finds it where no path fits
+        held = next((held for held in (wanted, file, name, *alike) if held in spec.assets), None)
+        inside = None if held is None else spec.assets[held]
         while name in copies.values():
             name = f"_{name}"
         source = Path(spec.modelfiledir or ".") / wanted

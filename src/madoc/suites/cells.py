@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
-from madoc.runs.files import replacing
+from madoc.runs.files import read_bytes, replacing
 from madoc.suites.options import Order, adapter
 
 Kind = Literal["record", "calibrate", "learn", "evaluate"]
@@ -103,7 +103,7 @@ def read_plans(suite: Path, name: str | None = None) -> list[Cell]:
         files = [file for file in files if file.stem == name]
     cells: dict[str, Cell] = {}
     for file in files:
-        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+        for number, line in enumerate(read_bytes(file).decode().splitlines(), 1):
             try:
                 cell = Cell(**json.loads(line))
             except (ValueError, TypeError) as error:

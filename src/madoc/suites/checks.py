@@ -17,9 +17,11 @@ from madoc.pipeline.keys import check_seed
 from madoc.pipeline.methods import candidates_for, make_method
 from madoc.pipeline.orders import (
     AUTO,
+    NO_PERMISSION,
     CalibrationOrder,
     Drawing,
     EvaluationOrder,
+    Permission,
     PolicyOrder,
     RecordOrder,
     Search,
@@ -54,7 +56,7 @@ def under(key: str) -> Iterator[None]:
         raise Misfit(key, str(error)) from error
 
 
-def check_calibration(order: CalibrationOrder, *, recorded: bool, allow_code: bool = False) -> None:
+def check_calibration(order: CalibrationOrder, *, recorded: bool, permission: Permission = NO_PERMISSION) -> None:
     """Refuse a calibration of an unknown robot, by an unknown method, or with impossible numbers.
 
     Of its data, only the existence is checked.
@@ -64,9 +66,9 @@ def check_calibration(order: CalibrationOrder, *, recorded: bool, allow_code: bo
     """
     search = order.search
     with under("task"):
-        task = _robot(order.task, search.physics, allow_code)
+        task = _robot(order.task, search.physics, permission)
     with under("level" if search.parameters is None else "parameters"):
-        _ranges(order.task, search.physics, search.parameters, search.level, allow_code)
+        _ranges(order.task, search.physics, search.parameters, search.level, permission)
     method = method_of(order)
     with under("method"):
         _calibrator(method, ())
@@ -86,11 +88,15 @@ def check_calibration(order: CalibrationOrder, *, recorded: bool, allow_code: bo
         with under("data"):
             for path in order.source.paths:
                 content_of_log(path, own=task.source is not None)
-    _check_truth(order.truth, order, allow_code)
+    _check_truth(order.truth, order, permission)
 
 
 def check_policy(
-    order: PolicyOrder, calibration: CalibrationOrder, recording: RecordOrder | None = None, *, allow_code: bool = False
+    order: PolicyOrder,
+    calibration: CalibrationOrder,
+    recording: RecordOrder | None = None,
+    *,
+    permission: Permission = NO_PERMISSION,
 ) -> None:
     """Refuse a policy that cannot be learnt of a calibrated robot.
 
@@ -98,14 +104,14 @@ def check_policy(
         order: The policy.
         calibration: The calibration that it needs.
         recording: What that takes; None where it takes a log.
-        allow_code: Run Python files that specs of robots name.
+        permission: What specs of robots may ask for.
 
     Raises:
         Misfit: Names the key.
     """
     from madoc.pipeline.learning_stage import require_no_goals, require_velocities  # reads data formats too
 
-    task = _robot(calibration.task, calibration.search.physics, allow_code)
+    task = _robot(calibration.task, calibration.search.physics, permission)
     with under("method"):
         _learner(order.method, ())
     with under("set"):
@@ -127,7 +133,7 @@ def check_policy(
             require_velocities(learner, disturbance, "the data of this cell")
     with under("seed"):
         check_seed(order.seed)
-    _check_truth(order.truth, calibration, allow_code)
+    _check_truth(order.truth, calibration, permission)
 
 
 def check_recording(order: RecordOrder) -> None:
@@ -149,7 +155,9 @@ def check_recording(order: RecordOrder) -> None:
         check_seed(order.seed)
 
 
-def check_evaluation(order: EvaluationOrder, calibration: CalibrationOrder, *, allow_code: bool = False) -> None:
+def check_evaluation(
+    order: EvaluationOrder, calibration: CalibrationOrder, *, permission: Permission = NO_PERMISSION
+) -> None:
     """Refuse an evaluation of no episodes or draws, of a policy for a calibrated robot.
 
     Raises:
@@ -161,27 +169,27 @@ def check_evaluation(order: EvaluationOrder, calibration: CalibrationOrder, *, a
         check_counts(draw=order.draws)
     with under("seed"):
         check_seed(order.seed)
-    _check_truth(order.truth, calibration, allow_code)
+    _check_truth(order.truth, calibration, permission)
 
 
-def _check_truth(truth: Path | None, calibration: CalibrationOrder, allow_code: bool) -> None:
+def _check_truth(truth: Path | None, calibration: CalibrationOrder, permission: Permission) -> None:
     """Refuse a file of true parameters that cannot be read, or does not fit what is calibrated."""
     if truth is not None:
         search = calibration.search
         with under("truth"):
-            _truth(truth, calibration.task, search.physics, search.parameters, allow_code)
+            _truth(truth, calibration.task, search.physics, search.parameters, permission)
 
 
-def name_of(kind: Kind, order: Order, needs: str | None, *, allow_code: bool = False) -> str:
+def name_of(kind: Kind, order: Order, needs: str | None, *, permission: Permission = NO_PERMISSION) -> str:
     """The name of the cell of an order: a hash of what that asks, and of the content of the files that it names.
 
     Raises:
         MadocError: A file cannot be read.
-        NotAllowed: A spec names a Python file, and `allow_code` is not given.
+        NotAllowed: A spec asks for what is not allowed.
     """
     told = stored(order)
     if isinstance(order, CalibrationOrder):
-        told["task"] = content_of_robot(order.task, allow_code=allow_code)
+        told["task"] = content_of_robot(order.task, permission=permission)
         own = order.task not in TASKS
         logs = [needs] if needs else [content_of_log(path, own=own) for path in order.source.paths]
         told["source"] = {key: value for key, value in told["source"].items() if key != "paths"} | {"logs": logs}
@@ -198,9 +206,9 @@ def forget_contents() -> None:
 
 
 @cache
-def content_of_robot(task: str, *, allow_code: bool = False) -> str:
+def content_of_robot(task: str, *, permission: Permission = NO_PERMISSION) -> str:
     """What a robot is: the name of one of Madoc's, or the content of a spec file and of what it names."""
-    return task if task in TASKS else hashed(dict(robots.load(task, allow_code=allow_code).task.source or {}))
+    return task if task in TASKS else hashed(dict(robots.load(task, **vars(permission)).task.source or {}))
 
 
 @cache
@@ -253,20 +261,24 @@ def content_of_file(path: str) -> str:
 
 
 @cache
-def _robot(task: str, physics: str | None, allow_code: bool) -> Task:
-    return robots.resolve(task, physics, allow_code=allow_code)
+def _robot(task: str, physics: str | None, permission: Permission) -> Task:
+    return robots.resolve(task, physics, **vars(permission))
 
 
 @cache
-def _ranges(task: str, physics: str | None, parameters: tuple[str, ...] | None, level: str, allow_code: bool) -> None:
-    check_search(Search(parameters=parameters, level=level), _robot(task, physics, allow_code), Path(task).name)
+def _ranges(
+    task: str, physics: str | None, parameters: tuple[str, ...] | None, level: str, permission: Permission
+) -> None:
+    check_search(Search(parameters=parameters, level=level), _robot(task, physics, permission), Path(task).name)
 
 
 @cache
-def _truth(file: Path, task: str, physics: str | None, parameters: tuple[str, ...] | None, allow_code: bool) -> None:
+def _truth(
+    file: Path, task: str, physics: str | None, parameters: tuple[str, ...] | None, permission: Permission
+) -> None:
     from madoc.pipeline.data_stage import Machine, read_truth
 
-    robot = _robot(task, physics, allow_code)
+    robot = _robot(task, physics, permission)
     values = read_truth(file) or {}
     Machine(robot).check_truth(values, robot.with_parameters(list(parameters or robot.parameters.names)))
 

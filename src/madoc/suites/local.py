@@ -1,6 +1,5 @@
 """The worker processes of this machine: started, started again where one is killed, and ended with the suite."""
 
-import os
 import subprocess
 import sys
 import time
@@ -9,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from madoc.errors import MadocError
+from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.runs.interruption import interruptible
 from madoc.runs.progress import display
 from madoc.suites.standing import Standing
@@ -21,13 +21,14 @@ _FUTILE = 5
 """How many workers in a row may end with an error before any cell has ended: then something is wrong with all."""
 
 
-def usual_workers() -> int:
-    """One worker for each core that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def run_locally(
-    suite: Path, standing: Standing, *, plan: str, workers: int, quiet: bool = False, allow_code: bool = False
+    suite: Path,
+    standing: Standing,
+    *,
+    plan: str,
+    workers: int,
+    quiet: bool = False,
+    permission: Permission = NO_PERMISSION,
 ) -> bool:
     """Do what is left of a suite with workers of this machine.
 
@@ -37,7 +38,7 @@ def run_locally(
         plan: Name of the plan that has its cells.
         workers: Number of processes.
         quiet: Show no progress.
-        allow_code: Workers may run the Python files that specs of robots name.
+        permission: What specs of robots may ask for.
 
     Returns:
         Whether all was done; False where it was interrupted.
@@ -48,7 +49,7 @@ def run_locally(
     with (
         interruptible() as interruption,
         display(suite.name, unit="cells", quiet=quiet) as show,
-        _crew(suite, plan, min(workers, len(standing.runnable)), allow_code=allow_code) as crew,
+        _crew(suite, plan, min(workers, len(standing.runnable)), permission=permission) as crew,
     ):
         while standing.runnable:
             show(standing.moment())
@@ -66,8 +67,8 @@ def run_locally(
 class Crew:
     """The processes of some workers; each writes to a log of its own in the suite's folder."""
 
-    def __init__(self, suite: Path, plan: str, workers: int, *, allow_code: bool = False) -> None:
-        self._suite, self._plan, self._futile, self._allow_code = suite, plan, 0, allow_code
+    def __init__(self, suite: Path, plan: str, workers: int, *, permission: Permission = NO_PERMISSION) -> None:
+        self._suite, self._plan, self._futile, self._permission = suite, plan, 0, permission
         self._logs = suite / "logs"
         self._logs.mkdir(exist_ok=True)
         self._processes = {number: self._start(number) for number in range(workers)}
@@ -112,7 +113,7 @@ class Crew:
         # A session of its own keeps Ctrl-C for us alone: we pass it on once.
         words = [sys.executable, "-m", "madoc", "worker", str(self._suite), "--attached", "--quiet"]
         words += [f"--plan={self._plan}"]
-        words += ["--allow-code"] if self._allow_code else []
+        words += self._permission.words
         with (self._logs / f"worker-{number}.log").open("ab") as log:
             return subprocess.Popen(
                 words,
@@ -128,9 +129,9 @@ class Crew:
 
 
 @contextmanager
-def _crew(suite: Path, plan: str, workers: int, *, allow_code: bool) -> Iterator[Crew]:
+def _crew(suite: Path, plan: str, workers: int, *, permission: Permission) -> Iterator[Crew]:
     """Workers for a block; none is left after it."""
-    crew = Crew(suite, plan, workers, allow_code=allow_code)
+    crew = Crew(suite, plan, workers, permission=permission)
     try:
         yield crew
     finally:

@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from madoc.errors import MadocError
+from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.runs.interruption import interruptible
+from madoc.runs.machine import usable_cores
 from madoc.runs.progress import display
 from madoc.suites.cells import Cell
 from madoc.suites.claims import MOST_ATTEMPTS
-from madoc.suites.local import usual_workers
 from madoc.suites.standing import Standing
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ _LOOK = 0.5
 """Time in s between two looks at the disk."""
 _WAIT = 30.0
 """Time in s that a task waits for a cell whose earlier process has not quite ended."""
+_LONGEST_PATH = 18
+"""Longest path of a temporary directory in which Ray's sockets can be made."""
 _OBJECT_STORE = 80 * 2**20
 """Memory for Ray's object store in bytes: only names of cells pass through it."""
 
@@ -43,7 +46,7 @@ def run_on_ray(
     workers: int | None,
     address: str | None,
     quiet: bool = False,
-    allow_code: bool = False,
+    permission: Permission = NO_PERMISSION,
 ) -> bool:
     """Do what is left of a suite on a Ray cluster.
 
@@ -54,7 +57,7 @@ def run_on_ray(
         workers: How many cells are done at a time, where the cluster is started for this suite.
         address: An existing cluster; None starts one on this machine and ends it afterwards.
         quiet: Show no progress.
-        allow_code: Tasks may run the Python files that specs of robots name.
+        permission: What specs of robots may ask for.
 
     Returns:
         Whether all was done; False where it was interrupted.
@@ -67,7 +70,7 @@ def run_on_ray(
         _cluster(workers, address) as ray,
         display(f"{suite.name} on Ray", unit="cells", quiet=quiet) as show,
     ):
-        tasks = _Tasks(ray, suite.resolve(), plan, allow_code=allow_code)
+        tasks = _Tasks(ray, suite.resolve(), plan, permission=permission)
         while standing.runnable:
             show(standing.moment())
             if interruption.asked:
@@ -80,7 +83,7 @@ def run_on_ray(
     return True
 
 
-def do_cell(suite: str, name: str, plan: str, allow_code: bool = False) -> str:
+def do_cell(suite: str, name: str, plan: str, permission: Permission = NO_PERMISSION) -> str:
     """One task: do a cell of a suite, in a process of the cluster.
 
     Returns:
@@ -88,12 +91,12 @@ def do_cell(suite: str, name: str, plan: str, allow_code: bool = False) -> str:
     """
     from madoc.suites.process import prepare
 
-    prepare(Path(suite))
+    prepare()
     from madoc.suites.worker import work  # computes numbers, on the core that was taken
 
     until = time.monotonic() + _WAIT
     while time.monotonic() < until:
-        done = work(Path(suite), [name], plan=plan, allow_code=allow_code)
+        done = work(Path(suite), [name], plan=plan, permission=permission)
         if done is None:
             return "interrupted"
         if done:
@@ -107,8 +110,8 @@ def do_cell(suite: str, name: str, plan: str, allow_code: bool = False) -> str:
 class _Tasks:
     """The tasks of a suite that Ray has been given."""
 
-    def __init__(self, ray: "ModuleType", suite: Path, plan: str, *, allow_code: bool = False) -> None:
-        self._ray, self._suite, self._plan, self._allow_code = ray, str(suite), plan, allow_code
+    def __init__(self, ray: "ModuleType", suite: Path, plan: str, *, permission: Permission = NO_PERMISSION) -> None:
+        self._ray, self._suite, self._plan, self._permission = ray, str(suite), plan, permission
         self._do = ray.remote(num_cpus=1, max_retries=MOST_ATTEMPTS)(do_cell)
         self._given: dict[str, Any] = {}
 
@@ -116,7 +119,7 @@ class _Tasks:
         """Give Ray every cell that can start, and again one whose task ended without an end of the cell."""
         for cell in standing.runnable:
             if cell.name not in self._given and _can_start(cell, standing):
-                self._given[cell.name] = self._do.remote(self._suite, cell.name, self._plan, self._allow_code)
+                self._given[cell.name] = self._do.remote(self._suite, cell.name, self._plan, self._permission)
         if not self._given:
             time.sleep(_LOOK)
             return
@@ -150,10 +153,12 @@ def _cluster(workers: int | None, address: str | None) -> Iterator["ModuleType"]
     """Ray, connected to a cluster for a block."""
     if address is not None:
         _look_for(address)
-    temporary = Path(tempfile.mkdtemp(prefix="madoc-ray-"))
+    temporary = Path(tempfile.mkdtemp(prefix="madoc-ray-", dir=_short_folder()))  # of mode 0700
     # Read by Ray when it is imported and by all processes it starts. A cluster of one's own lets in only who knows its
-    # token, which stands in no file.
+    # token, which stands in no file, and listens to this machine alone: on Linux, Ray takes an address that others
+    # reach for a loopback address, unless it is told as on other systems that there are no others.
     own = {
+        "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
         "RAY_USAGE_STATS_ENABLED": "0",
         "RAY_AUTH_MODE": "token",
         "RAY_AUTH_TOKEN": secrets.token_hex(32),
@@ -167,11 +172,11 @@ def _cluster(workers: int | None, address: str | None) -> Iterator["ModuleType"]
         common: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR, "configure_logging": False}
         if address is None:
             common |= {
-                "num_cpus": workers or usual_workers(),
+                "num_cpus": workers or usable_cores(),
                 "include_dashboard": False,
-                "_node_ip_address": "127.0.0.1",  # nobody outside this machine is spoken to
+                "_node_ip_address": "127.0.0.1",
                 "object_store_memory": _OBJECT_STORE,
-                "_temp_dir": str(temporary),
+                "_temp_dir": str(temporary / "r"),  # which Ray opens to all users
             }
         try:
             ray.init(address=address, **common)
@@ -186,6 +191,11 @@ def _cluster(workers: int | None, address: str | None) -> Iterator["ModuleType"]
         for name, value in before.items():
             os.environ.pop(name, None) if value is None else os.environ.update({name: value})
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _short_folder() -> str | None:
+    """Where Ray's files may lie: a socket's path has at most 103 characters, of which Ray needs 67; None is usual."""
+    return "/tmp" if len(tempfile.gettempdir()) > _LONGEST_PATH and os.path.isdir("/tmp") else None
 
 
 def _look_for(address: str) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from madoc.errors import nearest_hint
-from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
+from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, EvaluationOrder, Permission, PolicyOrder, RecordOrder
 from madoc.robots.document import Document
 from madoc.suites import checks
 from madoc.suites.cells import RECORDED, Cell, Kind
@@ -31,14 +31,14 @@ class Plan:
     cells: tuple[Cell, ...]
 
 
-def plan_of(file: Path, *, allow_code: bool = False) -> Plan:
-    """Read a suite file, and plan all that it asks; `allow_code` runs Python files that specs of robots name.
+def plan_of(file: Path, *, permission: Permission = NO_PERMISSION) -> Plan:
+    """Read a suite file, and plan all that it asks; `permission` is what specs of robots may ask for.
 
     Raises:
         MadocError: It has a mistake, or asks for the same thing twice; the sentence names the line.
     """
     suite, document = read_suite(file)
-    planner = _Planner(document, file.resolve().parent, allow_code=allow_code)
+    planner = _Planner(document, file.resolve().parent, permission=permission)
     for combination in combinations(suite, document, planner.folder):
         planner.add(combination)
     return Plan(file.stem, file, tuple(planner.cells.values()))
@@ -47,8 +47,8 @@ def plan_of(file: Path, *, allow_code: bool = False) -> Plan:
 class _Planner:
     """The cells so far, and the line at which each was asked for."""
 
-    def __init__(self, document: Document, folder: Path, *, allow_code: bool) -> None:
-        self.document, self.folder, self.allow_code = document, folder, allow_code
+    def __init__(self, document: Document, folder: Path, *, permission: Permission) -> None:
+        self.document, self.folder, self.permission = document, folder, permission
         self.cells: dict[str, Cell] = {}
         self._lines: dict[str, int] = {}
 
@@ -94,7 +94,7 @@ class _Planner:
         if unknown := next((key for key in given if key not in known), None):
             raise Misfit(unknown, f"unknown key {unknown!r}; {nearest_hint(unknown, known)}")
         order = build(CalibrationOrder, self._located(given, recorded=needs is not None))
-        checks.check_calibration(order, recorded=needs is not None, allow_code=self.allow_code)
+        checks.check_calibration(order, recorded=needs is not None, permission=self.permission)
         return self._put("calibrate", order, needs, asked)
 
     def _policy(self, parts: Mapping[str, object], calibration: Cell, asked: Combination) -> Cell:
@@ -108,18 +108,18 @@ class _Planner:
         with self._inside("learn", asked):
             recording = self.cells[calibration.needs].read() if calibration.needs else None
             assert recording is None or isinstance(recording, RecordOrder)
-            checks.check_policy(order, calibrating, recording, allow_code=self.allow_code)
+            checks.check_policy(order, calibrating, recording, permission=self.permission)
         policy = self._put("learn", order, calibration.name, asked)
         if "evaluate" not in parts:
             return policy
         evaluation = self._part(EvaluationOrder, "evaluate", parts["evaluate"], asked)
         with self._inside("evaluate", asked):
-            checks.check_evaluation(evaluation, calibrating, allow_code=self.allow_code)
+            checks.check_evaluation(evaluation, calibrating, permission=self.permission)
         return self._put("evaluate", evaluation, policy.name, asked)
 
     def _put(self, kind: Kind, order: Order, needs: str | None, asked: Combination) -> Cell:
         """The cell of an order, the same for all combinations that ask for the same."""
-        name = checks.name_of(kind, order, needs, allow_code=self.allow_code)
+        name = checks.name_of(kind, order, needs, permission=self.permission)
         cell = Cell(name, kind, stored(order), needs, asked.entry, asked.robot, wanted=False)
         return self.cells.setdefault(name, cell)
 

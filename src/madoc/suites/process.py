@@ -2,21 +2,24 @@
 
 import os
 import platform
-import tempfile
-from pathlib import Path
 
 import filelock
+
+from madoc.runs.machine import own_folder
 
 _held: list[filelock.BaseFileLock] = []
 """The lock of this process's core, held until it ends."""
 
 
-def prepare(suite: Path) -> None:
+def prepare() -> None:
     """Take a core, and let workers of this machine share what they compile; to be called before JAX is imported.
 
-    Machines of a cluster may differ in their instructions, so each has a folder for compiled code of its own.
+    Compiled code is run as it is found, so it is kept where nobody else can write, and never in a suite's folder.
+    Machines of a cluster may differ in their instructions, so each has a folder of its own.
     """
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(suite.resolve() / "compiled" / platform.node()))
+    compiled = own_folder("compiled", platform.node())
+    if compiled is not None:
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(compiled))
     take_core()
 
 
@@ -24,15 +27,16 @@ def take_core() -> None:
     """Keep this process to a core that no other worker of this machine has, by a lock that ends with the process.
 
     A core decides how fast a cell is, not what it finds. None is taken where there is no choice: one core only, all
-    taken, or a system without affinity.
+    taken, a system without affinity, or no folder of the user's own for the locks.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     if _held or not hasattr(os, "sched_setaffinity"):
         return
     cores = sorted(os.sched_getaffinity(0))
-    folder = Path(tempfile.gettempdir()) / f"madoc-cores-{os.getuid()}"  # in a container it may have no name
-    folder.mkdir(mode=0o700, exist_ok=True)
-    for core in cores if len(cores) > 1 else ():
+    folder = own_folder("cores", platform.node())
+    if folder is None or len(cores) == 1:
+        return
+    for core in cores:
         lock = filelock.FileLock(folder / f"{core}.lock", timeout=0, thread_local=False)
         try:
             lock.acquire()

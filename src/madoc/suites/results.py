@@ -9,7 +9,7 @@ from typing import Any
 
 from madoc.calibration.holdout import Verdict
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
-from madoc.errors import MadocError
+from madoc.errors import MadocError, printable
 from madoc.report.records import EvaluationRecord, read_object, read_record
 from madoc.runs.files import read_json, replacing
 from madoc.runs.memory import read_peak
@@ -102,9 +102,16 @@ def write_csv(file: Path, table: Sequence[dict[str, Any]]) -> None:
     text = io.StringIO()
     writer = csv.DictWriter(text, list(COLUMNS), lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: row.get(name) for name in COLUMNS} for row in table)
+    writer.writerows({name: _cell(row.get(name)) for name in COLUMNS} for row in table)
     with replacing(file) as stream:
         stream.write(text.getvalue().encode())
+
+
+def _cell(value: object) -> object:
+    """A value as a cell; text that a spreadsheet would take for a formula begins with an apostrophe."""
+    if not isinstance(value, str):
+        return value
+    return f"'{printable(value)}" if value.startswith(("=", "+", "-", "@", "\t", "\r")) else printable(value)
 
 
 def write_parquet(file: Path, table: Sequence[dict[str, Any]]) -> None:

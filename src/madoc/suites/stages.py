@@ -9,7 +9,7 @@ from madoc import data
 from madoc.errors import MadocError, NotAllowed
 from madoc.pipeline import calibrate_in, evaluate_folder, learn_in, read_calibration, record_named
 from madoc.pipeline.folders import ENDED, holds_run
-from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
+from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, EvaluationOrder, Permission, PolicyOrder, RecordOrder
 from madoc.runs.checkpoint import OtherState
 from madoc.suites.cells import RECORDED, Cell, read_plans
 from madoc.suites.checks import forget_contents, name_of
@@ -17,14 +17,14 @@ from madoc.suites.claims import MOST_ATTEMPTS, Claim, Outcome
 from madoc.suites.options import Order
 
 
-def carry_out(claim: Claim, suite: Path, *, allow_code: bool = False) -> Outcome | None:
+def carry_out(claim: Claim, suite: Path, *, permission: Permission = NO_PERMISSION) -> Outcome | None:
     """Do what a cell asks, or go on with it where an earlier process was stopped.
 
     Returns:
         How it ended; None where it was interrupted, and the next process goes on.
 
     Raises:
-        NotAllowed: A spec names a Python file, and `allow_code` is not given.
+        NotAllowed: A spec asks for what is not allowed.
     """
     if claim.attempts > MOST_ATTEMPTS:
         tried = (
@@ -33,7 +33,7 @@ def carry_out(claim: Claim, suite: Path, *, allow_code: bool = False) -> Outcome
         return claim.end("failed", tried, 0.0)
     started = monotonic()
     try:
-        status, sentence = _done(claim, suite, allow_code=allow_code)
+        status, sentence = _done(claim, suite, permission=permission)
     except NotAllowed:
         claim.take_back()
         raise  # another worker may be allowed to
@@ -52,10 +52,10 @@ def carry_out(claim: Claim, suite: Path, *, allow_code: bool = False) -> Outcome
     return claim.end(known, sentence, monotonic() - started)  # type: ignore[arg-type]
 
 
-def _done(claim: Claim, suite: Path, *, allow_code: bool) -> tuple[str, str]:
+def _done(claim: Claim, suite: Path, *, permission: Permission) -> tuple[str, str]:
     """Carry the order out: the status, and that in words."""
     folder, order = claim.folder, claim.cell.read()
-    _require_unchanged(claim.cell, order, allow_code=allow_code)
+    _require_unchanged(claim.cell, order, permission=permission)
     resume = holds_run(folder)
     needed = suite / "cells" / (claim.cell.needs or "")
     match order:
@@ -65,17 +65,17 @@ def _done(claim: Claim, suite: Path, *, allow_code: bool) -> tuple[str, str]:
             return "finished", f"{len(dataset):,} transitions are recorded"
         case CalibrationOrder():
             asked = _with_recording(order, claim, suite)
-            result = calibrate_in(folder, asked, resume=resume, quiet=True, allow_code=allow_code)
+            result = calibrate_in(folder, asked, resume=resume, quiet=True, permission=permission)
             return result.status, result.sentence
         case PolicyOrder():
-            calibrated = read_calibration(needed, allow_code=allow_code)
+            calibrated = read_calibration(needed, permission=permission)
             learnt = learn_in(folder, calibrated, order, resume=resume, quiet=True)
             return learnt.status, learnt.sentence
         case EvaluationOrder():
             policy = next(cell for cell in read_plans(suite) if cell.name == claim.cell.needs)
             calibration = suite / "cells" / (policy.needs or "")
             evaluation = evaluate_folder(
-                needed, order, calibration=calibration, out=folder, quiet=True, allow_code=allow_code
+                needed, order, calibration=calibration, out=folder, quiet=True, permission=permission
             )
             return "finished", f"{evaluation.episodes} episodes are evaluated"
 
@@ -84,11 +84,11 @@ class _Changed(MadocError):
     """A file that a cell names is not what it was when the cell was planned and named."""
 
 
-def _require_unchanged(cell: Cell, order: Order, *, allow_code: bool) -> None:
+def _require_unchanged(cell: Cell, order: Order, *, permission: Permission) -> None:
     """Refuse a cell whose name no longer tells what its files hold, so that no result stands under a wrong name."""
     forget_contents()
     try:
-        name = name_of(cell.kind, order, cell.needs, allow_code=allow_code)
+        name = name_of(cell.kind, order, cell.needs, permission=permission)
     except NotAllowed:
         raise
     except MadocError as error:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from madoc.errors import NotAllowed
+from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.suites.cells import Cell, read_plans
 from madoc.suites.claims import Outcome, attempts_of, claimed, outcome_of
 from madoc.suites.stages import carry_out
@@ -17,7 +18,7 @@ _PAUSES = (0.05, 2.0)
 
 
 def work(
-    suite: Path, names: Sequence[str] | None = None, *, plan: str | None = None, allow_code: bool = False
+    suite: Path, names: Sequence[str] | None = None, *, plan: str | None = None, permission: Permission = NO_PERMISSION
 ) -> list[Outcome] | None:
     """Carry out cells of a suite's plans until none is left that this process could begin.
 
@@ -28,21 +29,23 @@ def work(
         suite: The folder of the suite.
         names: Only these cells. Default: all.
         plan: Only the cells of this plan. Default: of all.
-        allow_code: Run the Python files that specs of robots name.
+        permission: What specs of robots may ask for.
 
     Returns:
         How the cells ended that this process did; None where it was interrupted.
 
     Raises:
-        NotAllowed: A spec names a Python file, and `allow_code` is not given; the cell is left to others, and all
+        NotAllowed: A spec asks for what is not allowed; the cell is left to others, and all
             that could be done without it is done.
     """
     planned = {cell.name: cell for cell in read_plans(suite, plan)}
     cells = list(planned.values()) if names is None else [planned[name] for name in names]
-    return _work(suite, cells, planned, allow_code=allow_code)
+    return _work(suite, cells, planned, permission=permission)
 
 
-def _work(suite: Path, cells: Sequence[Cell], known: dict[str, Cell], *, allow_code: bool) -> list[Outcome] | None:
+def _work(
+    suite: Path, cells: Sequence[Cell], known: dict[str, Cell], *, permission: Permission
+) -> list[Outcome] | None:
     """The loop of `work`."""
     done: list[Outcome] = []
     not_allowed: NotAllowed | None = None
@@ -71,7 +74,7 @@ def _work(suite: Path, cells: Sequence[Cell], known: dict[str, Cell], *, allow_c
                     later.append(cell)
                     continue
                 try:
-                    outcome = carry_out(claim, suite, allow_code=allow_code)
+                    outcome = carry_out(claim, suite, permission=permission)
                 except NotAllowed as error:
                     not_allowed = not_allowed or error
                     in_vain.add(cell.name)

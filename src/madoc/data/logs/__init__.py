@@ -7,6 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from madoc.data.dataset import Dataset
@@ -14,9 +15,10 @@ from madoc.data.findings import Finding
 from madoc.data.logs import csv_reader, hdf5_reader, lerobot_reader, mcap_reader, minari_runs, parquet_reader
 from madoc.data.logs.assembly import assemble, wanted_columns
 from madoc.data.logs.jumps import split_episodes, without_copies
-from madoc.data.logs.tables import Run, tables_of
+from madoc.data.logs.tables import Run, Stored, asked_tables
 from madoc.data.minari_reader import recognises as is_minari
-from madoc.data.npz import read_arrays
+from madoc.data.npz import read_array, read_headers, require_npz
+from madoc.data.sizes import LARGEST_OF_ALL, check_size
 from madoc.data.validation import require_file, validate
 from madoc.errors import MadocError, listed
 from madoc.robots import Robot
@@ -27,8 +29,8 @@ class LogFormat:
     """A layout of logs.
 
     Attributes:
-        read: (path, wanted columns) -> runs, with other columns too. A file that is damaged or of another layout raises
-            a MadocError, as does a library that is not installed.
+        read: (path, wanted columns) -> runs, which may have other columns too. A file that is damaged, too large or of
+            another layout raises a MadocError, as does a library that is not installed.
         suffixes: Endings of its files; empty where it is a folder.
     """
 
@@ -37,7 +39,12 @@ class LogFormat:
 
 
 def _read_npz(path: Path, wanted: Collection[str]) -> list[Run]:
-    return [Run(path.name, tables_of(read_arrays(path)))]
+    require_npz(path)
+    arrays = {
+        name: Stored(header.shape, header.dtype, header.size, partial(read_array, path, name))
+        for name, header in read_headers(path).items()
+    }
+    return [Run(path.name, asked_tables(arrays, wanted, path.name))]
 
 
 LOG_FORMATS: dict[str, LogFormat] = {
@@ -83,7 +90,8 @@ def read(
     if not sources:
         raise MadocError("expected at least one file or folder of logs, got none")
     wanted = set(wanted_columns(robot).values())
-    contents = [_runs(source, wanted) for source in sources]
+    contents = [_runs(source, wanted | {robot.spec.log.time}) for source in sources]
+    check_size(sum(run.size for runs, _ in contents for run in runs), "all logs together", LARGEST_OF_ALL)
     runs, findings = without_copies(_distinct([run for of_source, _ in contents for run in of_source]), sorted(wanted))
     episodes = [split_episodes(run, wanted) for run in runs]
     runs = [run for parts, _ in episodes for run in parts]
@@ -131,12 +139,15 @@ def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
         return LOG_FORMATS["minari"].read(source, wanted), []
     runs: list[Run] = []
     ignored: list[str] = []
+    size = 0
     for file in files_of(source):
         name, suffix = file.relative_to(source).as_posix(), file.suffix.lower()
         if suffix in _BY_SUFFIX:
             require_file(file)
             read_runs = _BY_SUFFIX[suffix].read(file, wanted)
             runs += [replace(run, name=run.name.replace(file.name, name, 1)) for run in read_runs]
+            size += sum(run.size for run in read_runs)
+            check_size(size, f"the logs in {source}", LARGEST_OF_ALL)
         else:
             ignored.append(name)
     if not runs:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from madoc.data.logs.tables import Run, Table
+from madoc.data.sizes import LARGEST, check_size
 from madoc.errors import MadocError
 
 SEPARATORS = (",", ";", "\t")
@@ -17,6 +18,7 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
 
     A header may itself begin with `#`, as NumPy writes it. Cells stay text where not all of the file is numbers.
     """
+    check_size(path.stat().st_size, f"the text of {path.name}", LARGEST)
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = list(file)

@@ -2,13 +2,13 @@
 
 import re
 from collections.abc import Collection
+from functools import partial
 from pathlib import Path
 
 import h5py
-import numpy as np
 
-from madoc.data.logs.tables import WIDEST, Run, tables_of
-from madoc.errors import MadocError
+from madoc.data.hdf5 import opened, read_values, size_of
+from madoc.data.logs.tables import Run, Stored, asked_tables
 
 _NUMBERED = re.compile(r".*\d+")
 
@@ -18,16 +18,12 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
 
     A dataset in a group is called by its path in the run: `obs/position[0]`.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            return [
-                Run(f"{path.name}{group.name}" if numbered else path.name, tables_of(_arrays(group)))
-                for group, numbered in _runs(file)
-            ]
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
-        raise MadocError(
-            f"cannot read {path.name} as HDF5 ({error}); it is damaged or was cut short, copy or record it again"
-        ) from error
+    with opened(path, "it is damaged or was cut short, copy or record it again") as file:
+        return [
+            Run(name, asked_tables(_arrays(group), wanted, name))
+            for group, numbered in _runs(file)
+            for name in [f"{path.name}{group.name}" if numbered else path.name]
+        ]
 
 
 def _runs(file: h5py.File) -> list[tuple[h5py.Group, bool]]:
@@ -53,11 +49,10 @@ def _names(group: h5py.Group) -> list[str]:
     return names
 
 
-def _arrays(group: h5py.Group) -> dict[str, np.ndarray]:
-    """Datasets by name; pictures are empty arrays of their shape."""
-    arrays = {}
-    for name in _names(group):
-        dataset = group[name]
-        picture = dataset.ndim > 2 or (dataset.ndim == 2 and dataset.shape[1] > WIDEST)
-        arrays[name] = np.empty((0, *dataset.shape[1:])) if picture else np.asarray(dataset[()])
-    return arrays
+def _arrays(group: h5py.Group) -> dict[str, Stored]:
+    """Datasets by name; none is read."""
+    datasets = {name: group[name] for name in _names(group)}
+    return {
+        name: Stored(dataset.shape or (), dataset.dtype, size_of(dataset), partial(read_values, dataset))
+        for name, dataset in datasets.items()
+    }

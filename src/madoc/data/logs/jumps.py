@@ -8,13 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.data.findings import Finding
-from madoc.data.logs.tables import MISSING, Run, Table
+from madoc.data.logs.tables import ENDS, EPISODES, MISSING, Run, Table
 from madoc.data.logs.timing import Series
 
-EPISODES = ("episode", "episode_id", "episode_index", "trial")
-"""Names of columns, in lower case, whose value changes from one episode to the next."""
-ENDS = ("terminals", "timeouts", "terminated", "truncated", "done", "is_last")
-"""Names of columns, in lower case, that become 1 in the last row of an episode."""
 _WITHIN = 1.05
 """Span of an angle that wraps around, in turns; noise may bring it slightly above 1."""
 _SLOW = 0.25

@@ -1,12 +1,15 @@
 """LeRobot's local format (Cadene et al. 2024), versions 2 and 3: Parquet files and meta/info.json, without torch."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from madoc.data.logs.parquet_reader import read_columns
 from madoc.data.logs.tables import Run, tables_of
+from madoc.data.sizes import LARGEST_OF_ALL, check_size
+from madoc.data.validation import require_file
 from madoc.errors import MadocError
 from madoc.runs.files import read_json
 
@@ -30,8 +33,13 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
         what = "no features in meta/info.json" if files else "no Parquet file in its folder data"
         raise MadocError(f"{path.name} is no whole LeRobot dataset: {what}; download or record it again")
     episodes: dict[int, list[dict[str, np.ndarray]]] = {}
+    unread: list[str] = []
+    size = 0
     for file in files:
-        columns = read_columns(file)
+        require_file(file)
+        columns, unread = read_columns(file, {*wanted, CLOCK})
+        size += sum(values.nbytes for values in columns.values())
+        check_size(size, f"the columns of {path.name} that are asked for", LARGEST_OF_ALL)
         if "episode_index" not in columns:
             raise MadocError(f"no column episode_index in {path.name}/{file.relative_to(path)}; is it of this dataset?")
         index = columns["episode_index"]
@@ -39,10 +47,17 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
             chosen = np.flatnonzero(index == episode)
             part = {name: values[chosen] for name, values in columns.items() if len(values) == len(index)}
             episodes.setdefault(int(episode), []).append(part)
-    return [_run(path, episode, parts, features) for episode, parts in sorted(episodes.items())]
+    return [_run(path, episode, parts, features, unread) for episode, parts in sorted(episodes.items())]
 
 
-def _run(path: Path, episode: int, parts: list[dict[str, np.ndarray]], features: Mapping[str, object]) -> Run:
+def _run(
+    path: Path,
+    episode: int,
+    parts: list[dict[str, np.ndarray]],
+    features: Mapping[str, object],
+    unread: Sequence[str],
+) -> Run:
+    """The run of an episode, of the parts of it that files have."""
     shared = [name for name in parts[0] if all(name in part for part in parts)]
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in shared}
     named = {
@@ -51,7 +66,8 @@ def _run(path: Path, episode: int, parts: list[dict[str, np.ndarray]], features:
         if len(elements := _element_names(features.get(name))) == values.shape[-1] and values.ndim == 2
         for element, column in zip(elements, values.T, strict=True)
     }
-    return Run(f"{path.name}/episode_{episode}", tables_of(arrays | named, clock=CLOCK))
+    tables = tables_of(arrays | named, clock=CLOCK)
+    return Run(f"{path.name}/episode_{episode}", tuple(replace(table, unread=unread) for table in tables))
 
 
 def _element_names(feature: object) -> list[str]:

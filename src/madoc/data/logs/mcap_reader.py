@@ -1,20 +1,30 @@
 """MCAP: topics of JSON or ROS 2 messages, each with its own clock."""
 
 import json
+from array import array
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from madoc.data.logs.tables import Run, Table
+from madoc.data.logs.tables import WIDEST, Run, Table
+from madoc.data.sizes import LARGEST, check_size
 from madoc.errors import MadocError
 
 if TYPE_CHECKING:
-    from mcap.records import Channel, Message, Schema
+    from mcap.records import Channel, Chunk, Message, Schema
 
 CLOCK = "log_time"
+LARGEST_CHUNK = 200_000_000
+"""Largest size of a chunk, bytes when unpacked; recorders write chunks of a million or less."""
+MOST_NAMES = 10_000
+"""Number of columns of a topic that are known by name, beside those that are asked for."""
+_MOST_OF_LZ4 = 255
+"""Largest ratio by which LZ4 packs."""
+_OF_TIMES = 200
+"""Size of the three times of a message, bytes in memory."""
 EXTRA = 'pip install "madoc-calibration[logs]"'
 
 
@@ -24,13 +34,33 @@ class _Topic:
 
     Attributes:
         decode: The decoder of its messages.
-        rows: The numbers of each message by path.
+        columns: The wanted numbers by path, NaN where a message lacks one.
         times: Times in ns at which each message was logged, published and measured; None for one without a stamp.
+        names: Paths of the numbers of the first message.
     """
 
     decode: Callable[[bytes], object]
-    rows: list[dict[str, float]] = field(default_factory=list)
+    columns: dict[str, "array[float]"] = field(default_factory=dict)
     times: list[tuple[int, int, int | None]] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+
+    def add(self, name: str, message: "Message", wanted: Collection[str]) -> None:
+        """Take over the wanted numbers of a message; those of the first are named all."""
+        content, count = self.decode(message.data), len(self.times)
+        for path, number in _flat(name, content):
+            if not count and len(self.names) < MOST_NAMES:
+                self.names.append(path)
+            if path in wanted:
+                self.columns.setdefault(path, array("d", [np.nan]) * count).append(number)
+        for column in self.columns.values():
+            column.extend([np.nan] * (count + 1 - len(column)))
+            del column[count + 1 :]  # of a name that is there twice
+        self.times.append((message.log_time, message.publish_time, _stamp(content)))
+
+    @property
+    def size(self) -> int:
+        """Size of what was taken over, bytes in memory."""
+        return sum(8 * len(column) for column in self.columns.values()) + _OF_TIMES * len(self.times)
 
 
 def read(path: Path, wanted: Collection[str]) -> list[Run]:
@@ -52,17 +82,18 @@ def read(path: Path, wanted: Collection[str]) -> list[Run]:
                 continue
             topics[name] = _Topic(decode)
         topic = topics[name]
-        if topic.rows and not any(f"{column}.".startswith((f"{name}.", f"{name}[")) for column in wanted):
+        if topic.times and not any(f"{column}.".startswith((f"{name}.", f"{name}[")) for column in wanted):
             continue
         try:
-            content = topic.decode(message.data)
+            topic.add(name, message, wanted)
         except Exception as error:  # decoders raise anything from KeyError to struct.error on a damaged message
             raise MadocError(
-                f"cannot decode message {len(topic.rows)} of {name} in {path.name} ({error}); it is damaged, "
+                f"cannot decode message {len(topic.times)} of {name} in {path.name} ({error}); it is damaged, "
                 "record it again"
             ) from error
-        topic.rows.append(dict(_flat(name, content)))
-        topic.times.append((message.log_time, message.publish_time, _stamp(content)))
+        if len(topic.times) % 1000 == 0:
+            size = sum(topic.size for topic in topics.values())
+            check_size(size, f"the columns of {path.name} that are asked for", LARGEST)
     if not topics:
         what = ", ".join(f"{topic} ({encoding} encoding)" for topic, encoding in unknown.items()) or "no messages"
         raise MadocError(f"expected topics of JSON or ROS 2 messages in {path.name}, got {what}; convert it to CSV")
@@ -78,6 +109,8 @@ def _messages(path: Path) -> Iterator[tuple["Channel", "Schema | None", "Message
         raise MadocError(f"MCAP logs need the library mcap: {EXTRA} ({error})") from error
     try:
         with path.open("rb") as file:
+            _check_chunks(file)
+            file.seek(0)
             for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
                 yield channel, schema, message
     except Exception as error:  # the reader passes on what its decompressors and unpackers raise
@@ -85,6 +118,30 @@ def _messages(path: Path) -> Iterator[tuple["Channel", "Schema | None", "Message
             f"cannot read {path.name} as MCAP ({type(error).__name__}: {error}); it is damaged or was cut short, "
             "`mcap recover` may save it"
         ) from error
+
+
+def _check_chunks(file: BinaryIO) -> None:
+    """Refuse, by a ValueError, a chunk that unpacks to more than any recorder writes."""
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+
+    for record in StreamReader(file, emit_chunks=True, record_size_limit=LARGEST_CHUNK).records:
+        if isinstance(record, Chunk) and _unpacked_size(record) > LARGEST_CHUNK:
+            raise ValueError(f"a chunk unpacks to more than {LARGEST_CHUNK:,} bytes")
+
+
+def _unpacked_size(chunk: "Chunk") -> int:
+    """Size in bytes to which a chunk unpacks at most; no more than the bound is unpacked to know it."""
+    if chunk.compression == "zstd":
+        import zstandard
+
+        told = zstandard.get_frame_parameters(chunk.data).content_size
+        return chunk.uncompressed_size if told == zstandard.CONTENTSIZE_UNKNOWN else max(told, chunk.uncompressed_size)
+    if chunk.compression == "lz4" and len(chunk.data) > LARGEST_CHUNK // _MOST_OF_LZ4:
+        from lz4.frame import LZ4FrameDecompressor
+
+        return len(LZ4FrameDecompressor().decompress(chunk.data, max_length=LARGEST_CHUNK + 1))
+    return 0
 
 
 def _decoder(channel: "Channel", schema: "Schema | None") -> Callable[[bytes], object] | None:
@@ -103,8 +160,10 @@ def _decoder(channel: "Channel", schema: "Schema | None") -> Callable[[bytes], o
 def _flat(name: str, value: object, elements: list[str] | None = None) -> Iterator[tuple[str, float]]:
     """Numbers in a message by path; text and empty fields are left out."""
     if isinstance(value, bool | int | float):
-        yield name, float(value)
+        yield name, _float(value)
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        if len(value) > WIDEST:
+            return  # a picture
         labels = elements if elements is not None and len(elements) == len(value) else range(len(value))
         for label, part in zip(labels, value, strict=True):
             yield from _flat(f"{name}[{label}]", part)
@@ -116,6 +175,14 @@ def _flat(name: str, value: object, elements: list[str] | None = None) -> Iterat
             if key == "stamp" and {"sec", "nanosec"} <= _parts(part).keys():
                 continue  # in whole nanoseconds, by `_stamp`
             yield from _flat(f"{name}.{key}", part, inner)
+
+
+def _float(value: float) -> float:
+    """A number as float; a whole number beyond its range is infinite."""
+    try:
+        return float(value)
+    except OverflowError:
+        return float("inf") if value > 0 else float("-inf")
 
 
 def _parts(value: object) -> dict[str, object]:
@@ -139,10 +206,9 @@ def _stamp(content: object) -> int | None:
 
 
 def _table(name: str, topic: _Topic, origin: int, others: Mapping[str, str]) -> Table:
-    """Messages as columns, NaN where a message lacks a field, in the order of logging."""
-    names = list(dict.fromkeys(key for row in topic.rows for key in row))
-    columns = {key: np.array([row.get(key, np.nan) for row in topic.rows]) for key in names}
+    """Messages as columns, in the order of logging."""
+    columns = {key: np.array(values) for key, values in topic.columns.items()}
     for clock, times in zip((CLOCK, "publish_time", "header.stamp"), zip(*topic.times, strict=True), strict=True):
         if None not in times:
             columns[clock] = (np.array(times, dtype=np.int64) - origin) / 1e9
-    return Table(columns, CLOCK, others=others)
+    return Table(columns, CLOCK, others=others, unread=[key for key in topic.names if key not in columns])

@@ -1,25 +1,38 @@
 """Parquet; a column of lists becomes one column for each element."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from madoc.data.logs.tables import Run, tables_of
+from madoc.data.logs.tables import Run, is_asked, tables_of
+from madoc.data.sizes import LARGEST, check_size
 from madoc.errors import MadocError
+
+_ROWS = 20_000
+"""Rows that are read at a time."""
 
 if TYPE_CHECKING:
     import pyarrow
+    import pyarrow.parquet
 
 
 def read(path: Path, wanted: Collection[str]) -> list[Run]:
     """One run. The elements of a list column `position` are the columns `position[0]`, ..."""
-    return [Run(path.name, tables_of(read_columns(path)))]
+    columns, unread = read_columns(path, wanted)
+    return [Run(path.name, tuple(replace(table, unread=unread) for table in tables_of(columns)))]
 
 
-def read_columns(path: Path) -> dict[str, np.ndarray]:
-    """Every column by name; columns that are not numbers, flags, times or text are empty."""
+def read_columns(path: Path, wanted: Collection[str]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The wanted columns by name, and the names of those that were not read.
+
+    Columns that are not numbers, flags, times or text are empty.
+
+    Raises:
+        MadocError: The file is damaged, or the wanted columns are larger than `LARGEST`.
+    """
     try:
         import pyarrow
         import pyarrow.parquet
@@ -27,18 +40,55 @@ def read_columns(path: Path) -> dict[str, np.ndarray]:
         raise MadocError(f'Parquet logs need pyarrow: pip install "madoc-calibration[logs]" ({error})') from error
     try:
         with path.open("rb") as file:
-            opened = pyarrow.parquet.ParquetFile(file)
-            readable = {field.name: _is_readable(field.type) for field in opened.schema_arrow}
-            table = opened.read(columns=[name for name, used in readable.items() if used])
-        return {
-            name: _column(table.column(name), path) if used else np.zeros(0, dtype="V1")
-            for name, used in readable.items()
+            schema = pyarrow.parquet.read_schema(file)
+            kinds = {field.name: field.type for field in schema}
+            asked = [name for name in kinds if is_asked(name, wanted)]
+            used = [name for name in asked if _is_readable(kinds[name])]
+            texts = [name for name in used if _is_text(kinds[name])]
+            opened = pyarrow.parquet.ParquetFile(file, read_dictionary=texts)  # which holds each text once
+            what = f"the columns of {path.name} that are asked for"
+            check_size(opened.metadata.num_rows * sum(_width(kinds[name]) for name in used), what, LARGEST)
+            table = _read_in_parts(opened, used, what)
+        check_size(sum(_size_of_text(table.column(name)) for name in texts), what, LARGEST)
+        columns = {
+            name: _column(table.column(name), path) if name in used else np.zeros(0, dtype="V1") for name in asked
         }
-    except (pyarrow.ArrowException, OSError) as error:
+    except MadocError:
+        raise
+    except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise MadocError(
             f"cannot read {path.name} as Parquet ({' '.join(str(error).split())}); it is damaged or was cut short, "
             "copy or record it again"
         ) from error
+    return columns, [name for name in kinds if name not in columns and _is_readable(kinds[name])]
+
+
+def _width(kind: "pyarrow.DataType") -> int:
+    """Size in memory of a row of a column, bytes; of a list of any length, that of one element."""
+    from pyarrow import types
+
+    return 8 * (kind.list_size if types.is_fixed_size_list(kind) else 1)
+
+
+def _read_in_parts(file: "pyarrow.parquet.ParquetFile", names: Sequence[str], what: str) -> "pyarrow.Table":
+    """Columns of a file, whose size is looked at after each part, as it does not say how long lists are."""
+    import pyarrow
+
+    parts, size = [], 0
+    for part in file.iter_batches(_ROWS, columns=names):
+        parts.append(part)
+        size += part.nbytes
+        check_size(size, what, LARGEST)
+    schema = pyarrow.schema([file.schema_arrow.field(name) for name in names])
+    return pyarrow.Table.from_batches(parts, schema if not parts else None)
+
+
+def _size_of_text(column: "pyarrow.ChunkedArray") -> int:
+    """Size in memory of text in bytes, which was read as places in a dictionary."""
+    from pyarrow import compute
+
+    longest = [compute.max(compute.binary_length(part.dictionary)).as_py() or 0 for part in column.chunks]
+    return sum(len(part) * length for part, length in zip(column.chunks, longest, strict=True))
 
 
 def _is_readable(kind: "pyarrow.DataType") -> bool:
@@ -47,7 +97,13 @@ def _is_readable(kind: "pyarrow.DataType") -> bool:
     if types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind):
         return types.is_integer(kind.value_type) or types.is_floating(kind.value_type)
     numbers = (types.is_integer, types.is_floating, types.is_boolean, types.is_decimal, types.is_timestamp)
-    return any(test(kind) for test in (*numbers, types.is_string, types.is_large_string))
+    return _is_text(kind) or any(test(kind) for test in numbers)
+
+
+def _is_text(kind: "pyarrow.DataType") -> bool:
+    from pyarrow import types
+
+    return bool(types.is_string(kind) or types.is_large_string(kind))
 
 
 def _column(column: "pyarrow.ChunkedArray", path: Path) -> np.ndarray:
@@ -57,6 +113,8 @@ def _column(column: "pyarrow.ChunkedArray", path: Path) -> np.ndarray:
 
     if types.is_decimal(column.type):
         column = column.cast(pyarrow.float64())
+    if types.is_dictionary(column.type):
+        column = column.cast(pyarrow.string())
     if not types.is_nested(column.type):
         return np.asarray(column.to_numpy())
     lengths = compute.unique(compute.list_value_length(column.drop_null())).to_pylist() or [0]

@@ -1,15 +1,21 @@
 """The result of every reader of logs: runs, each with tables of named columns."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from madoc.data.sizes import LARGEST, check_size
 from madoc.errors import MadocError
 
 WIDEST = 1000
 """Number of values per row; an array with more is taken for a picture and not read."""
+
+EPISODES = ("episode", "episode_id", "episode_index", "trial")
+"""Names of columns, in lower case, whose value changes from one episode to the next."""
+ENDS = ("terminals", "timeouts", "terminated", "truncated", "done", "is_last")
+"""Names of columns, in lower case, that become 1 in the last row of an episode."""
 
 MISSING = frozenset(("", "nan", "na", "n/a", "none", "null", "-"))
 """Words, in lower case, in the place of a number that is not there."""
@@ -24,12 +30,14 @@ class Table:
         clock: The column with the format's own time, in s; None where the format has none.
         lines: The line of each row in a text file; None for other formats.
         others: The kind of each array that is not one number per row, by name.
+        unread: Names of columns that nobody has asked for, which were not read.
     """
 
     columns: Mapping[str, np.ndarray]
     clock: str | None = None
     lines: Int[np.ndarray, " rows"] | None = None
     others: Mapping[str, str] = field(default_factory=dict)
+    unread: Sequence[str] = ()
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
@@ -54,9 +62,62 @@ class Run:
     timed: bool = True
 
     @property
+    def size(self) -> int:
+        """Size of all columns in memory, bytes."""
+        return sum(column.nbytes for table in self.tables for column in table.columns.values())
+
+    @property
     def names(self) -> list[str]:
         """Names of all columns that can be read."""
-        return list(dict.fromkeys(name for table in self.tables for name in table.columns))
+        return list(dict.fromkeys(name for table in self.tables for name in (*table.columns, *table.unread)))
+
+
+@dataclass(frozen=True)
+class Stored:
+    """An array of a file that has not been read.
+
+    Attributes:
+        shape: Its shape.
+        dtype: Kind of its values.
+        size: Its size in memory, bytes; for values of any length at least.
+        read: Reads it.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    size: int
+    read: Callable[[], np.ndarray]
+
+
+def is_asked(name: str, wanted: Collection[str]) -> bool:
+    """Whether an array has to be read: it or an element of it is wanted, or it may tell where episodes begin or end."""
+    return name.lower() in (*EPISODES, *ENDS) or any(one == name or one.startswith(f"{name}[") for one in wanted)
+
+
+def asked_tables(arrays: Mapping[str, Stored], wanted: Collection[str], file: str) -> tuple[Table, ...]:
+    """Tables of the arrays of a file that are wanted, the only ones that are read.
+
+    Raises:
+        MadocError: They are larger than `LARGEST`.
+    """
+    asked = {name: array for name, array in arrays.items() if is_asked(name, wanted)}
+    others = {name: _unreadable(array.shape, array.dtype) for name, array in arrays.items()}
+    readable = {name: array for name, array in asked.items() if not others[name]}
+    check_size(sum(array.size for array in readable.values()), f"the columns of {file} that are asked for", LARGEST)
+    unread = [
+        element
+        for name, array in arrays.items()
+        if name not in asked and not others[name]
+        for element in _element_names(name, array.shape)
+    ]
+    kinds = {name: what for name, what in others.items() if what}
+    tables = tables_of({name: array.read() for name, array in readable.items()})
+    return tuple(replace(table, others={**kinds, **table.others}, unread=unread) for table in tables)
+
+
+def _element_names(name: str, shape: tuple[int, ...]) -> list[str]:
+    """Names of the columns that an array becomes."""
+    return [name] if len(shape) == 1 or shape[1] == 1 else [f"{name}[{index}]" for index in range(shape[1])]
 
 
 def tables_of(arrays: Mapping[str, np.ndarray], *, clock: str | None = None) -> tuple[Table, ...]:
@@ -67,26 +128,25 @@ def tables_of(arrays: Mapping[str, np.ndarray], *, clock: str | None = None) -> 
     grouped: dict[int, dict[str, np.ndarray]] = {}
     others: dict[str, str] = {}
     for name, array in arrays.items():
-        what = _unreadable(array)
+        what = _unreadable(array.shape, array.dtype)
         if what:
             others[name] = what
         elif array.ndim == 1 or array.shape[1] == 1:
             grouped.setdefault(len(array), {})[name] = array.reshape(-1)
         else:
-            grouped.setdefault(len(array), {}).update({f"{name}[{at}]": column for at, column in enumerate(array.T)})
-    tables = (
-        Table(columns, clock if clock in columns else None, others=others) for columns in grouped.values() if columns
-    )
+            columns = zip(_element_names(name, array.shape), array.T, strict=True)
+            grouped.setdefault(len(array), {}).update(columns)
+    tables = (Table(values, clock if clock in values else None, others=others) for values in grouped.values() if values)
     return tuple(tables) or (Table({}, others=others),)
 
 
-def _unreadable(array: np.ndarray) -> str:
+def _unreadable(shape: tuple[int, ...], dtype: np.dtype) -> str:
     """The kind of an array that is not numbers, flags, times or text by row; empty for others."""
-    if array.ndim == 0:
+    if not shape:
         return "a single value"
-    if array.ndim > 2 or (array.ndim == 2 and array.shape[1] > WIDEST):
-        return f"an array of shape {array.shape}"
-    return "" if array.dtype.kind in "fiubMmUSO" else f"of type {array.dtype}"
+    if len(shape) > 2 or (len(shape) == 2 and shape[1] > WIDEST):
+        return f"an array of shape {shape}"
+    return "" if dtype.kind in "fiubMmUSO" else f"of type {dtype}"
 
 
 def as_numbers(table: Table, name: str, run: str) -> Float[np.ndarray, " rows"]:

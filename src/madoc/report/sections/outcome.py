@@ -1,5 +1,7 @@
 """What the run led to and what it took: policies, cost, and what was asked."""
 
+from collections.abc import Mapping
+
 from madoc.report.reading import MetricLog, Run
 from madoc.report.words import count, duration, memory
 
@@ -58,4 +60,7 @@ def asked(run: Run) -> dict[str, object] | str:
     """What the run was asked, and with which versions."""
     robot = run.spec.robot
     texts = [(f"The robot: {robot.get('file', 'its spec file')}", robot.get("spec", ""))] if robot else []
+    kept = robot.get("model") if robot else None
+    if isinstance(kept, Mapping) and isinstance(kept.get("contents"), Mapping):
+        texts.append(("Files of the model that this folder keeps", "\n".join(map(str, kept["contents"]))))
     return {"texts": [*texts, ("The run's spec", run.spec_text)], "versions": run.spec.versions}
