@@ -117,7 +117,7 @@ def test_rejected_data_ends_auto_with_a_code_of_its_own(log, tmp_path, capsys):
 
 def test_where_least_squares_refuses_auto_runs_madoc_and_says_why(log, tmp_path, capsys):
     whole = data.load(str(log), make("spring"), format=None, max_transitions=None, key=jax.random.key(0))
-    lost = disturb(whole, Disturbance(shuffled="next_observations"), make("spring"), jax.random.key(0))
+    lost = disturb(whole, Disturbance(hidden_velocities=True, shuffled="rows"), make("spring"), jax.random.key(0))
     data.save(lost, tmp_path / "lost.npz")
     ask = words("calibrate", tmp_path / "lost.npz", "--method", "auto", "--budget", 2000, "--out", tmp_path / "run")
     answer, code = asked_for_json(capsys, [*ask, "--set", *TINY])
