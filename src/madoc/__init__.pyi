@@ -15,6 +15,7 @@ from .calibration import Droid as Droid
 from .calibration import Dropo as Dropo
 from .calibration import LeastSquares as LeastSquares
 from .calibration import Madoc as Madoc
+from .calibration import Npe as Npe
 from .calibration import Oted as Oted
 from .calibration import Uncalibrated as Uncalibrated
 from .calibration import calibrate as calibrate

@@ -37,10 +37,10 @@ def test_json_and_a_forecast(arm, capsys):
     assert [finding["level"] for finding in told["findings"]] == ["note"]
     assert set(told["parameters"]) == {"body_mass.upper", "body_mass.fore", "dof_damping.shoulder", "dof_damping.elbow"}
     assert told["explanation"]["horizons"] == [1, 5, 20]
-    quick, madoc = told["forecast"]
+    quick, npe = told["forecast"]
     assert quick["method"] == "least-squares"
-    assert 0.0 < quick["seconds"] < madoc["seconds"]
-    assert madoc["control_steps"] == 300_000
+    assert 0.0 < quick["seconds"] < npe["seconds"]
+    assert npe["control_steps"] == 300_000
 
 
 def test_what_is_fatal_is_told_and_ends_with_code_2(arm, tmp_path, capsys):

@@ -9,7 +9,7 @@ import pytest
 from command_line import asked_for_json
 
 from madoc import data
-from madoc.calibration import CalibrationResult, LeastSquares, Madoc
+from madoc.calibration import CalibrationResult, LeastSquares, Npe
 from madoc.commands.main import main
 from madoc.data import Disturbance, disturb
 from madoc.errors import MadocError
@@ -18,12 +18,11 @@ from madoc.tasks import TASKS, make
 from robots import SPRING_TRUTH, recorded, spring
 
 TINY = [
-    *("madoc.hidden=[16]", "madoc.cloning_epochs=3", "madoc.cloning_updates=5"),
-    *("madoc.regression_hidden=[16]", "madoc.regression_epochs=3", "madoc.regression_updates=5"),
-    *("madoc.epoch_steps=100", "madoc.updates=5", "madoc.draws=5", "madoc.batch=32", "madoc.replay_capacity=500"),
-    *("madoc.agents.hidden=[16]", "madoc.agents.critic_hidden=[16]", "madoc.agents.batch=32"),
+    *("npe.draws=8", "npe.horizon=5", "npe.epochs=1", "npe.hidden=[8]", "npe.fitting_epochs=2", "npe.updates=5"),
+    *("npe.batch=16", "npe.replay_capacity=300", "npe.flow_layers=1", "npe.flow_width=4", "npe.flow_updates=8"),
+    *("npe.samples=50", "npe.cloning_epochs=2", "npe.cloning_updates=3", "npe.cloning_batch=16"),
 ]
-"""Every stage of madoc in epochs of milliseconds."""
+"""Every stage of npe in epochs of milliseconds."""
 
 
 def listed(physics):
@@ -97,11 +96,11 @@ def test_auto_leaves_nothing_where_every_method_refuses(log, tmp_path, capsys, m
     def refuse(method, problem, key):
         raise MadocError("it cannot")
 
-    for method in (LeastSquares, Madoc):
+    for method in (LeastSquares, Npe):
         monkeypatch.setattr(method, "init", refuse)
     ask = words("calibrate", log, "--method", "auto", "--out", tmp_path / "run")
     assert main([str(word) for word in ask]) == 2
-    assert "least-squares refuses: it cannot; madoc refuses: it cannot" in capsys.readouterr().err
+    assert "least-squares refuses: it cannot; npe refuses: it cannot" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 
@@ -115,16 +114,16 @@ def test_rejected_data_ends_auto_with_a_code_of_its_own(log, tmp_path, capsys):
     assert (answer["verdict"]["word"], code) == ("DATA_REJECTED", 13)
 
 
-def test_where_least_squares_refuses_auto_runs_madoc_and_says_why(log, tmp_path, capsys):
+def test_where_least_squares_refuses_auto_runs_npe_and_says_why(log, tmp_path, capsys):
     whole = data.load(str(log), make("spring"), format=None, max_transitions=None, key=jax.random.key(0))
     lost = disturb(whole, Disturbance(hidden_velocities=True, shuffled="rows"), make("spring"), jax.random.key(0))
     data.save(lost, tmp_path / "lost.npz")
     ask = words("calibrate", tmp_path / "lost.npz", "--method", "auto", "--budget", 2000, "--out", tmp_path / "run")
     answer, code = asked_for_json(capsys, [*ask, "--set", *TINY])
-    assert (answer["method"], answer["verdict"]["word"], code) == ("madoc", "DATA_REJECTED", 13)
-    assert answer["chosen"].startswith("auto took madoc: least-squares refuses: this method compares each row's next")
+    assert (answer["method"], answer["verdict"]["word"], code) == ("npe", "DATA_REJECTED", 13)
+    assert answer["chosen"].startswith("auto took npe: least-squares refuses: this method compares each row's next")
     spec = read(tmp_path / "run" / "spec.json")
-    assert (spec["method"], spec["hyperparameters"]["updates"]) == ("madoc", 5)
+    assert (spec["method"], spec["hyperparameters"]["updates"]) == ("npe", 5)
 
 
 @pytest.mark.parametrize(
@@ -132,8 +131,8 @@ def test_where_least_squares_refuses_auto_runs_madoc_and_says_why(log, tmp_path,
     [
         (["--holdout", "1.5"], "expected a share of the rows to hold out between 0 and 1, got 1.5"),
         (["--budget", "0"], "a budget of at least 1"),
-        (["--set", "updates=2"], "there are: least-squares.NAME, madoc.NAME"),
-        (["--set", "madoc.update=2"], "did you mean updates"),
+        (["--set", "updates=2"], "there are: least-squares.NAME, npe.NAME"),
+        (["--set", "npe.update=2"], "did you mean updates"),
     ],
 )
 def test_what_auto_cannot_do_is_refused_and_leaves_nothing(log, tmp_path, capsys, more, told):

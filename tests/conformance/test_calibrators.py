@@ -17,6 +17,7 @@ from madoc.calibration import (
     Droid,
     Dropo,
     LeastSquares,
+    Npe,
     Oted,
     Uncalibrated,
     calibrate,
@@ -70,6 +71,24 @@ METHODS = {
         batch=16,
     ),
 }
+METHODS["npe"] = Npe(
+    draws=8,
+    rows=2,
+    horizon=5,
+    epochs=1,
+    hidden=(8,),
+    fitting_epochs=2,
+    updates=3,
+    batch=16,
+    replay_capacity=300,
+    flow_layers=1,
+    flow_width=4,
+    flow_updates=8,
+    samples=50,
+    cloning_epochs=2,
+    cloning_updates=3,
+    cloning_batch=16,
+)
 IDLE = {"nominal": Uncalibrated(), "uniform": Uncalibrated(randomised=True)}
 
 
@@ -100,6 +119,7 @@ QUICK = (
     "dropo",
     "droid",
     "cma-es-distribution",
+    "npe",
 )  # the others differ by a value; `make test-slow` holds them to every rule too
 
 
@@ -290,7 +310,7 @@ def blind(dataset):
     return CalibrationProblem(dataset, simulation.make(replace(two_link_arm(), state_from_observation=None), threads=1))
 
 
-@pytest.mark.parametrize("name", quick_and_slow(name for name in METHODS if not name.startswith("madoc")))
+@pytest.mark.parametrize("name", quick_and_slow(name for name in METHODS if not name.startswith(("madoc", "npe"))))
 def test_logged_starts_without_states_are_refused(name, blind):
     method = METHODS[name]
     if isinstance(method, Oted | CmaEs):
@@ -305,7 +325,7 @@ def test_madoc_needs_no_states(blind):
 
 UNSEEING = (
     *("madoc", "least-squares", "least-squares, estimating", "oted, free running"),
-    *("cma-es, acting", "nominal", "uniform"),
+    *("cma-es, acting", "npe", "nominal", "uniform"),
 )
 
 

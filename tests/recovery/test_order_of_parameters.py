@@ -18,7 +18,7 @@ UNMOVED = ("nominal", "uniform")
 QUICK = {"least-squares": 1e-6, "droid": 0.1, "cma-es": 0.1, "dropo": 5.0}
 """% of its range that each parameter may be off."""
 MADOC = ("madoc", "madoc-s", "madoc-vdn", "madoc-isac", "madoc-grouped")
-SLOW = {"e-dropo": 5.0, "oted": 20.0, "cma-es-distribution": 10.0} | dict.fromkeys(MADOC, 15.0)
+SLOW = {"e-dropo": 5.0, "oted": 20.0, "cma-es-distribution": 10.0, "npe": 10.0} | dict.fromkeys(MADOC, 15.0)
 SAME_CODE = ("madoc-paper",)
 """Other constants of a method that is here, too slow for a spring."""
 KEY = jax.random.key(0)
@@ -34,6 +34,8 @@ def estimated(name, task, truth, *, budget):
     method = CALIBRATORS[name].make()
     if name == "oted":
         method = QUICK_OTED
+    elif name == "npe":
+        method = replace(method, hidden=(64, 64), draws=20, epochs=4, cloning_epochs=10)
     elif name in MADOC:
         method = replace(quick(name), patience=0)
     logged = recorded(task, {parameter: truth[parameter] for parameter in task.parameters.names}, 5000, KEY)
@@ -58,6 +60,8 @@ def test_the_other_way_round(name):
         task, truth, budget = two_link_arm().with_parameters(DAMPINGS), ARM_TRUTH, 60_000
     elif name == "oted":
         budget = 300_000
+    elif name == "npe":
+        budget = 60_000
     elif name in MADOC:
         budget = 36_000
     found = estimated(name, backward(task), truth, budget=budget)

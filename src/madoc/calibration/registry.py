@@ -6,6 +6,7 @@ from madoc.calibration.base import Calibrator
 from madoc.calibration.baselines.cma_es.calibrator import CmaEs
 from madoc.calibration.baselines.droid import Droid
 from madoc.calibration.baselines.dropo.calibrator import ENTROPY_WEIGHT, Dropo
+from madoc.calibration.baselines.npe.calibrator import Npe
 from madoc.calibration.baselines.oted.calibrator import Oted
 from madoc.calibration.baselines.uncalibrated import Uncalibrated
 from madoc.calibration.least_squares.calibrator import LeastSquares
@@ -19,6 +20,7 @@ _SHOWN: dict[type, tuple[str, ...]] = {
     Dropo: ("cost", "std", "deviation"),
     Droid: ("cost", "deviation"),
     CmaEs: ("cost", "deviation", "cloning_loss"),
+    Npe: ("width", "misfit", "cloning_loss"),
     Uncalibrated: (),
 }
 """Metrics beside the progress bar, by class of the method."""
@@ -88,6 +90,7 @@ _ENTRIES = (
         2026,
         {"objective": "distribution"},
     ),
+    _entry("npe", Npe, "posterior by a flow, on free rollouts", "Deistler et al.; Ramos et al., BayesSim", 2022),
     _entry("nominal", Uncalibrated, "mid-range, uncalibrated: a yardstick", "no paper: a yardstick", 2024),
     _entry(
         "uniform",

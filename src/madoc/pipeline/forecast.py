@@ -1,18 +1,18 @@
 """Forecasts of how long methods would take on this machine, from a second of each."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 
-from madoc.calibration import CalibrationProblem, LeastSquares, Madoc
+from madoc.calibration import CalibrationProblem, LeastSquares, Npe
 from madoc.errors import MadocError
 from madoc.report.words import duration
 
 REFINING_EPOCHS = 6
 """Number of steps on all windows that least squares usually takes."""
 PREPARATION = 1.15
-"""Ratio of the time of a whole run of Madoc to that of its calibrating epochs: measured with the defaults on Hopper."""
+"""Ratio of the time of a whole run of NPE to that of its rounds: cloning, and the posterior of each round."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Forecast:
 
 
 def forecast(problem: CalibrationProblem, *, budget: int) -> tuple[Forecast, ...]:
-    """Forecasts of least squares until it settles, and of Madoc for a budget of control steps, with their defaults.
+    """Forecasts of least squares until it settles, and of NPE for a budget of control steps, with their defaults.
 
-    Least squares takes one step of its search, Madoc two epochs, the first of which compiles.
+    Least squares takes one step of its search, NPE two epochs of each kind, the first of which compiles.
     """
-    return (_least_squares(problem), _madoc(problem, budget))
+    return (_least_squares(problem), _npe(problem, budget))
 
 
 def _least_squares(problem: CalibrationProblem) -> Forecast:
@@ -56,18 +56,17 @@ def _least_squares(problem: CalibrationProblem) -> Forecast:
     return Forecast(name, seconds / epoch.control_steps * total, total)
 
 
-def _madoc(problem: CalibrationProblem, budget: int) -> Forecast:
-    method = Madoc(cloning_epochs=0, regression_epochs=1, regression_updates=1)
-    name = "madoc"
+def _npe(problem: CalibrationProblem, budget: int) -> Forecast:
+    usual, name = Npe(), "npe"
+    method = replace(usual, cloning_epochs=0, epochs=2, fitting_epochs=2)
     try:
-        state = method.init(problem, jax.random.key(0))
-        state, _ = method.step(problem, state)
-        times = []
-        for _ in range(2):
+        state, times = method.init(problem, jax.random.key(0)), []
+        for _ in range(method.epochs + method.fitting_epochs):
             started = time.monotonic()
             state, epoch = method.step(problem, state)
-            times.append(time.monotonic() - started)
+            times.append((time.monotonic() - started, epoch.control_steps))
     except MadocError as error:
         return Forecast(name, None, 0, str(error))
-    epochs = budget / epoch.control_steps
-    return Forecast(name, times[0] + PREPARATION * epochs * times[1], budget)
+    (_, _), (simulating, steps), (_, _), (fitting, _) = times  # the first of each compiles
+    a_round = usual.epochs * simulating + usual.fitting_epochs * fitting
+    return Forecast(name, PREPARATION * a_round * budget / (usual.epochs * steps), budget)

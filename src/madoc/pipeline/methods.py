@@ -17,7 +17,7 @@ from madoc.types import MethodEntry
 
 Made = TypeVar("Made")
 
-CANDIDATES = ("least-squares", "madoc")
+CANDIDATES = ("least-squares", "npe")
 """The methods of which `auto` takes the first that does not refuse the data."""
 
 
@@ -51,7 +51,7 @@ def make_method(
 
 
 def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator]:
-    """The methods that `auto` may take, by name; a hyperparameter is changed under a name such as `madoc.updates`.
+    """The methods that `auto` may take, by name; a hyperparameter is changed under a name such as `npe.updates`.
 
     Raises:
         MadocError: A hyperparameter is named otherwise, or as `make_method`.

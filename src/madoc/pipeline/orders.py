@@ -87,7 +87,7 @@ class Search:
     """Calibrate only these; the others stay at the model's own values. Default: all of the robot's."""
     method: str | None = None
     """A calibrator, as `madoc methods` lists it. Default: auto, which takes least-squares wherever the robot's states
-    can be had or fitted, else madoc."""
+    can be had or fitted, else npe."""
     set: Settings = ()
     """Hyperparameters of the method as name=value; of a method that auto may take as least-squares.name=value."""
     budget: int | str | None = None

@@ -1,0 +1,1 @@
+"""Neural posterior estimation on free rollouts: a flow conditioned on what rows tell of the parameters."""
