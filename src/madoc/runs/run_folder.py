@@ -1,7 +1,9 @@
 """The folder of one run: its settings, its logs and its checkpoint, written by one process at a time."""
 
+import contextlib
 import os
 import platform
+import time
 import warnings
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -128,21 +130,28 @@ class RunLog:
     """
 
     def __init__(self, path: Path, offset: int, spent: int, unit: Unit) -> None:
-        from tensorboardX import SummaryWriter  # slow to import, and only runs with a folder need it
+        # Slow to import, and only runs with a folder need it. Its SummaryWriter would leave the writing to a thread,
+        # and wait for that for ever where the disk is full.
+        from tensorboardX.proto.event_pb2 import SessionLog
+        from tensorboardX.record_writer import RecordWriter
+        from tensorboardX.summary import scalar
 
         self._count = count_name(unit)
         self._lines = _cut(path / "metrics.jsonl", offset).open("ab")
         events = path / "tensorboard"
         events.mkdir(exist_ok=True)
-        suffix = f".{len(list(events.iterdir()))}"  # two writers in one second would overwrite the same file
-        self._events = SummaryWriter(str(events), purge_step=spent + 1, filename_suffix=suffix)
+        number = len(list(events.iterdir()))  # two writers in one second would overwrite the same file
+        name = f"events.out.tfevents.{time.time():.0f}.{platform.node()}.{number}"
+        self._events, self._scalar = RecordWriter(str(events / name)), scalar
+        self._add_event(0, file_version="brain.Event:2")
+        self._add_event(spent + 1, session_log=SessionLog(status=SessionLog.START))  # hides what was further
 
     def __enter__(self) -> "RunLog":
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._lines.close()
-        self._events.close()
+        with contextlib.closing(self._events), self._lines:  # both, even if one has no room for what it holds
+            pass
 
     def append(self, metrics: Metrics, *, stage: str, spent: int, seconds: float) -> None:
         """Add one epoch. A NaN or infinite metric is logged as null."""
@@ -152,7 +161,13 @@ class RunLog:
         self._lines.flush()
         for name, value in finite.items():
             if value is not None:
-                self._events.add_scalar(f"{stage}/{name}", value, spent)
+                self._add_event(spent, summary=self._scalar(f"{stage}/{name}", value))
+
+    def _add_event(self, step: int, **content: object) -> None:
+        """Add an event to those of TensorBoard."""
+        from tensorboardX.proto.event_pb2 import Event
+
+        self._events.write(Event(wall_time=time.time(), step=step, **content).SerializeToString())
 
     def sync(self) -> int:
         """Force all lines to the disk, and return the length of `metrics.jsonl` in bytes for the checkpoint."""

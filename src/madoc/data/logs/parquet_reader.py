@@ -48,7 +48,8 @@ def read_columns(path: Path, wanted: Collection[str]) -> tuple[dict[str, np.ndar
             opened = pyarrow.parquet.ParquetFile(file, read_dictionary=texts)  # which holds each text once
             what = f"the columns of {path.name} that are asked for"
             check_size(opened.metadata.num_rows * sum(_width(kinds[name]) for name in used), what, LARGEST)
-            table = _read_in_parts(opened, used, what)
+            lists = any(_is_of_any_length(kinds[name]) for name in used)
+            table = _read_in_parts(opened, used, what) if lists else opened.read(columns=used)
         check_size(sum(_size_of_text(table.column(name)) for name in texts), what, LARGEST)
         columns = {
             name: _column(table.column(name), path) if name in used else np.zeros(0, dtype="V1") for name in asked
@@ -68,6 +69,12 @@ def _width(kind: "pyarrow.DataType") -> int:
     from pyarrow import types
 
     return 8 * (kind.list_size if types.is_fixed_size_list(kind) else 1)
+
+
+def _is_of_any_length(kind: "pyarrow.DataType") -> bool:
+    from pyarrow import types
+
+    return bool(types.is_list(kind) or types.is_large_list(kind))
 
 
 def _read_in_parts(file: "pyarrow.parquet.ParquetFile", names: Sequence[str], what: str) -> "pyarrow.Table":
