@@ -79,7 +79,7 @@ def test_noise_that_nobody_declared_is_estimated_once_the_regression_has_learnt(
     exact = recorded(WHOLE, ARM_TRUTH, 1000, KEY)
     shown = replace(disturb(exact, Disturbance(noise=share), WHOLE, KEY), disturbance=Disturbance())
     clean, problem = (CalibrationProblem(log, simulation.make(WHOLE, threads=1)) for log in (exact, shown))
-    method = Madoc(cloning_epochs=0, regression_hidden=(64, 64), regression_epochs=10)
+    method = Madoc(cloning_epochs=0, regression_hidden=(64, 64), regression_epochs=6, batch=128)
     state = method.init(problem, KEY)
     for _ in range(method.regression_epochs):
         assert not state.noise.any()

@@ -87,7 +87,7 @@ MALFORMED = {
     "an unknown key": (spec("control_step:", "control_stp:"), "unknown key 'control_stp'; nearest: control_step"),
     "a key twice": (spec("madoc: 1", "madoc: 1\nname: a"), "'name' is given twice"),
     "a control step of no whole steps": (spec("0.02", "0.025"), "a whole multiple of the timestep 0.01 s"),
-    "a negative control step": (spec("0.02", "-0.02"), "expected greater than 0 in control_step"),
+    "a negative control step": (spec("0.02", "-0.02"), "expected greater than or equal to 0.000001 in control_step"),
     "a joint the model lacks": (spec("position(elbow)", "position(elbo)"), "no joint 'elbo'; nearest: elbow"),
     "an expression cut short": (spec("position(elbow)", "position(elbow"), "does not parse"),
     "an expression that would run code": (spec("position(elbow)", "__import__('os')"), "arm.yaml, line 7: "),

@@ -47,7 +47,7 @@ def test_units_of_signals_come_from_the_spec_of_a_robot_of_ones_own(bare):
         ("spec.json", b'{"seed": "one"}', "spec.json is damaged .seed: Input should be a valid integer"),
         ("metrics.jsonl", b"{\n{}\n", "metrics.jsonl, line 1, is not JSON"),
         ("evidence.npz", b"PK\x03\x04 no", "evidence.npz as npz .*is damaged.*restore it or delete it"),
-        ("embeddings.npz", b"", "embeddings.npz as npz .*is damaged.*restore it or delete it"),
+        ("embeddings.npz", b"", "embeddings.npz is empty; copy or download it again"),
     ],
 )
 def test_a_damaged_file_is_named(bare, file, content, message):

@@ -5,7 +5,7 @@ import json
 import jax
 import numpy as np
 import pytest
-from planted import ROBOTS, log_of
+from planted_logs import ROBOTS, log_of
 
 import madoc
 from madoc import robots, simulation

@@ -3,7 +3,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from planted import ROBOTS, bench, log_of
+from planted_logs import ROBOTS, bench, log_of
 
 from madoc.data import Disturbance, disturb, hide_velocities
 from madoc.verdict.evidence import evidence, save_evidence

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from planted import ROBOTS, log_of
+from planted_logs import ROBOTS, log_of
 
 from madoc import simulation
 from madoc.data import Disturbance, disturb, hide_velocities

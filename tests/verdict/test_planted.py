@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from planted import FEWER, ROBOTS, at_rest, bench, log_of, shuffled, verdict
+from planted_logs import FEWER, ROBOTS, at_rest, bench, log_of, shuffled, verdict
 
 from calibrating import madoc
 from madoc.calibration import CmaEs, Droid, LeastSquares

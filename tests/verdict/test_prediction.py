@@ -3,7 +3,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from planted import ROBOTS, log_of
+from planted_logs import ROBOTS, log_of
 
 from madoc import simulation
 from madoc.data import Disturbance, disturb

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from madoc.learning import replay
 from madoc.learning.networks import Network, Observations, Scalar, adam, minimise
 
-Grouping = Literal["physics", "learned", "one", "each"]
+Grouping = Literal["each", "learned", "one"]
 VOTING = 0.05
 """Share in [0, 1] of the epochs of grouping, the last ones, in which the VAE's groups are voted on; the authors'."""
 VOTES = 10
