@@ -90,7 +90,7 @@ _ENTRIES = (
         2026,
         {"objective": "distribution"},
     ),
-    _entry("npe", Npe, "posterior by a flow, on free rollouts", "Deistler et al.; Ramos et al., BayesSim", 2022),
+    _entry("npe", Npe, "posterior by a flow, on free rollouts", "Deistler et al., TSNPE", 2022),
     _entry("nominal", Uncalibrated, "mid-range, uncalibrated: a yardstick", "no paper: a yardstick", 2024),
     _entry(
         "uniform",
