@@ -124,7 +124,7 @@ def test_where_least_squares_refuses_auto_runs_npe_and_says_why(log, tmp_path, c
     # So few epochs calibrate nothing, and the verdict does not say that they do.
     assert (answer["method"], code) == ("npe", EXIT_CODES[answer["verdict"]["word"]])
     assert answer["verdict"]["word"] != "CALIBRATED"
-    assert answer["chosen"].startswith("auto took npe: least-squares refuses: this method compares each row's next")
+    assert answer["chosen"].startswith("auto took npe: least-squares refuses: expected at least as many readings")
     spec = read(tmp_path / "run" / "spec.json")
     assert (spec["method"], spec["hyperparameters"]["updates"]) == ("npe", 5)
 

@@ -20,8 +20,8 @@ from robots import SPRING_TRUTH, recorded
 
 TESTS = Path(__file__).parents[1]
 SMALL = [
-    *("updates=5", "epoch_steps=100", "horizon=5", "hidden=[16]", "agents.hidden=[16]", "patience=0"),
-    *("cloning_epochs=5", "regression_hidden=[16]", "regression_epochs=5", "regression_updates=20"),
+    *("draws=8", "horizon=5", "epochs=2", "hidden=[8]", "fitting_epochs=2", "updates=5", "batch=16", "samples=50"),
+    *("replay_capacity=300", "flow_layers=1", "flow_width=4", "flow_updates=8", "cloning_epochs=5"),
 ]
 VERDICTS = tuple(EXIT_CODES.values())
 
@@ -89,15 +89,15 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path, kills):
 
 @pytest.mark.slow
 def test_the_command_line_too(tmp_path):
-    """With `auto`, which takes Madoc of a robot that shows its speed alone, and a verdict in the end."""
+    """With `auto`, which takes npe of a robot that shows its speed alone, and a verdict in the end."""
     spec = SPRING_SPEC.replace("  - {name: place, reads: position(slide)}\n", "") + "max_episode_steps: 100\n"
     robot, data = write_robot(tmp_path, spec), tmp_path / "log.npz"
     save(recorded(load(robot).task, SPRING_TRUTH, 1000, jax.random.key(0)), data)
-    words = ["-m", "madoc", "calibrate", robot, "--data", data, "--budget", 12_000, "--quiet"]
-    words += ["--set", *(f"madoc.{setting}" for setting in SMALL)]
+    words = ["-m", "madoc", "calibrate", robot, "--data", data, "--budget", 6_000, "--quiet"]
+    words += ["--set", *(f"npe.{setting}" for setting in SMALL)]
     code = ended(start([*words, "--out", tmp_path / "whole"]), VERDICTS)
     process = start([*words, "--out", tmp_path / "run"])
     kill_after(process, folder=tmp_path / "run", more=20, seconds=0.1)
     assert ended(start([*words, "--out", tmp_path / "run", "--resume"]), VERDICTS) == code
     assert told(tmp_path / "run") == told(tmp_path / "whole")
-    assert told(tmp_path / "run")[0]["chosen"].startswith("auto took madoc")
+    assert told(tmp_path / "run")[0]["chosen"].startswith("auto took npe")
