@@ -12,7 +12,7 @@ from scipy import stats
 
 from madoc.calibration.madoc import grouping
 from madoc.calibration.madoc.actors import draw_parameters
-from madoc.calibration.madoc.calibrator import MadocState
+from madoc.calibration.madoc.state import MadocState
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.calibration_stage import methods_for
 from madoc.pipeline.keys import seed_key

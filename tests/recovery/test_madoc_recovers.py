@@ -76,3 +76,14 @@ def test_a_truth_outside_the_range_is_found_at_its_end_and_told():
     result = calibrate(method, problem, key=jax.random.key(0), budget=60_000)
     assert result.mean == pytest.approx(5.0, abs=0.1)
     assert any("at the end of its range: jnt_stiffness.slide" in warning for warning in result.warnings)
+
+
+def test_rows_at_the_mean_are_compared_with_mid_range_where_discriminators_see_raw_states_too():
+    raw = quick("madoc", features="raw", patience=0, cloning_epochs=1, updates=2)
+    method = replace(raw, agents=replace(raw.agents, reward_size=0.0))
+    problem = problem_of(spring(), SPRING_TRUTH)
+    state = method.init(problem, jax.random.key(0))
+    for _ in range(4):
+        state, _ = method.step(problem, state)
+    assert state.watch.gain != 0.0
+    assert state.watch.gain_squared > 0.0

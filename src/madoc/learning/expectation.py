@@ -17,6 +17,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
+from madoc.identification.losses import NORMAL_MAD
+from madoc.identification.noise import clipped
 from madoc.learning.networks import Network, Observations, Scalar, falling_adam, minimise
 
 LEAST_SPREAD = 1e-3
@@ -29,10 +31,6 @@ MOST_ROWS = 20_000
 """Largest number of logged rows from which spreads and noise are measured; more would hardly change them."""
 STEEPEST = 3.0
 """Bound of the derivatives of s' by s; those of contacts are larger, and would count too much."""
-NORMAL_MAD = 1.4826
-"""Ratio of the standard deviation of a normal distribution to its median absolute deviation."""
-OUTLIER = 5.0
-"""Robust standard deviations to which residuals are clipped before their products are averaged."""
 TOLD = 0.25
 """Least ratio of noise to what the regression leaves of a channel: smaller noise is not told from its errors."""
 
@@ -147,9 +145,7 @@ def noise_of_log(
     channels = following.shape[1]
     if not len(here):
         return np.zeros(channels)
-    residual = np.asarray(following - expected(expectation.network, window), np.float64)
-    limit = OUTLIER * NORMAL_MAD * np.median(np.abs(residual), axis=0)
-    residual = np.clip(residual, -limit, limit)
+    residual = clipped(np.asarray(following - expected(expectation.network, window), np.float64))
     size = np.maximum((residual**2).mean(0), LEAST_SPREAD**2)
     slopes = np.asarray(_slopes(expectation.network, window[here], channels), np.float64) * by_reading
     slopes = np.clip(slopes + np.eye(channels), -STEEPEST, STEEPEST)

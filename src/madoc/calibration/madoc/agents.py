@@ -166,13 +166,12 @@ class AgentSettings:
             of_logged, of_simulated, of_blur, of_dropout, of_actors = jax.random.split(key, 5)
             rows = jax.random.randint(of_logged, (self.batch,), 0, len(logged[0]))
             drawn = replay.sample(simulated, of_simulated, self.batch)
-            scale = jnp.exp(agents.log_blur) if self.reward_size else jnp.zeros(())
-            unit = jnp.sqrt(1.0 + scale**2)  # of s' with its blur, so that networks see numbers of order one
+            scale, unit = self._blur(agents)
             target, source = (part / unit for part in blur((logged[1][rows], drawn["following"]), scale, of_blur))
             agents, metrics = self._update_discriminators(
                 agents, (logged[0][rows], target), (drawn["pair"], source), of_dropout
             )
-            reward = log_dynamics_ratio(agents.judges, drawn["pair"], drawn["following"] / unit)
+            reward = self.reward(agents, drawn["pair"], drawn["following"])
             common = overlap(agents.judges, drawn["pair"])
             share = common / common.mean() if self.weigh_overlap else jnp.ones_like(reward)
             agents, reward_metrics = self._steer_blur(agents, reward, share)
@@ -193,6 +192,15 @@ class AgentSettings:
         )
         judges = moving_average(agents.judges, discriminators, self.judge_rate)
         return replace(agents, discriminators=discriminators, judges=judges, discriminator_optimiser=optimiser), metrics
+
+    def reward(self, agents: Agents, pair: Float[Array, "rows pair"], following: Observations) -> PerRow:
+        """The reward of rows by the judges, at s' without blur."""
+        return log_dynamics_ratio(agents.judges, pair, following / self._blur(agents)[1])
+
+    def _blur(self, agents: Agents) -> tuple[Scalar, Scalar]:
+        """The blur, and the unit of s' with it, in which networks see numbers of order one."""
+        scale = jnp.exp(agents.log_blur) if self.reward_size else jnp.zeros(())
+        return scale, jnp.sqrt(1.0 + scale**2)
 
     def _steer_blur(self, agents: Agents, reward: PerRow, share: PerRow) -> tuple[Agents, dict[str, Array]]:
         """Widen the blur where the mean |reward| is above `reward_size`, and narrow it where it is below.

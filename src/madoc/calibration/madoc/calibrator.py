@@ -5,29 +5,30 @@ freely from the task's resets; it is never set to a logged state and never diffe
 in any order.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.madoc import grouping, watch
 from madoc.calibration.madoc.actors import draw_parameters, squashed
-from madoc.calibration.madoc.agents import Agents, AgentSettings
+from madoc.calibration.madoc.agents import AgentSettings
 from madoc.calibration.madoc.collection import Collection, geometry
 from madoc.calibration.madoc.grouping import Grouping, GroupingVAE, Votes
+from madoc.calibration.madoc.state import MadocState
 from madoc.calibration.madoc.value_decomposition import Mixing
-from madoc.calibration.madoc.watch import Watch
 from madoc.calibration.sensing import log_noise, noise_deviation, rows_compared
 from madoc.errors import MadocError
 from madoc.learning import replay
-from madoc.learning.cloning import Clone, Pairs, cloning_epoch, fresh_clone
+from madoc.learning.cloning import Pairs, cloning_epoch, fresh_clone
 from madoc.learning.expectation import Expectation, fresh_expectation, learn_expectation
 from madoc.learning.networks import scalars
-from madoc.simulation.rollout import Walkers, out_of_step
+from madoc.simulation.rollout import out_of_step
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 Features = Literal["residual", "raw"]
@@ -36,42 +37,6 @@ Features = Literal["residual", "raw"]
 
 PROBES = 2
 """Systems of an epoch whose rows are not learnt from but compared with each other: the actors' mean, and mid-range."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class MadocState:
-    """Everything Madoc carries from epoch to epoch.
-
-    Attributes:
-        clone: The running policy.
-        expectation: The regression of s' on (s, a); None where discriminators see s' as it is.
-        noise: Standard deviation of the noise that simulated observations are given.
-        grouping: The VAE and its votes; None where no groups are found.
-        labels: Group of each parameter.
-        stability: Mean adjusted Rand index of the groups with those proposed in other epochs; 0 before there are any.
-        agents: Discriminators, critics and actors.
-        rows: Buffer of simulated rows.
-        walkers: Simulated rows that go on in the next epoch.
-        watch: Running averages, and the best estimate so far.
-        key: The random key.
-        grouped: Number of epochs of grouping so far.
-        failures: Number of simulated rows that exploded.
-    """
-
-    clone: Clone
-    expectation: Expectation | None
-    noise: Float[np.ndarray, " observation"]
-    grouping: Votes | None
-    labels: Int[np.ndarray, " d"]
-    stability: float
-    agents: Agents
-    rows: replay.Replay
-    walkers: Walkers
-    watch: Watch
-    key: PRNGKeyArray
-    grouped: int
-    failures: int
 
 
 @dataclass(frozen=True)
@@ -263,6 +228,13 @@ class Madoc:
             stages.append((state.grouped, self.grouping_epochs))
         return sum(min(stage) for stage in stages) / max(1, sum(epochs for _, epochs in stages))
 
+    def _likeness(self, state: MadocState) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """How much rows look like logged ones: by what the regression leaves of s', or else by the judges' reward."""
+        expectation = state.expectation
+        if expectation is None:
+            return lambda *rows: np.asarray(self.agents.reward(state.agents, *map(jnp.asarray, rows)))
+        return lambda window, following: -np.arcsinh(np.abs(expectation.left(window, following))).mean(-1)
+
     def _clone(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         clone, key, epoch = cloning_epoch(
             state.clone,
@@ -337,14 +309,14 @@ class Madoc:
             state.clone.policy, np.concatenate([draws, probes]), state.walkers, (of_action, of_restart)
         )
         rollout, probed = (everything.of_systems(part) for part in (slice(len(draws)), slice(len(draws), None)))
-        identity, logged, watched = np.zeros(len(draws), np.int64), collection.logged, state.watch
+        identity, logged = np.zeros(len(draws), np.int64), collection.logged
+        at_mean, at_middle = collection.mean_of(probed, self._likeness(state))
+        watched = watch.compare(state.watch, float(np.nan_to_num(at_mean - at_middle)))
         if expectation is None:
             rows = collection.remember(state.rows, rollout, draws, identity)
         else:
             rows = collection.remember(state.rows, rollout, draws, identity, expectation.left)
             logged = logged[0], expectation.logged
-            at_mean, at_middle = collection.sizes(probed, expectation.left)
-            watched = watch.compare(watched, float(np.nan_to_num(at_middle - at_mean)))
         agents, device_metrics = self.agents.update(
             state.agents,
             _some(rows, collection),

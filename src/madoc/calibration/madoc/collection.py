@@ -54,17 +54,17 @@ class Collection:
         recalled = numbers_recalled(self.problem, self.scaling.length)
         return begin(reset_states(self.problem.simulator), key, systems=systems, rows=rows, recalled=recalled)
 
-    def sizes(
-        self, rollout: Rollout, described: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    def mean_of(
+        self, rollout: Rollout, measure: Callable[[np.ndarray, np.ndarray], np.ndarray]
     ) -> Float[np.ndarray, " systems"]:
-        """How large described features of s' are under each system: the mean of asinh |feature| over whole windows.
+        """The mean under each system of a measure of rows, given features of (s, a) and of s', over whole windows.
 
         NaN for a system without any.
         """
         window, following, whole = self._windows(rollout)
-        size = np.arcsinh(np.abs(described(window, following))).mean(-1)
         count = whole.sum((0, 2))
-        return np.where(whole, size, 0.0).sum((0, 2)) / np.where(count, count, np.nan)
+        flat = measure(*(part.reshape(-1, part.shape[-1]) for part in (window, following)))
+        return np.where(whole, flat.reshape(whole.shape), 0.0).sum((0, 2)) / np.where(count, count, np.nan)
 
     def _windows(self, rollout: Rollout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Features of the windows of a rollout and of s' after each, and which windows are whole."""
