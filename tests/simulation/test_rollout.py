@@ -8,7 +8,7 @@ import pytest
 import madoc.tasks
 from madoc.parameters import Parameter
 from madoc.simulation.cpu import CpuSimulator
-from madoc.simulation.rollout import act, begin, chosen_states, replay_actions, reset_states, roll
+from madoc.simulation.rollout import act, begin, chosen_states, reset_states, roll
 
 KEY = jax.random.key(0)
 OTHER = jax.random.key(1)
@@ -230,41 +230,3 @@ def test_starts(hopper):
     logged = np.arange(12.0).reshape(6, 2)
     drawn = chosen_states(logged)(KEY, 200)
     assert {tuple(row) for row in drawn} == {tuple(row) for row in logged}
-
-
-def test_replayed_actions_start_at_logged_rows(spring_task):
-    task = spring_task(Parameter("jnt_stiffness", "slide", 1.0, 9.0))
-    simulator = CpuSimulator(task, threads=1)
-    states = np.random.default_rng(0).normal(size=(20, 2))
-    actions = np.random.default_rng(1).uniform(-1, 1, (20, 1))
-    system = simulator.bind(np.array([[1.0], [9.0]]))
-    rollout = replay_actions(system, task, states, actions, rows=7, key=KEY)
-    seen = rollout.transitions
-    assert seen.observation.shape == (1, 2, 7, 2)
-    assert rollout.valid.all()
-    logged = {(*state, *action) for state, action in zip(states, actions, strict=True)}
-    replayed = np.concatenate([seen.observation, seen.action], axis=-1).reshape(-1, 3)
-    assert {tuple(row) for row in replayed} <= logged
-    np.testing.assert_array_equal(seen.next_observation[0], system.step(seen.observation[0], seen.action[0]))
-    np.testing.assert_array_equal(seen.reward, seen.next_observation[..., 0] - seen.observation[..., 0])
-    assert not seen.truncated.any()
-    again = replay_actions(system, task, states, actions, rows=7, key=KEY)
-    for once, twice in zip(jax.tree.leaves(seen), jax.tree.leaves(again.transitions), strict=True):
-        np.testing.assert_array_equal(once, twice)
-
-
-def test_replayed_rows_that_fail_are_invalid_and_those_that_fall_terminate(spring_task):
-    task = spring_task()
-    simulator = CpuSimulator(task, threads=1)
-    states = np.array([[1e12, 0.0], [3.5, 0.0], [0.0, 0.0]])
-    rollout = replay_actions(
-        simulator.bind(task.parameters.middle[None]), task, states, np.zeros((3, 1)), rows=40, key=KEY
-    )
-    seen = rollout.transitions
-    exploded, fallen = (seen.observation[0, 0, :, 0] == position for position in (1e12, 3.5))
-    assert exploded.any()
-    assert fallen.any()
-    np.testing.assert_array_equal(rollout.valid[0, 0], ~exploded)
-    np.testing.assert_array_equal(seen.terminated[0, 0], fallen)
-    assert rollout.failures == exploded.sum()
-    assert np.isfinite(seen.next_observation).all()

@@ -44,12 +44,6 @@ def write_peak(folder: Path, peak: int | None) -> None:
 
 
 def read_peak(folder: Path) -> int | None:
-    """The peak of a run, bytes: that in its folder, or the largest of the methods that were tried there.
-
-    None where it is not known, or that of one of the methods is not.
-    """
-    own = folder / PEAK
-    files = [own] if own.exists() else [file.parent / PEAK for file in sorted(folder.glob("*/result.json"))]
-    if not files or not all(file.exists() for file in files):
-        return None
-    return max(int(read_json(file)["peak_memory"]) for file in files)
+    """The peak of a run, bytes; None where it is not known."""
+    file = folder / PEAK
+    return int(read_json(file)["peak_memory"]) if file.exists() else None

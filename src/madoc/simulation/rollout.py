@@ -151,24 +151,3 @@ def act(
 @partial(jax.jit, static_argnums=(0, 2))
 def _reset_noise(noise: Callable, key: PRNGKeyArray, count: int) -> Array:
     return noise(key, count)
-
-
-def replay_actions(
-    system: System,
-    task: Task,
-    states: Float[np.ndarray, "logged state"],
-    actions: Float[np.ndarray, "logged action"],
-    *,
-    rows: int,
-    key: PRNGKeyArray,
-) -> Rollout:
-    """One control step from logged states under their logged actions; `rows` of them are drawn for each system."""
-    chosen = np.asarray(jax.random.randint(key, (system.count, rows), 0, len(states)))
-    state, action = system.unbiased(states[chosen]), actions[chosen]
-    next_state = system.step(state, action)
-    valid = np.isfinite(next_state).all(-1)
-    safe = np.where(valid[..., None], next_state, state)
-    terminated = task.terminated(safe) & valid
-    reward, ended = task.reward(state, action, safe), np.zeros_like(terminated)
-    seen = Transitions(system.observe(state), action, reward, system.observe(safe), terminated, ended)
-    return Rollout(jax.tree.map(lambda column: column[None], seen), valid[None])

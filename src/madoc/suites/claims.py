@@ -137,5 +137,5 @@ def _futile(folder: Path) -> int:
 
 
 def _progress(folder: Path) -> int:
-    """How far a run is: the size of its log in bytes, those of the methods that `auto` tries included."""
+    """How far a run is: the size of its logs in bytes, those of all stages of a whole run."""
     return sum(log.stat().st_size for log in folder.glob("**/metrics.jsonl"))
