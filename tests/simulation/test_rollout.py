@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import madoc.tasks
-from madoc.parameters import Parameter
 from madoc.simulation.cpu import CpuSimulator
 from madoc.simulation.rollout import act, begin, chosen_states, reset_states, roll
 
