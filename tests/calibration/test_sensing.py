@@ -10,6 +10,7 @@ from madoc.calibration.least_squares.calibrator import horizon_of
 from madoc.calibration.madoc.collection import geometry
 from madoc.calibration.sensing import noise_deviation, rows_compared, with_sensor_noise
 from madoc.data import Disturbance, disturb, observed_task, stride
+from madoc.data.disturbing import row_change
 from madoc.errors import MadocError
 from madoc.simulation.rollout import Rollout
 from madoc.types import Transitions
@@ -30,7 +31,7 @@ def problem_of(log, **disturbance):
 
 
 def collection_of(problem, method=None):
-    return (method or Madoc())._collection(problem, noise_deviation(problem, None))
+    return (method or Madoc())._collection(problem, np.zeros(problem.simulator.task.observation_size))
 
 
 def test_windows_are_as_long_as_the_observation_wants(log):
@@ -63,15 +64,24 @@ def test_baselines_start_at_logged_states_where_those_are_known(log):
     assert [CmaEs("distribution")._acts(problem) for problem in (seen, hidden, blind)] == [False, True, True]
 
 
-def test_simulated_readings_carry_the_noise_that_the_data_says_it_has(log):
-    clean, noisy = problem_of(log), problem_of(log, noise=0.1)
-    assert not noise_deviation(clean, None).any()
-    change = clean.typical_change
-    np.testing.assert_allclose(noise_deviation(noisy, None), 0.1 * change, rtol=0.05)
-    np.testing.assert_allclose(noise_deviation(noisy, "estimated"), 0.1 * change, rtol=0.3)
-    (warning,) = collection_of(noisy).warnings
+def test_noise_that_simulated_readings_are_given_is_told():
+    exact = recorded(WHOLE, ARM_TRUTH, 300, KEY)
+    problem = problem_of(exact)
+    told = noise_deviation(problem, 0.1, 1)
+    np.testing.assert_allclose(told, 0.1 / np.sqrt(1.02) * problem.row_change)
+    (warning,) = Madoc()._collection(problem, told).warnings
     assert warning == "simulated observations were given sensor noise of up to 9.9 % of a step's change"
-    assert collection_of(clean).warnings == ()
+    assert collection_of(problem).warnings == ()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1])
+@pytest.mark.parametrize(("rows", "short"), [(1, 0.2), (3, 0.5)])  # of windows it is a lower bound
+def test_noise_is_estimated_from_a_log_that_declares_none(share, rows, short):
+    exact = recorded(WHOLE, ARM_TRUTH, 3000, KEY)
+    shown = replace(disturb(exact, Disturbance(noise=share), WHOLE, KEY), disturbance=Disturbance())
+    clean, problem = (CalibrationProblem(log, simulation.make(WHOLE, threads=1)) for log in (exact, shown))
+    found = noise_deviation(problem, None, rows) / clean.row_change
+    assert (found > (1.0 - short) * share - 0.01).all() and (found < 1.2 * share + 0.01).all()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1])
@@ -95,8 +105,7 @@ def test_noise_is_a_share_of_the_change_from_row_to_row_at_any_rate():
     assert stride(slow) > 1
     noisy = disturb(slow, Disturbance(noise=0.1), WHOLE, KEY)
     put_on = np.asarray(noisy.transitions.observation - smooth.observation).std(0)
-    problem = CalibrationProblem(noisy, simulation.make(WHOLE, threads=1))
-    np.testing.assert_allclose(noise_deviation(problem, None), put_on, rtol=0.1)
+    np.testing.assert_allclose(0.1 * row_change(slow), put_on, rtol=0.1)
 
 
 def test_sensor_noise_is_not_that_of_the_actions():

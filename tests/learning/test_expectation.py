@@ -8,24 +8,27 @@ import numpy as np
 import pytest
 
 from affine import affine
+from madoc.data import Dataset, Disturbance
 from madoc.learning.expectation import (
     LEAST_SPREAD,
     NORMAL_MAD,
+    derivatives_by_readings,
     expected,
     fresh_expectation,
     learn_expectation,
     noise_of_log,
     regression_loss,
 )
+from madoc.learning.features import LoggedFeatures, windows_ending
+from madoc.types import Transitions
 
 A = np.array([[0.9, 0.2], [-0.3, 0.7]])
 B = np.array([[0.0], [0.5]])
-PAIR_SCALE, NEXT_SCALE = np.array([2.0, 0.5, 1.0]), np.array([0.4, 0.1])
 ROWS, EPISODE = 20_000, 500
 
 
 def log_of(noise, seed=0):
-    """Features of (s, a) and of s' - s of x' = A x + B a read with noise, and whether each row is the next of one."""
+    """A log of x' = A x + B a, read with noise."""
     random = np.random.default_rng(seed)
     action = random.normal(size=(ROWS // EPISODE, EPISODE, 1))
     state = np.zeros((ROWS // EPISODE, EPISODE + 1, 2))
@@ -33,22 +36,24 @@ def log_of(noise, seed=0):
     for step in range(EPISODE):
         state[:, step + 1] = state[:, step] @ A.T + action[:, step] @ B.T
     seen = state + noise * random.normal(size=state.shape)
-    window = np.concatenate([seen[:, :-1], action], axis=-1) / PAIR_SCALE
-    following = (seen[:, 1:] - seen[:, :-1]) / NEXT_SCALE
-    consecutive = np.tile(np.arange(EPISODE) > 0, ROWS // EPISODE)
-    flat = (jnp.asarray(part.reshape(ROWS, -1), jnp.float32) for part in (window, following))
-    return tuple(flat), consecutive
+    zeros = np.zeros(ROWS)
+    before, action, after = (part.reshape(ROWS, -1) for part in (seen[:, :-1], action, seen[:, 1:]))
+    rows = Transitions(before, action, zeros, after, zeros.astype(bool), zeros.astype(bool))
+    return Dataset(rows, np.arange(0, ROWS, EPISODE), "linear", "unknown", "a linear system")
 
 
-def exact(logged):
+def exact(log):
     """A regression of one linear layer, with the weights of the system itself."""
-    weight = np.concatenate([A - np.eye(2), B], axis=1) * PAIR_SCALE / NEXT_SCALE[:, None]
-    return replace(fresh_expectation(logged, (), updates=1, key=jax.random.key(0)), network=affine(weight, np.zeros(2)))
+    scaling, logged = LoggedFeatures(log).windows("standardised", 1)
+    row = scaling.scaling
+    rate = np.concatenate([A - np.eye(2), B], axis=1)
+    network = affine(rate * row.pair_scale / row.next_scale[:, None], rate @ row.pair_offset / row.next_scale)
+    return replace(fresh_expectation(logged, (), updates=1, key=jax.random.key(0)), network=network)
 
 
 def noise_by_system(noise, seed=0):
-    logged, consecutive = log_of(np.asarray(noise), seed)
-    return noise_of_log(exact(logged), logged, consecutive, NEXT_SCALE / PAIR_SCALE[:2]) * NEXT_SCALE
+    log = log_of(np.asarray(noise), seed)
+    return noise_of_log(log, LoggedFeatures(log), 1, exact(log))
 
 
 def test_regression_loss_by_hand(compiled):
@@ -65,14 +70,42 @@ def test_noise_is_told_by_the_residuals_of_consecutive_rows(noise):
 
 def test_a_channel_that_is_exact_is_told_from_one_that_is_not():
     first, second = noise_by_system((0.0, 0.2))
-    assert first == 0.0
+    assert first < 0.02
     assert second == pytest.approx(0.2, rel=0.1)
 
 
 def test_without_noise_none_is_told_nor_where_no_row_follows_another():
-    assert noise_by_system((0.0, 0.0)).tolist() == [0.0, 0.0]
-    logged, consecutive = log_of(0.3)
-    assert noise_of_log(exact(logged), logged, np.zeros_like(consecutive), np.ones(2)).tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(noise_by_system((0.0, 0.0)), 0.0, atol=1e-6)
+    noisy = log_of(0.3)
+    for unordered in (
+        replace(noisy, episode_starts=np.arange(ROWS)),
+        replace(noisy, disturbance=Disturbance(shuffled="next_observations")),
+    ):
+        assert noise_of_log(unordered, LoggedFeatures(unordered), 1, exact(noisy)).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("length", [1, 3])
+def test_a_reading_enters_the_residuals_as_derived(length):
+    # One reading of a log that stands still is raised by 1: residuals of an affine regression change by H_k exactly.
+    random = np.random.default_rng(0)
+    log = log_of(0.1)
+    scaling, _ = LoggedFeatures(log).windows("standardised", length)
+    weight = random.normal(size=(2, scaling.sizes[0]))
+    network = affine(weight, np.zeros(2))
+    slopes = np.broadcast_to(weight, (1, *weight.shape))
+    by_reading = derivatives_by_readings(scaling, slopes)[:, 0]
+
+    def residuals(rows):
+        window, following = scaling.features(windows_ending(rows, np.arange(length - 1, 20), length))
+        return np.asarray(following - np.asarray(expected(network, window)), np.float64)
+
+    rows = log.transitions.take(np.arange(20))
+    raised = np.array(rows.observation), np.array(rows.next_observation)
+    raised[0][10, 1] += 1.0
+    raised[1][9, 1] += 1.0
+    moved = residuals(replace(rows, observation=raised[0], next_observation=raised[1])) - residuals(rows)
+    for lag, row in enumerate(range(9, 11 + length)):  # the window that ends in row 9 has the reading as its s'
+        np.testing.assert_allclose(moved[row - (length - 1)], by_reading[lag, :, 1], atol=1e-4)
 
 
 def trained(logged, seed=0, epochs=3):
@@ -83,8 +116,7 @@ def trained(logged, seed=0, epochs=3):
 
 
 def test_what_is_left_is_in_units_of_its_spread_over_logged_rows():
-    logged, _ = log_of(0.0)
-    window, following = logged
+    window, following = LoggedFeatures(log_of(0.0)).windows("standardised", 1)[1]
     scattered = following + 0.3 * jax.random.normal(jax.random.key(1), following.shape)
     before, made, _ = trained((window, scattered))
     assert before.epochs == 2 and (before.spread == 1.0).all() and not before.logged.any()
@@ -104,7 +136,7 @@ def test_what_is_expected_exactly_has_the_least_spread():
 
 
 def test_the_same_seed_has_the_same_bits():
-    logged, _ = log_of(0.1)
+    logged = LoggedFeatures(log_of(0.1)).windows("standardised", 1)[1]
     (_, first, loss), (_, again, same) = trained(logged, epochs=1), trained(logged, epochs=1)
     jax.tree.map(np.testing.assert_array_equal, first, again)
     assert loss == same

@@ -11,8 +11,9 @@ from madoc.data import Dataset, typical_change
 from madoc.data.disturbing import row_change
 from madoc.errors import MadocError
 from madoc.identification.information import NORMAL_95
-from madoc.identification.noise import difference_noise, regression_noise
+from madoc.identification.noise import difference_noise
 from madoc.identification.states import LoggedStates, probing_rows, states_of
+from madoc.learning.expectation import noise_of_log
 from madoc.learning.features import LoggedFeatures
 from madoc.simulation.base import Simulator
 from madoc.types import Method, State
@@ -30,6 +31,9 @@ class CalibrationProblem:
 
     dataset: Dataset
     simulator: Simulator
+    _noise: dict[int, Float[np.ndarray, " observation"]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         task = self.simulator.task
@@ -63,10 +67,11 @@ class CalibrationProblem:
         """Standard deviation of the sensor noise of each channel by differences of successive rows."""
         return difference_noise(self.dataset)
 
-    @cached_property
-    def estimated_noise(self) -> Float[np.ndarray, " observation"]:
-        """Standard deviation of the sensor noise of each channel, estimated from the log alone."""
-        return regression_noise(self.dataset)
+    def noise_of_log(self, rows: int) -> Float[np.ndarray, " observation"]:
+        """Standard deviation of the sensor noise of each channel, estimated from the log alone by windows of `rows`."""
+        if rows not in self._noise:
+            self._noise[rows] = noise_of_log(self.dataset, self.features, rows)
+        return self._noise[rows]
 
     @property
     def doubts(self) -> tuple[str, ...]:

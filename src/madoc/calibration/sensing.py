@@ -1,20 +1,18 @@
 """What methods are told of the sensors, each the same: their noise, and how many rows tell a state."""
 
 from dataclasses import replace
-from typing import Literal
 
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.learning.expectation import Expectation, noise_of_log
-from madoc.learning.features import HIDDEN_WINDOW, WindowScaling, last_rows
+from madoc.learning.features import HIDDEN_WINDOW, last_rows
 from madoc.simulation.rollout import Rollout
 from madoc.types import NotNegative, named_key
 
-SensorNoise = NotNegative | Literal["estimated"] | None
-"""Noise relative to a step's typical change, or estimated from the log alone, or, with None, as the log declares."""
+SensorNoise = NotNegative | None
+"""Noise of the sensors relative to a step's typical change; None estimates it from the log."""
 
 
 def rows_compared(problem: CalibrationProblem) -> int:
@@ -27,13 +25,13 @@ def rows_compared(problem: CalibrationProblem) -> int:
     return 1 if tells or not len(last_rows(problem.dataset, HIDDEN_WINDOW)) else HIDDEN_WINDOW
 
 
-def noise_deviation(problem: CalibrationProblem, share: SensorNoise) -> Float[np.ndarray, " observation"]:
-    """Standard deviation of the noise of observations: that which the data declares, or as told."""
-    if share == "estimated":
-        return problem.estimated_noise
-    share = problem.dataset.disturbance.noise if share is None else float(share)
-    if not share:
-        return np.zeros(problem.dataset.transitions.observation.shape[-1])
+def noise_deviation(problem: CalibrationProblem, share: SensorNoise, rows: int) -> Float[np.ndarray, " observation"]:
+    """Standard deviation of the noise of observations: as told, or estimated from the log by windows of so many rows.
+
+    What the log declares of its noise is not read: a user's log declares nothing.
+    """
+    if share is None:
+        return problem.noise_of_log(rows)
     # The logged change holds the noise of two readings; the share is that of the change without noise.
     return share / np.sqrt(1.0 + 2.0 * share**2) * problem.row_change
 
@@ -41,25 +39,6 @@ def noise_deviation(problem: CalibrationProblem, share: SensorNoise) -> Float[np
 def numbers_recalled(problem: CalibrationProblem, rows: int) -> int:
     """How many numbers a clone sees of earlier rows where `rows` are compared: it has to tell the state as they do."""
     return (rows - 1) * (problem.simulator.task.observation_size + problem.simulator.action_size)
-
-
-def log_noise(
-    problem: CalibrationProblem, expectation: Expectation, scaling: WindowScaling
-) -> Float[np.ndarray, " observation"]:
-    """Standard deviation of the noise of observations, estimated from the log alone; see `noise_of_log`.
-
-    Where one row does not tell the state, the regression's residuals say little of the sensors, and the motion is taken
-    to be smooth, as `difference_noise` has it.
-    """
-    if scaling.length > 1:
-        return problem.noise_by_differences
-    dataset, rows = problem.dataset, scaling.scaling
-    consecutive = np.ones(len(dataset), dtype=bool)
-    consecutive[dataset.episode_starts] = False
-    channels = len(rows.next_scale)
-    by_reading = rows.next_scale / rows.pair_scale[:channels]
-    logged = problem.features.windows("standardised", 1)[1]
-    return noise_of_log(expectation, logged, consecutive, by_reading) * rows.next_scale
 
 
 def with_sensor_noise(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:

@@ -2,19 +2,16 @@
 
 | estimator | from | assumes |
 |---|---|---|
-| `regression_noise` | the log alone | a quadratic of state and action predicts the next observation |
 | `difference_noise` | the log alone | motion is smooth over five rows |
 | `consecutive_noise` | one-step residuals of consecutive rows | their model errors do not alternate in sign |
 | `residual_noise` | all residuals of a fit | the fit leaves nothing but noise |
 | `channel_noise` | all residuals of a fit | most of them are noise |
 """
 
-from itertools import combinations_with_replacement
-
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.data.dataset import Dataset, spread_of
+from madoc.data.dataset import Dataset
 from madoc.identification.losses import NORMAL_MAD, robust_deviation
 from madoc.identification.states import states_observed_as
 from madoc.simulation.base import Simulator
@@ -26,10 +23,6 @@ STEP = 1e-3
 """Change of an observation, in typical changes of a stride, by which the derivative of a control step is taken."""
 SLOPE_LIMIT = 2.0
 """Largest derivative of a channel by itself over a control step; a contact's is larger, and is clipped to it."""
-_MOST_ROWS = 20_000
-"""Largest number of rows in the regression; more would hardly change a variance."""
-_LEAST_SLOPE = 0.3
-"""Absolute derivative of the next observation by the one before it; with a smaller one the noise counts as 0."""
 _SHORTEST = 5
 """Smallest number of rows of an episode; shorter ones have too few second differences and are left out."""
 _STANDARD_ERRORS = 3.0
@@ -40,36 +33,6 @@ _LEAST_SHARE = 1e-3
 """Smallest deviation relative to the noisiest channel's: no channel has more than a million times another's weight."""
 _SMALLEST = 1e-12
 """Smallest deviation in typical changes of a channel in a step; below it are rounding errors."""
-
-
-def regression_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:
-    """Noise of a log whose next observations a quadratic of observation and action predicts; 0 where none is seen.
-
-    A reading that is too high raises what is predicted from it: of s' = f(s, a) + e' - F e, fitted by a regression on
-    s, a and their products, the residuals of consecutive rows have the covariance -F σ². What the regression cannot
-    follow has the same sign in consecutive rows and hides noise smaller than itself, so this is a lower bound. Where no
-    row has one of its episode before it, none is seen.
-    """
-    logged = dataset.transitions
-    observation, action, following = (
-        np.asarray(part)[:_MOST_ROWS] for part in (logged.observation, logged.action, logged.next_observation)
-    )
-    count = observation.shape[1]
-    inner = np.ones(len(observation), dtype=bool)
-    inner[dataset.episode_starts[dataset.episode_starts < len(observation)]] = False
-    if not inner.any():
-        return np.zeros(count)
-    columns = np.concatenate([observation, action], axis=-1)
-    scale = spread_of(columns)
-    columns = (columns - columns.mean(0)) / scale
-    products = [columns[:, i] * columns[:, j] for i, j in combinations_with_replacement(range(columns.shape[1]), 2)]
-    inputs = np.column_stack([columns, *products, np.ones(len(columns))])
-    weights = np.linalg.lstsq(inputs, following, rcond=None)[0]
-    residual = following - inputs @ weights
-    slope = np.diagonal(weights[:count]) / scale[:count]
-    shared = (residual[1:] * residual[:-1])[inner[1:]].mean(0)
-    steep = np.abs(slope) > _LEAST_SLOPE
-    return np.sqrt(np.maximum(0.0, np.where(steep, -shared / np.where(steep, slope, 1.0), 0.0)))
 
 
 def difference_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:

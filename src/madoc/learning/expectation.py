@@ -15,10 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from scipy.optimize import nnls
 
+from madoc.data import Dataset
 from madoc.identification.losses import NORMAL_MAD
 from madoc.identification.noise import clipped
+from madoc.learning.features import LoggedFeatures, WindowScaling, last_rows
 from madoc.learning.networks import Network, Observations, Scalar, falling_adam, minimise
 
 LEAST_SPREAD = 1e-3
@@ -30,9 +33,13 @@ LEARNING_RATE = 1e-3
 MOST_ROWS = 20_000
 """Largest number of logged rows from which spreads and noise are measured; more would hardly change them."""
 STEEPEST = 3.0
-"""Bound of the derivatives of s' by s; those of contacts are larger, and would count too much."""
-TOLD = 0.25
-"""Least ratio of noise to what the regression leaves of a channel: smaller noise is not told from its errors."""
+"""Bound of the regression's derivatives; those at contacts are larger, and would count too much."""
+SLOPE_ROWS = 6_000
+"""Largest number of logged windows whose derivatives are computed for the noise."""
+NOISE_HIDDEN = (256, 256)
+"""Units per layer of a regression that is trained for the noise alone."""
+NOISE_EPOCHS, NOISE_UPDATES, NOISE_BATCH = 20, 200, 256
+"""Epochs of its training, updates in each, and windows in an update."""
 
 
 @jax.tree_util.register_dataclass
@@ -120,39 +127,70 @@ def regression_loss(error: Float[Array, "rows observation"]) -> Scalar:
 
 
 def noise_of_log(
-    expectation: Expectation,
-    logged: tuple[Float[Array, "rows window"], Observations],
-    consecutive: Bool[np.ndarray, " rows"],
-    by_reading: Float[np.ndarray, " observation"],
+    dataset: Dataset, features: LoggedFeatures, length: int, expectation: Expectation | None = None
 ) -> Float[np.ndarray, " observation"]:
-    """Standard deviation of the sensor noise of each channel, in units of the features of s'; 0 where none is seen.
+    """Standard deviation of the sensor noise of each channel, estimated from the log alone; 0 where none is seen.
 
-    A reading that is too high raises s' of one row and, by what the regression g makes of it, what is expected in the
-    next: with noise e and G = ∂s'/∂s, residuals are r_t = e_{t+1} - G_t e_t, so that those of consecutive rows have
-    E[r_{t+1} r_tᵀ] = -G_{t+1} Σ. For each channel j, σ_j² = -Σ w_i G_ij r_{t+1,i} r_{t,j} / Σ w_i G_ij², over rows t
-    and channels i with the weight w of their inverse mean square. Errors of the regression have the same sign in
-    consecutive rows and make it smaller.
+    A reading that is too high enters up to `length` + 1 residuals of a regression on windows: with noise e they are
+    r_t = Σ_k H_k(t) e_{t+1-k}, and those of consecutive windows have E[r_{t+1} r_tᵀ] = Σ_k H_{k+1}(t+1) Σ H_k(t)ᵀ. That
+    is linear in the variances, which are solved for by least squares without negative ones. Errors of the regression
+    have the same sign in consecutive windows; they make the estimate smaller.
 
     Args:
-        expectation: A regression that has learnt the log's changes s' - s.
-        logged: Features of (s, a), of which the first are those of s, and of s'.
-        consecutive: Whether each row is the one after the row before it in the log.
-        by_reading: Change of each feature of s by a change of 1 in the same feature of s'.
+        dataset: The log. Of rows without an order, or whose next observations are shuffled, no noise is told.
+        features: Its features.
+        length: Rows of a window.
+        expectation: A regression that has been trained on these windows; None trains one.
     """
-    count = min(MOST_ROWS, len(consecutive))
-    window, following = (part[:count] for part in logged)
-    here = np.flatnonzero(consecutive[1:count]) + 1
-    channels = following.shape[1]
-    if not len(here):
-        return np.zeros(channels)
-    residual = clipped(np.asarray(following - expected(expectation.network, window), np.float64))
-    size = np.maximum((residual**2).mean(0), LEAST_SPREAD**2)
-    slopes = np.asarray(_slopes(expectation.network, window[here], channels), np.float64) * by_reading
-    slopes = np.clip(slopes + np.eye(channels), -STEEPEST, STEEPEST)
-    shared = np.einsum("tij,ti,tj->j", slopes, residual[here] / size, residual[here - 1])
-    weight = np.einsum("tij,i->j", slopes**2, 1.0 / size)
-    noise = np.sqrt(np.maximum(-shared, 0.0) / weight)
-    return np.where(noise > TOLD * np.sqrt(size), noise, 0.0)
+    nothing = np.zeros(dataset.transitions.observation.shape[-1])
+    last = last_rows(dataset, length)[:SLOPE_ROWS]
+    episode = dataset.episode_of(last)
+    here = np.flatnonzero((np.diff(last) == 1) & (np.diff(episode) == 0)) + 1
+    if dataset.disturbance.shuffled == "next_observations" or not len(here):
+        return nothing
+    scaling, logged = features.windows("standardised", length)
+    network = (expectation or _trained(logged)).network
+    window, following = (part[: len(last)] for part in logged)
+    residual = clipped(np.asarray(following - expected(network, window), np.float64))
+    weight = 1.0 / np.maximum(np.sqrt((residual**2).mean(0)), LEAST_SPREAD)
+    slopes = np.clip(np.asarray(_slopes(network, window), np.float64), -STEEPEST, STEEPEST)
+    by_reading = derivatives_by_readings(scaling, slopes) * weight[:, None]
+    shared = sum(np.einsum("til,tjl->ijl", by_reading[k + 1, here], by_reading[k, here - 1]) for k in range(length + 1))
+    seen = np.einsum("ti,tj->ij", residual[here] * weight, residual[here - 1] * weight)
+    unit = scaling.scaling.next_scale  # variances in units of a step's change are of one order
+    return np.sqrt(nnls(np.reshape(shared * unit**2, (-1, len(unit))), seen.ravel())[0]) * unit
+
+
+def derivatives_by_readings(
+    scaling: WindowScaling, slopes: Float[np.ndarray, "rows out window"]
+) -> Float[np.ndarray, "lags rows out observation"]:
+    """H_k of `noise_of_log`: derivatives of residuals by the reading of k rows before s', for k from 0 to length + 1.
+
+    Args:
+        scaling: How windows are described; see `WindowScaling`.
+        slopes: Derivatives of what is expected by the features of each window.
+    """
+    channels, row, pairs = len(scaling.next_scale), scaling.scaling, len(scaling.scaling.pair_scale)
+    by_reading = np.zeros((scaling.length + 2, len(slopes), channels, channels))
+    described = np.diag(1.0 / scaling.next_scale)
+    for lag, factor in enumerate((1.0, -1.0) if scaling.length == 1 else (1.0, -2.0, 1.0)):
+        by_reading[lag] += factor * described
+    by_reading[1] -= slopes[..., :channels] / row.pair_scale[:channels]
+    for back in range(1, scaling.length):
+        earlier = slopes[..., back * pairs : back * pairs + channels] / row.next_scale
+        by_reading[back] -= earlier
+        by_reading[back + 1] += earlier
+    return by_reading
+
+
+def _trained(logged: tuple[Float[Array, "rows window"], Observations]) -> Expectation:
+    """A regression that is trained for the noise alone; the same log gives the same bits."""
+    expectation = fresh_expectation(logged, NOISE_HIDDEN, updates=NOISE_EPOCHS * NOISE_UPDATES, key=jax.random.key(0))
+    for key in jax.random.split(jax.random.key(1), NOISE_EPOCHS):
+        expectation, _ = learn_expectation(
+            expectation, logged, key, batch=NOISE_BATCH, updates=NOISE_UPDATES, epochs=NOISE_EPOCHS
+        )
+    return expectation
 
 
 @eqx.filter_jit
@@ -180,10 +218,6 @@ def expected(network: Network, window: Float[Array | np.ndarray, "*rows window"]
 
 
 @eqx.filter_jit
-def _slopes(network: Network, window: Float[Array, "rows window"], channels: int) -> Float[Array, "rows out channels"]:
-    """Derivatives of the expected features of s' by the first `channels` features of each row."""
-
-    def of_row(row: Array) -> Array:
-        return jax.jacfwd(lambda first: network(jnp.concatenate([first, row[channels:]])[None])[0])(row[:channels])
-
-    return jax.lax.map(of_row, window, batch_size=256)
+def _slopes(network: Network, window: Float[Array, "rows window"]) -> Float[Array, "rows out window"]:
+    """Derivatives of what is expected by the features of each window."""
+    return jax.lax.map(jax.jacfwd(lambda row: network(row[None])[0]), window, batch_size=256)

@@ -22,11 +22,11 @@ from madoc.calibration.madoc.collection import Collection, geometry
 from madoc.calibration.madoc.grouping import Grouping, GroupingVAE, Votes
 from madoc.calibration.madoc.state import MadocState
 from madoc.calibration.madoc.value_decomposition import Mixing
-from madoc.calibration.sensing import log_noise, noise_deviation, rows_compared
+from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.cloning import Pairs, cloning_epoch, fresh_clone
-from madoc.learning.expectation import Expectation, fresh_expectation, learn_expectation
+from madoc.learning.expectation import Expectation, fresh_expectation, learn_expectation, noise_of_log
 from madoc.learning.networks import scalars
 from madoc.simulation.rollout import out_of_step
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
@@ -52,7 +52,7 @@ class Madoc:
         window: Rows (s, a) that the discriminators see before s'; None takes 1 where an observation determines the
             state, as in the paper, else 3.
         sensor_noise: Noise put on simulated observations, as a share of a step's typical change; None estimates it from
-            the log, as `sensing.log_noise`, once the regression has learnt; there is none without a regression.
+            the log, once the regression has learnt; there is none without a regression.
         features: How discriminators see s': `residual`, what it differs by from what a regression on logged rows
             expects of (s, a), or `raw`, s' and (s, a) as they are, as in the paper.
         hidden: Units per layer of clone and VAE.
@@ -82,7 +82,7 @@ class Madoc:
     groups: Grouping = "each"
     group_count: Count | None = None
     window: Count | None = None
-    sensor_noise: NotNegative | None = None
+    sensor_noise: SensorNoise = None
     features: Features = "residual"
     hidden: Layers = (128, 128)
     cloning_epochs: CountOrZero = 40
@@ -131,7 +131,7 @@ class Madoc:
         """
         problem.require_pairs()
         count, groups = len(problem.simulator.parameters), self._group_count(problem)
-        noise = noise_deviation(problem, self.sensor_noise or 0.0)
+        noise = noise_deviation(problem, self.sensor_noise or 0.0, rows=1)
         collection = self._collection(problem, noise)
         window, following = collection.scaling.sizes
         of_policy, of_expectation, of_vae, of_agents, of_start, key = jax.random.split(key, 6)
@@ -263,7 +263,8 @@ class Madoc:
         )
         following = replace(state, expectation=expectation, key=key)
         if expectation.epochs == self.regression_epochs and self.sensor_noise is None:
-            following = replace(following, noise=log_noise(problem, expectation, collection.scaling))
+            noise = noise_of_log(problem.dataset, problem.features, collection.scaling.length, expectation)
+            following = replace(following, noise=noise)
         fraction = self._prepared(following)
         return following, Epoch({"regression_loss": float(loss)}, stage="regression", fraction=fraction)
 

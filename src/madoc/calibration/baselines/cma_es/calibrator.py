@@ -279,8 +279,8 @@ class CmaEs:
             key=of_actions,
             restart_key=of_restarts,
         )
-        seen = with_sensor_noise(rollout, noise_deviation(problem, None), of_actions).transitions
         length = self._window(problem)
+        seen = with_sensor_noise(rollout, noise_deviation(problem, None, length), of_actions).transitions
         scaling, _ = problem.features.windows("standardised", length)
         # All candidates share the first observation.
         windows = scaling.features(windows_ending(seen, np.arange(max(1, length - 1), len(seen)), length))[0]

@@ -62,8 +62,8 @@ class Dropo:
         draws: Parameter vectors per candidate, S.
         transitions: Logged rows in a generation.
         epsilon: ε, added to the variance of every channel.
-        sensor_noise: Noise of the sensors, which is not to be taken for a spread of parameters; estimated from the log
-            alone, a share of a step's typical change, or, with None, what the data declares.
+        sensor_noise: Noise of the sensors, which is not to be taken for a spread of parameters, as a share of a step's
+            typical change; None estimates it from the log.
         entropy_weight: Weight of E-DROPO's entropy bonus, which keeps σ from collapsing, relative to the mean
             log-likelihood of a transition.
         population: Candidates in a generation; None takes 4 + ⌊3 ln 2d⌋.
@@ -74,7 +74,7 @@ class Dropo:
     draws: Annotated[int, Field(ge=2)] = 16
     transitions: Count = 16
     epsilon: Annotated[float, Field(ge=1e-12)] = 1e-4
-    sensor_noise: SensorNoise = "estimated"
+    sensor_noise: SensorNoise = None
     entropy_weight: NotNegative = 0.0
     population: Annotated[int, Field(ge=4)] | None = None
     tolerance: NotNegative = 1e-4
@@ -97,7 +97,7 @@ class Dropo:
         )
         residuals = flat.reshape(*draws.shape[:2], *flat.shape[1:])
         centre, covariance = moments(residuals)
-        noise = noise_deviation(problem, self.sensor_noise)
+        noise = noise_deviation(problem, self.sensor_noise, rows=1)
         by_row = negative_log_likelihood(
             centre,
             shrunk(covariance, np.isfinite(residuals).all(-1).sum(1)),

@@ -233,9 +233,8 @@ class Npe:
             key=of_actions,
             restart_key=of_restarts,
         )
-        state = self._collect(
-            problem, state, with_sensor_noise(rollout, noise_deviation(problem, None), of_actions), points
-        )
+        noise = noise_deviation(problem, None, rows_compared(problem))
+        state = self._collect(problem, state, with_sensor_noise(rollout, noise, of_actions), points)
         state = replace(state, walkers=walkers, key=key, failures=state.failures + rollout.failures)
         if state.collected == self.epochs and state.trained:
             state = self._infer(problem, state, of_posterior)

@@ -56,7 +56,7 @@ class Oted:
     """Match the (s, a) distribution of a cloned policy's rollouts to that of the data.
 
     Where one row tells no state, windows of `HIDDEN_WINDOW` rows take the place of (s, a). Rows that run freely are
-    given the noise that the data says it has.
+    given the sensor noise that is estimated from the log.
 
     Attributes:
         starts: `logged` starts rollouts anew at logged states in every epoch; with `policy`, rows go on from resets.
@@ -193,7 +193,7 @@ class Oted:
             restart_key=of_restart,
         )
         if not anew:
-            rollout = with_sensor_noise(rollout, noise_deviation(problem, None), of_action)
+            rollout = with_sensor_noise(rollout, noise_deviation(problem, None, self._window(problem)), of_action)
         length, seen = self._window(problem), rollout.transitions
         scaling, (logged, _) = problem.features.windows("standardised", length)
         # The first pair of a row is its start, which does not depend on the draw.
