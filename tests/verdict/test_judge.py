@@ -9,6 +9,7 @@ from madoc.calibration.holdout import (
     AgainstChance,
     Area,
     Fitted,
+    OpenLoop,
     Predicted,
     PredictionError,
     PredictionErrors,
@@ -106,14 +107,52 @@ def test_a_mismatch_names_the_likeliest_term_though_it_hardly_moves_the_estimate
     assert verdict.sentence.endswith("{field: signal_bias, element: hip, low: 0, high: 0.2}")
 
 
-def test_errors_that_grow_far_faster_than_those_of_noise_are_a_mismatch():
-    noise = errors(0.1, 0.2)
-    assert judge(changed(PREDICTED, {"nearby_best": errors(0.2, 3.0), "noise": noise})).word == "CALIBRATED"
-    verdict = judge(changed(PREDICTED, {"nearby_best": errors(0.2, 3.4), "noise": noise}))
+def test_errors_beyond_those_of_noise_and_random_forces_are_a_mismatch():
+    assert judge(replace(PREDICTED, beside_random={"q": 1.3, "qd": 0.9})).word == "CALIBRATED"
+    verdict = judge(replace(PREDICTED, beside_random={"q": 0.9, "qd": 3.7}))
     assert verdict.word == "MODEL_MISMATCH"
-    assert "it grows 8.5 times as much from 1 step on as noise does" in verdict.sentence
-    without_noise = {"nearby_best": errors(0.002, 0.1), "noise": errors(0.0, 0.0)}
-    assert judge(changed(PREDICTED, without_noise)).word == "CALIBRATED"
+    assert "leave 3.7 times or more of the error in qd that sensor noise and random forces make" in verdict.sentence
+
+
+def predicted_over(seconds, relative, interval, *, whole=False):
+    given, estimate = {"q": 1.0}, {"q": relative}
+    return OpenLoop(seconds, whole, 60, given, given, estimate, relative, interval)
+
+
+@EITHER
+def test_what_predicts_much_better_than_the_model_as_given_is_usable_though_the_model_lacks_something(good):
+    lacking = changed(good, LEFT_OVER, explained=0.6)
+    over = (
+        predicted_over(0.1, 0.9, (0.8, 1.1)),
+        predicted_over(1.0, 0.4, (0.3, 0.6)),
+        predicted_over(6.0, 2.0, (1, 3), whole=True),
+    )
+    verdict = judge(replace(lacking, open_loop=over))
+    assert verdict.word == "USABLE"
+    told = "over 1 s held-out motion is predicted with 40 % of the error of the model as given (95 % interval 30 % to "
+    assert verdict.sentence.startswith(told)
+    assert "not the machine's own values, as the best parameters nearby leave 0.8" in verdict.sentence
+
+
+@EITHER
+@pytest.mark.parametrize(
+    ("relative", "interval", "change"),
+    [
+        (0.85, (0.8, 0.9), {}),
+        (0.7, (0.4, 1.01), {}),
+        (0.4, (0.3, 0.6), {"at_end": ("mass",)}),
+        (0.4, (0.3, 0.6), {"contradictions": ("actions come late",)}),
+    ],
+)
+def test_what_is_hardly_better_at_an_end_or_contradicted_stays_a_mismatch(good, relative, interval, change):
+    lacking = changed(good, LEFT_OVER, explained=0.6, open_loop=(predicted_over(1.0, relative, interval),), **change)
+    assert judge(lacking).word == "MODEL_MISMATCH"
+    assert judge(replace(lacking, open_loop=())).word == "MODEL_MISMATCH"
+
+
+def test_a_search_that_has_not_settled_is_never_usable():
+    lacking = changed(PREDICTED, LEFT_OVER, explained=0.6, open_loop=(predicted_over(1.0, 0.4, (0.3, 0.6)),))
+    assert judge(lacking, settled=False).word == "MODEL_MISMATCH"
 
 
 def test_correlated_residuals_of_single_steps_are_a_mismatch():

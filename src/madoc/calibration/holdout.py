@@ -4,14 +4,14 @@ Which measure is possible depends on whether the robot's states can be computed 
 records: `Predicted`, `Fitted` and `ToldApart`. `madoc.verdict` fills them in and judges them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
 from madoc.identification.term_tests import Alternative, ImitatedTerm, MissingTerm
 
-Word = Literal["CALIBRATED", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
+Word = Literal["CALIBRATED", "USABLE", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,32 @@ class PredictionErrors:
 
 
 @dataclass(frozen=True)
+class OpenLoop:
+    """Errors of held-out motion that is predicted from its start and the logged actions alone.
+
+    Attributes:
+        seconds: How long the simulator runs on.
+        whole: Whether that is the length of whole held-out runs.
+        windows: Number of stretches that were predicted.
+        as_given: Root mean square error over the stretches of each signal, in its unit, of the user's model as it was
+            given.
+        mid_range: The same with every parameter at the middle of its range.
+        estimate: The same at the estimate.
+        relative: Error at the estimate over that of the model as given, over all signals in units of their change.
+        relative_interval: 95 % confidence interval of that, by resampling episodes, or stretches where these are few.
+    """
+
+    seconds: float
+    whole: bool
+    windows: int
+    as_given: dict[str, float]
+    mid_range: dict[str, float]
+    estimate: dict[str, float]
+    relative: float
+    relative_interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Area:
     """Area under the ROC curve of a classifier of simulated and logged rows: 0.5 is chance, 1 is certainty.
 
@@ -123,6 +149,7 @@ class Judged:
             steps of a quarter of the length, the median over signals; 0 for a robot without a spec.
         finer: Whether other terms than the error of the integration step were tested with steps of a quarter of the
             length, as that error explains much and would hide them.
+        open_loop: Errors of open-loop predictions in the signals' units, the shortest first; none without states.
     """
 
     split: str
@@ -141,6 +168,7 @@ class Judged:
     contradictions: tuple[str, ...] = ()
     coarseness: float = 0.0
     finer: bool = False
+    open_loop: tuple[OpenLoop, ...] = ()
 
     @property
     def clearest(self) -> AgainstChance:
@@ -184,12 +212,15 @@ class Predicted(JudgedByErrors):
     Attributes:
         autocorrelation: Lag-one autocorrelation of the residuals at the best parameters nearby.
         persistence: Correlation of these residuals with those a few rows later; 0 if it is not certain.
+        beside_random: By signal, how many times as large errors of the longest horizon are, at the best parameters
+            nearby, as sensor noise and random forces of each step make them; the lower end of a 95 % interval.
         area_at_mid_range: How well a classifier distinguishes replays at mid-range from logged windows.
         area_at_estimate: The same for replays at the estimate.
     """
 
     autocorrelation: float
     persistence: float = 0.0
+    beside_random: dict[str, float] = field(default_factory=dict)
     area_at_mid_range: Area
     area_at_estimate: Area
     measure: Literal["predicted"] = "predicted"

@@ -20,6 +20,9 @@ from madoc.errors import MadocError
 from madoc.identification.combinations import Combination
 from madoc.identification.information import NORMAL_95
 
+MOST_SIGNALS = 12
+"""Largest number of signals whose prediction errors are printed."""
+
 
 @dataclass(frozen=True)
 class ParameterEstimate:
@@ -177,6 +180,25 @@ class CalibrationResult:
             table.add_row(*cells, *([f"{errors[name]:.2g}"] if errors else []))
         return table
 
+    def predictions(self) -> Table | None:
+        """Errors of open-loop predictions of the hold-out, of the model as given and at the estimate; None of none."""
+        shown = self.holdout.open_loop if self.holdout is not None else ()
+        if self.holdout is None or not shown:
+            return None
+        title = "held-out motion predicted from its start (root mean square error: the model as given → calibrated)"
+        table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0), pad_edge=False)
+        table.add_column("signal")
+        for each in shown:
+            table.add_column(f"over {each.seconds:.2g} s{' (whole runs)' if each.whole else ''}", justify="right")
+        table.add_column("noise", justify="right")
+        signals = list(shown[-1].estimate)
+        for name in signals[:MOST_SIGNALS]:
+            cells = (f"{each.as_given[name]:.2g} → {each.estimate[name]:.2g}" for each in shown)
+            table.add_row(name, *cells, f"{self.holdout.noise.get(name, 0.0):.2g}")
+        if len(signals) > MOST_SIGNALS:
+            table.add_row(f"and {len(signals) - MOST_SIGNALS} more in result.json")
+        return table
+
     def summary(self) -> str:
         """Status, cost, error and warnings, one line each."""
         lines = [
@@ -199,7 +221,10 @@ class CalibrationResult:
 
     def __str__(self) -> str:
         stream = io.StringIO()
-        Console(file=stream, width=100).print(self.table())
+        console, predictions = Console(file=stream, width=100), self.predictions()
+        console.print(self.table())
+        if predictions is not None:
+            console.print(predictions)
         verdict = f"{self.verdict}\n" if self.verdict else ""
         return verdict + stream.getvalue() + self.summary()
 

@@ -20,6 +20,7 @@ EXIT_CODES: Mapping[str, int] = {
     "rejected": 2,
     "interrupted": 130,
     "CALIBRATED": 0,
+    "USABLE": 9,
     "NO_IMPROVEMENT": 10,
     "NOT_IDENTIFIABLE": 11,
     "MODEL_MISMATCH": 12,
@@ -133,9 +134,10 @@ def _costs_table(name: str, costs: "Mapping[str, ErrorCost]") -> Table:
 
 
 def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
-    """The verdict, the table of estimates, and a summary."""
+    """The verdict, the tables of estimates and of predictions, and a summary."""
     verdict = (str(result.verdict),) if result.verdict else ()
-    return (*verdict, result.table(), result.summary())
+    predictions = result.predictions()
+    return (*verdict, result.table(), *(() if predictions is None else (predictions,)), result.summary())
 
 
 def calibration_status(result: "CalibrationResult") -> str:

@@ -16,8 +16,8 @@ class Calibrate:
     """Find the parameters under which the simulator moves as the data does.
 
     Leaves a run folder: result.json, spec.json, metrics.jsonl, TensorBoard events and a checkpoint. With a hold-out
-    the exit code is the verdict's: 0 CALIBRATED, 10 NO_IMPROVEMENT, 11 NOT_IDENTIFIABLE, 12 MODEL_MISMATCH,
-    13 DATA_REJECTED.
+    the exit code is the verdict's: 0 CALIBRATED, 9 USABLE, 10 NO_IMPROVEMENT, 11 NOT_IDENTIFIABLE,
+    12 MODEL_MISMATCH, 13 DATA_REJECTED.
     """
 
     order: Annotated[CalibrationOrder, arg(name="")]

@@ -8,6 +8,7 @@ from madoc.parameters import FIELDS
 
 TONES = {
     "CALIBRATED": "good",
+    "USABLE": "doubtful",
     "NO_IMPROVEMENT": "doubtful",
     "NOT_IDENTIFIABLE": "doubtful",
     "MODEL_MISMATCH": "bad",

@@ -16,6 +16,7 @@ from madoc.verdict.adequacy import about_imitated, with_widened_intervals
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.fitted import fitted
 from madoc.verdict.judge import beats_mid_range, explains_all, judge
+from madoc.verdict.open_loop import open_loop
 from madoc.verdict.predicted import noise_hides_gain, predicted
 
 NO_BETTER = "the estimate predicts the rows held out no better than mid-range does, so it is not settled"
@@ -70,7 +71,9 @@ def assess(
             f"expected a simulator with the result's parameters {', '.join(result.parameters)}, got one with "
             f"{', '.join(bench.simulator.parameters.names)}"
         )
+    point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
     holdout = measured(bench, result.mean, result.interval)
+    holdout = replace(holdout, open_loop=open_loop(bench, point))
     widened = with_widened_intervals(result, holdout)
     verdict = judge(holdout, settled=result.settled, long_tails=result.long_tails, combinations=widened.combinations)
     better = beats_mid_range(holdout) or explains_all(holdout)

@@ -38,7 +38,10 @@ _DAMPING = 1e-8
 
 @dataclass(frozen=True)
 class FittedReplays:
-    """Windows of the hold-out whose initial states are unknown: `near` are first guesses of them, at their `rows`."""
+    """Windows of the hold-out whose initial states are unknown: `near` are first guesses of them, at their `rows`.
+
+    `ahead` are the numbers of control steps after the fitted ones at which errors are taken.
+    """
 
     simulator: Simulator
     readings: Readings
@@ -46,16 +49,12 @@ class FittedReplays:
     rows: Int[np.ndarray, " windows"]
     episodes: Int[np.ndarray, " windows"]
     stride: int
+    ahead: tuple[int, ...]
 
     @property
     def fitted(self) -> int:
         """Number of control steps to whose observations an initial state is fitted."""
         return FITTED * self.stride
-
-    @property
-    def ahead(self) -> tuple[int, ...]:
-        """Numbers of control steps after the fitted ones at which errors are taken."""
-        return tuple(self.stride * strides for strides in AHEAD)
 
     def at_horizons(
         self, residuals: Float[np.ndarray, "systems windows readings channels"]
@@ -113,18 +112,28 @@ def _unfitted(before: Float[np.ndarray, "systems windows"], after: Float[np.ndar
 
 
 def fitted_replays_of(
-    held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " channels"], stride: int
+    held: Dataset,
+    simulator: Simulator,
+    scale: Float[np.ndarray, " channels"],
+    stride: int,
+    *,
+    ahead: tuple[int, ...] = (),
+    fewest: int = FEWEST_WINDOWS,
+    most: int = MOST,
 ) -> FittedReplays | None:
-    """Windows spread evenly over the hold-out; None where too few are long enough.
+    """Windows spread evenly over the hold-out; None where fewer than `fewest` are long enough.
 
     `stride` is the number of control steps between readings at which the robot has moved, `data.timescale.stride`.
+    `ahead` are control steps after the fitted ones, `AHEAD` strides where none are given.
     """
     logged = states_of(held, simulator)
     near, rows = logged.guesses()
-    steps = (FITTED + AHEAD[-1]) * stride
+    ahead = ahead or tuple(stride * strides for strides in AHEAD)
+    steps = FITTED * stride + ahead[-1]
     possible = rows_that_fit(held, rows, steps)
-    if len(possible) < FEWEST_WINDOWS:
+    if len(possible) < fewest:
         return None
-    chosen = evenly(possible, MOST)
+    chosen = evenly(possible, most)
     readings = Readings.at(held, logged, rows[chosen], steps, scale)
-    return FittedReplays(simulator, readings, near[chosen], rows[chosen], held.episode_of(rows[chosen]), stride)
+    episodes = held.episode_of(rows[chosen])
+    return FittedReplays(simulator, readings, near[chosen], rows[chosen], episodes, stride, ahead)

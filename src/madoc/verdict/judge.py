@@ -1,4 +1,8 @@
-"""The verdict on an estimate: one word, and a sentence with the numbers behind it."""
+"""The verdict on an estimate: one word, and a sentence with the numbers behind it.
+
+It answers two questions: does the simulator predict, and can the numbers be believed? An estimate that predicts though
+its model lacks something is `USABLE`: its numbers serve in this simulator and are not those of the machine.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,6 +13,7 @@ from madoc.calibration.holdout import (
     Area,
     Fitted,
     HoldOut,
+    OpenLoop,
     Predicted,
     PredictionErrors,
     ToldApart,
@@ -22,7 +27,7 @@ from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.bench import AT_END
 from madoc.verdict.remedies import WARM_UP, remedy, value_of
-from madoc.verdict.statistics import NEGLIGIBLE, WORTH_GAINING, beyond_noise, growth_beside_noise
+from madoc.verdict.statistics import NEGLIGIBLE, WORTH_GAINING, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
 
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
@@ -35,13 +40,16 @@ WHITE = 0.2
 """Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
 PERSISTENT = 0.1
 """Correlation in [-1, 1] of residuals with those a few rows later, above which a force is missing that lasts."""
-GROWS = 8.0
-"""Growth of errors with the horizon over that of noise; above it something adds up that is not random. Random forces of
-each row make it 5 at most in simulated robots, a floor with a slope that the model lacks 10 and more."""
+BEYOND_RANDOM = 1.3
+"""Lower end of the 95 % interval of a signal's error over that of noise and random forces; above it something adds up
+that is not random."""
 GAINED = 0.75
 """Share in [0, 1] of the possible gain over mid-range on the hold-out; with less, an estimate is no improvement."""
 _MOST_NAMED = 3
 """Largest number of terms that a sentence names beside the likeliest."""
+MUCH_BETTER = 0.8
+"""Error of open-loop predictions over that of the model as given, at or below which an estimate is of use though the
+model lacks something."""
 SEPARABLE = 0.65
 """Area under the curve in [0.5, 1]; above it simulated rows differ from logged ones. Rollouts of a cloned policy in the
 true simulator have about 0.55."""
@@ -50,9 +58,11 @@ true simulator have about 0.55."""
 def judge(
     holdout: HoldOut, *, settled: bool = True, long_tails: bool = False, combinations: Sequence[Combination] = ()
 ) -> Verdict:
-    """The first verdict that applies: rejected data, a mismatch, open parameters, no improvement; else calibrated.
+    """The first verdict that applies: rejected data, a model that lacks something, open parameters, no improvement.
 
-    A log that is too short to tell whether the model lacks a term, or tells no states, leaves its parameters open.
+    What the model lacks makes an estimate `USABLE` where it predicts much better than the model as given, and else a
+    mismatch. A log that is too short to tell whether the model lacks a term, or tells no states, leaves its parameters
+    open.
 
     Args:
         holdout: What the hold-out says of the estimate.
@@ -60,19 +70,44 @@ def judge(
         long_tails: Whether its residuals have longer tails than noise has.
         combinations: What the log tells of parameters that it leaves open.
     """
+    refused = _rejected(holdout) or _contradicted(holdout)
+    if refused:
+        return refused
+    lacking = _missing(holdout) or _mismatch(holdout) or _outside(holdout)
+    lacking = lacking or (_unlike_noise(holdout) if long_tails else None)
+    if lacking:
+        return (_usable(holdout, lacking) if settled else None) or lacking
     return (
-        _rejected(holdout)
-        or _contradicted(holdout)
-        or _missing(holdout)
-        or _mismatch(holdout)
-        or _outside(holdout)
-        or (_unlike_noise(holdout) if long_tails else None)
-        or _open(holdout, combinations)
+        _open(holdout, combinations)
         or _no_improvement(holdout)
         or (None if settled else Verdict("NO_IMPROVEMENT", f"{_how_good(holdout)}, but {UNSETTLED}"))
         or _untested(holdout)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and every parameter is known to within half of its range")
     )
+
+
+def _usable(holdout: HoldOut, lacking: Verdict) -> Verdict | None:
+    """An estimate that predicts much better than the model as given, though the model lacks something.
+
+    An estimate at an end of its range is none: a wider range would give another one.
+    """
+    found = furthest(holdout.open_loop)
+    if holdout.at_end or found is None or found.relative > MUCH_BETTER or found.relative_interval[1] >= 1.0:
+        return None
+    low, high = map(_percent, found.relative_interval)
+    return Verdict(
+        "USABLE",
+        f"over {found.seconds:.2g} s held-out motion is predicted with {_percent(found.relative)} of the error of the "
+        f"model as given (95 % interval {low} to {high}), so the estimates are of use in this simulator; they are not "
+        f"the machine's own values, as {lacking.sentence}",
+        lacking.parameters,
+    )
+
+
+def furthest(predictions: Sequence[OpenLoop]) -> OpenLoop | None:
+    """The prediction over the longest time that is not whole runs: those are often too few to compare models by."""
+    parts = [each for each in predictions if not each.whole] or list(predictions)
+    return max(parts, key=lambda each: each.seconds, default=None)
 
 
 def explains_all(holdout: HoldOut) -> bool:
@@ -212,20 +247,28 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
     if isinstance(holdout, Predicted) and holdout.persistence > PERSISTENT:
         lasts = f"it lasts over several rows (correlation {holdout.persistence:.2f})"
         reasons.append(f"{lasts}, as an external force does or a base that moves")
-    if direct and (grows := growth_beside_noise(errors)) > GROWS:
-        reasons.append(
-            f"it grows {grows:.2g} times as much from {_steps(errors.nearby_best[0].steps)} on as noise does"
-        )
     reasons += at_end
     beyond = beyond_noise(errors.nearby_best, errors.noise)
     if not beyond or not reasons:
-        return ""
+        return _adding_up(holdout) if isinstance(holdout, Predicted) else ""
     left, noise = max(beyond, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
     return (
         f"the best parameters nearby leave {left.mean:.2g} of the typical change in {_steps(errors.stride)} after "
         f"{_steps(left.steps)}{'' if direct else ' behind a fitted start'} on the hold-out, where noise leaves "
         f"{noise.mean:.2g}, and "
         f"{', '.join(reasons)}: the model cannot explain the data ({_change(errors)} at the estimate)"
+    )
+
+
+def _adding_up(holdout: Predicted) -> str:
+    """Which signal's error over the longest horizon is larger than noise and random forces make it; else empty."""
+    signal, factor = max(holdout.beside_random.items(), key=lambda pair: pair[1], default=("", 0.0))
+    if factor <= BEYOND_RANDOM:
+        return ""
+    return (
+        f"after {_steps(holdout.errors.nearby_best[-1].steps)} the best parameters nearby leave {factor:.2g} times or "
+        f"more of the error in {signal} that sensor noise and random forces make: the model cannot explain the data "
+        f"({_change(holdout.errors)} at the estimate)"
     )
 
 

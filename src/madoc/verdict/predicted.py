@@ -15,6 +15,8 @@ from madoc.identification.states import logged_states
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.prediction import nearby_best
 from madoc.verdict.statistics import (
+    NEGLIGIBLE,
+    beside_random,
     best_of,
     hides_gain,
     independent_groups,
@@ -49,6 +51,7 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         explained=max(single.explained, at_end),
         autocorrelation=single.autocorrelation,
         persistence=lasting,
+        beside_random=found.beside_random,
         area_at_mid_range=area_at_mid_range,
         area_at_estimate=area_at_estimate,
     )
@@ -75,7 +78,7 @@ class _Replayed(NamedTuple):
     """What replays of the hold-out leave at mid-range, at an estimate and at the `best` parameters nearby.
 
     Residuals are in typical changes of a stride, of shape (windows, steps, observation); `noisy` are those that noise
-    alone would cause at the best parameters.
+    alone would cause at the best parameters. `beside_random` are the errors of each signal over those of chance.
     """
 
     errors: PredictionErrors
@@ -85,6 +88,7 @@ class _Replayed(NamedTuple):
     at_best: Float[np.ndarray, "windows steps observation"]
     noisy: Float[np.ndarray, "windows steps observation"]
     single: "_SingleSteps"
+    beside_random: dict[str, float]
     control_steps: int
 
 
@@ -97,18 +101,24 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
     best = best_of(sizes)
     single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
+    kick = np.sqrt(np.maximum(single.size**2 - (noisy[0, :, 0] ** 2).mean(0), 0.0))
+    random = replays.magnitudes(replays.random_floor(points[best], noisy, np.where(kick > NEGLIGIBLE, kick, 0.0)))
+    groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
+    signals = signal_names(bench.simulator.task)
+    beside = beside_random(sizes[:, best, -1], random[:, 0, -1], groups)
     errors = prediction_errors(
         sizes,
         replays.magnitudes(noisy)[:, 0],
         best,
-        groups=independent_groups(replays.episodes, replays.rows, replays.windows.steps),
+        groups=groups,
         horizons=replays.horizons,
-        signals=signal_names(bench.simulator.task),
+        signals=signals,
         failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
         stride=stride(bench.problem.dataset),
     )
-    spent = searching + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps
-    return _Replayed(errors, points[best], residuals[0], residuals[1], residuals[best], noisy[0], single, spent)
+    spent = searching + residuals[..., 0].size + noisy[..., 0].size * 4 + single.control_steps
+    beyond = dict(zip(signals, beside.tolist(), strict=True))
+    return _Replayed(errors, points[best], residuals[0], residuals[1], residuals[best], noisy[0], single, beyond, spent)
 
 
 def _explained_at_end(

@@ -76,6 +76,35 @@ class Replays:
         moved = self.residuals(point[None], replace(self.windows, states=starts))
         return moved - self.residuals(point[None]) + deviation * rng.standard_normal(shape)
 
+    def random_floor(
+        self,
+        point: Float[np.ndarray, " d"],
+        noisy: Float[np.ndarray, "1 windows steps observation"],
+        kick: Float[np.ndarray, " observation"],
+    ) -> Float[np.ndarray, "1 windows steps observation"]:
+        """Residuals that sensor noise and random forces of each step would cause together.
+
+        `noisy` are those of sensor noise alone; `kick` is the standard deviation of what random forces change in a
+        control step, in typical changes of a stride. Errors of a wrong model have the same sign from step to step and
+        add up to more.
+        """
+        if not kick.any():
+            return noisy
+        windows, task, rng = self.windows, self.simulator.task, np.random.default_rng(1)
+        assert task.state_from_observation is not None  # windows begin at states that are rebuilt by it
+        system = self.simulator.bind(self.simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
+        steady = kicked = system.unbiased(np.ascontiguousarray(windows.states[None]))
+        moved = []
+        for step in range(windows.steps):
+            action = np.ascontiguousarray(windows.actions[None, :, step])
+            steady, kicked = system.step(steady, action), system.step(kicked, action)
+            seen = system.observe(kicked) + kick * self.scale * rng.standard_normal((1, len(windows), len(kick)))
+            physical = np.asarray(task.state_from_observation(seen), np.float64)
+            rebuilt = np.concatenate([physical, kicked[..., physical.shape[-1] :]], axis=-1)
+            kicked = np.where(np.isfinite(rebuilt), system.unbiased(rebuilt), kicked)
+            moved.append(system.observe(kicked) - system.observe(steady))
+        return noisy + np.stack(moved, axis=2) / self.scale
+
     def single_steps(self) -> Windows:
         """The beginning of each window, as long as the shortest horizon."""
         windows, steps = self.windows, self.horizons[0]

@@ -175,18 +175,18 @@ def beyond_noise(
     return [(left, alone) for left, alone in pairs if left.mean > max(NEGLIGIBLE, ABOVE_NOISE * alone.mean)]
 
 
-def growth_beside_noise(errors: PredictionErrors) -> float:
-    """The growth of errors from the shortest horizon to the longest, over that of the errors of noise alone.
+def beside_random(
+    left: Float[np.ndarray, "windows signals"],
+    random: Float[np.ndarray, "windows signals"],
+    groups: Int[np.ndarray, " windows"],
+) -> Float[np.ndarray, " signals"]:
+    """How many times as large errors of each signal are as those that noise and random forces make, at least.
 
-    The errors are those of the best parameters nearby; errors below those of noise count as those. It is 1 where there
-    is no noise to compare with.
+    It is the lower end of a 95 % interval by resampling; negligible errors count as `NEGLIGIBLE`.
     """
-    if errors.noise[0].mean <= NEGLIGIBLE:
-        return 1.0
-    beside_noise = [
-        max(left.mean, alone.mean) / alone.mean for left, alone in zip(errors.nearby_best, errors.noise, strict=True)
-    ]
-    return beside_noise[-1] / beside_noise[0]
+    kinds = np.maximum(np.stack([left, random], axis=1), NEGLIGIBLE)
+    draws = resampled(kinds, groups)
+    return interval_of(draws[:, 0] / draws[:, 1])[0]
 
 
 def hides_gain(errors: PredictionErrors) -> bool:

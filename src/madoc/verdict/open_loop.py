@@ -1,0 +1,134 @@
+"""How far the simulator can be believed, in the user's units: held-out motion predicted without a look at it.
+
+The simulator starts where the log does, gets the logged actions, and runs on. Its errors after a tenth of a second, a
+second and whole runs stand beside those of the user's own model as it was given, and of mid-range.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from madoc import simulation
+from madoc.calibration.holdout import OpenLoop
+from madoc.data import stride
+from madoc.diagnosis.channels import signal_names
+from madoc.identification.replay import window_residuals
+from madoc.identification.states import logged_states
+from madoc.identification.windows import evenly, rows_that_fit, windows_at
+from madoc.parameters import FIELDS, Parameter, ParameterSpace
+from madoc.simulation.base import Simulator
+from madoc.simulation.write import nominal_values
+from madoc.verdict.bench import Bench
+from madoc.verdict.fitted_starts import FITTED, fitted_replays_of
+from madoc.verdict.statistics import independent_groups, interval_of, resampled
+
+SECONDS = (0.1, 1.0)
+"""Times in s over which motion is predicted, besides whole runs."""
+MOST = 60
+"""Largest number of windows of one length."""
+FAILED = 10.0
+"""Error, in typical changes of a stride, of a window whose simulation failed."""
+
+
+def open_loop(bench: Bench, point: Float[np.ndarray, " d"]) -> tuple[OpenLoop, ...]:
+    """Errors of open-loop predictions of the hold-out at an estimate in [-1, 1], one record for each length of time.
+
+    There are none where the log tells no states to begin at, and none of a length that no held-out stretch has.
+    """
+    if bench.states.kind == "unknown" or bench.held_out.disturbance.shuffled != "none":
+        return ()
+    given, held, step = as_given(bench.simulator), bench.held_out, bench.simulator.control_step
+    before = 0 if bench.states_known else FITTED * stride(bench.problem.dataset)
+    whole = int(np.median(held.episode_ends - held.episode_starts)) - before
+    lengths = {max(1, round(seconds / step)) for seconds in SECONDS} | {whole}
+    found = (_over(bench, given, point, steps, whole=steps == whole) for steps in sorted(lengths) if 0 < steps <= whole)
+    return tuple(each for each in found if each is not None)
+
+
+def as_given(simulator: Simulator) -> Simulator:
+    """The simulator whose parameters at -1 are those of the user's model as it stands, each element with its own."""
+    model, space = simulator.task.model, simulator.parameters
+    own = [part for parameter in space.parameters for part in _own(parameter, nominal_values(model, parameter))]
+    return simulation.make(replace(simulator.task, parameters=ParameterSpace(tuple(own))))
+
+
+def _own(parameter: Parameter, values: tuple[float, ...]) -> list[Parameter]:
+    """A parameter for each element of a shared one, whose range begins at the element's value in the model."""
+    width = parameter.high - parameter.low
+    if not FIELDS[parameter.field].in_model or not parameter.elements:
+        return [replace(parameter, low=values[0], high=values[0] + width)]
+    pairs = zip(parameter.elements, values, strict=True)
+    return [replace(parameter, element=one, label="", low=value, high=value + width) for one, value in pairs]
+
+
+def _over(
+    bench: Bench, given: Simulator, point: Float[np.ndarray, " d"], steps: int, *, whole: bool
+) -> OpenLoop | None:
+    """The errors over windows of so many control steps; None where the hold-out has none as long."""
+    found = (_exact if bench.states_known else _from_fitted)(bench, given, point, steps)
+    if found is None:
+        return None
+    residuals, rows = found
+    size, units = np.where(np.isfinite(residuals), residuals, FAILED), bench.change[: residuals.shape[-1]]
+    of_signals = np.sqrt((size**2).mean((1, 2))) * units
+    squares = (size**2).mean((2, 3))
+    groups = independent_groups(bench.held_out.episode_of(rows), rows, steps)
+    before, _, after = np.sqrt(squares.mean(1))
+    draws = np.sqrt(resampled(squares.T, groups))
+    low, high = interval_of(draws[:, 2] / np.maximum(draws[:, 0], np.finfo(float).tiny))
+    named = [dict(zip(signal_names(bench.simulator.task), row, strict=False)) for row in of_signals.tolist()]
+    return OpenLoop(
+        seconds=steps * bench.simulator.control_step,
+        whole=whole,
+        windows=len(rows),
+        as_given=named[0],
+        mid_range=named[1],
+        estimate=named[2],
+        relative=float(after / max(before, np.finfo(float).tiny)),
+        relative_interval=(float(low), float(high)),
+    )
+
+
+def _exact(
+    bench: Bench, given: Simulator, point: Float[np.ndarray, " d"], steps: int
+) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
+    """Residuals from logged states as given, at mid-range and at the estimate, and the rows where windows begin."""
+    held = bench.held_out
+    states, rows = logged_states(held, bench.simulator.task)
+    possible = rows_that_fit(held, rows, steps)
+    if not len(possible):
+        return None
+    chosen = evenly(possible, MOST)
+    windows = windows_at(held, states[chosen], rows[chosen], steps)
+    flat = np.concatenate(
+        [
+            window_residuals(simulator, windows, points, bench.change)
+            for simulator, points in _models(bench, given, point)
+        ]
+    )
+    return flat.reshape(*flat.shape[:2], steps, -1), rows[chosen]
+
+
+def _from_fitted(
+    bench: Bench, given: Simulator, point: Float[np.ndarray, " d"], steps: int
+) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
+    """The same from starts that are fitted under each model to the strides before."""
+    moving, of_models, rows = stride(bench.problem.dataset), [], np.empty(0, np.int64)
+    for simulator, points in _models(bench, given, point):
+        replays = fitted_replays_of(
+            bench.held_out, simulator, bench.change, moving, ahead=(steps,), fewest=1, most=MOST
+        )
+        if replays is None:
+            return None
+        of_models.append(replays.residuals(points)[0][:, :, replays.fitted + 1 :])
+        rows = replays.rows
+    return np.concatenate(of_models), rows
+
+
+def _models(
+    bench: Bench, given: Simulator, point: Float[np.ndarray, " d"]
+) -> tuple[tuple[Simulator, Float[np.ndarray, "systems d"]], ...]:
+    """The user's model as given, then mid-range and the estimate."""
+    at_given = -np.ones((1, len(given.parameters)))
+    return (given, at_given), (bench.simulator, np.stack([np.zeros(len(point)), point]))

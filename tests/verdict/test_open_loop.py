@@ -1,0 +1,71 @@
+"""Open-loop predictions beside the user's own model, on planted logs."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import jax
+import numpy as np
+import pytest
+from planted_logs import ROBOTS, log_of
+
+from madoc import simulation
+from madoc.calibration import CalibrationProblem
+from madoc.data import Disturbance, disturb, observed_task
+from madoc.identification.states import logged_states
+from madoc.identification.windows import evenly, rows_that_fit
+from madoc.simulation.write import nominal_values
+from madoc.verdict import Bench
+from madoc.verdict.open_loop import MOST, as_given, open_loop
+
+TASK, TRUTH = ROBOTS["spring"]
+TASK = replace(TASK, velocities=1)
+
+
+def bench_of(disturbance=None):
+    log = log_of("spring", rows=600)
+    if disturbance is not None:
+        log = disturb(log, disturbance, TASK, jax.random.key(0))
+    train, held = log.split(0.3)
+    simulator = simulation.make(observed_task(TASK, log), threads=1)
+    return Bench(CalibrationProblem(train, simulator), held, jax.random.key(0))
+
+
+def at_truth(bench):
+    space = bench.simulator.parameters
+    return space.to_unit(space.vector(TRUTH))
+
+
+def test_the_model_as_given_has_the_values_of_its_file_and_no_range_bounds_them():
+    simulator = as_given(simulation.make(TASK, threads=1))
+    own = [value for row in TASK.parameters.parameters for value in nominal_values(TASK.model, row)]
+    assert simulator.parameters.to_physical(-np.ones(len(own))) == pytest.approx(own)
+
+
+@pytest.mark.parametrize("disturbance", [None, Disturbance(hidden_velocities=True)])
+def test_the_truth_predicts_and_the_model_as_given_does_not(disturbance):
+    bench = bench_of(disturbance)
+    predictions = open_loop(bench, at_truth(bench))
+    assert [each.whole for each in predictions][-1]
+    assert all(first.seconds < second.seconds for first, second in pairwise(predictions))
+    for each in predictions:
+        assert each.relative < 0.01 and each.relative_interval[1] < 0.02
+        assert all(each.estimate[name] < 0.01 * each.as_given[name] for name in each.estimate)
+
+
+def test_errors_are_those_of_stepping_on_from_the_log_in_the_signals_own_units():
+    bench = bench_of()
+    held, simulator = bench.held_out, bench.simulator
+    first = open_loop(bench, at_truth(bench))[0]
+    steps = round(first.seconds / simulator.control_step)
+    states, rows = logged_states(held, simulator.task)
+    begins = evenly(rows_that_fit(held, rows, steps), MOST)
+    system, state, errors = simulator.bind(simulator.parameters.middle[None]), states[begins][None], []
+    for step in range(steps):
+        state = system.step(state, np.asarray(held.transitions.action)[rows[begins] + step][None])
+        errors.append(system.observe(state)[0] - held.transitions.next_observation[rows[begins] + step])
+    assert list(first.mid_range.values()) == pytest.approx(np.sqrt((np.square(errors)).mean((0, 1))))
+
+
+def test_loose_rows_are_not_predicted_over_time():
+    bench = bench_of(Disturbance(shuffled="rows"))
+    assert open_loop(bench, at_truth(bench)) == ()
