@@ -30,6 +30,9 @@ class Field:
     in_model: bool = True
 
 
+AT_END = 0.98
+"""Position in [-1, 1] of its range; past it, to either side, a parameter is at the end of the range."""
+
 FIELDS: dict[str, Field] = {
     "gravity": Field(None, "m/s²", maximum=1e4),
     "body_mass": Field("body", "kg", 0.0),
@@ -163,6 +166,17 @@ class ParameterSpace:
     def to_unit(self, physical: ArrayLike) -> np.ndarray:
         """Map physical units to [-1, 1]; shape (..., d), float64."""
         return 2.0 * (np.asarray(physical, dtype=np.float64) - self.low) / (self.high - self.low) - 1.0
+
+    def at_end(self, unit: Float[np.ndarray, " d"]) -> tuple[str, ...]:
+        """Names of the parameters that stand at an end of their range, where the true value may lie beyond it.
+
+        The physical minimum of a field, such as a damping of 0, is no such end.
+        """
+        return tuple(
+            row.name
+            for row, value in zip(self.parameters, unit.tolist(), strict=True)
+            if abs(value) > AT_END and not (value < 0.0 and row.low <= FIELDS[row.field].minimum)
+        )
 
     def select(self, names: Sequence[str]) -> "ParameterSpace":
         """The space of the named parameters, in the order given.

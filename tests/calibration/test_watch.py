@@ -16,6 +16,7 @@ from madoc.calibration.madoc.watch import (
     stalled,
     warnings,
 )
+from madoc.parameters import Parameter, ParameterSpace
 
 SMALLEST, LARGEST = 0.02, 0.3
 
@@ -129,16 +130,21 @@ def test_crumbs_add_up_to_progress():
     assert stalled(watch, 10) is None
 
 
+SPACE = ParameterSpace(
+    (Parameter("body_mass", "cart", 1.0, 2.0, "mass"), Parameter("dof_damping", "slide", 0.1, 1.0, "damping"))
+)
+
+
 def warned(watch=None, unit=(0.0, 0.0)):
-    return warnings(watch or settled(blur=0.1), np.array(unit), ("mass", "damping"))
+    return warnings(watch or settled(blur=0.1), np.array(unit), SPACE)
 
 
 def test_a_healthy_run_is_not_warned_of():
-    assert warned(unit=(-0.94, 0.94)) == ()
+    assert warned(unit=(-0.97, 0.97)) == ()
 
 
 def test_a_parameter_at_the_end_of_its_range_is_named():
-    (warning,) = warned(unit=(0.5, -0.96))
+    (warning,) = warned(unit=(0.5, -0.99))
     assert warning == "at the end of its range: damping; widen the range or doubt the model"
     assert "mass, damping" in warned(unit=(1.0, -0.99))[0]
 

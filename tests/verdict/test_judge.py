@@ -82,7 +82,7 @@ def test_a_good_estimate_is_calibrated_and_the_sentence_has_its_numbers(good):
             "the best parameters nearby leave 0.8 of the typical change in 1 step",
         ),
         ("MODEL_MISMATCH", LEFT_OVER, {"explained": 0.6}, "actions? explain 60 % of it"),
-        ("MODEL_MISMATCH", LEFT_OVER, {"estimate": {"mass": 1.0}}, "mass at the end of the range"),
+        ("MODEL_MISMATCH", LEFT_OVER, {"at_end": ("mass",)}, "mass at the end of the range"),
         ("NOT_IDENTIFIABLE", {}, {"interval_shares": {"mass": 0.1, "damping": 0.7}}, "leaves damping open"),
         ("NO_IMPROVEMENT", {"relative": 1.1, "relative_interval": (0.9, 1.3)}, {}, "not at its end"),
         ("NO_IMPROVEMENT", {"relative": 0.5, "relative_interval": (0.4, 0.6)}, {}, "parameters nearby leave 9 %"),

@@ -5,12 +5,12 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Float
 
+from madoc.parameters import ParameterSpace
 
-def at_end_of_range(
-    scaled: Float[np.ndarray, " d"], names: tuple[str, ...], *, beyond: float = 0.98
-) -> tuple[str, ...]:
-    """Warn of estimates, scaled to [-1, 1], whose absolute value is larger than `beyond`."""
-    ends = [name for name, value in zip(names, scaled, strict=True) if abs(value) > beyond]
+
+def at_end_of_range(scaled: Float[np.ndarray, " d"], space: ParameterSpace) -> tuple[str, ...]:
+    """Warn of estimates, scaled to [-1, 1], that are at an end of their range; see `ParameterSpace.at_end`."""
+    ends = space.at_end(scaled)
     return (f"at the end of its range: {', '.join(ends)}; widen the range or doubt the model",) if ends else ()
 
 

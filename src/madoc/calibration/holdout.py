@@ -84,7 +84,8 @@ class OpenLoop:
             given.
         mid_range: The same with every parameter at the middle of its range.
         estimate: The same at the estimate.
-        relative: Error at the estimate over that of the model as given, over all signals in units of their change.
+        relative: Error at the estimate over that of the model as given: the mean over stretches of the root mean square
+            over all signals, each in units of its change.
         relative_interval: 95 % confidence interval of that, by resampling episodes, or stretches where these are few.
     """
 

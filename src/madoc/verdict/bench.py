@@ -24,7 +24,7 @@ from madoc.identification.states import LoggedStates, logged_states
 from madoc.identification.windows import consecutive_rows, evenly, horizons
 from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
-from madoc.parameters import FIELDS, ParameterSpace
+from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.types import named_key
 from madoc.verdict.adequacy import NUMERICAL, actions_in_time, felt, in_full, is_certain, widening
@@ -33,8 +33,6 @@ from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
 from madoc.verdict.two_sample import WindowView, behaviour, classify, rolled
 
-AT_END = 0.98
-"""Position in [-1, 1] of its range; past it, to either side, a parameter counts as pinned to the end."""
 _MOST_TERMS = 5
 """Number of missing terms that a report keeps, the most significant ones; besides them the integration step's and all
 that are certain are kept, as a verdict rests on them."""
@@ -262,11 +260,7 @@ def judged(
         contradictions=contradictions,
         coarseness=coarse,
         finer=finer,
-        at_end=tuple(
-            row.name
-            for row, value in zip(space.parameters, point, strict=True)
-            if abs(value) > AT_END and not (value < 0.0 and row.low <= FIELDS[row.field].minimum)
-        ),
+        at_end=space.at_end(point),
     )
 
 

@@ -25,7 +25,6 @@ from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
-from madoc.verdict.bench import AT_END
 from madoc.verdict.remedies import WARM_UP, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, WORTH_GAINING, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
@@ -91,9 +90,10 @@ def _usable(holdout: HoldOut, lacking: Verdict) -> Verdict | None:
 
     An estimate at an end of its range is none: a wider range would give another one.
     """
-    found = furthest(holdout.open_loop)
-    if holdout.at_end or found is None or found.relative > MUCH_BETTER or found.relative_interval[1] >= 1.0:
+    better = [each for each in holdout.open_loop if each.relative <= MUCH_BETTER and each.relative_interval[1] < 1.0]
+    if holdout.at_end or not better:
         return None
+    found = max(better, key=lambda each: (not each.whole, each.seconds))  # whole runs are often few
     low, high = map(_percent, found.relative_interval)
     return Verdict(
         "USABLE",
@@ -102,12 +102,6 @@ def _usable(holdout: HoldOut, lacking: Verdict) -> Verdict | None:
         f"the machine's own values, as {lacking.sentence}",
         lacking.parameters,
     )
-
-
-def furthest(predictions: Sequence[OpenLoop]) -> OpenLoop | None:
-    """The prediction over the longest time that is not whole runs: those are often too few to compare models by."""
-    parts = [each for each in predictions if not each.whole] or list(predictions)
-    return max(parts, key=lambda each: each.seconds, default=None)
 
 
 def explains_all(holdout: HoldOut) -> bool:
@@ -218,8 +212,7 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
 def _mismatch(holdout: HoldOut) -> Verdict | None:
     if numerical(holdout) is not None:
         return None
-    pinned = tuple(name for name, value in holdout.estimate.items() if abs(value) > AT_END)
-    at_end = [f"{', '.join(pinned)} at the end of the range"] if pinned else []
+    at_end = [f"{', '.join(holdout.at_end)} at the end of the range"] if holdout.at_end else []
     if isinstance(holdout, ToldApart):
         sentence = _separable(holdout.area_at_mid_range, holdout.area_at_estimate, at_end)
     else:
@@ -233,7 +226,7 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
             f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}){_others(holdout, term)}; "
             f"{remedy(term)}"
         )
-    return Verdict("MODEL_MISMATCH", f"{sentence}{about_timestep(holdout)}", pinned)
+    return Verdict("MODEL_MISMATCH", f"{sentence}{about_timestep(holdout)}", holdout.at_end)
 
 
 def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:

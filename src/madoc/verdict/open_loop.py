@@ -23,7 +23,7 @@ from madoc.verdict.bench import Bench
 from madoc.verdict.fitted_starts import FITTED, fitted_replays_of
 from madoc.verdict.statistics import independent_groups, interval_of, resampled
 
-SECONDS = (0.1, 1.0)
+SECONDS = (0.1, 0.3, 1.0)
 """Times in s over which motion is predicted, besides whole runs."""
 MOST = 60
 """Largest number of windows of one length."""
@@ -72,10 +72,10 @@ def _over(
     residuals, rows = found
     size, units = np.where(np.isfinite(residuals), residuals, FAILED), bench.change[: residuals.shape[-1]]
     of_signals = np.sqrt((size**2).mean((1, 2))) * units
-    squares = (size**2).mean((2, 3))
+    of_windows = np.sqrt((size**2).mean((2, 3)))  # of which means are taken, as a few windows may run away
     groups = independent_groups(bench.held_out.episode_of(rows), rows, steps)
-    before, _, after = np.sqrt(squares.mean(1))
-    draws = np.sqrt(resampled(squares.T, groups))
+    before, _, after = of_windows.mean(1)
+    draws = resampled(of_windows.T, groups)
     low, high = interval_of(draws[:, 2] / np.maximum(draws[:, 0], np.finfo(float).tiny))
     named = [dict(zip(signal_names(bench.simulator.task), row, strict=False)) for row in of_signals.tolist()]
     return OpenLoop(

@@ -104,7 +104,7 @@ def estimate_from_search(problem: CalibrationProblem, state: SearchState) -> Est
         mean=space.to_physical(state.search.mean),
         std=np.sqrt(np.diag(covariance)),
         failures=state.failures,
-        warnings=at_end_of_range(state.search.mean, space.names),
+        warnings=at_end_of_range(state.search.mean, space),
         covariance=covariance,
     )
 
@@ -119,6 +119,6 @@ def independent_estimate(
         mean=space.to_physical(mean),
         std=physical,
         failures=failures,
-        warnings=at_end_of_range(mean, space.names),
+        warnings=at_end_of_range(mean, space),
         covariance=np.diag(physical**2),
     )

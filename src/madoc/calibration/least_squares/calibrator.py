@@ -193,7 +193,7 @@ class LeastSquares:
             failures=sum(search.failures for search in searches),
             warnings=(
                 *identifiability(uncertainty, space.names),
-                *at_end_of_range(point, space.names),
+                *at_end_of_range(point, space),
                 *(() if settled else (sentences.NOT_SETTLED,)),
                 *self._about_states(problem, state),
             ),

@@ -183,7 +183,7 @@ class Madoc:
             group_stability=state.stability if state.grouped == self.grouping_epochs else None,
             failures=state.failures,
             warnings=(
-                *watch.warnings(state.watch, scaled, space.names),
+                *watch.warnings(state.watch, scaled, space),
                 *self._collection(problem, state.noise).warnings,
             ),
             settled=watch.settled(state.watch),

@@ -8,6 +8,7 @@ import numpy as np
 
 from madoc.calibration.cautions import at_end_of_range
 from madoc.calibration.madoc.actors import Actors
+from madoc.parameters import ParameterSpace
 from madoc.types import Metrics
 
 SMOOTHING = 0.1
@@ -20,8 +21,6 @@ LEAST_REWARD = 0.7
 """Smallest ratio of the mean |reward| to its set value at which the mismatch of an epoch is used."""
 CLOSE = 0.1
 """Relative excess over the lowest mismatch up to which an estimate is as good as the best; the latest one is kept."""
-AT_END = 0.95
-"""Absolute value in [-1, 1] above which a warning names the parameter; entropy keeps estimates below 1."""
 GAIN_SMOOTHING = 0.02
 """Weight of the newest epoch in the averages of what the estimate gains over mid-range: that of about 100 epochs."""
 SURE = 2.0
@@ -144,7 +143,7 @@ def settled(watch: Watch) -> bool:
     return watch.epochs >= SETTLING and beats_mid_range(watch)
 
 
-def warnings(watch: Watch, scaled: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
+def warnings(watch: Watch, scaled: np.ndarray, space: ParameterSpace) -> tuple[str, ...]:
     """Warnings about the estimate `scaled` (d,) in [-1, 1], one sentence each."""
     sentences = []
     if watch.epochs < SETTLING:
@@ -162,4 +161,4 @@ def warnings(watch: Watch, scaled: np.ndarray, names: tuple[str, ...]) -> tuple[
             f"the discriminators are sure of {watch.at_bound:.0%} of the simulated rows (reward at its bound), "
             "so the reward has no slope; narrow the ranges"
         )
-    return *sentences, *at_end_of_range(scaled, names, beyond=AT_END)
+    return *sentences, *at_end_of_range(scaled, space)

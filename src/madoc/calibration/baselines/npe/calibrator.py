@@ -191,7 +191,7 @@ class Npe:
             mean=space.to_physical(belief.mean),
             std=np.sqrt(np.diag(covariance)),
             failures=state.failures,
-            warnings=(*warnings, *at_end_of_range(belief.mean, space.names)),
+            warnings=(*warnings, *at_end_of_range(belief.mean, space)),
             covariance=covariance,
             interval=np.stack([space.to_physical(end) for end in belief.interval.T], axis=-1),
             settled=not warnings,
