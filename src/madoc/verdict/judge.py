@@ -13,7 +13,6 @@ from madoc.calibration.holdout import (
     Area,
     Fitted,
     HoldOut,
-    OpenLoop,
     Predicted,
     PredictionErrors,
     ToldApart,
