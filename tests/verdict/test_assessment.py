@@ -1,6 +1,7 @@
 """`madoc.assess`: a verdict right after a calibration, and for a result read from a file."""
 
 import json
+import time
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ from madoc.calibration import CalibrationProblem, CalibrationResult, LeastSquare
 from madoc.data.split import hold_out
 from madoc.errors import MadocError
 from madoc.identification.candidate_terms import INTEGRATION
+from madoc.verdict import Bench
 from own_robots import SPRING_SPEC, write_robot
 from robots import SPRING_TRUTH, recorded
 
@@ -36,6 +38,19 @@ def test_a_result_and_rows_held_out_are_all_it_needs(result, split):
     assert str(found).startswith("CALIBRATED: the prediction error on the hold-out is")
     assert (found.holdout.rows, found.holdout.measure) == (len(split.held), "predicted")
     assert found.holdout.split == "100 rows in 1 episode were held out"
+
+
+def test_without_time_nothing_is_said_to_be_tested(result, split):
+    bench = Bench(CalibrationProblem(split.kept, simulation.make(TASK, threads=1)), split.held, jax.random.key(0))
+    found = madoc.assess(result, bench.within(time.monotonic(), rate=1e5))
+    assert found.verdict.word == "NOT_IDENTIFIABLE" and not found.holdout.tested
+    assert found.holdout.open_loop == () and found.holdout.coarseness == 0.0
+    assert found.result.warnings[-1] == (
+        "the budget left no time for tests of what the model lacks, exchanged columns, predictions over longer times; a "
+        "larger one judges in full"
+    )
+    in_full = madoc.assess(result, bench.within(time.monotonic() + 1000.0, rate=1e5))
+    assert in_full.verdict.word == "CALIBRATED" and in_full.holdout == madoc.assess(result, bench).holdout
 
 
 def test_a_log_of_a_finer_simulation_is_judged_with_a_finer_step_and_its_truth_is_covered(tmp_path):

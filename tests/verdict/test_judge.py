@@ -223,7 +223,7 @@ def test_rows_alone_are_judged_by_the_classifier(word, before, after):
 def test_what_could_not_be_tested_or_stands_at_an_end_is_not_calibrated(good):
     untested = judge(replace(good, tested=False))
     assert untested.word == "NOT_IDENTIFIABLE"
-    why = "the log tells no states" if good is TOLD_APART else "the log has too few windows that the model can follow"
+    why = "the log tells no states" if good is TOLD_APART else "whether the model lacks anything was not tested"
     assert f", but {why}" in untested.sentence
     assert judge(replace(good, at_end=("mass",))).word == "MODEL_MISMATCH"
 

@@ -60,13 +60,19 @@ class LoggedWindows:
 
 
 def windows_of(
-    dataset: Dataset, logged: LoggedStates, scale: Float[np.ndarray, " observation"], *, fewest: int
+    dataset: Dataset,
+    logged: LoggedStates,
+    scale: Float[np.ndarray, " observation"],
+    *,
+    fewest: int,
+    most: int | None = None,
 ) -> LoggedWindows:
     """Windows to test a model by, evenly spread over the log.
 
     They are shorter than `STRIDES` where the log has not enough rows for `fewest` of that length, or where the episode
     of its median row is shorter. Where every row is an episode of its own they are single rows, as many as make up
-    those windows, and the action before each, which is not known, is taken to be its own.
+    those windows, and the action before each, which is not known, is taken to be its own. There are `most` windows at
+    most, where that is given.
     """
     lengths = dataset.episode_ends - dataset.episode_starts
     age = logged.rows - dataset.episode_starts[dataset.episode_of(logged.rows)]
@@ -80,8 +86,8 @@ def windows_of(
     steps, chosen = min(STRIDES * stride(dataset), affordable), np.zeros(0, np.int64)
     if len(rows):
         steps = longest_fit(dataset, rows, steps)
-        most = WINDOWS * STRIDES if loose else WINDOWS
-        chosen = evenly(disjoint_windows(dataset, rows, steps), max(most, fewest))
+        usually = max(WINDOWS * STRIDES if loose else WINDOWS, fewest)
+        chosen = evenly(disjoint_windows(dataset, rows, steps), usually if most is None else min(usually, most))
     readings = Readings.at(dataset, logged, rows[chosen], steps, scale)
     runs = dataset.episode_of(rows[chosen])
     acted = np.maximum(rows[chosen] - 1, dataset.episode_starts[runs])

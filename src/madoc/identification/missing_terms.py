@@ -91,6 +91,7 @@ def suspicions(
     scale: Float[np.ndarray, " observation"],
     *,
     of_other_model: bool = False,
+    most: int | None = None,
 ) -> Suspicions:
     """Terms that the model may lack, and what including them would do to the estimate.
 
@@ -104,8 +105,9 @@ def suspicions(
         scale: Typical change of each signal in a step.
         of_other_model: Whether the estimate is another model's, so that other windows may move it for a reason:
             alternatives then move by that as well.
+        most: Largest number of windows; None for the usual one.
     """
-    windows = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)))
+    windows = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)), most=most)
     readings, runs = windows.readings, windows.runs
     if len(readings) < FEWEST + len(point):
         return Suspicions(tested=False)

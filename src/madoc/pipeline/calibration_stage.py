@@ -1,5 +1,6 @@
 """Calibration as a stage: by one method, which `auto` chooses by what the data allows."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +11,13 @@ from madoc.pipeline.methods import choose, hyperparameters, methods_for
 from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, Permission
 from madoc.pipeline.preparation import Prepared, prepare
 from madoc.pipeline.refusals import check_order, method_of
+from madoc.runs.budget import Seconds
 from madoc.runs.progress import waiting
 from madoc.verdict import assess
 from madoc.verdict.evidence import evidence, save_evidence
+
+LEAST_OF_SEARCH = 0.2
+"""Least share of a time budget that the search gets."""
 
 
 def calibrate_in(
@@ -28,20 +33,24 @@ def calibrate_in(
     Raises:
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
-    out = Path(out)
+    out, began = Path(out), time.monotonic()
     check_order(order, out)
     methods = methods_for(order)
     prepared = prepare(order, permission=permission)
     key = seed_key(prepared.seed)
     name, why = choose(methods, prepared.problem, key)
     prepared, method = prepared.by(name), methods[name]
+    judged_by, budget = None, prepared.budget
+    asked = order.search.budget is not None and prepared.holdout is not None
+    if asked and isinstance(budget, Seconds):
+        judged_by, budget = began + budget.seconds, _for_search(budget, time.monotonic() - began)
     spec = prepared.spec(out) | {"hyperparameters": hyperparameters(method)}
     with working_folder(out, spec, resume=resume) as folder:
         result = calibrate(
             method,
             prepared.problem,
             key=key,
-            budget=prepared.budget,
+            budget=budget,
             truth=prepared.calibrated_truth,
             folder=folder,
             resume=resume,
@@ -49,11 +58,22 @@ def calibrate_in(
         )
         result = replace(result, chosen=why)
         if prepared.holdout is not None and result.status in ENDED:
+            bench = prepared.bench
+            if judged_by is not None:
+                bench = bench.within(judged_by, result.control_steps / max(result.seconds, 1e-3))
             with waiting("judging the estimate on the rows held out", quiet=quiet):
-                result = assess(result, prepared.bench).result
+                result = assess(result, bench).result
             _leave_evidence(out, prepared, result)
         folder.write_json("result.json", result.to_json())
         return result
+
+
+def _for_search(budget: Seconds, spent: float) -> Seconds:
+    """What a search gets of a time that is for the whole command, of which some is spent: half, as judging takes it.
+
+    It gets a fifth at least.
+    """
+    return Seconds(max(budget.seconds * LEAST_OF_SEARCH, budget.seconds / 2.0 - spent))
 
 
 def default_folder(order: CalibrationOrder) -> Path:

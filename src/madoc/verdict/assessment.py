@@ -73,11 +73,14 @@ def assess(
         )
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
     holdout = measured(bench, result.mean, result.interval)
-    holdout = replace(holdout, open_loop=open_loop(bench, point))
+    if bench.has_time("predictions over longer times"):
+        holdout = replace(holdout, open_loop=open_loop(bench, point))
     widened = with_widened_intervals(result, holdout)
     verdict = judge(holdout, settled=result.settled, long_tails=result.long_tails, combinations=widened.combinations)
     better = beats_mid_range(holdout) or explains_all(holdout)
     warnings = [*widened.warnings, *about_imitated(holdout), *([] if better else [NO_BETTER])]
+    if bench.left_out:
+        warnings.append(f"the budget left no time for {', '.join(bench.left_out)}; a larger one judges in full")
     settled = result.settled and better
     widened = replace(widened, verdict=verdict, holdout=holdout, warnings=warnings, settled=settled)
     return Assessment(verdict, holdout, widened)

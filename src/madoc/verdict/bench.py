@@ -1,7 +1,8 @@
 """What estimates of one problem are judged on: the training rows, the hold-out, and ways to replay the latter."""
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -19,8 +20,10 @@ from madoc.errors import MadocError
 from madoc.identification.candidate_terms import INTEGRATION
 from madoc.identification.coarseness import FINER, coarseness
 from madoc.identification.excitation import expected_half_widths
+from madoc.identification.fitted_windows import STRIDES
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
 from madoc.identification.states import LoggedStates, logged_states
+from madoc.identification.term_tests import FEWEST
 from madoc.identification.windows import consecutive_rows, evenly, horizons
 from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
@@ -40,6 +43,11 @@ FEWEST_HELD = 10
 """Smallest number of rows held out, at least 1. With fewer, even perfect predictions could be chance."""
 _NEIGHBOURS = 5000
 """Largest number of training rows among which the nearest neighbour of a row held out is searched."""
+COLUMNS, COLUMNS_OF_A_VALUE = 60, 20
+"""Simulations of a window that testing a model takes about, and how many more for each parameter and each degree of
+freedom."""
+TESTING = 0.7
+"""Share in (0, 1) of the time left that testing what the model lacks may take."""
 _LONGEST_ROLLOUT = 1000
 """Largest length of a rollout in control steps, also where the episodes of the log are longer."""
 
@@ -55,6 +63,9 @@ class Bench:
         held_out: Rows that no method has seen.
         key: Randomness of the cloned policy and of its rollouts.
         split: How the rows were held out, in a sentence.
+        until: The time (`time.monotonic`) at which judging has to end; None for whenever it is done.
+        rate: Control steps that are simulated in a second, which matters under such a limit.
+        left_out: What there was no time for so far.
 
     Raises:
         MadocError: Too few rows are held out, or they are not of the simulator's robot.
@@ -64,6 +75,9 @@ class Bench:
     held_out: Dataset
     key: PRNGKeyArray
     split: str = ""
+    until: float | None = None
+    rate: float = 1.0
+    left_out: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if len(self.held_out) < FEWEST_HELD:
@@ -72,6 +86,22 @@ class Bench:
                 f"{len(self.problem.dataset)}; log more, or hold out a larger share"
             )
         object.__setattr__(self, "held_out", CalibrationProblem(self.held_out, self.simulator).dataset)
+
+    @property
+    def seconds_left(self) -> float:
+        """Time in s for what is still to be judged."""
+        return np.inf if self.until is None else self.until - time.monotonic()
+
+    def within(self, until: float, rate: float) -> "Bench":
+        """The same under a limit of time; see the attributes."""
+        return replace(self, until=until, rate=max(rate, 1.0), left_out=[])
+
+    def has_time(self, part: str, seconds: float = 0.0) -> bool:
+        """Whether there is time for a part that takes so long; a part for which there is none is noted."""
+        if self.seconds_left > seconds:
+            return True
+        self.left_out.append(part)
+        return False
 
     @property
     def simulator(self) -> Simulator:
@@ -181,21 +211,29 @@ def _doubts(
 
     Where the error of the integration step explains much, it hides other terms or looks like them. These are then
     tested with steps of a quarter of the length, unless their error explains much there too. A log that tells neither
-    states nor what is needed to fit them cannot be tested, nor can one without pairs of consecutive observations.
+    states nor what is needed to fit them cannot be tested, nor can one without pairs of consecutive observations. Under
+    a limit of time windows are as many as that allows.
     """
     problem, task = bench.problem, bench.problem.simulator.task
     ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
     told = bench.states_known or (bench.states.kind == "approximate" and ordered)
     if not told or problem.dataset.disturbance.shuffled == "next_observations":
         return Suspicions(tested=False), False
-    given = problem.dataset, bench.states
-    doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change)
+    given, most = (problem.dataset, bench.states), None
+    if bench.until is not None:
+        window = STRIDES * stride(problem.dataset) * (COLUMNS + COLUMNS_OF_A_VALUE * (len(point) + task.model.nv))
+        most = int(TESTING * bench.rate * bench.seconds_left / window)
+        if most < FEWEST + len(point) and not bench.has_time("tests of what the model lacks", np.inf):
+            return Suspicions(tested=False), False
+    doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most)
     doubts = replace(doubts, alternatives=in_full(doubts.alternatives, doubts.terms))
     step = felt(doubts.terms)
     if step is None or task.source is None:
         return doubts, False
+    if not bench.has_time("the same tests with a finer timestep", FINER * doubts.control_steps / bench.rate):
+        return doubts, False
     finer = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
-    fine = suspicions(*given, finer, point, half_widths, bench.change, of_other_model=True)
+    fine = suspicions(*given, finer, point, half_widths, bench.change, of_other_model=True, most=most)
     spent = doubts.control_steps + FINER * fine.control_steps
     left = felt(fine.terms)
     if not fine.tested or (left is not None and left.explained >= NUMERICAL):
@@ -235,7 +273,7 @@ def judged(
     doubts, finer = _doubts(bench, point, own)
     contradictions, of_columns = _contradictions(bench, point, at, doubts)
     coarse, of_steps = 0.0, 0
-    if bench.simulator.task.source is not None:  # else no timestep can be given
+    if bench.simulator.task.source is not None and bench.has_time("the length of the timestep"):
         coarse, of_steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
     ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
     shares = _shares(space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own, doubts)
@@ -295,7 +333,8 @@ def _contradictions(
     """
     simulator, dataset = bench.simulator, bench.problem.dataset
     found, spent = dataset.findings, 0
-    if simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none":
+    possible = simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none"
+    if possible and bench.has_time("exchanged columns"):
         points = np.stack([np.zeros(len(point)), point, at])
         exchanged, spent = exchanged_columns(
             bench.held_out, simulator, points, horizons(dataset)[1], bench.change, contradicts=True

@@ -298,8 +298,8 @@ def _untested(holdout: HoldOut) -> Verdict | None:
         )
     else:
         why = (
-            "the log has too few windows that the model can follow to tell whether it lacks anything; log more, or in "
-            "longer runs"
+            "whether the model lacks anything was not tested: the log has too few windows that the model can follow, "
+            "or the budget was too short; log more, or in longer runs, or give it more time"
         )
     return Verdict("NOT_IDENTIFIABLE", f"{_how_good(holdout)}, but {why}")
 
