@@ -1,6 +1,6 @@
 """What was measured, as Markdown.
 
-python benchmarks/tables.py            # prints, and writes results/README.md and the tables of the README
+python benchmarks/tables.py            # prints, and writes results/README.md and the table of the page on methods
 
 `make figures` writes all that is made of kept results.
 """
@@ -12,10 +12,10 @@ from typing import Any
 import adversary
 import adversary_table
 import coverage
+import method_page
 import numpy as np
 import planted
 import rates
-import readme
 from disturbances import disturbed, settled_wrongly
 from kept import CALIBRATIONS, POLICIES, RESULTS, SYSID, Study, commits, is_time
 from pooling import by_log, label, order, shown
@@ -28,7 +28,7 @@ SINGLE = {name: Study(RESULTS / f"{name}.jsonl", ()) for name in ("real_pendulum
 def main() -> None:
     text = measured()
     PAGE.write_text(text)
-    readme.README.write_text(readme.rewritten(readme.README.read_text()))
+    method_page.PAGE.write_text(method_page.rewritten(method_page.PAGE.read_text()))
     print(text)
 
 

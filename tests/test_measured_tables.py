@@ -17,11 +17,11 @@ import costs
 import embedding
 import figure_2
 import kept
+import method_page
 import paper
 import paper_cells
 import paper_errors
 import pooling
-import readme
 import tables
 
 from madoc.calibration.madoc.actors import initial_actors
@@ -30,10 +30,10 @@ from madoc.parameters import Parameter, ParameterSpace
 STALE = "stale: run make figures"
 
 
-def test_the_readme_says_what_was_measured():
-    text = readme.README.read_text()
+def test_the_page_on_methods_says_what_was_measured():
+    text = method_page.PAGE.read_text()
     assert text.count("<!-- measured: ") == 1
-    assert readme.rewritten(text) == text, STALE
+    assert method_page.rewritten(text) == text, STALE
 
 
 def test_the_tables_say_what_was_measured():

@@ -62,7 +62,7 @@ class MetricLog:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Windows of held-out data beside their simulation at mid-range (before) and at the estimate (after).
+    """Windows of held-out data beside their simulation in the model as given (before) and at the estimate (after).
 
     Simulations are NaN once they have failed, and None where no state can be rebuilt to start from.
 
@@ -71,9 +71,9 @@ class Evidence:
         scale: Typical change of each signal in a stride of rows (`data.timescale`), in its unit.
         time: Time since the beginning of a window, s.
         measured: What was logged.
-        before: Simulated at mid-range.
+        before: Simulated in the model as given.
         after: Simulated at the estimate.
-        residual_before: Simulated minus measured after one control step, at mid-range.
+        residual_before: Simulated minus measured after one control step, in the model as given.
         residual_after: The same at the estimate.
     """
 

@@ -1,5 +1,6 @@
 """What the hold-out looks like before and after calibration, as arrays for plots: `evidence.npz`."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, first_rows, longest_fit, readings_at, windows_at
 from madoc.runs.files import replacing
 from madoc.verdict.bench import Bench
+from madoc.verdict.open_loop import as_given
 
 TRACES = 6
 """Largest number of stretches of the hold-out that are drawn."""
@@ -23,10 +25,10 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
 
     There are always `signals` (names), `scale` (typical change in a stride, in each signal's unit), `time` (s),
     `episode` and `row` (where each stretch begins in the hold-out) and `measured` (stretches, times, signals). Where
-    states can be rebuilt there are also `before` and `after`, the same stretches simulated at mid-range and at the
-    estimate from the first measured state under the logged actions (NaN once a simulation has failed), and
-    `residual_before` and `residual_after` (windows, signals), simulated minus measured observations after the shortest
-    horizon.
+    states can be rebuilt there are also `before` and `after`, the same stretches simulated in the user's model as it
+    was given and at the estimate from the first measured state under the logged actions (NaN once a simulation has
+    failed), and `residual_before` and `residual_after` (windows, signals), simulated minus measured observations after
+    the shortest horizon.
     `mean` is the estimate in physical units, `control_step` the time between two rows in s.
     """
     held, replays = bench.held_out, bench.replays if bench.states_known else None
@@ -45,13 +47,17 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     if replays is None:
         return arrays
     point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
-    points = np.stack([np.zeros(len(point)), point])
-    residuals = replays.residuals(points, windows_at(held, states[chosen], first, steps)) * bench.change
-    start = arrays["measured"][:, :1]
-    for when, simulated in zip(("before", "after"), residuals, strict=True):
+    given = as_given(bench.simulator)
+    models = (
+        ("before", replace(replays, simulator=given), -np.ones((1, len(given.parameters)))),
+        ("after", replays, point[None]),
+    )
+    start, windows = arrays["measured"][:, :1], windows_at(held, states[chosen], first, steps)
+    for when, replayed, at in models:
+        simulated = replayed.residuals(at, windows)[0] * bench.change
         arrays[when] = np.concatenate([start, arrays["measured"][:, 1:] + simulated], axis=1)
-    single = replays.residuals(points, replays.single_steps())[:, :, 0] * bench.change
-    return arrays | {"residual_before": single[0], "residual_after": single[1]}
+        arrays[f"residual_{when}"] = replayed.residuals(at, replays.single_steps())[0, :, 0] * bench.change
+    return arrays
 
 
 def save_evidence(path: Path, arrays: dict[str, np.ndarray]) -> None:

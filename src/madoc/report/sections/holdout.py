@@ -66,7 +66,7 @@ def signals(run: Run) -> dict[str, object] | str:
         lines = [
             Line(name, _joined(values[:windows, :, signal]), colour, dashed=dashed)
             for name, values, colour, dashed in (
-                ("at mid-range", evidence.before, "before", True),
+                ("your model as given", evidence.before, "before", True),
                 ("measured", evidence.measured, "measured", False),
                 ("calibrated", evidence.after, "after", False),
             )
@@ -80,7 +80,7 @@ def signals(run: Run) -> dict[str, object] | str:
             y_range=_fit(lines),
         )
         charts.append({"title": name, "unit": run.units.get(name, ""), "chart": chart})
-    legend = [("measured", "measured"), ("before", "simulated at mid-range"), ("after", "simulated, calibrated")]
+    legend = [("measured", "measured"), ("before", "your model as given"), ("after", "simulated, calibrated")]
     return {"charts": charts, "legend": legend, "omitted": len(evidence.signals) - len(order)}
 
 
@@ -97,7 +97,7 @@ def _joined(windows: np.ndarray) -> np.ndarray:
 
 
 def _fit(lines: Sequence[Line]) -> tuple[float, float] | None:
-    """The range of all but mid-range, which may extend it by its own width at most to either side."""
+    """The range of all but the model as given, which may extend it by its own width at most to either side."""
     near = np.concatenate([line.y for line in lines if line.colour != "before"])
     every = np.concatenate([line.y for line in lines])
     near, every = near[np.isfinite(near)], every[np.isfinite(every)]

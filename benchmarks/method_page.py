@@ -1,4 +1,4 @@
-"""The measured tables of the README, made from kept results, between marks that name them."""
+"""The table of the page on methods that is made from kept results, between marks that name it."""
 
 import re
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from paper_cells import printed
 from paper_errors import calibrations, error_cell
 from pooling import OUR_LOGS
 
-README = Path(__file__).parents[1] / "README.md"
+PAGE = Path(__file__).parents[1] / "docs" / "concepts" / "which-method.md"
 NAMES = {"hopper": "Hopper", "halfcheetah": "HalfCheetah", "walker2d": "Walker2d", "ant": "Ant"}
 COLUMNS = ("madoc", "least-squares", "cma-es", "droid", "dropo", "oted", "mid-range")
 """Methods of the table of errors; mid-range is no method."""
@@ -18,7 +18,7 @@ _MARKED = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL
 
 
 def rewritten(text: str) -> str:
-    """The README with its marked tables made anew.
+    """The page with its marked tables made anew.
 
     Raises:
         KeyError: A mark names no table.
