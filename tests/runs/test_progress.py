@@ -58,8 +58,10 @@ def test_a_bar_of_known_size(capsys, total):
 def test_work_of_unknown_length_shows_the_time_it_has_taken_and_no_share_that_is_done(monkeypatch, capsys):
     now = 0.0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
-    with progress.waiting("judging [arm]"):
+    with progress.waiting("judging [arm]") as tell:
         assert capsys.readouterr().err == "judging [arm]: begun\n"
+        tell("its columns")
+        assert capsys.readouterr().err == "judging [arm]: its columns\n"
         now = 75.0
     assert capsys.readouterr().err == "judging [arm]: done, 1:15 elapsed\n"
     with progress.waiting("judging [arm]", quiet=True):

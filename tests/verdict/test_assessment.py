@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -42,14 +43,14 @@ def test_a_result_and_rows_held_out_are_all_it_needs(result, split):
 
 def test_without_time_nothing_is_said_to_be_tested(result, split):
     bench = Bench(CalibrationProblem(split.kept, simulation.make(TASK, threads=1)), split.held, jax.random.key(0))
-    found = madoc.assess(result, bench.within(time.monotonic(), rate=1e5))
+    found = madoc.assess(result, replace(bench, until=time.monotonic()))
     assert found.verdict.word == "NOT_IDENTIFIABLE" and not found.holdout.tested
     assert found.holdout.open_loop == () and found.holdout.coarseness == 0.0
     assert found.result.warnings[-1] == (
         "the budget left no time for tests of what the model lacks, exchanged columns, predictions over longer times; "
         "a larger one judges in full"
     )
-    in_full = madoc.assess(result, bench.within(time.monotonic() + 1000.0, rate=1e5))
+    in_full = madoc.assess(result, replace(bench, until=time.monotonic() + 1000.0, rate=1e5))
     assert in_full.verdict.word == "CALIBRATED" and in_full.holdout == madoc.assess(result, bench).holdout
 
 

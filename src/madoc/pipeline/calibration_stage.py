@@ -58,10 +58,9 @@ def calibrate_in(
         )
         result = replace(result, chosen=why)
         if prepared.holdout is not None and result.status in ENDED:
-            bench = prepared.bench
-            if judged_by is not None:
-                bench = bench.within(judged_by, result.control_steps / max(result.seconds, 1e-3))
-            with waiting("judging the estimate on the rows held out", quiet=quiet):
+            rate = result.control_steps / max(result.seconds, 1e-3)
+            with waiting("judging the estimate on the rows held out", quiet=quiet) as tell:
+                bench = replace(prepared.bench, until=judged_by, rate=max(rate, 1.0), tell=tell)
                 result = assess(result, bench).result
             _leave_evidence(out, prepared, result)
         folder.write_json("result.json", result.to_json())

@@ -69,14 +69,15 @@ def bar(description: str, *, total: int, unit: str, quiet: bool = False) -> Iter
 
 
 @contextmanager
-def waiting(description: str, *, quiet: bool = False) -> Iterator[None]:
+def waiting(description: str, *, quiet: bool = False) -> Iterator[Callable[[str], None]]:
     """Show work whose length nobody knows, with the time that it has taken.
 
-    It is a moving bar in a terminal, and a line at its begin and one at its end anywhere else.
+    It is a moving bar in a terminal, and a line at its begin and one at its end anywhere else. The function that it
+    gives is told of each part of the work.
     """
     started = time.monotonic()
     if quiet:
-        yield
+        yield lambda part: None
     elif sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -84,11 +85,11 @@ def waiting(description: str, *, quiet: bool = False) -> Iterator[None]:
         columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
         with Progress(*columns, console=Console(stderr=True)) as progress:
             task = progress.add_task(description, total=None)
-            yield
+            yield lambda part: progress.update(task, description=f"{description}: {part}")
             progress.update(task, total=1.0, completed=1.0)
     else:
         print(f"{description}: begun", file=sys.stderr, flush=True)
-        yield
+        yield lambda part: print(f"{description}: {part}", file=sys.stderr, flush=True)
         print(f"{description}: done, {_clock(time.monotonic() - started)} elapsed", file=sys.stderr, flush=True)
 
 

@@ -73,7 +73,7 @@ def assess(
         )
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
     holdout = measured(bench, result.mean, result.interval)
-    if bench.has_time("predictions over longer times"):
+    if bench.begins("predictions over longer times"):
         holdout = replace(holdout, open_loop=open_loop(bench, point))
     widened = with_widened_intervals(result, holdout)
     verdict = judge(holdout, settled=result.settled, long_tails=result.long_tails, combinations=widened.combinations)
@@ -95,6 +95,7 @@ def measured(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.nda
         MadocError: No state of the hold-out can be rebuilt though the robot's observations determine it.
     """
     point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
+    bench.tell("predictions of single steps and short windows")
     if bench.states_known and (not noise_hides_gain(bench) or bench.fitted is None):
         return predicted(bench, point, interval)
     if bench.fitted is not None:

@@ -65,6 +65,7 @@ class Bench:
         split: How the rows were held out, in a sentence.
         until: The time (`time.monotonic`) at which judging has to end; None for whenever it is done.
         rate: Control steps that are simulated in a second, which matters under such a limit.
+        tell: What is told of each part of the work.
         left_out: What there was no time for so far.
 
     Raises:
@@ -77,6 +78,7 @@ class Bench:
     split: str = ""
     until: float | None = None
     rate: float = 1.0
+    tell: Callable[[str], None] = lambda part: None
     left_out: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -92,13 +94,10 @@ class Bench:
         """Time in s for what is still to be judged."""
         return np.inf if self.until is None else self.until - time.monotonic()
 
-    def within(self, until: float, rate: float) -> "Bench":
-        """The same under a limit of time; see the attributes."""
-        return replace(self, until=until, rate=max(rate, 1.0), left_out=[])
-
-    def has_time(self, part: str, seconds: float = 0.0) -> bool:
-        """Whether there is time for a part that takes so long; a part for which there is none is noted."""
+    def begins(self, part: str, seconds: float = 0.0) -> bool:
+        """Whether there is time for a part that takes so long: it is told of, or noted where there is none."""
         if self.seconds_left > seconds:
+            self.tell(part)
             return True
         self.left_out.append(part)
         return False
@@ -223,14 +222,15 @@ def _doubts(
     if bench.until is not None:
         window = STRIDES * stride(problem.dataset) * (COLUMNS + COLUMNS_OF_A_VALUE * (len(point) + task.model.nv))
         most = int(TESTING * bench.rate * bench.seconds_left / window)
-        if most < FEWEST + len(point) and not bench.has_time("tests of what the model lacks", np.inf):
-            return Suspicions(tested=False), False
+    enough = most is None or most >= FEWEST + len(point)
+    if not bench.begins("tests of what the model lacks", 0.0 if enough else np.inf):
+        return Suspicions(tested=False), False
     doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most)
     doubts = replace(doubts, alternatives=in_full(doubts.alternatives, doubts.terms))
     step = felt(doubts.terms)
     if step is None or task.source is None:
         return doubts, False
-    if not bench.has_time("the same tests with a finer timestep", FINER * doubts.control_steps / bench.rate):
+    if not bench.begins("the same tests with a finer timestep", FINER * doubts.control_steps / bench.rate):
         return doubts, False
     finer = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
     fine = suspicions(*given, finer, point, half_widths, bench.change, of_other_model=True, most=most)
@@ -273,7 +273,7 @@ def judged(
     doubts, finer = _doubts(bench, point, own)
     contradictions, of_columns = _contradictions(bench, point, at, doubts)
     coarse, of_steps = 0.0, 0
-    if bench.simulator.task.source is not None and bench.has_time("the length of the timestep"):
+    if bench.simulator.task.source is not None and bench.begins("the length of the timestep"):
         coarse, of_steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
     ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
     shares = _shares(space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own, doubts)
@@ -334,7 +334,7 @@ def _contradictions(
     simulator, dataset = bench.simulator, bench.problem.dataset
     found, spent = dataset.findings, 0
     possible = simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none"
-    if possible and bench.has_time("exchanged columns"):
+    if possible and bench.begins("exchanged columns"):
         points = np.stack([np.zeros(len(point)), point, at])
         exchanged, spent = exchanged_columns(
             bench.held_out, simulator, points, horizons(dataset)[1], bench.change, contradicts=True
