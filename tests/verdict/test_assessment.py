@@ -36,7 +36,7 @@ def result(split):
 def test_a_result_and_rows_held_out_are_all_it_needs(result, split):
     found = madoc.assess(result, split.held)
     assert found.verdict.word == "CALIBRATED"
-    assert str(found).startswith("CALIBRATED: the prediction error on the hold-out is")
+    assert str(found).startswith("CALIBRATED: over ")
     assert (found.holdout.rows, found.holdout.measure) == (len(split.held), "predicted")
     assert found.holdout.split == "100 rows in 1 episode were held out"
 

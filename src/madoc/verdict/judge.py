@@ -13,6 +13,7 @@ from madoc.calibration.holdout import (
     Area,
     Fitted,
     HoldOut,
+    OpenLoop,
     Predicted,
     PredictionErrors,
     ToldApart,
@@ -93,13 +94,20 @@ def _usable(holdout: HoldOut, lacking: Verdict) -> Verdict | None:
     if holdout.at_end or not better:
         return None
     found = max(better, key=lambda each: (not each.whole, each.seconds))  # whole runs are often few
-    low, high = map(_percent, found.relative_interval)
     return Verdict(
         "USABLE",
-        f"over {found.seconds:.2g} s held-out motion is predicted with {_percent(found.relative)} of the error of the "
-        f"model as given (95 % interval {low} to {high}), so the estimates are of use in this simulator; they are not "
-        f"the machine's own values, as {lacking.sentence}",
+        f"{_beside_given(found)}, so the estimates are of use in this simulator; they are not the machine's own "
+        f"values, as {lacking.sentence}",
         lacking.parameters,
+    )
+
+
+def _beside_given(found: OpenLoop) -> str:
+    """How small open-loop errors are beside those of the model as given."""
+    low, high = map(_percent, found.relative_interval)
+    return (
+        f"over {found.seconds:.2g} s held-out motion is predicted with {_percent(found.relative)} of the error of the "
+        f"model as given (95 % interval {low} to {high})"
     )
 
 
@@ -360,7 +368,9 @@ def _no_better_areas(before: Area, after: Area) -> str:
 def _how_good(holdout: HoldOut) -> str:
     if not isinstance(holdout, ToldApart):
         confirmed = ", and mid-range is confirmed: every interval holds it" if _mid_range_was_right(holdout) else ""
-        return f"{_how_small(holdout.errors)}{confirmed}"
+        parts = [each for each in holdout.open_loop if not each.whole]
+        told = _beside_given(parts[-1]) if parts else _how_small(holdout.errors)
+        return f"{told}{', down to the noise' if explains_all(holdout) else ''}{confirmed}"
     return (
         "a classifier tells rows of the simulator from those held out with an area of "
         f"{_area(holdout.area_at_estimate)}, after {_area(holdout.area_at_mid_range)} at mid-range (0.5 is chance)"
