@@ -6,9 +6,11 @@ BIN := $(VENV)/bin
 RUNS := $(VENV)/runs
 SEED ?= 0
 TESTS := $(VENV)/tests
+# The oldest and the newest MuJoCo; 4.x by its core, which has all that Madoc imports of it.
+MUJOCO := mujoco==3.8.0 mujoco-core==4.0.1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test test-slow check figures docs lock clean
+.PHONY: demo test test-slow test-versions check figures docs lock clean
 
 DEMO := examples/reach
 demo: $(RUNS)  ## the main job on an arm with an unknown load: logs, calibration, policies, evaluation; SEED=1 is another
@@ -28,6 +30,14 @@ test: $(TESTS)  ## every test that takes seconds
 
 test-slow: $(TESTS)  ## the others
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+
+# A folder with one MuJoCo alone, ahead of the locked packages on the path, so that everything else is as in the lock.
+test-versions: $(TESTS)  ## what makes and steps models, with the oldest and the newest MuJoCo
+	set -e; for one in $(MUJOCO); do folder=$(abspath $(VENV))/$$one; \
+	  test -d $$folder/mujoco || $(PIP) install --no-deps --target $$folder $$one; \
+	  echo "$$one:"; PYTHONPATH=$$folder$${PYTHONPATH:+:$$PYTHONPATH} $(BIN)/python -m pytest -n 2 --dist worksteal -rs \
+	    tests/simulation tests/tasks tests/robots tests/data tests/identification; \
+	done
 
 check: $(TESTS)  ## format, lint, types, layers
 	$(BIN)/ruff format --check src tests benchmarks examples docs/hooks.py

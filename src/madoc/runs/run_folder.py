@@ -19,6 +19,8 @@ from madoc.types import Metrics, Unit
 
 _FREE = ("budget", "versions")
 """Keys of a spec that may differ when a run is resumed."""
+_PACKAGES = {"madoc": ("madoc-calibration",), "jax": ("jax",), "mujoco": ("mujoco-core", "mujoco")}
+"""What results depend on, and where its version is found: since 4.0 MuJoCo's library is in a package of its own."""
 
 
 class RunFolder:
@@ -185,12 +187,18 @@ def count_name(unit: Unit) -> str:
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages on which the results of a run depend, by name."""
     installed = {"python": platform.python_version()}
-    for name, package in {"madoc": "madoc-calibration", "jax": "jax", "mujoco": "mujoco"}.items():
-        try:
-            installed[name] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            installed[name] = "not installed"
+    for name, packages in _PACKAGES.items():
+        found = (_version(package) for package in packages)
+        installed[name] = next((version for version in found if version), "not installed")
     return installed
+
+
+def _version(package: str) -> str:
+    """Version of an installed package, empty where there is none of that name."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
 
 
 def _lock(path: Path) -> filelock.BaseFileLock:
