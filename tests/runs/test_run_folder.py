@@ -1,12 +1,11 @@
 import json
 import subprocess
 import sys
-from importlib import metadata
 
 import pytest
 
 from madoc.errors import MadocError
-from madoc.runs.run_folder import RunFolder, versions
+from madoc.runs.run_folder import RunFolder
 
 SPEC = {
     "method": "madoc",
@@ -25,22 +24,6 @@ def test_a_spec_is_kept_with_versions(tmp_path):
     assert spec["hyperparameters"]["layers"] == [2, 2]
     with RunFolder.open(tmp_path / "deep/run", SPEC) as folder:
         assert folder.spec == spec
-
-
-def test_the_version_of_mujoco_is_that_of_its_core_where_it_has_one(monkeypatch):
-    installed = {"mujoco": "4.0.0", "mujoco-core": "4.0.1"}
-
-    def version(package):
-        if package not in installed:
-            raise metadata.PackageNotFoundError
-        return installed[package]
-
-    monkeypatch.setattr(metadata, "version", version)
-    assert versions()["mujoco"] == "4.0.1"
-    del installed["mujoco-core"]
-    assert versions()["mujoco"] == "4.0.0"
-    installed.clear()
-    assert versions()["mujoco"] == "not installed"
 
 
 def test_a_folder_with_a_run_is_refused_without_resume(tmp_path):

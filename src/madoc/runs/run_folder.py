@@ -7,7 +7,6 @@ import time
 import warnings
 from collections.abc import Mapping
 from contextlib import ExitStack
-from importlib import metadata
 from pathlib import Path
 
 import filelock
@@ -15,12 +14,11 @@ import numpy as np
 
 from madoc.errors import MadocError
 from madoc.runs.files import json_text, read_json, remove_leftovers, write_json
+from madoc.runs.versions import versions
 from madoc.types import Metrics, Unit
 
 _FREE = ("budget", "versions")
 """Keys of a spec that may differ when a run is resumed."""
-_PACKAGES = {"madoc": ("madoc-calibration",), "jax": ("jax",), "mujoco": ("mujoco-core", "mujoco")}
-"""What results depend on, and where its version is found: since 4.0 MuJoCo's library is in a package of its own."""
 
 
 class RunFolder:
@@ -182,23 +180,6 @@ class RunLog:
 def count_name(unit: Unit) -> str:
     """The unit as a key in JSON: `control_steps` or `updates`."""
     return unit.replace(" ", "_")
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages on which the results of a run depend, by name."""
-    installed = {"python": platform.python_version()}
-    for name, packages in _PACKAGES.items():
-        found = (_version(package) for package in packages)
-        installed[name] = next((version for version in found if version), "not installed")
-    return installed
-
-
-def _version(package: str) -> str:
-    """Version of an installed package, empty where there is none of that name."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return ""
 
 
 def _lock(path: Path) -> filelock.BaseFileLock:
