@@ -101,7 +101,7 @@ def _parse(arguments: Sequence[str]) -> Command:
     try:
         with contextlib.redirect_stderr(printed):
             return tyro.cli(
-                Commands,  # type: ignore[arg-type]
+                Commands,
                 prog="madoc",
                 description="Calibrate a simulator to logged robot data, learn a policy there, and show that it "
                 "works in the target. `madoc --version` tells the versions of what is installed.",
