@@ -10,7 +10,7 @@ TESTS := $(VENV)/tests
 MUJOCO := mujoco==3.8.0 mujoco-core==4.0.1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test test-slow test-versions check figures docs lock clean
+.PHONY: demo test test-slow test-versions wheel check figures docs lock clean
 
 DEMO := examples/reach
 demo: $(RUNS)  ## the main job on an arm with an unknown load: logs, calibration, policies, evaluation; SEED=1 is another
@@ -38,6 +38,16 @@ test-versions: $(TESTS)  ## what makes and steps models, with the oldest and the
 	  echo "$$one:"; PYTHONPATH=$$folder$${PYTHONPATH:+:$$PYTHONPATH} $(BIN)/python -m pytest -n 2 --dist worksteal -rs \
 	    tests/simulation tests/tasks tests/robots tests/data tests/identification; \
 	done
+
+WHEEL := $(VENV)/wheel
+wheel: $(TESTS)  ## the package as others get it: built, installed in an empty environment, and an arm calibrated with it
+	rm -rf $(WHEEL) && $(BIN)/python -m build --outdir $(WHEEL)/dist . > /dev/null
+	$(PYTHON) -m venv $(WHEEL)/env
+	$(WHEEL)/env/bin/python -m pip --disable-pip-version-check --quiet install -r requirements.lock $(WHEEL)/dist/*.whl
+	$(WHEEL)/env/bin/madoc --version
+	$(WHEEL)/env/bin/python examples/record_logs.py examples/arm/arm.yaml examples/arm/truth.json $(WHEEL)/logs
+	$(WHEEL)/env/bin/madoc calibrate examples/arm/arm.yaml --data $(WHEEL)/logs --out $(WHEEL)/run --quiet
+	$(WHEEL)/env/bin/madoc report $(WHEEL)/run
 
 check: $(TESTS)  ## format, lint, types, layers
 	$(BIN)/ruff format --check src tests benchmarks examples docs/hooks.py
