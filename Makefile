@@ -6,9 +6,11 @@ BIN := $(VENV)/bin
 RUNS := $(VENV)/runs
 SEED ?= 0
 TESTS := $(VENV)/tests
+# The oldest and the newest MuJoCo; 4.x by its core, which has all that Madoc imports of it.
+MUJOCO := mujoco==3.8.0 mujoco-core==4.0.1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test test-slow check figures docs lock clean
+.PHONY: demo test test-slow test-versions wheel check figures docs lock clean
 
 DEMO := examples/reach
 demo: $(RUNS)  ## the main job on an arm with an unknown load: logs, calibration, policies, evaluation; SEED=1 is another
@@ -28,6 +30,24 @@ test: $(TESTS)  ## every test that takes seconds
 
 test-slow: $(TESTS)  ## the others
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+
+# A folder with one MuJoCo alone, ahead of the locked packages on the path, so that everything else is as in the lock.
+test-versions: $(TESTS)  ## what makes and steps models, with the oldest and the newest MuJoCo
+	set -e; for one in $(MUJOCO); do folder=$(abspath $(VENV))/$$one; \
+	  test -d $$folder/mujoco || $(PIP) install --no-deps --target $$folder $$one; \
+	  echo "$$one:"; PYTHONPATH=$$folder$${PYTHONPATH:+:$$PYTHONPATH} $(BIN)/python -m pytest -n 2 --dist worksteal -rs \
+	    tests/simulation tests/tasks tests/robots tests/data tests/identification; \
+	done
+
+WHEEL := $(VENV)/wheel
+wheel: $(TESTS)  ## the package as others get it: built, installed in an empty environment, and an arm calibrated with it
+	rm -rf $(WHEEL) && $(BIN)/python -m build --outdir $(WHEEL)/dist . > /dev/null
+	$(PYTHON) -m venv $(WHEEL)/env
+	$(WHEEL)/env/bin/python -m pip --disable-pip-version-check --quiet install -r requirements.lock $(WHEEL)/dist/*.whl
+	$(WHEEL)/env/bin/madoc --version
+	$(WHEEL)/env/bin/python examples/record_logs.py examples/arm/arm.yaml examples/arm/truth.json $(WHEEL)/logs
+	$(WHEEL)/env/bin/madoc calibrate examples/arm/arm.yaml --data $(WHEEL)/logs --out $(WHEEL)/run --quiet
+	$(WHEEL)/env/bin/madoc report $(WHEEL)/run
 
 check: $(TESTS)  ## format, lint, types, layers
 	$(BIN)/ruff format --check src tests benchmarks examples docs/hooks.py

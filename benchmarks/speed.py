@@ -6,7 +6,6 @@ Single-core figures pin the process to one core (`taskset -c 0`), as the row say
 """
 
 import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,6 +25,7 @@ from madoc.learning import replay
 from madoc.learning.cloning import continue_cloning
 from madoc.policies import LEARNERS, FastSAC, PolicyProblem
 from madoc.policies.behaviours import record_quality
+from madoc.runs.machine import usable_cores
 from madoc.simulation.cpu import CpuSimulator
 
 STUDY = Study(RESULTS / "speed.jsonl", ())
@@ -37,7 +37,7 @@ PRODUCTS = 300 * 2 * 256**3
 
 
 def main() -> None:
-    rows = {"cores": len(os.sched_getaffinity(0))}
+    rows = {"cores": usable_cores()}
     rows["calibration_epoch"] = calibration_epoch(Madoc())
     rows["learner_updates"] = {name: learner_updates(name) for name in FLOPS}
     rows["least_squares_hopper_1000_rows"] = least_squares(1000)

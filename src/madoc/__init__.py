@@ -9,6 +9,7 @@ import contextlib
 import importlib
 import sys
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 
 
@@ -37,6 +38,11 @@ def lazily(package: str) -> tuple[Callable[[str], object], Callable[[], list[str
 
 
 __getattr__, __dir__, __all__ = lazily(__name__)
+
+try:
+    __version__ = metadata.version("madoc-calibration")
+except metadata.PackageNotFoundError:  # its files without their package, as copied to a robot's computer
+    __version__ = "unknown"
 
 ENVIRONMENTS = {"Hopper": "hopper", "HalfCheetah": "halfcheetah", "Walker2d": "walker2d", "Ant": "ant"}
 """The robots by the names of their Gymnasium environments: `hopper` is `madoc/Hopper`."""

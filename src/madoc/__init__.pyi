@@ -51,6 +51,7 @@ from .policies import save_policy as save_policy
 from .runs.run_folder import RunFolder as RunFolder
 from .verdict import assess as assess
 
+__version__: str
 ENVIRONMENTS: dict[str, str]
 EPISODE_STEPS: int
 

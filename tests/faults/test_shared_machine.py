@@ -28,6 +28,29 @@ with _cluster(1, None) as ray:
         print(oct(folder.stat().st_mode & 0o777))
 """
 
+LINUX_ALONE = ("sched_getaffinity", "sched_setaffinity")
+ELSEWHERE = """
+import builtins, importlib, io, os, pkgutil
+for name in {names}:
+    delattr(os, name)
+opened = io.open
+def open_elsewhere(file, *arguments, **options):
+    if str(file).startswith("/proc"):
+        raise FileNotFoundError(file)
+    return opened(file, *arguments, **options)
+builtins.open = io.open = open_elsewhere
+import madoc
+for module in pkgutil.walk_packages(madoc.__path__, "madoc."):
+    if not module.name.endswith(("__main__", "render_process")):
+        importlib.import_module(module.name)
+import numpy as np
+simulator = madoc.simulation.make(madoc.tasks.make("hopper"))
+system = simulator.bind(simulator.parameters.to_physical(np.zeros((1, len(simulator.parameters)))))
+print(system.step(simulator.initial_state[None, None], np.zeros((1, 1, 3))).shape)
+madoc.runs.memory.forget_peak()
+print(madoc.runs.memory.peak_memory())
+"""
+
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
@@ -75,9 +98,28 @@ def test_compiled_code_lies_in_no_folder_of_a_suite(cache, monkeypatch):
     assert mode(compiled) == 0o700
 
 
-def test_a_system_without_affinity_has_cores_too(monkeypatch):
-    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+def test_a_system_without_affinity_has_cores_too_and_none_is_taken(cache, monkeypatch):
+    for name in LINUX_ALONE:
+        monkeypatch.delattr(os, name, raising=False)
     assert machine.usable_cores() == os.cpu_count()
+    monkeypatch.setattr(process, "_held", [])
+    process.take_core()
+    assert process._held == []
+    machine.keep_to_core(0)
+
+
+def test_every_module_is_imported_and_a_robot_steps_where_linux_is_not():
+    """As on macOS: no affinity, no /proc."""
+    done = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE.format(names=LINUX_ALONE)],
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src"), "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["(1,", "1,", "12)", "None"]
 
 
 @pytest.mark.slow

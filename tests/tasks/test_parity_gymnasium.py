@@ -61,7 +61,7 @@ def test_observation_reward_and_termination_along_random_episodes(robot, nominal
             if terminated:
                 falls += 1
                 break
-    assert falls == (0 if task.name == "halfcheetah" else 5)
+    assert (falls > 0) == (task.name != "halfcheetah")  # how many is chance: of the Ant 5 to MuJoCo 3, 3 from 4.0 on
 
 
 def test_health_agrees_far_from_where_random_episodes_go(robot):

@@ -1,6 +1,7 @@
 """Every calibrator by the name that `madoc methods` lists."""
 
 from collections.abc import Mapping
+from typing import Any
 
 from madoc.calibration.base import Calibrator
 from madoc.calibration.baselines.cma_es.calibrator import CmaEs
@@ -30,14 +31,14 @@ _MADOC = "Jiang et al., Madoc"
 
 def _entry(
     name: str,
-    kind: type[Calibrator],
+    kind: type[Calibrator[Any]],
     summary: str,
     paper: str,
     year: int,
     settings: Mapping[str, object] | None = None,
     recognised_by: tuple[str, ...] | None = None,
     usual_budget: int | str = 300_000,
-) -> MethodEntry[Calibrator]:
+) -> MethodEntry[Calibrator[Any]]:
     simulates = kind is not Uncalibrated
     return MethodEntry(
         name,
@@ -102,4 +103,4 @@ _ENTRIES = (
     ),
 )
 
-CALIBRATORS: dict[str, MethodEntry[Calibrator]] = {entry.name: entry for entry in _ENTRIES}
+CALIBRATORS: dict[str, MethodEntry[Calibrator[Any]]] = {entry.name: entry for entry in _ENTRIES}

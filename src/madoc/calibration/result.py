@@ -230,7 +230,7 @@ class CalibrationResult:
 
 
 @functools.cache
-def _adapter() -> TypeAdapter:
+def _adapter() -> TypeAdapter:  # type: ignore[type-arg]  # beartype knows no TypeAdapter[...]
     return TypeAdapter(CalibrationResult)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes
@@ -50,7 +50,7 @@ class Methods:
         from madoc.calibration import CALIBRATORS
         from madoc.policies import LEARNERS
 
-        kinds: dict[str, Mapping[str, MethodEntry]] = {"calibrator": CALIBRATORS, "policy learner": LEARNERS}
+        kinds: dict[str, Mapping[str, MethodEntry[Any]]] = {"calibrator": CALIBRATORS, "policy learner": LEARNERS}
         rows = [
             {"name": name, "kind": kind, "summary": entry.summary, "paper": entry.paper, "year": entry.year}
             | {"budget": entry.unit}
@@ -60,7 +60,7 @@ class Methods:
         return Answer({"methods": rows}, tuple(_methods_table(kind, entries) for kind, entries in kinds.items()))
 
 
-def _methods_table(kind: str, entries: "Mapping[str, MethodEntry]") -> Table:
+def _methods_table(kind: str, entries: "Mapping[str, MethodEntry[Any]]") -> Table:
     """The methods of one kind; the unit of their budgets is in the title where all have the same."""
     units = {entry.unit for entry in entries.values()}
     columns = ["summary", "paper", "year", *(["unit"] if len(units) > 1 else [])]

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import tyro
 
+from madoc import __version__
 from madoc.commands.answer import EXIT_CODES, Answer, Command
 from madoc.commands.calibrate import Calibrate
 from madoc.commands.check import Check
@@ -26,6 +27,7 @@ from madoc.commands.suite import Suite
 from madoc.commands.worker import Worker
 from madoc.errors import MadocError, printable
 from madoc.runs.files import json_text
+from madoc.runs.versions import versions
 
 WIDTH = 110
 """Width of a table in characters where standard output is no terminal."""
@@ -54,8 +56,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal that lacks a letter shows its number instead
         sys.stdout.reconfigure(errors="backslashreplace")
     code = 0
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words == ["--version"]:
+        others = {name: version for name, version in versions().items() if name != "madoc"}
+        print(f"madoc {__version__} ({', '.join(f'{name} {version}' for name, version in others.items())})")
+        return code
     try:
-        command = _parse(sys.argv[1:] if arguments is None else list(arguments))
+        command = _parse(words)
         with _calm(), contextlib.redirect_stdout(sys.stderr):
             answer = command.run()
         code = EXIT_CODES[answer.status]
@@ -94,10 +101,10 @@ def _parse(arguments: Sequence[str]) -> Command:
     try:
         with contextlib.redirect_stderr(printed):
             return tyro.cli(
-                Commands,  # type: ignore[arg-type]
+                Commands,
                 prog="madoc",
                 description="Calibrate a simulator to logged robot data, learn a policy there, and show that it "
-                "works in the target.",
+                "works in the target. `madoc --version` tells the versions of what is installed.",
                 args=arguments,
                 config=(tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone),
             )

@@ -39,7 +39,7 @@ FORMATS: dict[str, Format] = {
 
 
 def load(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     task: Task,
     *,
     format: str | None = None,

@@ -40,7 +40,7 @@ def recognises(path: Path) -> bool:
     return holds(path, "metadata", "episode_starts")
 
 
-def save(dataset: Dataset, path: str | os.PathLike) -> None:
+def save(dataset: Dataset, path: str | os.PathLike[str]) -> None:
     """Write a dataset whole or not at all: a failure leaves `path` as it was.
 
     Raises:

@@ -221,8 +221,8 @@ def _jackknife(influence: Float[np.ndarray, "windows k"]) -> Float[np.ndarray, "
 
 
 def _solved(
-    matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, "k *columns"]
-) -> Float[np.ndarray, "k *columns"]:
+    matrix: Float[np.ndarray, "k k"], right: Float[np.ndarray, " k *columns"]
+) -> Float[np.ndarray, " k *columns"]:
     """The least-squares solution of a symmetric system that may be singular, in units of its diagonal."""
     lengths = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
     inverse = np.linalg.pinv(matrix / lengths[:, None] / lengths, rcond=_SINGULAR, hermitian=True)

@@ -78,7 +78,7 @@ def generator_loss(generated: PerRow) -> Scalar:
     return -jax.nn.softplus(generated).mean()
 
 
-def dynamics_reward(logits: Float[Array, "members *rows"]) -> Float[Array, "*rows"]:
+def dynamics_reward(logits: Float[Array, " members *rows"]) -> Float[Array, "*rows"]:
     """R = -log(1 - mean D) over past discriminators; 0.69 where D is a half."""
     return -jnp.log1p(-jnp.minimum(jax.nn.sigmoid(logits).mean(0), SURE))
 

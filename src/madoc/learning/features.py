@@ -226,8 +226,8 @@ def last_rows(dataset: Dataset, length: int) -> Int[np.ndarray, " windows"]:
 
 
 def unbroken(
-    valid: Bool[np.ndarray, "steps *rows"], ended: Bool[np.ndarray, "steps *rows"], length: int
-) -> Bool[np.ndarray, "windows *rows"]:
+    valid: Bool[np.ndarray, " steps *rows"], ended: Bool[np.ndarray, " steps *rows"], length: int
+) -> Bool[np.ndarray, " windows *rows"]:
     """Whether each window of a rollout has only valid steps, and no episode that ends before its last step."""
     steps = _rows_of(np.arange(length - 1, len(valid)), length)
     return valid[steps].all(0) & ~ended[steps[:-1]].any(0)

@@ -90,7 +90,7 @@ def stack(count: int, make: Callable[[PRNGKeyArray], Carry], key: PRNGKeyArray) 
 
 
 def map_stack(
-    apply: Callable[[Carry, Array], Array], stacked: Carry, inputs: Float[Array, "members *rows"] | None = None
+    apply: Callable[[Carry, Array], Array], stacked: Carry, inputs: Float[Array, " members *rows"] | None = None
 ) -> Array:
     """Apply each module of a stack to its own inputs, one after the other: on a CPU faster than a batched product."""
     arrays, static = eqx.partition(stacked, eqx.is_array)
@@ -154,7 +154,9 @@ def falling_adam(learning_rate: float, updates: int) -> optax.GradientTransforma
     return optax.adam(optax.cosine_decay_schedule(learning_rate, updates))
 
 
-def descend(optimiser, gradients: PyTree, optimiser_state: PyTree, parameters: Carry) -> tuple[Carry, PyTree]:
+def descend(
+    optimiser: optax.GradientTransformation, gradients: PyTree, optimiser_state: PyTree, parameters: Carry
+) -> tuple[Carry, PyTree]:
     """One step of an Optax optimiser on the arrays of a module."""
     updates, optimiser_state = optimiser.update(gradients, optimiser_state)
     return eqx.apply_updates(parameters, updates), optimiser_state

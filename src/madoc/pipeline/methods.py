@@ -50,7 +50,7 @@ def make_method(
     return make(**new)
 
 
-def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator]:
+def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator[Any]]:
     """The methods that `auto` may take, by name; a hyperparameter is changed under a name such as `npe.updates`.
 
     Raises:
@@ -66,7 +66,7 @@ def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator]:
     return {name: make_method(CALIBRATORS, name, changed[name]) for name in CANDIDATES}
 
 
-def methods_for(order: CalibrationOrder) -> dict[str, Calibrator]:
+def methods_for(order: CalibrationOrder) -> dict[str, Calibrator[Any]]:
     """The methods of an order by name: one, or those that `auto` may take.
 
     Raises:
@@ -78,7 +78,9 @@ def methods_for(order: CalibrationOrder) -> dict[str, Calibrator]:
     return {name: make_method(CALIBRATORS, name, order.search.changes)}
 
 
-def choose(methods: Mapping[str, Calibrator], problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[str, str | None]:
+def choose(
+    methods: Mapping[str, Calibrator[Any]], problem: CalibrationProblem, key: PRNGKeyArray
+) -> tuple[str, str | None]:
     """The name of the first method that takes the problem, and why the ones before it refuse; None for the only one.
 
     Raises:

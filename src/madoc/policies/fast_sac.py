@@ -184,7 +184,9 @@ class FastSAC:
             batches = {name: jnp.concatenate([batches[name], rows[name]], axis=2) for name in batches}
         noise = jax.random.normal(of_noise, (self._cycles, self.policy_delay + 1, *batches["action"].shape[2:]))
 
-        def cycle(learner: ActorCritic, given: tuple[Batch, Float[Array, "steps rows action"]]):
+        def cycle(
+            learner: ActorCritic, given: tuple[Batch, Float[Array, "steps rows action"]]
+        ) -> tuple[ActorCritic, dict[str, Array]]:
             batches, noise = given
             for index in range(self.policy_delay):
                 batch = {name: column[index] for name, column in batches.items()}

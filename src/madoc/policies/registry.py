@@ -1,6 +1,7 @@
 """Every policy learner by the name that `madoc methods` lists."""
 
 from functools import partial
+from typing import Any
 
 from madoc.policies.base import PolicyLearner
 from madoc.policies.bc import BC
@@ -16,11 +17,11 @@ CLONING = {"cloning": 2.5}
 
 SAC_SHOWN = ("return_in_simulator", "temperature")
 
-_sac = partial(MethodEntry[PolicyLearner], kind=SAC, shown=SAC_SHOWN)
-_fast_sac = partial(MethodEntry[PolicyLearner], kind=FastSAC, shown=SAC_SHOWN, usual_budget=2_400_000)
-_offline = partial(MethodEntry[PolicyLearner], unit="updates", simulates=False, needs_parameters=False)
+_sac = partial(MethodEntry[PolicyLearner[Any]], kind=SAC, shown=SAC_SHOWN)
+_fast_sac = partial(MethodEntry[PolicyLearner[Any]], kind=FastSAC, shown=SAC_SHOWN, usual_budget=2_400_000)
+_offline = partial(MethodEntry[PolicyLearner[Any]], unit="updates", simulates=False, needs_parameters=False)
 
-_ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
+_ENTRIES: tuple[MethodEntry[PolicyLearner[Any]], ...] = (
     _sac(
         name="sac",
         summary="SAC in the calibrated simulator",
@@ -93,4 +94,4 @@ _ENTRIES: tuple[MethodEntry[PolicyLearner], ...] = (
     ),
 )
 
-LEARNERS: dict[str, MethodEntry[PolicyLearner]] = {entry.name: entry for entry in _ENTRIES}
+LEARNERS: dict[str, MethodEntry[PolicyLearner[Any]]] = {entry.name: entry for entry in _ENTRIES}

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from ruamel.yaml import YAML, YAMLError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult, ParameterEstimate

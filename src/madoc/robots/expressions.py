@@ -8,6 +8,7 @@ import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 from madoc.tasks.base import Batch
 
@@ -17,7 +18,11 @@ FUNCTIONS: dict[str, int] = {
     "where": 3,
 }
 """Functions and their numbers of arguments; all are in the array API, so NumPy and JAX both have them."""
-LOGIC = {"logical_and": all, "logical_or": any, "logical_not": lambda values: not values[0]}
+LOGIC: dict[str, Callable[[list[Any]], Any]] = {
+    "logical_and": all,
+    "logical_or": any,
+    "logical_not": lambda values: not values[0],
+}
 """How conditions are combined: names of the array API, and what they are of plain Python values."""
 _OF_ARRAYS = {"min": "minimum", "max": "maximum"}
 """Functions that the array API calls otherwise."""

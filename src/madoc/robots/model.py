@@ -13,6 +13,7 @@ from madoc.robots.model_files import ModelFiles
 from madoc.robots.spec import RobotSpec
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF
 from madoc.tasks.base import compiled_model
+from madoc.tasks.mujoco_versions import refuse_unfit_mujoco
 
 
 def read_model(files: ModelFiles) -> mujoco.MjSpec:
@@ -20,6 +21,7 @@ def read_model(files: ModelFiles) -> mujoco.MjSpec:
 
     A joint takes the name of its body, where it is the only one there, and an actuator that of its joint.
     """
+    refuse_unfit_mujoco()
     text, includes, assets = files.parts()
     try:
         spec = mujoco.MjSpec.from_string(text, include=includes, assets=assets)

@@ -165,7 +165,7 @@ def _describe(path: str, leaf: object) -> Leaf:
     if isinstance(leaf, jax.Array):
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             return Leaf("key", str(jax.random.key_impl(leaf)), leaf.shape)
-        return Leaf("jax", leaf.dtype.name, leaf.shape, bool(leaf.aval.weak_type))  # type: ignore[attr-defined]
+        return Leaf("jax", leaf.dtype.name, leaf.shape, bool(leaf.aval.weak_type))
     if isinstance(leaf, np.ndarray | np.generic):
         if leaf.dtype.hasobject or leaf.dtype.names or np.dtype(leaf.dtype.name) != leaf.dtype:
             raise MadocError(f"cannot save {path}: NumPy dtype {leaf.dtype!r}; expected plain native numbers")

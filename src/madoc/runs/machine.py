@@ -10,7 +10,18 @@ from pathlib import Path
 
 def usable_cores() -> int:
     """Number of cores that this process may use; all of the machine where the system knows no affinity."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return len(choosable_cores()) or os.cpu_count() or 1
+
+
+def choosable_cores() -> list[int]:
+    """Numbers of the cores that this process may keep itself to; none where the system knows no affinity (macOS)."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
+def keep_to_core(core: int) -> None:
+    """Keep this process to one of the cores that it can choose."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {core})
 
 
 def own_folder(*parts: str) -> Path | None:

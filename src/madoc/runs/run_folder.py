@@ -7,7 +7,6 @@ import time
 import warnings
 from collections.abc import Mapping
 from contextlib import ExitStack
-from importlib import metadata
 from pathlib import Path
 
 import filelock
@@ -15,6 +14,7 @@ import numpy as np
 
 from madoc.errors import MadocError
 from madoc.runs.files import json_text, read_json, remove_leftovers, write_json
+from madoc.runs.versions import versions
 from madoc.types import Metrics, Unit
 
 _FREE = ("budget", "versions")
@@ -180,17 +180,6 @@ class RunLog:
 def count_name(unit: Unit) -> str:
     """The unit as a key in JSON: `control_steps` or `updates`."""
     return unit.replace(" ", "_")
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages on which the results of a run depend, by name."""
-    installed = {"python": platform.python_version()}
-    for name, package in {"madoc": "madoc-calibration", "jax": "jax", "mujoco": "mujoco"}.items():
-        try:
-            installed[name] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            installed[name] = "not installed"
-    return installed
 
 
 def _lock(path: Path) -> filelock.BaseFileLock:

@@ -149,5 +149,5 @@ def act(
 
 
 @partial(jax.jit, static_argnums=(0, 2))
-def _reset_noise(noise: Callable, key: PRNGKeyArray, count: int) -> Array:
+def _reset_noise(noise: Callable[[PRNGKeyArray, int], Array], key: PRNGKeyArray, count: int) -> Array:
     return noise(key, count)

@@ -66,7 +66,7 @@ def forecast(left: Iterable[Cell], ended: Mapping[str, tuple[Cell, Outcome]], *,
     if not expected or None in expected:
         return Forecast(None if expected else 0.0, len(expected), len(ended), unlike)
     known = [seconds for seconds in expected if seconds is not None]
-    return Forecast(max(sum(known) / workers, max(known)), len(known), len(ended), unlike)
+    return Forecast(max(sum(known) / workers, *known), len(known), len(ended), unlike)
 
 
 _SAME_METHOD = 3

@@ -108,7 +108,7 @@ class Crew:
             if process.stdin:
                 process.stdin.close()
 
-    def _start(self, number: int) -> subprocess.Popen:
+    def _start(self, number: int) -> subprocess.Popen[bytes]:
         # Its standard input is our end of a pipe that says nothing: it closes when we end, however that happens.
         # A session of its own keeps Ctrl-C for us alone: we pass it on once.
         words = [sys.executable, "-m", "madoc", "worker", str(self._suite), "--attached", "--quiet"]

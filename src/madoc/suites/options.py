@@ -81,7 +81,7 @@ def build(order: type[Kind], given: Mapping[str, object]) -> Kind:
 
 
 @functools.cache
-def adapter(order: Any) -> TypeAdapter:
+def adapter(order: Any) -> TypeAdapter:  # type: ignore[type-arg]  # beartype knows no TypeAdapter[...]
     """What reads and writes an order as JSON."""
     return TypeAdapter(order)
 

@@ -5,7 +5,7 @@ import platform
 
 import filelock
 
-from madoc.runs.machine import own_folder
+from madoc.runs.machine import choosable_cores, keep_to_core, own_folder
 
 _held: list[filelock.BaseFileLock] = []
 """The lock of this process's core, held until it ends."""
@@ -30,11 +30,11 @@ def take_core() -> None:
     taken, a system without affinity, or no folder of the user's own for the locks.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    if _held or not hasattr(os, "sched_setaffinity"):
+    cores = choosable_cores()
+    if _held or len(cores) < 2:
         return
-    cores = sorted(os.sched_getaffinity(0))
     folder = own_folder("cores", platform.node())
-    if folder is None or len(cores) == 1:
+    if folder is None:
         return
     for core in cores:
         lock = filelock.FileLock(folder / f"{core}.lock", timeout=0, thread_local=False)
@@ -43,5 +43,5 @@ def take_core() -> None:
         except filelock.Timeout:
             continue
         _held.append(lock)
-        os.sched_setaffinity(0, {core})
+        keep_to_core(core)
         return

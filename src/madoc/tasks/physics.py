@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from madoc.errors import MadocError
+from madoc.tasks.mujoco_versions import refuse_unfit_mujoco
 
 PHYSICS = ("legacy", "modern")
 
@@ -19,6 +20,7 @@ def load_robot(file: str, physics: str, total_mass: float | None = None) -> mujo
 
     Masses and inertias are scaled so that the masses sum to `total_mass` in kg, where it is given.
     """
+    refuse_unfit_mujoco()
     if physics not in PHYSICS:
         raise MadocError(f"unknown physics {physics!r}; expected one of {', '.join(PHYSICS)}")
     xml = (importlib.resources.files("gymnasium") / "envs" / "mujoco" / "assets" / file).read_text()

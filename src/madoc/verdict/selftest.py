@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -141,7 +142,7 @@ def _with_differences(planted: Dataset, task: Task, key: PRNGKeyArray) -> Datase
 
 
 def selftest(
-    methods: Sequence[Calibrator],
+    methods: Sequence[Calibrator[Any]],
     dataset: Dataset,
     simulator: Simulator,
     *,
@@ -183,7 +184,9 @@ def selftest(
     )
 
 
-def _first_willing(methods: Sequence[Calibrator], problem: CalibrationProblem, key: PRNGKeyArray) -> Calibrator:
+def _first_willing(
+    methods: Sequence[Calibrator[Any]], problem: CalibrationProblem, key: PRNGKeyArray
+) -> Calibrator[Any]:
     refusal: MadocError | None = None
     for method in methods:
         try:

@@ -45,8 +45,8 @@ def independent_groups(
 
 
 def resampled(
-    values: Float[np.ndarray, "windows *kinds"], groups: Int[np.ndarray, " windows"]
-) -> Float[np.ndarray, "resamples *kinds"]:
+    values: Float[np.ndarray, " windows *kinds"], groups: Int[np.ndarray, " windows"]
+) -> Float[np.ndarray, " resamples *kinds"]:
     """Bootstrap samples of means over windows: whole groups are resampled, every kind of value by the same draws."""
     _, member = np.unique(groups, return_inverse=True)
     count = int(member.max()) + 1
@@ -58,7 +58,7 @@ def resampled(
     return (drawn @ sums / (drawn @ sizes)[:, None]).reshape(RESAMPLES, *values.shape[1:])
 
 
-def interval_of(draws: Float[np.ndarray, "resamples *kinds"]) -> Float[np.ndarray, "2 *kinds"]:
+def interval_of(draws: Float[np.ndarray, " resamples *kinds"]) -> Float[np.ndarray, " 2 *kinds"]:
     """The percentile interval of bootstrap samples."""
     tail = 50.0 * (1.0 - CONFIDENCE)
     return np.percentile(draws, [tail, 100.0 - tail], axis=0)

@@ -1,5 +1,8 @@
 """Whether residuals are noise, or a function of the robot's state and action."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from sklearn.ensemble import ExtraTreesRegressor
@@ -31,7 +34,7 @@ no longer correlate."""
 CERTAIN = 6.0
 """Standard errors of a correlation, from which it counts; many channels are looked at."""
 
-EXPLAINERS = {
+EXPLAINERS: dict[str, Callable[[], Any]] = {
     "a linear function": lambda: make_pipeline(StandardScaler(), RidgeCV(np.logspace(-3, 3, 7))),
     "trees": lambda: ExtraTreesRegressor(10, min_samples_leaf=3, random_state=0),
 }

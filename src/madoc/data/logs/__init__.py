@@ -70,7 +70,7 @@ _OF_A_SUITE = ("plans", "cells")
 
 
 def read(
-    paths: str | os.PathLike | Iterable[str | os.PathLike], robot: Robot, *, clip_actions: bool = False
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], robot: Robot, *, clip_actions: bool = False
 ) -> Dataset:
     """Read logs of a robot from files and folders; each file, or each episode in one, is a run.
 

@@ -40,7 +40,7 @@ def visits(dataset: Dataset, starts: Int[np.ndarray, " starts"], horizon: int) -
     return before[row] - before[np.maximum(first, row - horizon + 1)]
 
 
-def first_lives(seen: Transitions, valid: Bool[np.ndarray, "steps *rows"]) -> Bool[np.ndarray, "steps *rows"]:
+def first_lives(seen: Transitions, valid: Bool[np.ndarray, " steps *rows"]) -> Bool[np.ndarray, " steps *rows"]:
     """Valid steps of each row before its first end or failure; later steps began at another start."""
     ended = np.asarray(seen.terminated) | np.asarray(seen.truncated) | ~valid
     earlier = np.concatenate([np.zeros_like(ended[:1]), ended[:-1]])
