@@ -10,6 +10,7 @@ from madoc.identification.gauss_newton import descend
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states, states_observed_as
 from madoc.identification.windows import Windows, evenly, rows_that_fit, windows_at
+from madoc.simulation.attitudes import moved
 from madoc.simulation.base import Simulator
 
 MOST_WINDOWS = 400
@@ -70,11 +71,12 @@ class Replays:
             return np.zeros((1, *shape))
         rng = np.random.default_rng(0)
         observation = np.asarray(held.transitions.observation)
-        noisy = observation + deviation * self.scale * rng.standard_normal(observation.shape)
+        noise = deviation * self.scale * rng.standard_normal(observation.shape)
+        noisy = moved(self.simulator.task.attitudes, observation, noise)
         rebuilt = states_observed_as(held, self.simulator.task, self.rows, noisy)
         starts = np.where(np.isfinite(rebuilt), rebuilt, self.windows.states)
-        moved = self.residuals(point[None], replace(self.windows, states=starts))
-        return moved - self.residuals(point[None]) + deviation * rng.standard_normal(shape)
+        following = self.residuals(point[None], replace(self.windows, states=starts))
+        return following - self.residuals(point[None]) + deviation * rng.standard_normal(shape)
 
     def single_steps(self) -> Windows:
         """The beginning of each window, as long as the shortest horizon."""
