@@ -112,17 +112,22 @@ BODY = """<mujoco><option gravity="0 0 0" timestep="0.02"/><worldbody><body><joi
   <actuator><motor name="push" site="side" gear="0 1 0 0 0 0"/></actuator></mujoco>"""
 
 
-def test_noise_of_an_attitude_is_that_of_small_rotations(tmp_path):
-    """A body that sways about its first attitude: by its component alone, noise of w would seem many times larger."""
+def body_task(folder):
+    """A free body that a force pushes at its side, with all signals in the order of (qpos, qvel)."""
     signals = [("position", index) for index in range(7)] + [("velocity", index) for index in range(6)]
     lines = [f"  - {{name: {kind}_{index}, reads: '{kind}(root)[{index}]'}}\n" for kind, index in signals]
-    (tmp_path / "model.xml").write_text(BODY)
-    (tmp_path / "body.yaml").write_text(
+    (folder / "model.xml").write_text(BODY)
+    (folder / "body.yaml").write_text(
         f"madoc: 1\nname: body\nmodel: model.xml\ncontrol_step: 0.02\nsignals:\n{''.join(lines)}"
         "actions:\n  - {name: push, actuator: push, low: -1, high: 1}\n"
         "parameters:\n  - {field: dof_damping, element: root, low: 0, high: 0.1}\n"
     )
-    task = robots.load(tmp_path / "body.yaml").task
+    return robots.load(folder / "body.yaml").task
+
+
+def test_noise_of_an_attitude_is_that_of_small_rotations(tmp_path):
+    """A body that sways about its first attitude: by its component alone, noise of w would seem many times larger."""
+    task = body_task(tmp_path)
     assert task.attitudes == ((3, 4, 5, 6),)
     simulator, random = simulation.make(task, threads=1), np.random.default_rng(0)
     state, action, seen = simulator.initial_state, np.zeros(1), []

@@ -113,8 +113,8 @@ class Readings:
 
     def trajectories(
         self, simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
-    ) -> tuple[Float[np.ndarray, "windows steps state"], Float[np.ndarray, "windows steps dof"]]:
-        """The simulated state before each action, and what the actuators of joints exert there, in N or N·m.
+    ) -> tuple[Float[np.ndarray, "windows steps state"], Float[np.ndarray, "windows steps actuator dof"]]:
+        """The simulated state before each action, and what each actuator exerts there on every degree of freedom.
 
         Spends windows · steps control steps.
         """
@@ -123,7 +123,7 @@ class Readings:
         visited = np.concatenate([states[:, None], after[:, :-1]], axis=1)
         flat_states, flat_actions = (each.reshape(1, -1, each.shape[-1]) for each in (visited, self.actions))
         exerted = system.actuator_forces(flat_states, flat_actions)
-        return visited, exerted.reshape(*visited.shape[:2], -1)
+        return visited, exerted.reshape(*visited.shape[:2], *exerted.shape[2:])
 
     def residuals(
         self,

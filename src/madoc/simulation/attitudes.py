@@ -8,9 +8,11 @@ components; they stand in the places of the last three, with 0 in that of the fi
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 Attitudes = Sequence[tuple[int, int, int, int]]
 """For each quaternion of an observation the indices of its components w, x, y and z."""
@@ -43,6 +45,59 @@ def moved(
         turn[..., 0] = np.sqrt(np.maximum(1.0 - (turn**2).sum(-1), 0.0))
         found[..., indices] = _product(_unit(readings[..., indices]), turn)
     return found
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """Small differences of states (qpos, qvel, ...) in the units of velocities, rotations in the body's own frame.
+
+    Attributes:
+        attitudes: Of each quaternion in qpos the indices of its components.
+        places: Index in qpos of each degree of freedom; components x, y and z of a quaternion for its rotations.
+        halves: By what a change there is multiplied to be one of the degree of freedom, 2 of a quaternion and else 1.
+    """
+
+    attitudes: tuple[tuple[int, int, int, int], ...]
+    places: Int[np.ndarray, " dof"]
+    halves: Float[np.ndarray, " dof"]
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel) -> "Tangent":
+        """That of a model's states."""
+        behind = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
+        of_joints = zip(model.jnt_type.tolist(), model.jnt_qposadr.tolist(), strict=True)
+        firsts = [address + behind[kind] for kind, address in of_joints if kind in behind]
+        places = np.delete(np.arange(model.nq), firsts)
+        halves = np.where(np.isin(places, [first + step for first in firsts for step in (1, 2, 3)]), 2.0, 1.0)
+        return cls(tuple((first, first + 1, first + 2, first + 3) for first in firsts), places, halves)
+
+    def differences(
+        self, states: Float[np.ndarray, "rows state"], others: Float[np.ndarray, "rows state"]
+    ) -> Float[np.ndarray, "rows both"]:
+        """By how much positions and velocities differ from those of the others."""
+        positions = self.halves * differences(self.attitudes, states, others)[:, self.places]
+        velocities = slice(len(self.places) + len(self.attitudes), 2 * len(self.places) + len(self.attitudes))
+        return np.concatenate([positions, states[:, velocities] - others[:, velocities]], axis=1)
+
+    def moved(
+        self, states: Float[np.ndarray, "rows state"], by: Float[np.ndarray, " both"]
+    ) -> Float[np.ndarray, "rows state"]:
+        """The states that differ from the given ones by this much."""
+        count, change = len(self.places), np.zeros(states.shape[1])
+        change[self.places] = by[:count] / self.halves
+        change[count + len(self.attitudes) :][:count] = by[count:]
+        return moved(self.attitudes, states, change)
+
+
+def rotated(
+    attitude: Float[np.ndarray, "*#some 4"], vector: Float[np.ndarray, "*#some 3"], *, back: bool = False
+) -> Float[np.ndarray, "*some 3"]:
+    """A vector of a body's frame in the world's by the body's attitude, or `back` from the world's in the body's."""
+    turn = _unit(attitude)
+    back_turn = turn * (1.0, -1.0, -1.0, -1.0)
+    turn, back_turn = (back_turn, turn) if back else (turn, back_turn)
+    pure = np.concatenate([np.zeros((*vector.shape[:-1], 1)), vector], axis=-1)
+    return _product(_product(turn, pure), back_turn)[..., 1:]
 
 
 def _unit(quaternion: Float[np.ndarray, "*some 4"]) -> Float[np.ndarray, "*some 4"]:
