@@ -2,7 +2,7 @@ import jax
 import numpy as np
 import pytest
 
-from madoc import simulation
+from madoc import robots, simulation
 from madoc.data import Dataset
 from madoc.identification.noise import (
     channel_noise,
@@ -12,6 +12,7 @@ from madoc.identification.noise import (
     own_slopes,
     residual_noise,
 )
+from madoc.simulation.attitudes import differences, moved
 from madoc.types import Transitions
 from robots import SPRING_TRUTH, recorded, spring
 
@@ -104,3 +105,48 @@ def test_the_noise_of_a_fit_counts_its_unknowns():
     residuals = np.array([[[1.0, 2.0], [-1.0, -2.0], [1.0, 2.0]]])
     np.testing.assert_allclose(residual_noise(residuals, 2), np.sqrt([1.5, 6.0]))
     assert (residual_noise(np.full((1, 3, 2), np.nan), 2) == 0.0).all()
+
+
+BODY = """<mujoco><option gravity="0 0 0" timestep="0.02"/><worldbody><body><joint name="root" type="free"/>
+  <geom type="box" size=".1 .2 .3" mass="1"/><site name="side" pos=".1 0 0"/></body></worldbody>
+  <actuator><motor name="push" site="side" gear="0 1 0 0 0 0"/></actuator></mujoco>"""
+
+
+def body_task(folder):
+    """A free body that a force pushes at its side, with all signals in the order of (qpos, qvel)."""
+    signals = [("position", index) for index in range(7)] + [("velocity", index) for index in range(6)]
+    lines = [f"  - {{name: {kind}_{index}, reads: '{kind}(root)[{index}]'}}\n" for kind, index in signals]
+    (folder / "model.xml").write_text(BODY)
+    (folder / "body.yaml").write_text(
+        f"madoc: 1\nname: body\nmodel: model.xml\ncontrol_step: 0.02\nsignals:\n{''.join(lines)}"
+        "actions:\n  - {name: push, actuator: push, low: -1, high: 1}\n"
+        "parameters:\n  - {field: dof_damping, element: root, low: 0, high: 0.1}\n"
+    )
+    return robots.load(folder / "body.yaml").task
+
+
+def test_noise_of_an_attitude_is_that_of_small_rotations(tmp_path):
+    """A body that sways about its first attitude: by its component alone, noise of w would seem many times larger."""
+    task = body_task(tmp_path)
+    assert task.attitudes == ((3, 4, 5, 6),)
+    simulator, random = simulation.make(task, threads=1), np.random.default_rng(0)
+    state, action, seen = simulator.initial_state, np.zeros(1), []
+    system = simulator.bind(simulator.parameters.middle[None])
+    actions = np.sin(0.2 * np.arange(600))[:, None]
+    for action in actions:
+        seen.append(state)
+        state = system.step(state[None, None], action[None, None])[0, 0]
+    exact = np.stack([*seen, state])
+    noise = np.concatenate([np.zeros(4), np.full(3, 0.004), np.zeros(6)])
+    logged = moved(task.attitudes, exact, noise * random.standard_normal(exact.shape))
+    flags = np.zeros(len(actions), bool)
+    rows = Transitions(logged[:-1], actions, np.zeros(len(actions)), logged[1:], flags, flags)
+    dataset, every = Dataset(rows, np.array([0]), task.name, "modern", "a test"), np.arange(len(actions))
+    after = system.step(logged[None, :-1], actions[None])[0]
+    residuals = differences(task.attitudes, after, logged[1:])
+    slopes = own_slopes(simulator, dataset, np.zeros(1), every[:-1], np.ones(13))
+    found = consecutive_noise(residuals[:-1], residuals[1:], slopes)
+    assert found == pytest.approx(noise, abs=5e-4)
+    components = (after - logged[1:])[:, 3:4]  # as if they were independent: E[r r'] / A, with A = x² + y² + z² << 1
+    carried = 1.0 - logged[:-2, 3:4] ** 2
+    assert consecutive_noise(components[:-1], components[1:], carried) > 2.0 * components.std()

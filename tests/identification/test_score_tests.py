@@ -2,14 +2,19 @@
 
 import numpy as np
 import pytest
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from madoc.identification.score_tests import (
     Products,
+    _together,
     deviate,
+    family_score,
     imitators,
     joint_shift,
     parameter_shift,
     score,
+    shared_deviate,
     variances_by_group,
 )
 
@@ -91,3 +96,71 @@ def test_leaving_out_runs_shows_what_differs_between_them():
     assert by_run == pytest.approx([3 / 4 * 4 * (1 / 3) ** 2])
     assert by_window == pytest.approx([11 / 12 * 12 * (1 / 11) ** 2])
     assert (freedom, windows) == (pytest.approx([3.0]), pytest.approx([11.0]))
+
+
+def test_one_of_many_tests_is_as_significant_as_if_it_were_the_only_one():
+    assert shared_deviate(norm.isf(1e-4), 50) == pytest.approx(norm.isf(5e-3))
+    assert shared_deviate(0.0, 3) == -np.inf
+    assert shared_deviate(2.0, 1) == pytest.approx(2.0)
+
+
+def test_a_family_of_one_column_is_hotellings_test_by_hand():
+    """Windows of scores 1, 2, 1, 2, ...: T² = n mean² / variance, here Student's t² with n - 1 degrees of freedom."""
+    residuals = -np.tile([1.0, 2.0], 10)[:, None]
+    products = Products.of(residuals, np.zeros((20, 1, 0)), np.ones((20, 1, 1)))
+    together, found = _together(products, [1], ()), family_score(products, [1])
+    t = np.sqrt(20) * 1.5 / np.sqrt(0.25 * 20 / 19)
+    assert together.t == pytest.approx(norm.isf(student.sf(t, 19)))
+    assert together.changes == pytest.approx([1.5])
+    # Of the mean square 2.5 the mean explains 2.25, and by chance its variance of 5 / 19 / 20.
+    assert together.explained == pytest.approx((2.25 - 0.25 / 19) / 2.5)
+    assert found.t == pytest.approx(max(shared_deviate(each, 2) for each in (together.t, score(products, 1).t)))
+    assert (found.leading, len(found.shifts)) == (0, 0)
+
+
+def test_one_column_of_many_shows_by_itself():
+    random = np.random.default_rng(0)
+    columns = random.standard_normal((60, 8, 40))
+    products = Products.of(-0.4 * columns[..., 7] + random.standard_normal((60, 8)), np.zeros((60, 8, 0)), columns)
+    found, alone = family_score(products, range(1, 41)), score(products, 8)
+    assert found.leading == 7
+    assert found.t == pytest.approx(shared_deviate(alone.t, 80))
+    assert np.flatnonzero(found.changes).tolist() == [7]
+
+
+def planted(size, seed):
+    """Windows in which five columns beside the parameter's are tried, and a mixture of two of them is missing."""
+    random = np.random.default_rng(seed)
+    columns, parameter = random.standard_normal((90, 8, 5)), random.standard_normal((90, 8, 1))
+    columns[..., 3] += parameter[..., 0]  # so that the parameter makes up for a part of it
+    missing = columns[..., 1] + columns[..., 3]
+    loud = random.uniform(0.5, 2.0, (90, 1))
+    return Products.of(-size * missing + loud * random.standard_normal((90, 8)), parameter, columns)
+
+
+def test_a_family_finds_a_mixture_and_says_how_it_moves_the_parameter():
+    found = family_score(planted(0.5, 0), range(2, 7))
+    assert found.t > 6.0
+    assert _together(planted(0.5, 0), range(2, 7), ()).changes == pytest.approx([0.0, 0.5, 0.0, 0.5, 0.0], abs=0.12)
+    assert found.shifts == pytest.approx([-0.5], abs=0.15)
+    assert 0.01 < found.errors[0] < 0.1
+    assert found.leading in (1, 3)
+
+
+def test_a_family_of_which_nothing_is_missing_is_as_significant_as_chance_says():
+    of = [planted(0.0, seed) for seed in range(400)]
+    significant = [_together(products, range(2, 7), ()).t > norm.isf(0.05 / 2) for products in of]
+    assert np.mean(significant) == pytest.approx(0.05, abs=0.03)
+    assert np.mean([family_score(products, range(2, 7)).t > norm.isf(0.05 / 2) for products in of]) < 0.06
+
+
+def test_a_family_that_parameters_imitate_is_none():
+    assert family_score(Products.of(NOISE, ONES, 3.0 * ONES), [2]) is None
+
+
+def test_columns_put_together_have_the_products_of_their_sum():
+    random = np.random.default_rng(0)
+    residuals, parameter, columns = (random.standard_normal(shape) for shape in ((5, 3), (5, 3, 1), (5, 3, 2)))
+    weights = np.array([[2.0], [-1.0]])
+    combined = Products.of(residuals, parameter, columns).combined([1], [2, 3], weights)
+    assert combined.each == pytest.approx(Products.of(residuals, parameter, columns @ weights).each)

@@ -11,7 +11,7 @@ from madoc.errors import MadocError
 from madoc.parameters import Parameter, ParameterSpace
 from madoc.robots import load
 from madoc.simulation.cpu import CpuSimulator, CpuSystem
-from madoc.simulation.drives import joint_drives
+from madoc.simulation.drives import drive_forces
 from own_robots import CART_SPEC, write_robot
 from robots import spring
 
@@ -333,7 +333,7 @@ def test_a_force_from_outside_acts_as_an_actuator_would_and_is_gone_after_its_st
     simulator = CpuSimulator(spring(), threads=1)
     system, action = simulator.bind(simulator.parameters.middle[None]), np.full((1, 1, 1), 0.4)
     state, idle = np.array([[[0.2, -0.1]]]), np.zeros((1, 1, 1))
-    force = system.actuator_forces(state, action)
+    force = system.actuator_forces(state, action)[:, :, 0]
     assert force.shape == (1, 1, 1)
     pushed = system.step(state, idle, force)
     np.testing.assert_allclose(pushed, system.step(state, action), rtol=0, atol=1e-12)
@@ -341,7 +341,7 @@ def test_a_force_from_outside_acts_as_an_actuator_would_and_is_gone_after_its_st
     np.testing.assert_array_equal(system.step(state, idle), system.step(state, idle, np.zeros((1, 1, 1))))
 
 
-def test_what_motors_and_position_servos_exert():
+def test_what_actuators_exert_on_joints_and_by_sites():
     motor, servo, other = (
         '<motor joint="a" gear="3" ctrllimited="true" ctrlrange="-1 1"/>',
         '<position jointinparent="b" kp="10" kv="2" forcelimited="true" forcerange="-4 4"/>',
@@ -353,10 +353,12 @@ def test_what_motors_and_position_servos_exert():
       <tendon><fixed name="both"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed></tendon>
       <actuator>{motor}{servo}{other}</actuator></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
-    state, control = np.array([[0.3, 0.1, 0.5, -0.2]]), np.array([[2.0, 0.2, 0.0]])
-    found = joint_drives(model, state, control)
+    state, control = np.array([[0.3, 0.1, 0.5, -0.2]]), np.array([[2.0, 0.2, 0.5]])
+    each = drive_forces(model, state, control)[0]
+    np.testing.assert_allclose(each[1:], [[0.0, 1.4], [0.5 * 2.5 / 3.5, 0.5]])
+    found = each.sum(0)[None]
     # The motor is asked for more than it can, and its joint bears less still. The servo: 10 (0.2 - 0.1) - 2 (-0.2) N.
-    np.testing.assert_allclose(found, [[2.5, 1.4]])
+    np.testing.assert_allclose(found, [[2.5, 1.9]])
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = state[0, :2], state[0, 2:], control[0]
     mujoco.mj_forward(model, data)

@@ -10,7 +10,15 @@ import madoc.tasks
 from madoc.errors import MadocError
 from madoc.parameters import FIELDS, Parameter
 from madoc.simulation.cpu import CpuSimulator
-from madoc.simulation.write import MASS_FLOOR, element_names, find_elements, nominal_values, write_parameters
+from madoc.simulation.write import (
+    MASS_FLOOR,
+    body_reach,
+    element_names,
+    find_elements,
+    free_joints,
+    nominal_values,
+    write_parameters,
+)
 from robots import ARM
 
 WRITTEN = {
@@ -234,3 +242,14 @@ def test_a_massless_body_cannot_be_scaled():
     model = madoc.tasks.make("hopper").compile()
     with pytest.raises(MadocError, match="body_mass_and_inertia: body 'world' has no mass to scale; use body_mass"):
         written(model, Parameter("body_mass_and_inertia", "world", 0.0, 1.0), 1.0)
+
+
+def test_a_body_reaches_as_far_as_spheres_about_its_geoms():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body name="a"><freejoint name="free"/><geom size="0.1" pos="0 0 -0.5"/>
+        <geom type="box" size="0.2 0.1 0.2" pos="0.3 0 0"/><body name="b"><joint name="j"/>
+        <inertial pos="0 0 1" mass="1" diaginertia="1 1 1"/></body></body></worldbody></mujoco>"""
+    )
+    assert body_reach(model, Parameter("body_com", "a", 0.0, 1.0)) == pytest.approx(0.6)
+    assert body_reach(model, Parameter("body_com", "b", 0.0, 1.0)) == np.inf
+    assert [joint.name for joint in free_joints(model)] == ["free"]

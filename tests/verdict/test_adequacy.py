@@ -7,9 +7,10 @@ import pytest
 
 from madoc.calibration.holdout import AgainstChance, Area, ToldApart
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
-from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, LATE_DRIVE, TILTS
+from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, LATE_DRIVE, TILTS, UNLISTED
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
+from madoc.identification.joint_forces import WEAKENING
 from madoc.identification.term_tests import Alternative, ImitatedTerm, MissingTerm
 from madoc.verdict import judge
 from madoc.verdict.adequacy import (
@@ -103,13 +104,25 @@ def test_the_term_that_explains_most_is_named_among_those_as_significant():
     assert missing_term(held(term("a spring", t=30.0, explained=0.05), friction)).cause == "a spring"
 
 
-def test_what_is_usual_is_named_before_a_tilted_base_and_another_gravity():
+def test_what_is_usual_is_named_before_a_tilted_base():
     gain, tilt = term("another gain", explained=0.45), term(TILTS[0], explained=0.5, parameter="")
-    weak = replace(term("another gravity", explained=0.5, parameter="gravity"), value=-10.2, standard_error=0.01)
-    assert likeliest([tilt, weak, gain]) is gain
-    assert likeliest([replace(weak, value=-9.81), gain]).parameter == "gravity"
+    assert likeliest([tilt, gain]) is gain
     assert likeliest([replace(tilt, explained=0.9), gain]).cause == TILTS[0]
     assert likeliest([]) is None
+
+
+def test_forces_that_are_not_listed_are_named_where_nothing_listed_explains_half_as_much():
+    family = term(f"{UNLISTED} (hip), which grows most with its speed", t=12.0, explained=0.5, parameter="")
+    drag = term(f"{WEAKENING} (hip)", t=7.5, explained=0.26, parameter="")
+    assert missing_term(held(family, drag)) is drag
+    assert as_likely(held(family, drag), drag) == []
+    weaker, elsewhere = replace(drag, explained=0.24), replace(family, cause=f"{UNLISTED} (knee)", explained=0.45)
+    assert missing_term(held(family, weaker)) is family
+    assert as_likely(held(family, elsewhere, weaker), family) == [elsewhere]
+    sentence = judge(held(family, elsewhere)).sentence
+    assert f"the model lacks {family.cause}: a value of 1 ± 0.08 N·m explains 50 %" in sentence
+    assert f"({elsewhere.cause} would explain nearly as much); look there for what the model leaves out" in sentence
+    assert "add to the spec" not in sentence
 
 
 def test_what_is_uncertain_or_moves_nothing_is_not_missing():

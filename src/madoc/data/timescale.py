@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.data.dataset import Dataset, spread_of
+from madoc.simulation.attitudes import Attitudes, differences
 
 STEPS = 20
 """Number of steps of comparison in a time scale, 1 or more. Rows that are closer together are taken together."""
@@ -62,10 +63,13 @@ def stride(dataset: Dataset) -> int:
     return max(1, round(dataset.time_scale / STEPS))
 
 
-def typical_change(dataset: Dataset) -> Float[np.ndarray, " observation"]:
-    """Standard deviation of each channel's change in a stride of rows, in its unit; 1 for one that never moves."""
+def typical_change(dataset: Dataset, attitudes: Attitudes = ()) -> Float[np.ndarray, " observation"]:
+    """Standard deviation of each channel's change in a stride of rows, in its unit; 1 for one that never moves.
+
+    Changes of `attitudes` are rotations, as in `simulation.attitudes`.
+    """
     logged, rows = dataset.transitions, stride(dataset)
     observation, following = np.asarray(logged.observation), np.asarray(logged.next_observation)
     last = np.arange(len(dataset)) + rows - 1
     whole = last < dataset.episode_ends[dataset.episode_of(np.arange(len(dataset)))]
-    return spread_of(following[last[whole]] - observation[whole])
+    return spread_of(differences(attitudes, following[last[whole]], observation[whole]))

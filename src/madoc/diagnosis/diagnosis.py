@@ -81,7 +81,7 @@ def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None,
         if logged.kind == "exact":
             explanation = explain(dataset, simulator, logged, draws, key=of_starts)
             points, ahead = draws[[0, explanation.best]], explanation.horizons[min(1, len(explanation.horizons) - 1)]
-            scale = typical_change(dataset)
+            scale = typical_change(dataset, simulator.task.attitudes)
             exchanged, steps = exchanged_columns(dataset, simulator, points, ahead, scale, contradicts=False)
             findings += [*explanation_findings(explanation, channels, exchanged), *exchanged]
             spent += steps

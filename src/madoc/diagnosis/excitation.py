@@ -100,7 +100,7 @@ def _excited(
         simulator,
         windows,
         first,
-        typical_change(dataset),
+        typical_change(dataset, simulator.task.attitudes),
         steps=ROUNDS,
         loss="linear",
         damping=_DAMPING,
@@ -133,7 +133,8 @@ def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates)
     windows = probing_windows(logged, dataset, simulator, steps=strides * stride(dataset), count=count)
     middle = np.zeros(len(space))
     points = difference_points(middle)
-    around = linearise(points, window_residuals(simulator, windows, points, typical_change(dataset)))
+    scale = typical_change(dataset, simulator.task.attitudes)
+    around = linearise(points, window_residuals(simulator, windows, points, scale))
     certainty = sandwich(bread(around, 1.0, "linear"), np.zeros((len(space), len(space))))
     certainty, only_ratios = _without_scale(certainty, around, middle, space)
     unknown = np.full(len(space), np.nan)

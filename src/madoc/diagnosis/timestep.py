@@ -21,7 +21,8 @@ def timestep_findings(
         logged: The log's states.
         point: The parameters in [-1, 1] at which both are simulated.
     """
-    change, spent = coarseness(dataset, logged, simulator, point, typical_change(dataset))
+    scale = typical_change(dataset, simulator.task.attitudes)
+    change, spent = coarseness(dataset, logged, simulator, point, scale)
     if change <= COARSE:
         return [], spent
     timestep = simulator.control_step / simulator.task.frame_skip

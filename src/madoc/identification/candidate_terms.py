@@ -17,7 +17,7 @@ from madoc.identification.score_tests import Score
 from madoc.identification.states import LoggedStates
 from madoc.parameters import FIELDS, Parameter
 from madoc.simulation.base import Simulator
-from madoc.simulation.write import element_names, has_gain, heavy_bodies, nominal_values, off_centre
+from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, nominal_values, off_centre
 
 CAUSES = {
     "dof_frictionloss": "Coulomb friction",
@@ -41,6 +41,10 @@ TILTS = ("a base or a floor that is tilted towards x", "a base or a floor that i
 INTEGRATION = "the error of the model's integration step"
 LATE_DRIVE = "a drive that acts later than the others"
 LATE_SENSOR = "a sensor that reads late, as behind a filter"
+UNLISTED = "a force that no listed term describes"
+"""What a family of forces stands for, or a listed term of a value that no machine has; more words follow."""
+ON_THE_GROUND = (-9.9, -9.7)
+"""m/s², gravity downwards at the poles, at the equator and on mountains."""
 _KNOWN_BEFORE = ("body_mass", "body_com")
 _STILL = 1e-9
 """Standard deviation of a joint's position below which it does not move, so that nothing tells of a spring."""
@@ -73,6 +77,8 @@ class Candidate:
         elements: Elements of the model that share the value; empty for a term of the whole robot.
         known_before: Whether users know the value well without the log, as by scales or a level, or no parameter of
             a spec adds the term: it is not taken together with others that cannot be excluded then.
+        plausible: Smallest and largest value that a machine can have; beyond them something else is missing, that the
+            term imitates.
     """
 
     cause: str
@@ -83,6 +89,11 @@ class Candidate:
     least: float
     elements: tuple[str, ...] = ()
     known_before: bool = False
+    plausible: tuple[float, float] = (-np.inf, np.inf)
+
+    def imitates(self, value: float, error: float) -> bool:
+        """Whether a value is none that a machine can have, beyond two of its standard errors."""
+        return not self.plausible[0] - 2.0 * error <= value <= self.plausible[1] + 2.0 * error
 
     def added(self, score: Score) -> Parameter | None:
         """The parameter that adds the term, in a range wide enough for its score; None if there is none."""
@@ -126,7 +137,12 @@ def candidates(
         wanted += [("signal_bias", signal, float(typical)) for signal, typical in measured]
     for field, element, reference in wanted:
         if (field, element) not in calibrated:
-            yield _candidate(partial(nominal_values, model), field, element, reference)
+            candidate, parameter = _candidate(partial(nominal_values, model), field, element, reference)
+            if field == "gravity":
+                candidate = replace(candidate, plausible=ON_THE_GROUND)
+            if field == "body_com":
+                candidate = replace(candidate, plausible=(-np.inf, body_reach(model, parameter)))
+            yield candidate, parameter
 
 
 def references_of(logged: LoggedStates, simulator: Simulator, joint: Any) -> dict[str, float]:
@@ -259,14 +275,16 @@ def _of_groups(
     added: list[tuple[Candidate, Parameter]],
     columns: Float[np.ndarray, "added windows values"],
 ) -> Iterator[tuple[Candidate, Float[np.ndarray, "windows values"]]]:
-    """The terms of joints that share a calibrated parameter, of one value for all: effects of small values add up.
+    """The terms of joints that share a calibrated parameter, and the gain of all drives, of one value for all.
 
-    Of terms that all of these joints lack, the others would hide each single one.
+    Effects of small values add up. Of terms that all of these lack, the others would hide each single one.
     """
     index_of = {(parameter.field, parameter.element): index for index, (_, parameter) in enumerate(added)}
     groups = dict.fromkeys(row.elements for row in simulator.parameters.parameters if len(row.elements) > 1)
     joint_fields = [field for field in CAUSES if FIELDS[field].element == "joint"]
-    for field, group in product(joint_fields, groups):
+    gains = {parameter.element: each.nominal for each, parameter in added if parameter.field == "actuator_gain"}
+    drives = [("actuator_gain", tuple(gains))] if len(gains) > 1 and len(set(gains.values())) == 1 else []
+    for field, group in (*product(joint_fields, groups), *drives):
         members = [index_of[field, element] for element in group if (field, element) in index_of]
         if len(members) == len(group):
             single = [added[index][0] for index in members]

@@ -1,17 +1,18 @@
 """Forces at a joint that no parameter of a spec adds: what each stands for, and its effect on simulated windows.
 
 Each is a function of the joint's position, its speed and what its drive exerts, or of another joint's motion. To first
-order the motion under a small force is that under its values along the motion without it, so one simulation of each
-window gives its effect. During a control step a force has its value at the begin of that.
+order the motion under a small force is that under its values along the motion without it. During a control step a force
+has its value at the begin of that.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from madoc.identification.candidate_terms import CHANGE, Candidate, references_of
-from madoc.identification.replay import Readings
+from madoc.identification.body_forces import OF_BODIES, OF_DRIVES, free_bodies, of_all_drives, on_body
+from madoc.identification.candidate_terms import UNLISTED, Candidate, references_of
+from madoc.identification.responses import Responses
 from madoc.identification.states import LoggedStates
 from madoc.simulation.base import Simulator
 from madoc.simulation.write import single_joints
@@ -29,6 +30,8 @@ COUPLED = "a force that another joint's motion exerts"
 BUILT_UP = "friction that builds up over a distance after each reversal, as of belts and seals"
 FORCES = (CONSTANT, LOADED, SLOW, WEAKENING, DEAD_ZONE, BENT, RIPPLE, UNEVEN, PLACED, COUPLED, BUILT_UP)
 """What each stands for, in words, the most usual first; the joint's name follows in brackets."""
+RESISTING = (LOADED, SLOW)
+"""Those that take energy out, so that no machine has a value below 0."""
 USUAL = 5
 """Number of `FORCES` that are tried at every joint; the others only at robots of few joints."""
 FEW_JOINTS = 4
@@ -50,8 +53,8 @@ _SMALLEST = 1e-9
 
 
 def is_joint_force(cause: str) -> bool:
-    """Whether the cause of a term is one of `FORCES`."""
-    return cause.startswith(FORCES)
+    """Whether the cause of a term is a force that no parameter of a spec adds, at a joint or elsewhere."""
+    return cause.startswith((*FORCES, *OF_BODIES, *OF_DRIVES, UNLISTED))
 
 
 def joint_forces(
@@ -133,43 +136,39 @@ def _standardised(values: Float[np.ndarray, "windows steps"]) -> Float[np.ndarra
 
 def force_effects(
     simulator: Simulator,
-    readings: Readings,
     logged: LoggedStates,
-    point: Float[np.ndarray, " d"],
-    states: Float[np.ndarray, "windows state"],
-    whole: Bool[np.ndarray, " windows"],
+    responses: Responses,
     earlier: Float[np.ndarray, "windows earlier state"],
 ) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"]]:
-    """Every force at a joint of one degree of freedom, and the derivative of the residuals by it, in its reference.
+    """Every listed force at joints and free bodies and of all drives, and the residuals' derivatives by it.
 
-    `whole` are the windows that count; a force with which one of these diverges has no effect. `earlier` are logged
-    states before each window. It takes one simulation of every window for each force, and two besides.
+    These are in its reference. `earlier` are logged states before each window.
     """
     model, joints = simulator.task.model, single_joints(simulator.task.model)
-    tried, effects = list[Candidate](), [np.zeros((len(readings), readings.observed[0].size, 0))]
-    if not joints or not whole.any():
-        return tried, effects[0]
-    motion, exerted = readings.trajectories(simulator, point, states)
-    motion, exerted = (np.where(whole[:, None, None], each, np.nan) for each in (motion, exerted))
-    base = readings.residuals(simulator, point[None], states[None])[0, 0]
-    few = model.njnt <= FEW_JOINTS
-    causes = FORCES if few else FORCES[:USUAL]
+    tried, forces = list[Candidate](), list[np.ndarray]()
+    few, exerted = model.njnt <= FEW_JOINTS, responses.drives.sum(2)
+    motion, causes = responses.motion, FORCES if few else FORCES[:USUAL]
     along = [(motion[..., int(each.qposadr[0])], motion[..., model.nq + int(each.dofadr[0])]) for each, _ in joints]
     for place, (joint, turns) in enumerate(joints):
-        dof, torque = int(joint.dofadr[0]), references_of(logged, simulator, joint)["dof_frictionloss"]
+        dof, size = int(joint.dofadr[0]), references_of(logged, simulator, joint)["dof_frictionloss"]
         others = [*along[:place], *along[place + 1 :]] if few else []
         came_from = earlier[..., int(joint.qposadr[0])]
         found = joint_forces(*along[place], exerted[..., dof], others, turns=turns, earlier=came_from)
-        shapes = [(each, shape) for each in causes for shape in found.get(each, [])]
-        forces = np.zeros((len(shapes), *exerted.shape))
-        for index, (cause, shape) in enumerate(shapes):
-            least = 0.0 if cause == DEAD_ZONE else -np.inf
-            unit = "N·m" if turns else "N"
-            tried.append(Candidate(f"{cause} ({joint.name})", "", unit, 0.0, torque, least, known_before=True))
-            forces[index, ..., dof] = CHANGE * torque * np.nan_to_num(shape)
-        points, starts = (np.repeat(each[None], len(shapes), axis=0) for each in (point, states))
-        moved = readings.residuals(simulator, points, starts, forces)[:, 0]
-        effects.append(np.moveaxis((moved - base) / CHANGE, 0, -1))
-    every = np.concatenate(effects, axis=-1)
-    every[..., ~np.isfinite(every[whole]).all((0, 1))] = 0.0
-    return tried, every
+        for cause, shape in ((each, shape) for each in causes for shape in found.get(each, [])):
+            least, plausible = 0.0 if cause == DEAD_ZONE else -np.inf, (0.0 if cause in RESISTING else -np.inf, np.inf)
+            named, unit = f"{cause} ({joint.name})", "N·m" if turns else "N"
+            tried.append(Candidate(named, "", unit, 0.0, size, least, known_before=True, plausible=plausible))
+            forces.append(size * shape[..., None] * (np.arange(model.nv) == dof))
+    speed = motion[..., model.nq : model.nq + model.nv]
+    bodies = list(free_bodies(simulator, responses))
+    if responses.drives.shape[2] > 1:
+        height = bodies[0].height if len(bodies) == 1 else None
+        for cause, force in of_all_drives(responses.drives, speed, height).items():
+            tried.append(Candidate(cause, "", "of what they exert", 0.0, 1.0, -np.inf, known_before=True))
+            forces.append(force)
+    for body in bodies:
+        for cause, pull, torque in on_body(body):
+            size, unit = (body.typical_torque, "N·m") if torque.any() else (body.typical_force, "N")
+            tried.append(Candidate(f"{cause} ({body.name})", "", unit, 0.0, size, -np.inf, known_before=True))
+            forces.append(size * body.generalised(pull, torque, model.nv))
+    return tried, responses.effects(np.stack(forces, axis=-1) if forces else np.zeros((*exerted.shape, 0)))

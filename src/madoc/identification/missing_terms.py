@@ -28,11 +28,13 @@ from madoc.identification.fitted_windows import Fit, LoggedWindows, fit_windows,
 from madoc.identification.information import NORMAL_95
 from madoc.identification.joint_forces import force_effects, is_joint_force
 from madoc.identification.replay import Readings
+from madoc.identification.responses import Responses, responses_of
 from madoc.identification.score_tests import deviate, joint_shift, parameter_shift, score
 from madoc.identification.states import LoggedStates
 from madoc.identification.term_tests import (
     DISAGREEING,
     FEWEST,
+    LIKELY_FORCE,
     SUSPICIOUS,
     Alternative,
     ImitatedTerm,
@@ -42,6 +44,7 @@ from madoc.identification.term_tests import (
     named,
     term_of,
 )
+from madoc.identification.unlisted_forces import families, unlisted_forces
 from madoc.parameters import FIELDS, ParameterSpace
 from madoc.simulation.base import Simulator
 
@@ -57,9 +60,6 @@ _AT_MINIMUM = 1e-3
 """Distance in [-1, 1] from the end of a range, up to which a parameter is at its minimum."""
 LIKELY_FRICTION = 1.0
 """t from which Coulomb friction counts though it is not significant; 16 % of joints without any reach it by chance."""
-LIKELY_FORCE = 3.5
-"""|t| from which a force at a joint counts though it is not certain; of a hundred that are tested, one log in twenty
-has such a one by chance."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
 
 
@@ -113,8 +113,9 @@ def suspicions(
         return Suspicions(tested=False)
     fit = fit_windows(simulator, readings, windows.states, point)
     led = fit.point
-    tried, by_terms = _effects(logged, simulator, windows, fit, scale)
-    spent = fit.control_steps + (3 + len(tried)) * len(readings) * readings.steps
+    responses = responses_of(simulator, readings, fit.point, fit.states, fit.slopes.whole)
+    tried, by_terms, simulated = _effects(logged, simulator, windows, fit, scale, responses)
+    spent = fit.control_steps + (1 + simulated) * len(readings) * readings.steps + responses.control_steps
     both = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, by_terms], axis=-1))
     products, counted = products_of(both, readings, len(led)), both.finite
     if products is None or len(products) < FEWEST + len(led):
@@ -122,6 +123,8 @@ def suspicions(
     tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
     drifts, others, of_parts = drifts_of(tests, simulator, readings, runs, fit, point)
     terms = [*_terms(tests), *_below_minimum(tests, led), *drifts]
+    unlisted, covering = unlisted_forces(tests, families(simulator, responses), readings, fit, by_terms, responses)
+    terms, others = [*terms, *unlisted], [*others, *covering]
     for other in _of_other_windows(tests, led - point):
         others.append(other)
         if of_other_model:
@@ -142,20 +145,24 @@ def _effects(
     windows: LoggedWindows,
     fit: Fit,
     scale: Float[np.ndarray, " observation"],
-) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"]]:
-    """Every candidate and the derivative of the residuals by it, 0 for one that most windows cannot bear."""
+    responses: Responses,
+) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"], int]:
+    """Every candidate and the derivative of the residuals by it, 0 for one that most windows cannot bear.
+
+    Also how often every window was simulated.
+    """
     readings, added = windows.readings, list(candidates(logged, simulator, fit.point, scale))
     space = ParameterSpace((*simulator.parameters.parameters, *(parameter for _, parameter in added)))
     wide = simulation.make(replace(simulator.task, parameters=space))
     at_nominal = np.concatenate([fit.point, -np.ones(len(added))])
     tried, by_terms = effects(simulator, wide, readings, windows.before, at_nominal, fit.states, added)
-    whole, earlier = fit.slopes.whole, windows.earlier
-    forces, by_forces = force_effects(simulator, readings, logged, fit.point, fit.states, whole, earlier)
-    by_terms = np.concatenate([by_terms, by_forces], axis=-1)
+    whole = fit.slopes.whole
+    forces, by_forces = force_effects(simulator, logged, responses, windows.earlier)
+    simulated, by_terms = len(tried), np.concatenate([by_terms, by_forces], axis=-1)
     if whole.any():
         diverges = (~np.isfinite(by_terms).all(1)[whole]).mean(0) > DIVERGING
         by_terms[..., diverges] = 0.0  # so that others are tested
-    return [*tried, *forces], by_terms
+    return [*tried, *forces], by_terms, simulated
 
 
 def _of_chosen(

@@ -1,5 +1,7 @@
 """Every estimator of sensor noise, each with what it assumes; all return one standard deviation a channel.
 
+Of attitudes it is that of small rotations, as in `simulation.attitudes`, but for `difference_noise`.
+
 | estimator | from | assumes |
 |---|---|---|
 | `difference_noise` | the log alone | motion is smooth over five rows |
@@ -14,6 +16,7 @@ from jaxtyping import Float, Int
 from madoc.data.dataset import Dataset
 from madoc.identification.losses import NORMAL_MAD, robust_deviation
 from madoc.identification.states import states_observed_as
+from madoc.simulation.attitudes import differences, moved
 from madoc.simulation.base import Simulator
 
 OUTLIER = 5.0
@@ -126,8 +129,9 @@ def own_slopes(
     It is taken at parameters in [-1, 1] and rows with exact states. `scale` is a step's typical change of each channel.
     """
     moves = [np.zeros(len(scale)), *(STEP * np.diag(scale))]
-    observation = np.asarray(dataset.transitions.observation)
-    states = np.stack([states_observed_as(dataset, simulator.task, rows, observation + move) for move in moves])
+    observation, attitudes = np.asarray(dataset.transitions.observation), simulator.task.attitudes
+    readings = (moved(attitudes, observation, move) for move in moves)
+    states = np.stack([states_observed_as(dataset, simulator.task, rows, each) for each in readings])
     action = np.asarray(dataset.transitions.action)[rows]
     system = simulator.bind(simulator.parameters.to_physical(point)[None])
     flat = states.reshape(1, -1, states.shape[-1])
@@ -135,6 +139,7 @@ def own_slopes(
     flat = np.where(rebuilt, flat, np.tile(states[:1], (len(moves), 1, 1)).reshape(flat.shape))
     after = system.observe(system.step(system.unbiased(flat), np.tile(action, (len(moves), 1))[None]))
     after = after.reshape(len(moves), len(rows), -1)
-    moved = np.diagonal(after[1:] - after[0], axis1=0, axis2=2) / (STEP * scale)
+    change = differences(attitudes, after[1:], after[0])
+    slopes = np.diagonal(change, axis1=0, axis2=2) / (STEP * scale)
     rebuilt = rebuilt.reshape(len(moves), len(rows))[1:].T
-    return np.where(rebuilt & np.isfinite(moved), moved, 0.0)
+    return np.where(rebuilt & np.isfinite(slopes), slopes, 0.0)

@@ -16,6 +16,7 @@ from madoc.identification.linearisation import (
 )
 from madoc.identification.states import LoggedStates
 from madoc.identification.windows import Windows, readings_at
+from madoc.simulation.attitudes import differences
 from madoc.simulation.base import Simulator, System
 
 
@@ -27,13 +28,16 @@ def window_residuals(
 ) -> Float[np.ndarray, "systems windows values"]:
     """Simulated minus logged observations after every action, over `scale`, from the windows' logged states.
 
+    Residuals of attitudes are rotations, as in `simulation.attitudes`.
+
     NaN in windows whose simulation failed. Spends systems · windows · steps control steps.
     """
     system = simulator.bind(simulator.parameters.to_physical(np.clip(points, -1.0, 1.0)))
     states = system.unbiased(
         np.ascontiguousarray(np.broadcast_to(windows.states, (len(points), *windows.states.shape)))
     )
-    residuals = (_observations(system, states, windows.actions) - windows.following) / scale
+    seen = _observations(system, states, windows.actions)
+    residuals = differences(simulator.task.attitudes, seen, windows.following) / scale
     return residuals.reshape(len(points), len(windows.states), math.prod(residuals.shape[2:]))
 
 
@@ -109,8 +113,8 @@ class Readings:
 
     def trajectories(
         self, simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
-    ) -> tuple[Float[np.ndarray, "windows steps state"], Float[np.ndarray, "windows steps dof"]]:
-        """The simulated state before each action, and what the actuators of joints exert there, in N or N·m.
+    ) -> tuple[Float[np.ndarray, "windows steps state"], Float[np.ndarray, "windows steps actuator dof"]]:
+        """The simulated state before each action, and what each actuator exerts there on every degree of freedom.
 
         Spends windows · steps control steps.
         """
@@ -119,7 +123,7 @@ class Readings:
         visited = np.concatenate([states[:, None], after[:, :-1]], axis=1)
         flat_states, flat_actions = (each.reshape(1, -1, each.shape[-1]) for each in (visited, self.actions))
         exerted = system.actuator_forces(flat_states, flat_actions)
-        return visited, exerted.reshape(*visited.shape[:2], -1)
+        return visited, exerted.reshape(*visited.shape[:2], *exerted.shape[2:])
 
     def residuals(
         self,
@@ -138,7 +142,8 @@ class Readings:
         start = np.ascontiguousarray(states)
         following = _observations(system, start, np.tile(self.actions, (times, 1, 1)), force)
         simulated = np.concatenate([system.observe(start)[:, :, None], following], axis=2)[..., : len(self.scale)]
-        residuals = (simulated.reshape(len(points), times, *self.observed.shape) - self.observed) / self.scale
+        simulated = simulated.reshape(len(points), times, *self.observed.shape)
+        residuals = differences(simulator.task.attitudes, simulated, self.observed) / self.scale
         return residuals.reshape(len(points), times, len(self), -1)
 
 

@@ -8,13 +8,15 @@ change is bounded (Mallows 1975).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 REACH = 3.0
 """Length of a column of derivatives in a window relative to the median window's; a window with more is shrunk to it."""
+WINDOWS_EACH = 10
+"""Number of windows for each principal component of a family, so that their covariance is well known."""
 _DISTINCT = 1e-3
 """Share of a column's squares that the columns before it cannot imitate; below it the two are one."""
 _SINGULAR = 1e-10
@@ -56,6 +58,19 @@ class Products:
         first = [0, *(1 + index for index in (*kept, *others))]
         order = [*first, *range(len(first), self.each.shape[1])]
         return Products(self.each[:, order][:, :, order], len(kept))
+
+    def combined(
+        self, included: Sequence[int], terms: Sequence[int], weights: Float[np.ndarray, "some few"]
+    ) -> "Products":
+        """Those of the residuals, the included columns, and sums of the terms' columns with these weights."""
+        first = np.array([0, *included])
+        corner, mixed = self.each[:, first[:, None], first], self.each[:, first[:, None], np.array(terms)] @ weights
+        inner = weights.T @ self.each[:, np.array(terms)[:, None], np.array(terms)] @ weights
+        upper, lower = (
+            np.concatenate([corner, mixed], axis=2),
+            np.concatenate([np.swapaxes(mixed, 1, 2), inner], axis=2),
+        )
+        return Products(np.concatenate([upper, lower], axis=1), self.count)
 
     def bounded(self, columns: Sequence[int]) -> Float[np.ndarray, "windows some some"]:
         """The products of the residuals and these columns, in this order.
@@ -113,6 +128,13 @@ def deviate(ratio: float, freedom: float) -> float:
     return float(np.copysign(norm.isf(chance), ratio))
 
 
+def shared_deviate(t: float, tests: int) -> float:
+    """The normal deviate by whose probability one of so many tests exceeds t by chance, at most (Bonferroni 1936)."""
+    from scipy.stats import norm  # slow to import, and only tests of terms need it
+
+    return float(norm.isf(min(1.0, tests * max(float(norm.sf(t)), np.finfo(float).tiny))))
+
+
 def score(
     products: Products,
     index: int,
@@ -151,6 +173,117 @@ def score(
         return None
     freedom = max(1.0, power**2 / float((alone**2).sum()) - 1.0 - len(included))
     return Score(change, error, change**2 * power / float(squares), -response * change, freedom)
+
+
+@dataclass(frozen=True)
+class FamilyScore:
+    """What several columns tell as one family.
+
+    Attributes:
+        t: The normal deviate of the probability of the family's statistic.
+        changes: Of each column, in its reference, as they explain the residuals: of all, or of the leading one alone
+            where that is more significant.
+        explained: Share of the squared residuals that they explain, those of initial states and parameters taken away.
+        shifts: How they move each calibrated parameter, in [-1, 1].
+        errors: Standard errors of the shifts.
+        leading: The column that by itself is the most significant.
+    """
+
+    t: float
+    changes: Float[np.ndarray, " terms"]
+    explained: float
+    shifts: Float[np.ndarray, " d"]
+    errors: Float[np.ndarray, " d"]
+    leading: int
+
+
+def family_score(products: Products, terms: Sequence[int], already: Sequence[int] = ()) -> FamilyScore | None:
+    """Whether columns explain anything where the parameters' columns and those `already` included do not.
+
+    They are tested together, and the most significant one by itself as one of so many (Bonferroni 1936). A mixture of
+    many shows in the first way, and what is nearly one of them, however many others there are, in the second. The more
+    significant counts, as one of two. None if all columns are imitated by those included.
+    """
+    single = {place: found for place, term in enumerate(terms) if (found := score(products, term, already)) is not None}
+    together = _together(products, terms, already)
+    if not single:
+        return None
+    leading = max(single, key=lambda place: abs(single[place].t))
+    best = single[leading]
+    t = shared_deviate(abs(best.t), 2 * len(terms))
+    if together is not None and shared_deviate(together.t, 2) > t:
+        return replace(together, t=shared_deviate(together.t, 2), leading=leading)
+    changes = np.where(np.arange(len(terms)) == leading, best.change, 0.0)
+    errors = np.abs(best.shifts) * best.error / abs(best.change)
+    return FamilyScore(t, changes, best.explained, best.shifts, errors, leading)
+
+
+def _together(products: Products, terms: Sequence[int], already: Sequence[int]) -> FamilyScore | None:
+    """All columns by one statistic; its `leading` column is not told.
+
+    The residuals' products with what is left of the columns are the score of each window. If nothing is missing their
+    mean is 0, and its square in units of their own covariance between windows has Hotelling's (1931) distribution, with
+    as many degrees of freedom as there are windows that tell of the columns. Only the largest principal components of
+    columns count, one for `WINDOWS_EACH` windows at most; what they explain is what chance does not.
+    """
+    from scipy.stats import f as fisher  # slow to import, and only tests of terms need it
+    from scipy.stats import norm
+
+    included = [*products.parameters, *already]
+    weights = _principal(products.each.sum(0), included, terms, max(1, len(products) // WINDOWS_EACH))
+    count, few = len(included), weights.shape[1]
+    if not few:
+        return None
+    each = products.combined(included, terms, weights).bounded(range(1, 1 + count + few))
+    fixed, own = slice(1, 1 + count), slice(1 + count, None)
+    inner, right, mixed = each[:, fixed, fixed], each[:, fixed, 0], each[:, fixed, own]
+    total = inner.sum(0)
+    imitation, fitted = _solved(total, mixed.sum(0)), _solved(total, right.sum(0))
+    crossed = np.swapaxes(mixed, 1, 2) @ imitation
+    alone = each[:, own, own] - crossed - np.swapaxes(crossed, 1, 2) + imitation.T @ inner @ imitation
+    left = each[:, own, 0] - np.einsum("wij,i->wj", mixed, fitted)
+    left -= right @ imitation - np.einsum("wij,ik,j->wk", inner, imitation, fitted)
+    power = alone.sum(0)
+    inverse = np.linalg.pinv(power, rcond=_SINGULAR, hermitian=True)
+    leverage = np.einsum("wij,ji->w", alone, inverse)
+    windows = few**2 / max(float((leverage**2).sum()), np.finfo(float).tiny) - count
+    if windows <= few + 1:
+        return None
+    mean, spread = left.mean(0), np.atleast_2d(np.cov(left, rowvar=False))
+    squared = len(left) * float(mean @ np.linalg.pinv(spread, rcond=_SINGULAR, hermitian=True) @ mean)
+    chance = float(fisher.sf((windows - few) / (few * (windows - 1)) * squared, few, windows - few)) / 2.0
+    change = -inverse @ left.sum(0)
+    influence = (left + np.einsum("wij,j->wi", alone, change)) @ inverse
+    scatter = influence.T @ influence * len(left) / max(1, len(left) - count - few)
+    squares = each[:, 0, 0].sum() - 2.0 * fitted @ right.sum(0) + fitted @ total @ fitted
+    response = -imitation[: products.count]
+    return FamilyScore(
+        t=float(norm.isf(max(chance, np.finfo(float).tiny))),
+        changes=weights @ change,
+        explained=max(0.0, float(change @ power @ change) - float(np.trace(scatter @ power))) / float(squares),
+        shifts=response @ change,
+        errors=np.sqrt(np.maximum(np.diag(response @ scatter @ response.T), 0.0)),
+        leading=0,
+    )
+
+
+def _principal(
+    total: Float[np.ndarray, "columns columns"], included: Sequence[int], terms: Sequence[int], most: int
+) -> Float[np.ndarray, "terms few"]:
+    """Weights of the terms' columns in the largest principal components of what those included leave of them.
+
+    Each column counts alike, by its length before; one that is imitated does not count.
+    """
+    chosen, own = np.array(included, dtype=int), np.array(terms)
+    imitation = _solved(total[chosen[:, None], chosen], total[chosen[:, None], own])
+    left = total[own[:, None], own] - total[own[:, None], chosen] @ imitation
+    before, alone = np.diag(total)[own], np.maximum(np.diag(left), 0.0)
+    counted = alone > _DISTINCT * before
+    scale = np.where(counted, 1.0 / np.sqrt(np.where(counted, alone, 1.0)), 0.0)
+    sizes, directions = np.linalg.eigh(left * scale[:, None] * scale)
+    kept = np.argsort(-sizes)[:most]
+    kept = kept[sizes[kept] > _DISTINCT * max(float(sizes.max(initial=0.0)), np.finfo(float).tiny)]
+    return scale[:, None] * directions[:, kept] / np.sqrt(sizes[kept])
 
 
 def imitators(products: Products, index: int) -> Float[np.ndarray, " d"] | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.identification.candidate_terms import DELAY, EARLY, Candidate
+from madoc.identification.candidate_terms import DELAY, EARLY, UNLISTED, Candidate
 from madoc.identification.score_tests import Products, Score, imitators, score
 from madoc.parameters import ParameterSpace
 
@@ -14,6 +14,9 @@ SUSPICIOUS = 2.0
 """|t| from which a term cannot be excluded: 5 % of terms that are not missing reach it by chance."""
 DISAGREEING = 3.0
 """|t| from which parts of the log, or windows of another length, give another estimate: one in 370 does by chance."""
+LIKELY_FORCE = 3.5
+"""|t| from which a force at a joint counts though it is not certain; of a hundred that are tested, one log in twenty
+has such a one by chance."""
 FEWEST = 12
 """Fewest windows beyond the number of parameters for which a standard error is worth anything."""
 MOVES_TOO = 0.1
@@ -117,8 +120,8 @@ class TermTests:
         return None if below else found
 
     def by_name(self, values: Float[np.ndarray, " d"]) -> dict[str, float]:
-        """Values in [-1, 1] of each parameter, by name and in half-widths."""
-        return dict(zip(self.space.names, (values / self.half_widths).tolist(), strict=True))
+        """Values in [-1, 1] of each parameter, by name and in half-widths; no estimate leaves its range by more."""
+        return dict(zip(self.space.names, (np.clip(values, -2.0, 2.0) / self.half_widths).tolist(), strict=True))
 
     def alternative(
         self,
@@ -134,13 +137,19 @@ class TermTests:
 
 
 def term_of(candidate: Candidate, found: Score, shifts: dict[str, float]) -> MissingTerm:
-    """A candidate as its score test finds it; a delay below 0 has a cause of its own, `EARLY`."""
+    """A candidate as its score test finds it; a delay below 0 has a cause of its own, `EARLY`.
+
+    One of a value that is not plausible is another force, which this one imitates.
+    """
     early = candidate.cause == DELAY and found.change < 0.0
+    value, error = candidate.nominal + found.change * candidate.reference, found.error * candidate.reference
+    imitates = candidate.imitates(value, error)
+    cause = f"{UNLISTED}, which acts like {candidate.cause} of an impossible value" if imitates else candidate.cause
     return MissingTerm(
-        cause=EARLY if early else candidate.cause,
-        parameter="" if early else candidate.parameter,
-        value=candidate.nominal + found.change * candidate.reference,
-        standard_error=found.error * candidate.reference,
+        cause=EARLY if early else cause,
+        parameter="" if early or imitates else candidate.parameter,
+        value=value,
+        standard_error=error,
         unit=candidate.unit,
         explained=found.explained,
         t=found.t,

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 
 import mujoco
 
@@ -72,6 +73,22 @@ def quaternion_of(model: mujoco.MjModel, expression: Expression) -> str:
         return ""
     first = _FIRST_OF_QUATERNION.get(int(model.joint(read.name).type[0]), read.index + 1)
     return read.name if first <= read.index < first + 4 else ""
+
+
+def attitudes_of(model: mujoco.MjModel, expressions: Sequence[Expression]) -> tuple[tuple[int, int, int, int], ...]:
+    """Of each quaternion that signals show whole, as it is, the places of its values w, x, y and z."""
+    joints = [quaternion_of(model, expression) for expression in expressions]
+    found = []
+    for joint in filter(None, dict.fromkeys(joints)):
+        of_component: dict[int, int] = {}
+        for place, expression in enumerate(expressions):
+            if joints[place] == joint:
+                ((read, _),) = (expression.affine() or ({}, 0.0))[0].items()
+                of_component.setdefault(read.index or 0, place)
+        if len(of_component) == 4:
+            w, x, y, z = (of_component[index] for index in sorted(of_component))
+            found.append((w, x, y, z))
+    return tuple(found)
 
 
 def signal_unit(draft: Draft, model: mujoco.MjModel, expression: Expression, index: int) -> str:

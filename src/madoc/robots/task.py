@@ -17,7 +17,7 @@ from madoc.robots.episodes import Episode, no_reward, read_episode
 from madoc.robots.functions import PythonFile
 from madoc.robots.model import Draft, compiled, make_model, read_model
 from madoc.robots.model_files import ModelFiles
-from madoc.robots.signals import quaternion_of, read_signals, signal_unit, turn_of
+from madoc.robots.signals import attitudes_of, quaternion_of, read_signals, signal_unit, turn_of
 from madoc.robots.space import parameter_space
 from madoc.robots.spec import (
     LONGEST_TIMESTEP,
@@ -121,6 +121,7 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
         reference_returns=(0.0, 100.0),
         state_from_observation=signals.rebuild(),
         posture=signals.posture(),
+        attitudes=attitudes_of(model, signals.expressions),
         pending=pending,
         actions=actions,
         signals=names,

@@ -49,11 +49,10 @@ class System(Protocol):
 
     def actuator_forces(
         self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
-    ) -> Float[np.ndarray, "systems rows dof"]:
-        """What the actuators of joints exert on each degree of freedom at the begin of a step, in N or N·m.
+    ) -> Float[np.ndarray, "systems rows actuator dof"]:
+        """What each actuator exerts on every degree of freedom at the begin of a step, in N or N·m.
 
-        Late actions count as late. It is 0 where an actuator has another transmission than a joint, another gain than a
-        constant, or another bias than a linear one.
+        Late actions count as late.
         """
         ...
 

@@ -13,7 +13,7 @@ from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter
 from madoc.runs.machine import usable_cores
 from madoc.simulation.delay import blend, delay_weights, in_effect
-from madoc.simulation.drives import joint_drives
+from madoc.simulation.drives import drive_forces
 from madoc.simulation.write import find_elements, write_parameters
 from madoc.tasks.base import Task
 
@@ -246,15 +246,14 @@ class CpuSystem:
 
     def actuator_forces(
         self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
-    ) -> Float[np.ndarray, "systems rows dof"]:
-        """What the actuators of joints exert on each degree of freedom at the begin of a step, in N or N·m.
+    ) -> Float[np.ndarray, "systems rows actuator dof"]:
+        """What each actuator exerts on every degree of freedom at the begin of a step, in N or N·m.
 
-        Late actions count as late. It is 0 where an actuator has another transmission than a joint, another gain than a
-        constant, or another bias than a linear one.
+        Late actions count as late.
         """
         history = self._histories(state, action[:, :, None])[:, :, 0]
         control = self._simulator._controls(blend(self._weights, history))[:, :, 0]
-        return np.stack([joint_drives(*each) for each in zip(self.models, state, control, strict=True)])
+        return np.stack([drive_forces(*each) for each in zip(self.models, state, control, strict=True)])
 
     def unbiased(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows state"]:
         """States rebuilt from logged observations, corrected for the bias of each system's sensors."""

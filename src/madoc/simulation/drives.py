@@ -1,48 +1,32 @@
-"""What actuators of joints exert, by their own equations, for many states at once."""
+"""What each actuator exerts on every degree of freedom, for many states at once."""
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from madoc.simulation.write import OF_A_JOINT, ONE_DOF, has_gain
 
-_BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
-"""Biases of motors, and of position and velocity servos."""
-
-
-def joint_drives(
+def drive_forces(
     model: mujoco.MjModel, state: Float[np.ndarray, "rows state"], control: Float[np.ndarray, "rows actuator"]
-) -> Float[np.ndarray, "rows dof"]:
-    """The force on each degree of freedom by actuators of hinges and slides, in N or N·m.
+) -> Float[np.ndarray, "rows actuator dof"]:
+    """Generalised forces of each actuator at the begin of a step, in N or N·m, whatever it acts on.
 
-    States are (qpos, qvel, ...). Actuators of other transmissions, gains or biases than those of motors and servos are
-    left out, and so is gravity compensation by actuators. Controls and forces are cut off where the model does so.
+    States are (qpos, qvel, ...). Controls and forces are cut off where the model does so; at a joint whose actuators
+    together are cut off, all are in proportion.
     """
-    forces = np.zeros((len(state), model.nv))
-    clamped = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
-    for index in range(model.nu):
-        joint, given = int(model.actuator_trnid[index, 0]), control[:, index]
-        usual = (
-            model.actuator_trntype[index] in OF_A_JOINT
-            and has_gain(model, index)
-            and model.actuator_biastype[index] in _BIASES
+    data, forces = mujoco.MjData(model), np.zeros((len(state), model.nu, model.nv))
+    for row, (values, given) in enumerate(zip(state, control, strict=True)):
+        data.qpos[:], data.qvel[:] = values[: model.nq], values[model.nq : model.nq + model.nv]
+        data.ctrl[:] = given
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_fwdActuation(model, data)
+        mujoco.mju_sparse2dense(
+            forces[row], data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
         )
-        if not usual or model.jnt_type[joint] not in ONE_DOF:
-            continue
-        if clamped and model.actuator_ctrllimited[index]:
-            given = np.clip(given, *model.actuator_ctrlrange[index])
-        gear, dof, bias = (
-            float(model.actuator_gear[index, 0]),
-            int(model.jnt_dofadr[joint]),
-            model.actuator_biasprm[index],
-        )
-        length, speed = gear * state[:, int(model.jnt_qposadr[joint])], gear * state[:, model.nq + dof]
-        force = model.actuator_gainprm[index, 0] * given + bias[0] + bias[1] * length + bias[2] * speed
-        if model.actuator_forcelimited[index]:
-            force = np.clip(force, *model.actuator_forcerange[index])
-        forces[:, dof] += gear * force
+        forces[row] *= data.actuator_force[:, None]
     for joint in np.flatnonzero(model.jnt_actfrclimited).tolist():
-        if model.jnt_type[joint] in ONE_DOF:
-            dof = int(model.jnt_dofadr[joint])
-            forces[:, dof] = np.clip(forces[:, dof], *model.jnt_actfrcrange[joint])
+        dof = int(model.jnt_dofadr[joint])
+        total = forces[..., dof].sum(1)
+        share = np.clip(total, *model.jnt_actfrcrange[joint]) / np.where(total == 0.0, 1.0, total)
+        forces[..., dof] *= share[:, None]
     return forces

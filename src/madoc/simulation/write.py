@@ -97,6 +97,19 @@ def single_joints(model: mujoco.MjModel) -> list[tuple[Any, bool]]:
     ]
 
 
+def free_joints(model: mujoco.MjModel) -> list[Any]:
+    """Views of the joints by which bodies move freely."""
+    return [model.joint(index) for index in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).tolist()]
+
+
+def body_reach(model: mujoco.MjModel, parameter: Parameter) -> float:
+    """Largest distance from a body's origin, m, within a sphere about one of its geoms; infinite without geoms."""
+    (body,) = find_elements(model, parameter)
+    geoms = np.flatnonzero((model.geom_bodyid == body) & (model.geom_rbound > 0.0))
+    far = np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]
+    return float(far.max(initial=0.0)) or np.inf
+
+
 def heavy_bodies(model: mujoco.MjModel) -> Iterator[str]:
     """Names of bodies that move and have a mass; a body without a name takes that of its first joint."""
     bodies = element_names(model, "body")

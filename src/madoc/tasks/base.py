@@ -116,6 +116,7 @@ class Task:
         episodes: The task that policies learn, where a user's own robot starts, ends or is rewarded there unlike in
             its logs; None where it is this one. `for_policies` has the parameters as well.
         posture: observation -> (qpos, qvel), NaN for values not determined; None where no position is determined.
+        attitudes: Of each quaternion that an observation shows the indices of its values w, x, y and z.
     """
 
     name: str
@@ -142,6 +143,7 @@ class Task:
     rewarded: bool = True
     source: Mapping[str, object] | None = None
     posture: Callable[[Batch], Batch] | None = None
+    attitudes: tuple[tuple[int, int, int, int], ...] = ()
     goals: tuple[str, ...] = ()
     traced_reset: bool = True
     episodes: "Task | None" = None

@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.constants import g as standard_gravity
 
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult
-from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, is_late
+from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, UNLISTED, is_late
 from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
@@ -43,12 +42,12 @@ AS_SIGNIFICANT = 0.6
 """|t| over that of the most significant term; among terms above it the one that explains most is named."""
 NEARLY = 0.8
 """Share explained by a term over that of the one named; terms above it are as likely."""
+HALF = 0.5
+"""Share explained by a listed term over that of forces that are not listed, from which these are not named."""
 SURER = 1.314
 """Half of a 99 % interval over half of a 95 % interval: an alternative is covered unless one in a hundred is worse."""
 NAMED = 3
 """Number of causes named for which intervals are widened, and of terms that the log cannot tell."""
-EARTH = 0.03
-"""m/s², by which gravity on the ground differs from the standard 9.80665 (poles, equator, mountains)."""
 
 
 def missing_term(holdout: HoldOut) -> MissingTerm | None:
@@ -72,11 +71,13 @@ def missing_term(holdout: HoldOut) -> MissingTerm | None:
 def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     """Of significant terms the one that explains most, or nearly as much if that is unusual; None of none.
 
-    A tilted base looks like an offset of a sensor, which is more usual, and a gravity that is not the earth's like a
-    wrong mass or gain. Actions that seem to come early are more often a sign of forces that the model lacks, and values
-    that change within each run may be one of motions that do. A force that no parameter adds is named only where no
-    other term explains nearly as much.
+    A tilted base looks like an offset of a sensor, which is more usual. Actions that seem to come early are more often
+    a sign of forces that the model lacks, and values that change within each run may be one of motions that do. A force
+    that no parameter adds is named only where no other term explains nearly as much, and one that is not listed only
+    where no listed one explains half as much.
     """
+    explained = max((term.explained for term in terms if not _unlisted(term)), default=0.0)
+    terms = [term for term in terms if not _unlisted(term) or explained < HALF * term.explained]
     most = max((abs(term.t) for term in terms), default=0.0)
     significant = [term for term in terms if abs(term.t) >= AS_SIGNIFICANT * most]
     enough = NEARLY * max((term.explained for term in significant), default=0.0)
@@ -84,9 +85,11 @@ def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     return max(likely, key=lambda term: (not _unusual(term), term.explained), default=None)
 
 
+def _unlisted(term: MissingTerm) -> bool:
+    return term.cause.startswith(UNLISTED)
+
+
 def _unusual(term: MissingTerm) -> bool:
-    if term.parameter == "gravity":
-        return abs(abs(term.value) - standard_gravity) > EARTH + 2.0 * term.standard_error
     return term.cause in (EARLY, WITHIN_RUNS, *TILTS) or is_joint_force(term.cause) or is_late(term.cause)
 
 
@@ -99,6 +102,7 @@ def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
         and is_certain(term)
         and term.cause not in DRIFTS
         and term.explained >= NEARLY * named.explained
+        and (_unlisted(named) or not _unlisted(term))
     ]
 
 

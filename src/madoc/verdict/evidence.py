@@ -11,6 +11,7 @@ from madoc.diagnosis.channels import signal_names
 from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, first_rows, longest_fit, readings_at, windows_at
 from madoc.runs.files import replacing
+from madoc.simulation.attitudes import moved
 from madoc.verdict.bench import Bench
 from madoc.verdict.open_loop import as_given
 
@@ -55,7 +56,8 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     start, windows = arrays["measured"][:, :1], windows_at(held, states[chosen], first, steps)
     for when, replayed, at in models:
         simulated = replayed.residuals(at, windows)[0] * bench.change
-        arrays[when] = np.concatenate([start, arrays["measured"][:, 1:] + simulated], axis=1)
+        seen = moved(bench.simulator.task.attitudes, arrays["measured"][:, 1:], simulated)
+        arrays[when] = np.concatenate([start, seen], axis=1)
         arrays[f"residual_{when}"] = replayed.residuals(at, replays.single_steps())[0, :, 0] * bench.change
     return arrays
 

@@ -14,6 +14,7 @@ from madoc.identification.gauss_newton import damped_step, eliminate, triangular
 from madoc.identification.losses import curvature_share, loss_slope, scale_of
 from madoc.identification.noise import residual_noise
 from madoc.identification.replay import slopes_at
+from madoc.simulation.attitudes import moved
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.fitted_starts import FittedReplays
 from madoc.verdict.prediction import magnitudes
@@ -85,7 +86,8 @@ def _with_noise_alone(
     key, readings = jax.random.fold_in(bench.key, 2), replays.readings
     noise = np.asarray(jax.random.normal(key, residuals.shape), np.float64) * deviation
     simulated = np.where(np.isfinite(residuals), residuals, 0.0) + noise
-    drawn = replace(readings, observed=readings.observed + simulated * readings.scale)
+    observed = moved(bench.simulator.task.attitudes, readings.observed, simulated * readings.scale)
+    drawn = replace(readings, observed=observed)
     return replace(replays, readings=drawn).residuals(point[None])
 
 
@@ -123,6 +125,7 @@ def _against_chance(replays: FittedReplays, residuals: Float[np.ndarray, "window
     spread = np.maximum(observed.std((0, 1)), 1e-8)
     followed = observed[:, replays.fitted + replays.stride]
     ahead = residuals[:, replays.fitted + replays.stride]
-    guess = np.where(np.isfinite(ahead), followed + ahead * scale, observed[:, replays.fitted])
+    guess = moved(replays.simulator.task.attitudes, followed, ahead * scale)
+    guess = np.where(np.isfinite(ahead), guess, observed[:, replays.fitted])
     skill, p_value = better_than_chance(guess / spread, followed / spread, replays.episodes)
     return AgainstChance("the simulator at the best parameters nearby, from fitted states", skill, p_value)

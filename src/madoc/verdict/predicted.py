@@ -12,6 +12,7 @@ from madoc.diagnosis.channels import signal_names
 from madoc.identification import noise as sensors
 from madoc.identification.gauss_newton import descend
 from madoc.identification.states import logged_states
+from madoc.simulation.attitudes import differences
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.prediction import nearby_best
 from madoc.verdict.statistics import (
@@ -179,8 +180,7 @@ class _SingleSteps(NamedTuple):
 
 def _single_steps(bench: Bench, point: Float[np.ndarray, " d"]) -> _SingleSteps:
     held, rows, scale = bench.held_out, bench.judged_rows, bench.change
-    followed = np.asarray(held.transitions.next_observation)[rows]
-    residuals = sensors.clipped((_simulated(bench, point) - followed) / scale)
+    residuals = sensors.clipped(_residuals(bench, point, rows))
     first = np.flatnonzero((np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts))
     share, explanation = explained(bench.scaling.features(held.transitions.take(rows))[0], residuals)
     noise, spent = np.zeros(len(scale)), len(rows)
@@ -199,10 +199,17 @@ def _persistence(bench: Bench, point: Float[np.ndarray, " d"]) -> tuple[float, i
     """How residuals of single steps last, over the first rows whose states can be rebuilt, and their number."""
     held = bench.held_out
     rows = logged_states(held, bench.simulator.task)[1][:MOST_ROWS]
-    followed = np.asarray(held.transitions.next_observation)[rows]
-    residuals = sensors.clipped((_simulated(bench, point, rows) - followed) / bench.change)
+    residuals = sensors.clipped(_residuals(bench, point, rows))
     follows = np.concatenate([[False], (np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts)])
     return persistence(residuals, follows), len(rows)
+
+
+def _residuals(
+    bench: Bench, point: Float[np.ndarray, " d"], rows: Int[np.ndarray, " rows"]
+) -> Float[np.ndarray, "rows observation"]:
+    """Simulated minus logged next observations of some rows, in typical changes of a stride."""
+    followed = np.asarray(bench.held_out.transitions.next_observation)[rows]
+    return differences(bench.simulator.task.attitudes, _simulated(bench, point, rows), followed) / bench.change
 
 
 def _simulated(

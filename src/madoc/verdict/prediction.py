@@ -10,6 +10,7 @@ from madoc.identification.gauss_newton import descend
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states, states_observed_as
 from madoc.identification.windows import Windows, evenly, rows_that_fit, windows_at
+from madoc.simulation.attitudes import differences, moved
 from madoc.simulation.base import Simulator
 
 MOST_WINDOWS = 400
@@ -70,11 +71,12 @@ class Replays:
             return np.zeros((1, *shape))
         rng = np.random.default_rng(0)
         observation = np.asarray(held.transitions.observation)
-        noisy = observation + deviation * self.scale * rng.standard_normal(observation.shape)
+        noise = deviation * self.scale * rng.standard_normal(observation.shape)
+        noisy = moved(self.simulator.task.attitudes, observation, noise)
         rebuilt = states_observed_as(held, self.simulator.task, self.rows, noisy)
         starts = np.where(np.isfinite(rebuilt), rebuilt, self.windows.states)
-        moved = self.residuals(point[None], replace(self.windows, states=starts))
-        return moved - self.residuals(point[None]) + deviation * rng.standard_normal(shape)
+        following = self.residuals(point[None], replace(self.windows, states=starts))
+        return following - self.residuals(point[None]) + deviation * rng.standard_normal(shape)
 
     def random_floor(
         self,
@@ -94,16 +96,17 @@ class Replays:
         assert task.state_from_observation is not None  # windows begin at states that are rebuilt by it
         system = self.simulator.bind(self.simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
         steady = kicked = system.unbiased(np.ascontiguousarray(windows.states[None]))
-        moved = []
+        departures = []
         for step in range(windows.steps):
             action = np.ascontiguousarray(windows.actions[None, :, step])
             steady, kicked = system.step(steady, action), system.step(kicked, action)
-            seen = system.observe(kicked) + kick * self.scale * rng.standard_normal((1, len(windows), len(kick)))
+            pushed = kick * self.scale * rng.standard_normal((1, len(windows), len(kick)))
+            seen = moved(task.attitudes, system.observe(kicked), pushed)
             physical = np.asarray(task.state_from_observation(seen), np.float64)
             rebuilt = np.concatenate([physical, kicked[..., physical.shape[-1] :]], axis=-1)
             kicked = np.where(np.isfinite(rebuilt), system.unbiased(rebuilt), kicked)
-            moved.append(system.observe(kicked) - system.observe(steady))
-        return noisy + np.stack(moved, axis=2) / self.scale
+            departures.append(differences(task.attitudes, system.observe(kicked), system.observe(steady)))
+        return noisy + np.stack(departures, axis=2) / self.scale
 
     def single_steps(self) -> Windows:
         """The beginning of each window, as long as the shortest horizon."""

@@ -1,6 +1,15 @@
 """What a user can do about a term that the model lacks."""
 
-from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, LATE_SENSOR, SATURATION, SPACING, TILTS, is_late
+from madoc.identification.candidate_terms import (
+    BELOW_MINIMUM,
+    EARLY,
+    LATE_SENSOR,
+    SATURATION,
+    SPACING,
+    TILTS,
+    UNLISTED,
+    is_late,
+)
 from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.term_tests import MissingTerm
 from madoc.parameters import FIELDS
@@ -17,6 +26,8 @@ WARM_UP = "let the machine warm up before it is logged, or leave the begin of ea
 """The same for a parameter that changes within each run."""
 CHANGE_MACHINE = "no parameter of a spec adds it: take it out of the machine, or log motions in which it is small"
 """The same for a force at a joint."""
+LOOK = "look there for what the model leaves out; a parameter that acts like it would be wrong in its place"
+"""The same for a force that no listed term describes."""
 CHANGE_LOG = "log it without its filter, or shift its column by that time"
 CHANGE_DRIVE = "no parameter of a spec adds the lag of one drive (action_delay is that of all): take out its filter"
 """The same for a sensor and for a drive that are late."""
@@ -35,6 +46,8 @@ def remedy(term: MissingTerm) -> str:
         return REMEDIES[term.cause]
     if is_late(term.cause):
         return CHANGE_LOG if term.cause.startswith(LATE_SENSOR) else CHANGE_DRIVE
+    if term.cause.startswith(UNLISTED):
+        return LOOK
     if is_joint_force(term.cause):
         return CHANGE_MACHINE
     high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
