@@ -46,9 +46,6 @@ def test_public_names_are_there():
 
 SMALL = {
     "transitions=20_000": "transitions=500",
-    "budget=50_000": "budget=1_000",
-    "madoc.SAC()": "madoc.SAC(warmup_steps=500, updates_per_step=0.01, epoch_steps=500, hidden=(16, 16))",
-    "key=jax.random.key(3))": "key=jax.random.key(3), episodes=2)",
 }
 """What makes the README's example small enough for a test."""
 
@@ -61,8 +58,7 @@ def test_the_python_of_the_readme_runs(capsys):
         block = block.replace(before, after)
     exec(compile(block, "README.md", "exec"), {})
     told = capsys.readouterr()
-    assert "body_mass.torso" in told.out
-    assert "'episodes': 2" in told.out
+    assert told.out.startswith("CALIBRATED: ")
     assert "recording hopper-medium" in told.err  # progress is shown unless it is silenced
 
 
