@@ -1,6 +1,15 @@
 """A calibration out of Madoc: the model, what changed in it, ranges to randomize in, a policy for other runtimes."""
 
+from madoc.export.draws import save_draws
 from madoc.export.onnx_policy import save_onnx
 from madoc.export.parameter_files import Exported, is_patch, save_patch, save_randomization, save_sysid_parameters
 
-__all__ = ["Exported", "is_patch", "save_onnx", "save_patch", "save_randomization", "save_sysid_parameters"]
+__all__ = [
+    "Exported",
+    "is_patch",
+    "save_draws",
+    "save_onnx",
+    "save_patch",
+    "save_randomization",
+    "save_sysid_parameters",
+]

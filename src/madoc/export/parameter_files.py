@@ -72,7 +72,7 @@ def save_randomization(
     """
     content: dict[str, object] = {
         "provenance": _without_empty(provenance),
-        "parameters": {each.parameter.name: _distribution(each.row) for each in exported},
+        "parameters": {each.parameter.name: _distribution(each) for each in exported},
     }
     if covariance is not None:
         content["covariance"] = {"order": [each.parameter.name for each in exported], "rows": covariance}
@@ -114,9 +114,11 @@ def _patched(exported: Exported) -> dict[str, object]:
     return _without_empty(fields)
 
 
-def _distribution(row: ParameterEstimate) -> dict[str, object]:
+def _distribution(exported: Exported) -> dict[str, object]:
+    parameter, row = exported.parameter, exported.row
     low, high = row.interval or (row.estimate - NORMAL_95 * row.std, row.estimate + NORMAL_95 * row.std)
-    return {
+    named = {"field": parameter.field, "element": _single(parameter.elements) if parameter.elements else None}
+    return _without_empty(named) | {
         "low": float(min(max(low, row.low), row.estimate)),
         "high": float(max(min(high, row.high), row.estimate)),
         "mean": row.estimate,

@@ -8,20 +8,34 @@ import numpy as np
 
 from madoc import simulation
 from madoc.errors import MadocError
-from madoc.export import Exported, is_patch, save_onnx, save_patch, save_randomization, save_sysid_parameters
+from madoc.export import (
+    Exported,
+    is_patch,
+    save_draws,
+    save_onnx,
+    save_patch,
+    save_randomization,
+    save_sysid_parameters,
+)
 from madoc.numpy_policy import NumpyPolicy
+from madoc.parameters import FIELDS
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
+from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.simulation import Simulator
+from madoc.simulation.drawn import numbers_of_draws
 from madoc.simulation.mjcf import save_mjcf
 from madoc.simulation.write import nominal_values
+
+DRAWS = 1000
+"""Number of models drawn from the distribution of an estimate; their covariance is within 5 % of its own."""
 
 
 def export_run(
     run: Path, out: Path | None = None, *, onnx: bool = False, permission: Permission = NO_PERMISSION
 ) -> dict[str, Path]:
-    """Leave a finished calibration as MJCF, patch, randomization ranges and parameters for `mujoco.sysid`.
+    """Leave a finished calibration as MJCF, patch, ranges, draws of models and parameters for `mujoco.sysid`.
 
     Policies are written too, as ONNX, if asked. The folder `out` is `export` in the run folder by default.
 
@@ -51,6 +65,8 @@ def export_run(
         "patch": folder / "patch.yaml",
         "randomization ranges": folder / "randomization.yaml",
         "mujoco.sysid parameters": folder / "sysid_parameters.yaml",
+        "draws of models": folder / "draws.npz",
+        "how to use them": folder / "draws.py",
     }
     targets = {name: folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx") for name in policies}
     if out is not None:
@@ -61,10 +77,19 @@ def export_run(
         files["randomization ranges"], exported, provenance, None if result.covariance is None else covariance.tolist()
     )
     save_sysid_parameters(files["mujoco.sysid parameters"], exported)
+    _leave_draws(folder, simulator, calibrated)
     for name, file in policies.items():
         save_onnx(NumpyPolicy.load(file), targets[name])
         files[f"policy {name}"] = targets[name]
     return files
+
+
+def _leave_draws(folder: Path, simulator: Simulator, calibrated: Calibrated) -> None:
+    """Leave models drawn from the joint distribution of the estimate."""
+    key = stage_key(calibrated.result.seed, "export")
+    values = np.asarray(calibrated.distribution().draw(key, DRAWS), np.float64)
+    around = [row.name for row in simulator.parameters.parameters if not FIELDS[row.field].in_model]
+    save_draws(folder, simulator.parameters.names, around, values, numbers_of_draws(simulator, values))
 
 
 def _require_ours(folder: Path, files: Iterable[Path]) -> None:

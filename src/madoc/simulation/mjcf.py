@@ -22,7 +22,7 @@ DIGITS = 17
 ASSETS = "assets"
 """Folder of meshes, height fields and textures beside a written model."""
 
-_NOT_COMPARED = ("_", "bvh", "cam_", "geom_rgba", "light_", "mat_", "mesh_", "oct_", "site_rgba", "skin_", "tex_")
+NOT_COMPARED = ("_", "bvh", "cam_", "geom_rgba", "light_", "mat_", "mesh_", "oct_", "site_rgba", "skin_", "tex_")
 """Beginnings of the names of a model's arrays that only matter for rendering or for finding contacts faster."""
 
 _LONG_NUMBER = re.compile(r'(?<=["\s])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?=["\s])')
@@ -99,7 +99,7 @@ def _refuse_difference(wanted: mujoco.MjModel, got: mujoco.MjModel, where: str) 
     """Refuse a model that differs from the bound one in a number, but for rounding of derived constants."""
     for name in dir(wanted):
         ours, theirs = getattr(wanted, name), getattr(got, name)
-        if name.startswith(_NOT_COMPARED) or not isinstance(ours, np.ndarray) or ours.dtype.kind != "f":
+        if name.startswith(NOT_COMPARED) or not isinstance(ours, np.ndarray) or ours.dtype.kind != "f":
             continue
         if ours.shape != theirs.shape:
             raise MadocError(f"the model {where} has {name} of shape {theirs.shape}, the bound one {ours.shape}")
