@@ -175,7 +175,7 @@ class LeastSquares:
         point = best.point[0 if best.refining else int(np.argmin(best.cost))]
         spread = best
         if state.best and self._with_model_errors(problem, state) is not None:
-            # Model errors bias all lengths about alike, and only the wide intervals of the shortest may cover that.
+            # Model errors bias all lengths, and only the wide intervals of the shortest may cover that.
             spread = state.unknown[0]
             windows = spread.explained
         uncertainty = sandwich(spread.bread, spread.meat)
@@ -289,10 +289,11 @@ class LeastSquares:
         Where the log shows no contact in the longest, these come first: motion is smooth, and they mostly serve. Where
         they do not, shorter ones have their turn, and then the longest again unless they have settled.
 
-        If longer windows show model errors, the estimate of the shortest is kept: model errors bias the estimate by
-        about as much for all lengths, and only wide intervals may cover that. At contacts longer windows may leave
-        residuals because their initial states were not found: there the estimate of the longest that were explained is
-        kept, with the intervals of the shortest.
+        If longer windows show model errors, the estimate is that of windows three times as long as the first, with the
+        wide intervals of the shortest: with a wrong model it predicts better, as the free initial states of short
+        windows explain much of what it gets wrong. At contacts longer windows may leave residuals because their initial
+        states were not found: there the estimate of the longest that were explained is kept, with the intervals of the
+        shortest.
         """
         searches, length = state.unknown, state.length
         search = searches[length]
@@ -300,11 +301,14 @@ class LeastSquares:
             return state
         if not self._unknown(problem).settled(search):
             lost = hopeless(search, searches[0], searches[state.best]) or search.epochs >= self.search_epochs
-            return _failed(state) if length >= LONGER and lost and not search.waiting else state
+            last = length == LONGER and not search.touching.any()
+            return _failed(state) if length >= LONGER and lost and not last and not search.waiting else state
         if length == WIDER:
             return _finished(state, WIDER)
         if length and not self._noise_alone(problem, state, length):
-            return _ended(state, state.best if search.rough else 0)
+            if search.touching.any():
+                return _ended(state, state.best if search.rough else 0)
+            return _finished(state, LONGER) if length == LONGER else _failed(state)
         if length and not tells_more(search, searches[state.best]):
             return _failed(state)
         if float(search.deviation.max()) < sentences.EXACT or (not length and search.rough and precise(search)):
@@ -322,8 +326,8 @@ class LeastSquares:
         return noise_alone(state.unknown[length], state.unknown[0], readings)
 
     def _with_model_errors(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:
-        """Index of the shortest longer windows than those of the estimate that leave more than noise; None for none."""
-        for longer in range(max(state.best + 1, LONGER), len(state.unknown)):
+        """Index of the first longer windows, none shorter than the estimate's, that leave more than noise, or None."""
+        for longer in range(max(state.best, LONGER), len(state.unknown)):
             settled = self._unknown(problem).settled(state.unknown[longer])
             if settled and not self._noise_alone(problem, state, longer):
                 return longer

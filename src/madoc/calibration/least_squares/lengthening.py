@@ -26,8 +26,8 @@ SHORTEST = 3
 state."""
 READINGS = 2
 """Largest number of readings in all longer windows, relative to the first search; more only for `FEWEST` windows."""
-FEWEST = 10
-"""Smallest number of windows beyond that of parameters; with fewer, Student's t would widen the intervals."""
+FEWEST = 5
+"""Smallest number of windows beyond that of parameters; with fewer, Student's t would widen the intervals much."""
 AS_WELL = 1.2
 """Ratio of a channel's noise to that of the first windows, at least 1; above it longer windows show model errors."""
 HOPELESS = 2.0
