@@ -300,9 +300,10 @@ class LeastSquares:
         if state.finished:
             return state
         if not self._unknown(problem).settled(search):
-            lost = hopeless(search, searches[0], searches[state.best]) or search.epochs >= self.search_epochs
             last = length == LONGER and not search.touching.any()
-            return _failed(state) if length >= LONGER and lost and not last and not search.waiting else state
+            lost = not last and hopeless(search, searches[0], searches[state.best])
+            lost = lost or search.epochs >= self.search_epochs
+            return _failed(state) if length >= LONGER and lost and not search.waiting else state
         if length == WIDER:
             return _finished(state, WIDER)
         if length and not self._noise_alone(problem, state, length):
