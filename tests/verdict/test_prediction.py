@@ -50,3 +50,23 @@ def test_nearby_the_truth_is_found():
     assert points[-1] == pytest.approx(truth, abs=1e-4)
     assert spent % (7 * len(replays.windows)) == 0
     assert 2 <= spent / (7 * len(replays.windows)) <= 8
+
+
+def test_random_forces_add_up_with_random_signs_and_a_constant_one_adds_up_to_more():
+    # A push of the speed in each step leaves n pushes after n steps if all have one sign, about √n if it is random.
+    replays = replays_of(log_of("spring", rows=600), SIMULATOR, SCALE, HORIZONS)
+    truth = TASK.parameters.to_unit(TASK.parameters.vector(TRUTH))
+    nothing = np.zeros((1, len(replays.windows), 20, 2))
+    assert replays.random_floor(truth, nothing, nothing[0]) is nothing
+    pushes = np.zeros((len(replays.windows), 20, 2))
+    pushes[:, 0, 1] = 0.01
+    (floor,) = replays.random_floor(truth, nothing, pushes)
+    # After the first step alone it is the push itself, with either sign, in the speed and not in the position.
+    assert np.abs(floor[:, 0, 1]) == pytest.approx(0.01)
+    assert floor[:, 0, 0] == pytest.approx(0.0)
+    assert {-1.0, 1.0} == set(np.sign(floor[:, 0, 1]))
+    pushes[:, :, 1] = 0.01
+    (floor,) = replays.random_floor(truth, nothing, pushes)
+    signs = np.sign(np.diff(np.concatenate([np.zeros((len(floor), 1)), floor[:, :3, 1]], axis=1)))
+    assert (signs > 0).mean() == pytest.approx(0.5, abs=0.15)
+    assert np.sqrt((floor[:, 4, 1] ** 2).mean()) == pytest.approx(0.01 * np.sqrt(5.0), rel=0.25)

@@ -12,6 +12,7 @@ from madoc.diagnosis.channels import signal_names
 from madoc.identification import noise as sensors
 from madoc.identification.gauss_newton import descend
 from madoc.identification.states import logged_states
+from madoc.identification.windows import evenly
 from madoc.simulation.attitudes import differences
 from madoc.verdict.bench import Bench, judged
 from madoc.verdict.prediction import nearby_best
@@ -102,8 +103,8 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
     best = best_of(sizes)
     single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
-    kick = np.sqrt(np.maximum(single.size**2 - (noisy[0, :, 0] ** 2).mean(0), 0.0))
-    random = replays.magnitudes(replays.random_floor(points[best], noisy, np.where(kick > NEGLIGIBLE, kick, 0.0)))
+    pushes, of_rows = _pushes(bench, points[best], (noisy[0, :, 0] ** 2).mean(0))
+    random = replays.magnitudes(replays.random_floor(points[best], noisy, pushes))
     groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
     signals = signal_names(bench.simulator.task)
     beside = beside_random(sizes[:, best, -1], random[:, 0, -1], groups)
@@ -117,9 +118,25 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
         failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
         stride=stride(bench.problem.dataset),
     )
-    spent = searching + residuals[..., 0].size + noisy[..., 0].size * 4 + single.control_steps
+    spent = searching + residuals[..., 0].size + noisy[..., 0].size * 4 + single.control_steps + of_rows
     beyond = dict(zip(signals, beside.tolist(), strict=True))
     return _Replayed(errors, points[best], residuals[0], residuals[1], residuals[best], noisy[0], single, beyond, spent)
+
+
+def _pushes(
+    bench: Bench, point: Float[np.ndarray, " d"], by_noise: Float[np.ndarray, " observation"]
+) -> tuple[Float[np.ndarray, "windows steps observation"], int]:
+    """What random forces may have changed in each row of the windows, and the control steps simulated.
+
+    That is the row's residual, less the share of all their mean square that sensor noise makes (`by_noise`). Rows whose
+    state cannot be rebuilt have the residual of another one.
+    """
+    wanted = bench.replays.rows[:, None] + np.arange(bench.replays.windows.steps)
+    rows = evenly(np.intersect1d(logged_states(bench.held_out, bench.simulator.task)[1], wanted), MOST_ROWS)
+    residuals = np.nan_to_num(_residuals(bench, point, rows))
+    square = np.maximum((residuals**2).mean(0), np.finfo(float).tiny)
+    share = np.sqrt(np.maximum(1.0 - by_noise / square, 0.0)) * (square > NEGLIGIBLE**2)
+    return (residuals * share)[np.minimum(np.searchsorted(rows, wanted), len(rows) - 1)], len(rows)
 
 
 def _explained_at_end(

@@ -82,17 +82,18 @@ class Replays:
         self,
         point: Float[np.ndarray, " d"],
         noisy: Float[np.ndarray, "1 windows steps observation"],
-        kick: Float[np.ndarray, " observation"],
+        pushes: Float[np.ndarray, "windows steps observation"],
     ) -> Float[np.ndarray, "1 windows steps observation"]:
         """Residuals that sensor noise and random forces of each step would cause together.
 
-        `noisy` are those of sensor noise alone; `kick` is the standard deviation of what random forces change in a
-        control step, in typical changes of a stride. Errors of a wrong model have the same sign from step to step and
-        add up to more.
+        `noisy` are those of sensor noise alone; `pushes` are what random forces change in each control step, in typical
+        changes of a stride: each step gets a random sign. Errors of a wrong model have the same sign from step to step
+        and add up to more.
         """
-        if not kick.any():
+        if not pushes.any():
             return noisy
-        windows, task, rng = self.windows, self.simulator.task, np.random.default_rng(1)
+        windows, task = self.windows, self.simulator.task
+        signs = np.random.default_rng(1).choice([-1.0, 1.0], (len(windows), windows.steps, 1))
         assert task.state_from_observation is not None  # windows begin at states that are rebuilt by it
         system = self.simulator.bind(self.simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
         steady = kicked = system.unbiased(np.ascontiguousarray(windows.states[None]))
@@ -100,8 +101,8 @@ class Replays:
         for step in range(windows.steps):
             action = np.ascontiguousarray(windows.actions[None, :, step])
             steady, kicked = system.step(steady, action), system.step(kicked, action)
-            pushed = kick * self.scale * rng.standard_normal((1, len(windows), len(kick)))
-            seen = moved(task.attitudes, system.observe(kicked), pushed)
+            pushed = signs[:, step] * pushes[:, step] * self.scale
+            seen = moved(task.attitudes, system.observe(kicked), pushed[None])
             physical = np.asarray(task.state_from_observation(seen), np.float64)
             rebuilt = np.concatenate([physical, kicked[..., physical.shape[-1] :]], axis=-1)
             kicked = np.where(np.isfinite(rebuilt), system.unbiased(rebuilt), kicked)
