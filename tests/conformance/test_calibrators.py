@@ -53,9 +53,11 @@ METHODS = {
         initial_states="estimated", horizon=3, windows=4, search_windows=2, search_epochs=1, tolerance=0.0
     ),
     "oted": Oted(draws=6, rows=2, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=2, cloning_updates=3),
-    "oted, free running": Oted("policy", draws=4, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=0),
-    "dropo": Dropo(draws=4, transitions=3),
-    "e-dropo": Dropo(draws=4, transitions=3, entropy_weight=0.1),
+    "oted, free running": Oted(
+        "policy", draws=4, horizon=5, updates=2, batch=16, hidden=(8,), cloning_epochs=0, sensor_noise=0.0
+    ),
+    "dropo": Dropo(draws=4, transitions=3, sensor_noise=0.0),
+    "e-dropo": Dropo(draws=4, transitions=3, sensor_noise=0.0, entropy_weight=0.1),
     "droid": Droid(horizon=3, windows=3),
     "cma-es": CmaEs(rows=9),
     "cma-es-distribution": CmaEs("distribution", rows=9, features=7),
@@ -69,6 +71,7 @@ METHODS = {
         cloning_epochs=2,
         cloning_updates=3,
         batch=16,
+        sensor_noise=0.0,
     ),
 }
 METHODS["npe"] = Npe(
@@ -88,6 +91,7 @@ METHODS["npe"] = Npe(
     cloning_epochs=2,
     cloning_updates=3,
     cloning_batch=16,
+    sensor_noise=0.0,  # estimating it takes seconds
 )
 IDLE = {"nominal": Uncalibrated(), "uniform": Uncalibrated(randomised=True)}
 

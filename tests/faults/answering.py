@@ -1,4 +1,4 @@
-"""Command lines one after another in this process: what each answered, in how many seconds and how much memory.
+"""Command lines one after another in this process: what each answered, its processor time in s, and its memory.
 
 Standard input has a JSON list of lists of words, standard output gets a JSON list of answers.
 """
@@ -15,17 +15,17 @@ from madoc.runs.memory import forget_peak, peak_memory
 
 
 def answered(words):
-    """Exit code, standard output and error, seconds, and the most memory in bytes while it ran."""
+    """Exit code, standard output and error, seconds of processor time, and the most memory in bytes while it ran."""
     out, err = io.StringIO(), io.StringIO()
     forget_peak()
-    begun = time.monotonic()
+    begun = time.process_time()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             code = main(words)
         except BaseException:
             code = -1
             traceback.print_exc()
-    seconds = time.monotonic() - begun
+    seconds = time.process_time() - begun
     return {"code": code, "out": out.getvalue(), "err": err.getvalue(), "seconds": seconds, "memory": peak_memory()}
 
 

@@ -31,7 +31,7 @@ ACTED = 25.0
 """... and those of a clone's own rollouts, the roughest of all."""
 TOLD = 15.0
 """... of windows of positions alone: mid-range is 19 to 25 off."""
-CLONED = {"hidden": (32, 32), "cloning_epochs": 5}
+CLONED = {"hidden": (32, 32), "cloning_epochs": 5, "sensor_noise": 0.0}
 
 
 def off(method, robot, *, rows=2000, budget=100_000, **disturbance):
@@ -58,13 +58,13 @@ def test_errors_of_replayed_rows_lead_to_the_truth_and_the_search_ends_there(rob
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("weight", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_a_likely_distribution_stands_about_the_truth(robot, weight):
-    error, _ = off(Dropo(entropy_weight=weight), robot)
+    error, _ = off(Dropo(sensor_noise=0.0, entropy_weight=weight), robot)
     assert (error < LIKELY).all(), error
 
 
 @pytest.mark.slow
 def test_an_entropy_bonus_keeps_the_distribution_wide():
-    narrow, wide = (off(Dropo(entropy_weight=weight), "spring")[1].std for weight in (0.0, 3.0))
+    narrow, wide = (off(Dropo(sensor_noise=0.0, entropy_weight=weight), "spring")[1].std for weight in (0.0, 3.0))
     assert (wide > narrow).all()
 
 

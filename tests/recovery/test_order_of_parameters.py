@@ -38,6 +38,8 @@ def estimated(name, task, truth, *, budget):
         method = replace(method, hidden=(64, 64), draws=20, epochs=4, cloning_epochs=10)
     elif name in MADOC:
         method = replace(quick(name), patience=0)
+    elif name == "dropo":
+        method = replace(method, sensor_noise=0.0)
     logged = recorded(task, {parameter: truth[parameter] for parameter in task.parameters.names}, 5000, KEY)
     result = calibrate(method, CalibrationProblem(logged, simulation.make(task, threads=1)), key=KEY, budget=budget)
     return {parameter: row.estimate for parameter, row in result.parameters.items()}

@@ -24,7 +24,7 @@ from madoc.calibration.baselines.population_search import (
     next_generation,
     replay_residuals,
 )
-from madoc.calibration.sensing import noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
+from madoc.calibration.sensing import SensorNoise, noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
 from madoc.errors import MadocError
 from madoc.identification.windows import first_rows
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
@@ -100,6 +100,8 @@ class CmaEs:
         learning_rate: Adam's learning rate.
         population: Candidates in a generation; None takes 4 + ⌊3 ln d⌋.
         tolerance: Largest deviation of the search, as a share of each range, at which it stops; 0 never stops.
+        sensor_noise: Noise put on what a clone does, as a share of a step's typical change; None estimates it from the
+            log.
     """
 
     objective: Literal["one-step", "distribution"] = "one-step"
@@ -114,6 +116,7 @@ class CmaEs:
     learning_rate: NotNegative = 1e-3
     population: Annotated[int, Field(ge=4)] | None = None
     tolerance: NotNegative = 1e-5
+    sensor_noise: SensorNoise = None
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
@@ -280,7 +283,7 @@ class CmaEs:
             restart_key=of_restarts,
         )
         length = self._window(problem)
-        seen = with_sensor_noise(rollout, noise_deviation(problem, None, length), of_actions).transitions
+        seen = with_sensor_noise(rollout, noise_deviation(problem, self.sensor_noise, length), of_actions).transitions
         scaling, _ = problem.features.windows("standardised", length)
         # All candidates share the first observation.
         windows = scaling.features(windows_ending(seen, np.arange(max(1, length - 1), len(seen)), length))[0]

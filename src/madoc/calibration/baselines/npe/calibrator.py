@@ -36,7 +36,7 @@ from madoc.calibration.baselines.npe.emulator import (
 from madoc.calibration.baselines.npe.moments import Sets
 from madoc.calibration.baselines.npe.summaries import by_halves, logged_moments, set_moments, unpaired
 from madoc.calibration.cautions import at_end_of_range
-from madoc.calibration.sensing import noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
+from madoc.calibration.sensing import SensorNoise, noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
 from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
@@ -119,6 +119,8 @@ class Npe:
         cloning_epochs: Epochs of behaviour cloning, before anything is simulated.
         cloning_updates: Updates in each epoch of cloning.
         cloning_batch: Logged rows in an update of the clone.
+        sensor_noise: Noise put on simulated observations, as a share of a step's typical change; None estimates it from
+            the log.
     """
 
     draws: Annotated[int, Field(ge=2)] = 50
@@ -141,6 +143,7 @@ class Npe:
     cloning_epochs: CountOrZero = 40
     cloning_updates: Count = 200
     cloning_batch: Count = 256
+    sensor_noise: SensorNoise = None
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
@@ -233,7 +236,7 @@ class Npe:
             key=of_actions,
             restart_key=of_restarts,
         )
-        noise = noise_deviation(problem, None, rows_compared(problem))
+        noise = noise_deviation(problem, self.sensor_noise, rows_compared(problem))
         state = self._collect(problem, state, with_sensor_noise(rollout, noise, of_actions), points)
         state = replace(state, walkers=walkers, key=key, failures=state.failures + rollout.failures)
         if state.collected == self.epochs and state.trained:

@@ -25,7 +25,7 @@ from madoc.calibration.baselines.oted.bandit import (
 )
 from madoc.calibration.baselines.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
 from madoc.calibration.baselines.population_search import independent_estimate
-from madoc.calibration.sensing import noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
+from madoc.calibration.sensing import SensorNoise, noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
 from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
@@ -76,6 +76,8 @@ class Oted:
         cloning_updates: Updates in each epoch of cloning.
         learning_rate: Adam's learning rate of both networks.
         replay_capacity: Number of simulated rows kept for the discriminator.
+        sensor_noise: Noise put on rows that run freely, as a share of a step's typical change; None estimates it from
+            the log.
     """
 
     starts: Literal["logged", "policy"] | None = None
@@ -94,6 +96,7 @@ class Oted:
     cloning_updates: Count = 200
     learning_rate: NotNegative = 1e-3
     replay_capacity: Count = 20_000
+    sensor_noise: SensorNoise = None
 
     def __post_init__(self) -> None:
         check_hyperparameters(self)
@@ -193,7 +196,9 @@ class Oted:
             restart_key=of_restart,
         )
         if not anew:
-            rollout = with_sensor_noise(rollout, noise_deviation(problem, None, self._window(problem)), of_action)
+            rollout = with_sensor_noise(
+                rollout, noise_deviation(problem, self.sensor_noise, self._window(problem)), of_action
+            )
         length, seen = self._window(problem), rollout.transitions
         scaling, (logged, _) = problem.features.windows("standardised", length)
         # The first pair of a row is its start, which does not depend on the draw.
