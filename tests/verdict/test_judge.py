@@ -114,9 +114,9 @@ def test_errors_beyond_those_of_noise_and_random_forces_are_a_mismatch():
     assert "leave 3.7 times or more of the error in qd that sensor noise and random forces make" in verdict.sentence
 
 
-def predicted_over(seconds, relative, interval, *, whole=False):
+def predicted_over(seconds, relative, interval, *, whole=False, windows=60):
     given, estimate = {"q": 1.0}, {"q": relative}
-    return OpenLoop(seconds, whole, 60, given, given, estimate, relative, interval)
+    return OpenLoop(seconds, whole, windows, given, given, estimate, relative, interval)
 
 
 @EITHER
@@ -148,6 +148,11 @@ def test_what_is_hardly_better_at_an_end_or_contradicted_stays_a_mismatch(good, 
     lacking = changed(good, LEFT_OVER, explained=0.6, open_loop=(predicted_over(1.0, relative, interval),), **change)
     assert judge(lacking).word == "MODEL_MISMATCH"
     assert judge(replace(lacking, open_loop=())).word == "MODEL_MISMATCH"
+
+
+def test_a_few_windows_show_nothing():
+    few = predicted_over(1.0, 0.4, (0.4, 0.4), windows=4)
+    assert judge(changed(PREDICTED, LEFT_OVER, explained=0.6, open_loop=(few,))).word == "MODEL_MISMATCH"
 
 
 def test_a_search_that_has_not_settled_is_never_usable():

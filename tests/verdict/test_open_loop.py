@@ -15,6 +15,7 @@ from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, rows_that_fit
 from madoc.simulation.write import nominal_values
 from madoc.verdict import Bench
+from madoc.verdict import open_loop as module
 from madoc.verdict.open_loop import MOST, as_given, open_loop
 
 TASK, TRUTH = ROBOTS["spring"]
@@ -69,3 +70,12 @@ def test_errors_are_those_of_stepping_on_from_the_log_in_the_signals_own_units()
 def test_loose_rows_are_not_predicted_over_time():
     bench = bench_of(Disturbance(shuffled="rows"))
     assert open_loop(bench, at_truth(bench)) == ()
+
+
+def test_a_simulation_that_fails_counts_as_the_worst_that_does_not(monkeypatch):
+    bench = bench_of()
+    residuals = np.full((3, 6, 4, 2), 0.1)
+    residuals[0], residuals[2, :, 1:] = 40.0, np.nan  # the model as given drifts far, the estimate blows up
+    monkeypatch.setattr(module, "_exact", lambda *_: (residuals, np.arange(6) * 50))
+    first = open_loop(bench, at_truth(bench))[0]
+    assert first.relative == pytest.approx(np.sqrt((3 * 40.0**2 + 0.1**2) / 4) / 40.0)

@@ -189,7 +189,7 @@ class CalibrationResult:
         table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0), pad_edge=False)
         table.add_column("signal")
         for each in shown:
-            table.add_column(f"over {each.seconds:.2g} s{' (whole runs)' if each.whole else ''}", justify="right")
+            table.add_column(f"over {each.seconds:.3g} s{' (whole runs)' if each.whole else ''}", justify="right")
         table.add_column("noise", justify="right")
         signals = list(shown[-1].estimate)
         for name in signals[:MOST_SIGNALS]:

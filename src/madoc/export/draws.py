@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 
 from madoc.runs.files import replacing
 
@@ -58,6 +58,8 @@ def domain_randomize(model, rng, table=TABLE):
         rows = jax.vmap(lambda key: jax.random.randint(key, (), 0, len(stored["values"])))(rng)
         changed = {}
         for field in stored["fields"]:
+            if field == "bvh_aabb" or stored[f"numbers/{field}"].dtype.kind != "f":
+                continue  # MJX has no boxes for finding contacts, and its whole numbers are fixed
             part = model.opt.gravity if field == "opt.gravity" else getattr(model, field)
             numbers = jnp.asarray(stored[f"numbers/{field}"], part.dtype)[rows]
             flat = jnp.broadcast_to(part.reshape(-1), (len(rows), part.size))
@@ -73,7 +75,7 @@ def save_draws(
     names: Sequence[str],
     around: Sequence[str],
     values: Float[np.ndarray, "draws parameters"],
-    numbers: Mapping[str, tuple[Int[np.ndarray, " numbers"], Float[np.ndarray, "draws numbers"]]],
+    numbers: Mapping[str, tuple[Int[np.ndarray, " numbers"], Num[np.ndarray, "draws numbers"]]],
 ) -> tuple[Path, Path]:
     """Write `draws.npz` and `draws.py` into a folder: the values of every draw, and the numbers of the model.
 

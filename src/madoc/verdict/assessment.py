@@ -71,6 +71,7 @@ def assess(
             f"expected a simulator with the result's parameters {', '.join(result.parameters)}, got one with "
             f"{', '.join(bench.simulator.parameters.names)}"
         )
+    bench.left_out.clear()
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
     holdout = measured(bench, result.mean, result.interval)
     if bench.begins("predictions over longer times"):

@@ -20,7 +20,7 @@ from madoc.errors import MadocError
 from madoc.identification.candidate_terms import INTEGRATION
 from madoc.identification.coarseness import FINER, coarseness
 from madoc.identification.excitation import expected_half_widths
-from madoc.identification.fitted_windows import STRIDES
+from madoc.identification.fitted_windows import STRIDES, WINDOWS
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
 from madoc.identification.states import LoggedStates, logged_states
 from madoc.identification.term_tests import FEWEST
@@ -46,6 +46,8 @@ _NEIGHBOURS = 5000
 COLUMNS, COLUMNS_OF_A_VALUE = 60, 20
 """Simulations of a window that testing a model takes about, and how many more for each parameter and each degree of
 freedom."""
+EXCHANGED = "exchanged columns"
+"""A part of judging without which nothing is tested."""
 TESTING = 0.7
 """Share in (0, 1) of the time left that testing what the model lacks may take."""
 _LONGEST_ROLLOUT = 1000
@@ -222,9 +224,11 @@ def _doubts(
     if bench.until is not None:
         window = STRIDES * stride(problem.dataset) * (COLUMNS + COLUMNS_OF_A_VALUE * (len(point) + task.model.nv))
         most = int(TESTING * bench.rate * bench.seconds_left / window)
-    enough = most is None or most >= FEWEST + len(point)
+    enough = most is None or most >= 2 * (FEWEST + len(point))
     if not bench.begins("tests of what the model lacks", 0.0 if enough else np.inf):
         return Suspicions(tested=False), False
+    if most is not None and most < WINDOWS:
+        bench.left_out.append("tests on as many windows as usual")
     doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most)
     doubts = replace(doubts, alternatives=in_full(doubts.alternatives, doubts.terms))
     step = felt(doubts.terms)
@@ -294,7 +298,7 @@ def judged(
         ),
         alternatives=doubts.alternatives,
         imitated=doubts.imitated,
-        tested=doubts.tested,
+        tested=doubts.tested and EXCHANGED not in bench.left_out,
         contradictions=contradictions,
         coarseness=coarse,
         finer=finer,
@@ -334,7 +338,7 @@ def _contradictions(
     simulator, dataset = bench.simulator, bench.problem.dataset
     found, spent = dataset.findings, 0
     possible = simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none"
-    if possible and bench.begins("exchanged columns"):
+    if possible and bench.begins(EXCHANGED):
         points = np.stack([np.zeros(len(point)), point, at])
         exchanged, spent = exchanged_columns(
             bench.held_out, simulator, points, horizons(dataset)[1], bench.change, contradicts=True

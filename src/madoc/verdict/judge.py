@@ -26,7 +26,7 @@ from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, remedy, value_of
-from madoc.verdict.statistics import NEGLIGIBLE, WORTH_GAINING, beyond_noise
+from madoc.verdict.statistics import FEWEST_GROUPS, NEGLIGIBLE, WORTH_GAINING, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
 
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
@@ -90,7 +90,8 @@ def _usable(holdout: HoldOut, lacking: Verdict) -> Verdict | None:
 
     An estimate at an end of its range is none: a wider range would give another one.
     """
-    better = [each for each in holdout.open_loop if each.relative <= MUCH_BETTER and each.relative_interval[1] < 1.0]
+    enough = (each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS)
+    better = [each for each in enough if each.relative <= MUCH_BETTER and each.relative_interval[1] < 1.0]
     if holdout.at_end or not better:
         return None
     found = max(better, key=lambda each: (not each.whole, each.seconds))  # whole runs are often few
@@ -106,7 +107,7 @@ def _beside_given(found: OpenLoop) -> str:
     """How small open-loop errors are beside those of the model as given."""
     low, high = map(_percent, found.relative_interval)
     return (
-        f"over {found.seconds:.2g} s held-out motion is predicted with {_percent(found.relative)} of the error of the "
+        f"over {found.seconds:.3g} s held-out motion is predicted with {_percent(found.relative)} of the error of the "
         f"model as given (95 % interval {low} to {high})"
     )
 
@@ -368,7 +369,7 @@ def _no_better_areas(before: Area, after: Area) -> str:
 def _how_good(holdout: HoldOut) -> str:
     if not isinstance(holdout, ToldApart):
         confirmed = ", and mid-range is confirmed: every interval holds it" if _mid_range_was_right(holdout) else ""
-        parts = [each for each in holdout.open_loop if not each.whole]
+        parts = [each for each in holdout.open_loop if not each.whole and each.relative <= 1.0]
         told = _beside_given(parts[-1]) if parts else _how_small(holdout.errors)
         return f"{told}{', down to the noise' if explains_all(holdout) else ''}{confirmed}"
     return (

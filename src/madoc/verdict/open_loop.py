@@ -28,7 +28,7 @@ SECONDS = (0.1, 0.3, 1.0)
 MOST = 60
 """Largest number of windows of one length."""
 FAILED = 10.0
-"""Error, in typical changes of a stride, of a window whose simulation failed."""
+"""Least error, in typical changes of a stride, once a simulation has failed; it is the worst of any that has not."""
 
 
 def open_loop(bench: Bench, point: Float[np.ndarray, " d"]) -> tuple[OpenLoop, ...]:
@@ -59,7 +59,10 @@ def _own(parameter: Parameter, values: tuple[float, ...]) -> list[Parameter]:
     if not FIELDS[parameter.field].in_model or not parameter.elements:
         return [replace(parameter, low=values[0], high=values[0] + width)]
     pairs = zip(parameter.elements, values, strict=True)
-    return [replace(parameter, element=one, label="", low=value, high=value + width) for one, value in pairs]
+    return [
+        replace(parameter, element=one, label=f"{parameter.name} of {one}", low=value, high=value + width)
+        for one, value in pairs
+    ]
 
 
 def _over(
@@ -70,7 +73,9 @@ def _over(
     if found is None:
         return None
     residuals, rows = found
-    size, units = np.where(np.isfinite(residuals), residuals, FAILED), bench.change[: residuals.shape[-1]]
+    known = np.isfinite(residuals)
+    worst = np.maximum(np.abs(np.where(known, residuals, 0.0)).max((0, 1, 2)), FAILED)
+    size, units = np.where(known, residuals, worst), bench.change[: residuals.shape[-1]]
     of_signals = np.sqrt((size**2).mean((1, 2))) * units
     of_windows = np.sqrt((size**2).mean((2, 3)))  # of which means are taken, as a few windows may run away
     groups = independent_groups(bench.held_out.episode_of(rows), rows, steps)

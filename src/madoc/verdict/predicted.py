@@ -103,7 +103,7 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
     best = best_of(sizes)
     single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
-    pushes, of_rows = _pushes(bench, points[best], (noisy[0, :, 0] ** 2).mean(0))
+    pushes, of_rows = _pushes(bench, points[best], np.nan_to_num(np.nanmean(noisy[0, :, 0] ** 2, axis=0)))
     random = replays.magnitudes(replays.random_floor(points[best], noisy, pushes))
     groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
     signals = signal_names(bench.simulator.task)

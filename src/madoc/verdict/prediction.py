@@ -105,7 +105,10 @@ class Replays:
             seen = moved(task.attitudes, system.observe(kicked), pushed[None])
             physical = np.asarray(task.state_from_observation(seen), np.float64)
             rebuilt = np.concatenate([physical, kicked[..., physical.shape[-1] :]], axis=-1)
-            kicked = np.where(np.isfinite(rebuilt), system.unbiased(rebuilt), kicked)
+            known = np.isfinite(rebuilt).all(-1)
+            if task.rebuildable is not None:  # a clipped reading says another state
+                known &= np.asarray(task.rebuildable(seen))
+            kicked = np.where(known[..., None], system.unbiased(rebuilt), kicked)
             departures.append(differences(task.attitudes, system.observe(kicked), system.observe(steady)))
         return noisy + np.stack(departures, axis=2) / self.scale
 
