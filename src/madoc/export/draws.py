@@ -18,6 +18,7 @@ SOURCE = '''"""Draws of a calibrated model: a row of draws.npz is a model out of
 correlations, and so do the constants that MuJoCo derives from them: mj_setConst need not be called.
 """
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,28 +26,33 @@ import numpy as np
 TABLE = Path(__file__).with_name("draws.npz")
 
 
+@cache
+def read(table=TABLE):
+    """The table, read once: arrays by name."""
+    with np.load(table) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
 def count(table=TABLE):
     """How many draws there are."""
-    with np.load(table) as stored:
-        return len(stored["values"])
+    return len(read(table)["values"])
+
+
+def around(table=TABLE):
+    """Names of the parameters that are not in a model: delays in s, biases of sensors."""
+    return read(table)["around"].tolist()
 
 
 def put(model, row, table=TABLE):
     """Put one draw into a mujoco.MjModel, and return the values of its parameters by name.
 
-    Values of `around` (delays in s, biases of sensors) are not in a model: put them around it.
+    Those of `around` are not in a model: put them around it.
     """
-    with np.load(table) as stored:
-        for field in stored["fields"]:
-            owner, name = (model.opt, "gravity") if field == "opt.gravity" else (model, field)
-            getattr(owner, name).reshape(-1)[stored[f"places/{field}"]] = stored[f"numbers/{field}"][row]
-        return dict(zip(stored["names"].tolist(), stored["values"][row].tolist()))
-
-
-def around(table=TABLE):
-    """Names of the parameters that are not in a model."""
-    with np.load(table) as stored:
-        return stored["around"].tolist()
+    stored = read(table)
+    for field in stored["fields"]:
+        owner, name = (model.opt, "gravity") if field == "opt.gravity" else (model, field)
+        getattr(owner, name).reshape(-1)[stored[f"places/{field}"]] = stored[f"numbers/{field}"][row]
+    return dict(zip(stored["names"].tolist(), stored["values"][row].tolist()))
 
 
 def domain_randomize(model, rng, table=TABLE):
@@ -54,16 +60,17 @@ def domain_randomize(model, rng, table=TABLE):
     import jax
     import jax.numpy as jnp
 
-    with np.load(table) as stored:
-        rows = jax.vmap(lambda key: jax.random.randint(key, (), 0, len(stored["values"])))(rng)
-        changed = {}
-        for field in stored["fields"]:
-            if field == "bvh_aabb" or stored[f"numbers/{field}"].dtype.kind != "f":
-                continue  # MJX has no boxes for finding contacts, and its whole numbers are fixed
-            part = model.opt.gravity if field == "opt.gravity" else getattr(model, field)
-            numbers = jnp.asarray(stored[f"numbers/{field}"], part.dtype)[rows]
-            flat = jnp.broadcast_to(part.reshape(-1), (len(rows), part.size))
-            changed[field] = flat.at[:, stored[f"places/{field}"]].set(numbers).reshape(len(rows), *part.shape)
+    stored = read(table)
+    rows = jax.vmap(lambda key: jax.random.randint(key, (), 0, len(stored["values"])))(rng)
+    changed = {}
+    for field in stored["fields"].tolist():
+        part = model.opt.gravity if field == "opt.gravity" else getattr(model, field, None)
+        numbers = stored[f"numbers/{field}"]
+        if part is None or numbers.dtype.kind != "f":
+            continue  # MJX has no boxes for finding contacts, and its whole numbers are fixed
+        drawn = jnp.asarray(numbers, part.dtype)[rows]
+        flat = jnp.broadcast_to(jnp.asarray(part).reshape(-1), (len(rows), part.size))
+        changed[field] = flat.at[:, stored[f"places/{field}"]].set(drawn).reshape(len(rows), *part.shape)
     in_axes = jax.tree_util.tree_map(lambda part: None, model).tree_replace({field: 0 for field in changed})
     return model.tree_replace(changed), in_axes
 '''

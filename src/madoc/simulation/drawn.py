@@ -25,10 +25,11 @@ def numbers_of_draws(simulator: Simulator, values: Float[np.ndarray, "draws para
     for draw in values:
         model = task.compile()
         write_parameters(model, mujoco.MjData(model), simulator.parameters.parameters, draw)
-        rows.append(_arrays(model))
-    stacked = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        rows.append({name: part for name, part in _arrays(model).items() if not np.array_equal(part, own[name])})
+    changed = dict.fromkeys(name for row in rows for name in row)
+    stacked = {name: np.stack([row.get(name, own[name]) for row in rows]) for name in changed}
     varied = {name: np.flatnonzero((part != own[name]).any(0)) for name, part in stacked.items()}
-    return {name: (places, stacked[name][:, places]) for name, places in varied.items() if len(places)}
+    return {name: (places, stacked[name][:, places]) for name, places in varied.items()}
 
 
 def _arrays(model: mujoco.MjModel) -> dict[str, np.ndarray]:

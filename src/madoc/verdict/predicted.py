@@ -47,13 +47,14 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         for part in (found.at_mid_range, found.at_estimate)
     )
     at_end, refitting = _explained_at_end(bench, best, found.at_best, point, interval)
+    beside, of_chance = _beside_random(bench, found)
     record = partial(
         Predicted,
         errors=found.errors,
         explained=max(single.explained, at_end),
         autocorrelation=single.autocorrelation,
         persistence=lasting,
-        beside_random=found.beside_random,
+        beside_random=dict(zip(signal_names(bench.simulator.task), beside.tolist(), strict=True)),
         area_at_mid_range=area_at_mid_range,
         area_at_estimate=area_at_estimate,
     )
@@ -67,7 +68,7 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         by_model=tuple(bench.against_chance(name, _simulated(bench, system)) for name, system in systems.items()),
         noise=single.noise,
         exact=True,
-        control_steps=found.control_steps + rows + refitting,
+        control_steps=found.control_steps + rows + refitting + of_chance,
     )
 
 
@@ -80,7 +81,7 @@ class _Replayed(NamedTuple):
     """What replays of the hold-out leave at mid-range, at an estimate and at the `best` parameters nearby.
 
     Residuals are in typical changes of a stride, of shape (windows, steps, observation); `noisy` are those that noise
-    alone would cause at the best parameters. `beside_random` are the errors of each signal over those of chance.
+    alone would cause at the best parameters.
     """
 
     errors: PredictionErrors
@@ -90,7 +91,6 @@ class _Replayed(NamedTuple):
     at_best: Float[np.ndarray, "windows steps observation"]
     noisy: Float[np.ndarray, "windows steps observation"]
     single: "_SingleSteps"
-    beside_random: dict[str, float]
     control_steps: int
 
 
@@ -103,11 +103,8 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
     best = best_of(sizes)
     single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
-    pushes, of_rows = _pushes(bench, points[best], np.nan_to_num(np.nanmean(noisy[0, :, 0] ** 2, axis=0)))
-    random = replays.magnitudes(replays.random_floor(points[best], noisy, pushes))
     groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
     signals = signal_names(bench.simulator.task)
-    beside = beside_random(sizes[:, best, -1], random[:, 0, -1], groups)
     errors = prediction_errors(
         sizes,
         replays.magnitudes(noisy)[:, 0],
@@ -118,9 +115,18 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
         failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
         stride=stride(bench.problem.dataset),
     )
-    spent = searching + residuals[..., 0].size + noisy[..., 0].size * 4 + single.control_steps + of_rows
-    beyond = dict(zip(signals, beside.tolist(), strict=True))
-    return _Replayed(errors, points[best], residuals[0], residuals[1], residuals[best], noisy[0], single, beyond, spent)
+    spent = searching + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps
+    return _Replayed(errors, points[best], residuals[0], residuals[1], residuals[best], noisy[0], single, spent)
+
+
+def _beside_random(bench: Bench, found: _Replayed) -> tuple[Float[np.ndarray, " observation"], int]:
+    """The errors of each signal after the longest horizon over those of chance, and the control steps simulated."""
+    replays = bench.replays
+    pushes, rows = _pushes(bench, found.best, np.nan_to_num(np.nanmean(found.noisy[:, 0] ** 2, axis=0)))
+    random = replays.random_floor(found.best, found.noisy[None], pushes)
+    left, by_chance = (replays.magnitudes(each)[:, 0, -1] for each in (found.at_best[None], random))
+    groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
+    return beside_random(left, by_chance, groups), rows + 2 * random[..., 0].size
 
 
 def _pushes(
