@@ -48,6 +48,25 @@ FIELDS: dict[str, Field] = {
     "geom_friction": Field("geom", "1", 0.0),
     "actuator_gain": Field("actuator", "1"),
     "actuator_kv": Field("actuator", "N·m·s/rad", 0.0),
+    "drive_supply": Field("actuator", "V", 0.0),
+    "drive_kt": Field("actuator", "N·m/A", 0.0),
+    "drive_resistance": Field("actuator", "Ω", 1e-9),
+    "drive_gain": Field("actuator", "1", 0.0),
+    "drive_damping_gain": Field("actuator", "1", 0.0),
+    "drive_duty_limit": Field("actuator", "1", 0.0, 1.0),
+    "drive_current_limit": Field("actuator", "A", 0.0),
+    "drive_strength": Field("actuator", "1", 0.0),
+    "friction_stribeck": Field("joint", "N·m", 0.0),
+    "friction_stribeck_speed": Field("joint", "rad/s", 1e-9),
+    "friction_stribeck_exponent": Field("joint", "1", 0.0, 100.0),
+    "friction_load": Field("joint", "1", 0.0),
+    "friction_load_motor": Field("joint", "1", 0.0),
+    "friction_load_external": Field("joint", "1", 0.0),
+    "friction_stribeck_load": Field("joint", "1", 0.0),
+    "friction_stribeck_load_motor": Field("joint", "1", 0.0),
+    "friction_stribeck_load_external": Field("joint", "1", 0.0),
+    "friction_quadratic_motor": Field("joint", "1/(N·m)", 0.0),
+    "friction_quadratic_external": Field("joint", "1/(N·m)", 0.0),
     "action_delay": Field(None, "s", 0.0, 10.0, in_model=False),
     "signal_bias": Field("signal", "1", in_model=False),
 }
@@ -59,7 +78,9 @@ is how far the centre of mass is from the body's origin, in the direction it has
 velocity servo is its kp or kv, and moves the servo's bias with it; `actuator_kv` is the damping of a position servo.
 `jnt_ref` is what a hinge or slide reads, and is commanded to, where the model as drawn has its zero. `action_delay` is
 the time from an action to its effect, `signal_bias` what a sensor reads too much. `dof_drag` is damping that grows with
-the square of the speed.
+the square of the speed. `drive_*` are the numbers of a d.c. drive, `friction_*` those of friction that depends on speed
+and load (`simulation/callbacks.py` has the equations); `friction_load` and `friction_stribeck_load` are one value for
+the motor's and the external torque.
 """
 
 

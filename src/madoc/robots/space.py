@@ -3,6 +3,7 @@
 import mujoco
 
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
+from madoc.robots.drives import friction_parameters
 from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_slide
 from madoc.robots.signals import signal_unit
@@ -29,6 +30,7 @@ def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
         for other, earlier in enumerate(parameters):
             _check_distinct(draft, model, index, parameter, other, earlier)
         parameters.append(parameter)
+    parameters += friction_parameters(draft)
     return ParameterSpace(tuple(parameters))
 
 

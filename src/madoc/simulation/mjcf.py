@@ -213,7 +213,9 @@ def _write_rows(
         turns = kind == "joint" and int(element.type) == int(mujoco.mjtJoint.mjJNT_HINGE)
         if attribute in _ANGLES and spec.compiler.degree and turns:
             old, new = np.rad2deg(old).tolist(), np.rad2deg(new).tolist()
-        if np.ndim(getattr(element, attribute)):
+        if attribute == "userdata":
+            element.userdata = new
+        elif np.ndim(getattr(element, attribute)):
             getattr(element, attribute)[: max(len(old), len(new))] = [*new, *[0.0] * (len(old) - len(new))]
         else:
             setattr(element, attribute, new[0])
@@ -253,6 +255,7 @@ _ROWS = (
     ("joint", "ref", "qpos0"),
     ("joint", "springref", "qpos_spring"),
     ("joint", "range", "jnt_range"),
+    ("joint", "userdata", "jnt_user"),
     ("tendon", "springlength", "tendon_lengthspring"),
     ("tendon", "range", "tendon_range"),
     ("geom", "friction", "geom_friction"),
@@ -261,6 +264,7 @@ _ROWS = (
     ("site", "pos", "site_pos"),
     ("actuator", "gainprm", "actuator_gainprm"),
     ("actuator", "biasprm", "actuator_biasprm"),
+    ("actuator", "userdata", "actuator_user"),
 )
 """What a parameter may change, besides gravity and inertias: kind of element, attribute in MJCF, array of the model."""
 

@@ -1,0 +1,140 @@
+"""Drives, friction and conditions of a spec: the numbers they put into the model, and what a log brings in for them."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from madoc.parameters import Parameter
+from madoc.robots.document import Place
+from madoc.robots.drive_spec import DriveSpec, FrictionSpec
+from madoc.robots.model import AddedActuator, Draft, JointFriction
+from madoc.simulation.callbacks import DRIVE, FRICTION, MARK, MEANS
+from madoc.simulation.write import ONE_DOF
+from madoc.tasks.base import ActionChannel
+
+_WIDEST_SUPPLY = 2.0
+"""Largest measured supply over the nominal one."""
+_SHAPE = {"stribeck_speed": (0.1, 10.0), "stribeck_exponent": (0.5, 10.0)}
+"""Ranges of how friction falls with the speed, in rad/s and 1: those of servos (Rhoban/bam), and faster ones."""
+_LOAD = {"load": 0.5, "stribeck_load": 1.0, "quadratic": 0.1}
+"""Largest ratio of friction to load, as Rhoban/bam's fits have it, and the largest quadratic one in 1/(N·m), ten times
+that of their fits."""
+
+
+def drive_numbers(drive: DriveSpec, means: str) -> tuple[float, ...]:
+    """The numbers of a drive in the model, in the order of `DRIVE`; what it takes from the log comes in later."""
+    return (
+        MARK,
+        float(MEANS.index(means)),
+        drive.supply,
+        drive.kt,
+        drive.resistance,
+        1.0 if drive.gain is None else drive.gain,
+        drive.damping_gain,
+        drive.duty_limit,
+        float("inf") if drive.current_limit is None else drive.current_limit,
+        drive.strength,
+        -1.0,
+        -1.0,
+        -1.0,
+    )
+
+
+def with_inputs(
+    draft: Draft, added: tuple[AddedActuator, ...]
+) -> tuple[tuple[AddedActuator, ...], tuple[ActionChannel, ...]]:
+    """The actuators, and behind them one for each number that a log brings in, without force; and their channels.
+
+    A drive gets the numbers of those that it takes something from.
+    """
+    inputs: dict[str, AddedActuator] = {}
+    channels: dict[str, ActionChannel] = {}
+    taken: dict[str, list[float]] = {actuator.name: list(actuator.numbers) for actuator in added}
+    first = len(draft.base.actuators) + len(added)
+    conditions = {condition.name: condition for condition in draft.spec.conditions}
+    for index, action in enumerate(draft.spec.actions):
+        drive = action.drive
+        for key in ("enable", "supply_from", "gain_from"):
+            column = None if drive is None else getattr(drive, key)
+            if drive is None or column is None:
+                continue
+            place: Place = ("actions", index, "drive", key)
+            if key == "gain_from" and column not in conditions:
+                raise draft.document.unknown(place, "the name of a condition", column, conditions)
+            low, high, unit, usual = 0.0, 1.0, "1", 1.0
+            if key == "supply_from":
+                high, unit, usual = _WIDEST_SUPPLY * drive.supply, "V", drive.supply
+            elif key == "gain_from":
+                values = conditions[column].values
+                low, high, usual = min(0.0, *values), max(0.0, *values), values[0]
+            rest = 2.0 * (usual - low) / (high - low) - 1.0
+            channel = ActionChannel(column, column, low, high, unit, rest=rest, command=False)
+            if channels.setdefault(column, channel) != channel:
+                raise draft.document.error(place, f"the column {column!r} is used for something else already")
+            inputs.setdefault(column, AddedActuator(column, str(action.joint), low, high, 0.0, numbers=(MARK,)))
+            taken[action.name][DRIVE.index(key)] = float(first + list(inputs).index(column))
+    drives = tuple(replace(actuator, numbers=tuple(taken[actuator.name])) for actuator in added)
+    return (*drives, *inputs.values()), tuple(channels.values())
+
+
+def joint_frictions(draft: Draft) -> tuple[JointFriction, ...]:
+    """What the spec says of the friction of joints, each joint once."""
+    found: dict[str, JointFriction] = {}
+    for index, friction in enumerate(draft.spec.friction):
+        for joint in friction.names:
+            _check_joint(draft, index, joint)
+            if joint in found:
+                raise draft.document.error(("friction", index), f"the friction of {joint!r} is said already; say it once")
+            numbers = _friction_numbers(friction)
+            found[joint] = JointFriction(joint, friction.coulomb, friction.viscous, numbers)
+    return tuple(found.values())
+
+
+def friction_parameters(draft: Draft) -> Iterator[Parameter]:
+    """Parameters of the terms of friction that have no number and no line of their own."""
+    own = {(row.field, element) for row in draft.spec.parameters for element in row.parameter().elements}
+    for index, friction in enumerate(draft.spec.friction):
+        for term in (*friction.chosen, *friction.shape):
+            field = {"coulomb": "dof_frictionloss", "viscous": "dof_damping"}.get(term, f"friction_{term}")
+            for joint in friction.names:
+                if getattr(friction, term) is None and (field, joint) not in own:
+                    yield Parameter(field, joint, *_range(draft, index, term))
+
+
+def _range(draft: Draft, index: int, term: str) -> tuple[float, float]:
+    """The range of a term of friction."""
+    if term in _SHAPE:
+        return _SHAPE[term]
+    ratio = next((most for begin, most in _LOAD.items() if term.startswith(begin)), None)
+    if ratio is not None:
+        return 0.0, ratio
+    up_to = draft.spec.friction[index].up_to
+    if up_to is None:
+        raise draft.document.error(
+            ("friction", index), f"expected up_to:, the largest friction in N·m, as {term} is to be calibrated"
+        )
+    return 0.0, up_to
+
+
+def _friction_numbers(friction: FrictionSpec) -> tuple[float, ...]:
+    """The numbers of a joint's friction in the model, in the order of `FRICTION`; empty where MuJoCo's own say it."""
+    if set(friction.chosen) <= {"coulomb", "viscous"}:
+        return ()
+
+    def number(name: str) -> float:
+        both = name.removesuffix("_motor").removesuffix("_external")
+        given = (getattr(friction, name, None), getattr(friction, both, None))
+        return next((value for value in given if value is not None), 1.0 if name in _SHAPE else 0.0)
+
+    return (MARK, *(number(name) for name in FRICTION[1:]))
+
+
+def _check_joint(draft: Draft, index: int, name: str) -> None:
+    joint = draft.base.joint(name)
+    place = ("friction", index)
+    if joint is None:
+        names = [joint.name for joint in draft.base.joints if joint.name]
+        raise draft.document.unknown(place, "the name of a joint", name, names)
+    if int(joint.type) not in ONE_DOF:
+        raise draft.document.error(place, f"expected a hinge or a slide, got {name!r}, which is a ball or free")
+    if any(len(other.userdata) for other in draft.base.joints):
+        raise draft.document.error(place, "the model keeps user data of its joints (user=), where friction is kept")
