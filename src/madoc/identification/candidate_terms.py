@@ -17,7 +17,15 @@ from madoc.identification.score_tests import Score
 from madoc.identification.states import LoggedStates
 from madoc.parameters import FIELDS, Parameter
 from madoc.simulation.base import Simulator
-from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, nominal_values, off_centre
+from madoc.simulation.user_data import is_drive
+from madoc.simulation.write import (
+    body_reach,
+    element_names,
+    has_gain,
+    heavy_bodies,
+    nominal_values,
+    off_centre,
+)
 
 CAUSES = {
     "dof_frictionloss": "Coulomb friction",
@@ -26,6 +34,7 @@ CAUSES = {
     "dof_armature": "inertia that goes with the acceleration of a joint",
     "jnt_stiffness": "a spring",
     "actuator_gain": "another gain of the actuator",
+    "drive_strength": "another strength of the drive",
     "signal_bias": "an offset of the sensor",
     "gravity": "another gravity",
     "body_mass": "another mass, as of a payload",
@@ -122,7 +131,9 @@ def candidates(
             references = references_of(logged, simulator, model.joint(name))
             wanted += [(field, name, reference) for field, reference in references.items()]
     for actuator in (model.actuator(channel.actuator) for channel in task.actions):
-        if has_gain(model, actuator.id):
+        if is_drive(model, actuator.id):
+            wanted.append(("drive_strength", actuator.name, 1.0))
+        elif has_gain(model, actuator.id):
             wanted.append(("actuator_gain", actuator.name, abs(float(actuator.gainprm[0])) or 1.0))
     weighed = {element for field, element in calibrated if field in ("body_mass", "body_mass_and_inertia")}
     for body in heavy_bodies(model):
@@ -229,7 +240,8 @@ def effects(
             moved = inputs.residuals(other, point[None], states[None])[0, 0]
             tried.append(candidate)
             found.append((moved - base) / change)
-    for place, channel in enumerate(simulator.task.actions if len(simulator.task.actions) > 1 else ()):
+    commands = [(place, channel) for place, channel in enumerate(simulator.task.actions) if channel.command]
+    for place, channel in commands if len(commands) > 1 else ():
         actions = readings.actions.copy()
         actions[..., place] = late.actions[..., place]
         moved = replace(readings, actions=actions).residuals(simulator, point[None], states[None])[0, 0]
@@ -267,6 +279,7 @@ def _cut_off(
     middle, half = simulator.task.action_ranges
     asked = actions * half + middle
     most = (1.0 - _SATURATED) * np.abs(asked).max((0, 1))
+    most[[not channel.command for channel in simulator.task.actions] or slice(0)] = np.inf
     return (np.clip(asked, -most, most) - middle) / half
 
 

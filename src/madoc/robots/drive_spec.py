@@ -54,7 +54,9 @@ class DriveSpec(Part):
 
     def check(self, means: str) -> None:
         """Refuse a gain that is missing or means nothing, as ValueError, and a command that is none of a drive."""
-        refuse(means not in ("position", "velocity", "duty"), "expected means: position, velocity or duty beside drive:")
+        refuse(
+            means not in ("position", "velocity", "duty"), "expected means: position, velocity or duty beside drive:"
+        )
         refuse(means != "duty" and self.gain is None, f"expected gain: of the drive, duty per error of {means}")
         given = [key for key in ("gain", "gain_from") if getattr(self, key) is not None]
         refuse(means == "duty" and bool(given), f"{''.join(given[:1])}: means nothing beside means: duty")

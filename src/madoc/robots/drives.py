@@ -8,6 +8,7 @@ from madoc.robots.document import Place
 from madoc.robots.drive_spec import DriveSpec, FrictionSpec
 from madoc.robots.model import AddedActuator, Draft, JointFriction
 from madoc.simulation.callbacks import DRIVE, FRICTION, MARK, MEANS
+from madoc.simulation.user_data import by_own_elements, elements_of_drive
 from madoc.simulation.write import ONE_DOF
 from madoc.tasks.base import ActionChannel
 
@@ -72,8 +73,23 @@ def with_inputs(
                 raise draft.document.error(place, f"the column {column!r} is used for something else already")
             inputs.setdefault(column, AddedActuator(column, str(action.joint), low, high, 0.0, numbers=(MARK,)))
             taken[action.name][DRIVE.index(key)] = float(first + list(inputs).index(column))
-    drives = tuple(replace(actuator, numbers=tuple(taken[actuator.name])) for actuator in added)
+    loaded = {joint for friction in draft.spec.friction if _friction_numbers(friction) for joint in friction.names}
+    drives = (
+        _as_elements(replace(actuator, numbers=tuple(taken[actuator.name])), loaded=actuator.joint in loaded)
+        for actuator in added
+    )
     return (*drives, *inputs.values()), tuple(channels.values())
+
+
+def _as_elements(actuator: AddedActuator, *, loaded: bool) -> AddedActuator:
+    """A drive that MuJoCo's own elements say, as these; any other actuator as it is.
+
+    So is one whose whole torque, with its back-EMF, the friction of its joint grows with.
+    """
+    if loaded or not actuator.numbers or not by_own_elements(actuator.numbers):
+        return actuator
+    gain, (position, speed), largest, drag = elements_of_drive(actuator.numbers)
+    return replace(actuator, gain=gain, stiffness=-position, damping=-speed, limit=largest, drag=drag)
 
 
 def joint_frictions(draft: Draft) -> tuple[JointFriction, ...]:
@@ -83,7 +99,9 @@ def joint_frictions(draft: Draft) -> tuple[JointFriction, ...]:
         for joint in friction.names:
             _check_joint(draft, index, joint)
             if joint in found:
-                raise draft.document.error(("friction", index), f"the friction of {joint!r} is said already; say it once")
+                raise draft.document.error(
+                    ("friction", index), f"the friction of {joint!r} is said already; say it once"
+                )
             numbers = _friction_numbers(friction)
             found[joint] = JointFriction(joint, friction.coulomb, friction.viscous, numbers)
     return tuple(found.values())

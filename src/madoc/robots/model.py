@@ -11,8 +11,8 @@ from madoc.robots.document import Document
 from madoc.robots.functions import PythonFile
 from madoc.robots.model_files import ModelFiles
 from madoc.robots.spec import RobotSpec
-from madoc.simulation import callbacks
-from madoc.simulation.write import LEAST_FRICTION, OF_A_JOINT, ONE_DOF
+from madoc.simulation.user_data import LEAST_FRICTION
+from madoc.simulation.write import OF_A_JOINT, ONE_DOF
 from madoc.tasks.base import compiled_model
 from madoc.tasks.mujoco_versions import refuse_unfit_mujoco
 
@@ -60,8 +60,9 @@ class AddedActuator:
         stiffness: Force per position, in SI units.
         damping: Force per velocity, in SI units.
         limit: Largest force; None is unlimited.
-        numbers: Those of a drive of its own equation (`callbacks.DRIVE`), which is its force then; or MARK alone, of
-            an actuator that only brings a logged number in.
+        drag: Damping that no limit cuts off, as by back-EMF.
+        numbers: Those of a drive (`callbacks.DRIVE`), whose equation is its force where there is no limit; or MARK
+            alone, of an actuator that only brings a logged number in.
     """
 
     name: str
@@ -72,6 +73,7 @@ class AddedActuator:
     stiffness: float = 0.0
     damping: float = 0.0
     limit: float | None = None
+    drag: float = 0.0
     numbers: tuple[float, ...] = ()
 
 
@@ -96,8 +98,6 @@ def make_model(
 ) -> mujoco.MjSpec:
     """A copy of a spec with added actuators and frictions, and with another timestep if one is given."""
     spec = base.copy()
-    if any(part.numbers for part in (*added, *frictions)):
-        install_callbacks()
     for friction in frictions:
         joint = spec.joint(friction.joint)
         if friction.viscous is not None:
@@ -122,25 +122,10 @@ def make_model(
             new.forcerange = np.array([-actuator.limit, actuator.limit])
         if actuator.numbers:
             new.userdata = actuator.numbers
-            new.biastype = mujoco.mjtBias.mjBIAS_USER
+            new.damping[0] = actuator.drag
+            if actuator.limit is None and len(actuator.numbers) > 1:
+                new.biastype = mujoco.mjtBias.mjBIAS_USER
     return spec
-
-
-def install_callbacks() -> None:
-    """Have MuJoCo compute drives and friction that its elements cannot say.
-
-    Raises:
-        MadocError: Numba is not installed, or this MuJoCo is laid out otherwise than it declares.
-    """
-    try:
-        callbacks.install()
-    except ImportError as error:
-        raise MadocError(
-            "a drive:, and friction that depends on speed or load, need Numba; install it: "
-            "pip install 'madoc-calibration[drives]'"
-        ) from error
-    except RuntimeError as error:
-        raise MadocError(f"{error}; install another version of it") from error
 
 
 def compiled(spec: Callable[[], mujoco.MjSpec], file: str) -> mujoco.MjModel:

@@ -54,7 +54,7 @@ class ActionSpec(Part):
     actuator: Name | None = Field(None, description="The model's own actuator that gets it as its control.")
     means: Literal["torque", "force", "position", "velocity", "duty"] | None = Field(
         None,
-        description="With `joint`: torque (N·m; of a slide, force in N), the target of a servo, or the duty of a drive.",
+        description="With `joint`: torque (N·m; of a slide, force in N), a servo's target, or a drive's duty.",
     )
     low: Finite | None = Field(None, description="Smallest value, in `unit`. Default: the actuator's ctrlrange.")
     high: Finite | None = Field(None, description="Largest value, in `unit`. Default: the actuator's ctrlrange.")

@@ -152,9 +152,7 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
     return Robot(Path(file), spec, task, shown, signals.undetermined(), idle, kept)
 
 
-def _model(
-    draft: Draft, file: str
-) -> tuple[Callable[[], mujoco.MjSpec], mujoco.MjModel, tuple[ActionChannel, ...]]:
+def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco.MjModel, tuple[ActionChannel, ...]]:
     """The function that builds the MuJoCo spec with the added actuators, its model, and what drives take from a log."""
     actuators = [added_actuator(draft, index) for index in range(len(draft.spec.actions))]
     added, inputs = with_inputs(draft, tuple(actuator for actuator in actuators if actuator is not None))

@@ -10,7 +10,8 @@ This file needs MuJoCo and Numba alone: an exported model comes with a copy, who
 import ctypes
 import math
 from functools import cache
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -54,10 +55,6 @@ FRICTION = (
 """User data of a joint: N·m, rad/s, 1; ratios; and 1/(N·m). Its Coulomb and viscous friction are MuJoCo's own."""
 
 _FRICTION_DOF = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
-_OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-_USER = int(mujoco.mjtBias.mjBIAS_USER)
-_AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
-_FIXED = int(mujoco.mjtGain.mjGAIN_FIXED)
 
 
 def dc_torque(
@@ -124,143 +121,137 @@ def install() -> None:
         ImportError: Numba is not installed.
         RuntimeError: This version of MuJoCo keeps its numbers elsewhere than it says.
     """
-    control, bias = _compiled()
-    mujoco.set_mjcb_control(control.ctypes)
-    mujoco.set_mjcb_act_bias(bias.ctypes)
+    from numba import cfunc, types
+
+    friction, drive = _callbacks(_Places.found())
+    both = types.voidptr, types.voidptr
+    mujoco.set_mjcb_control(cfunc(types.void(*both), error_model="numpy")(friction).ctypes)
+    mujoco.set_mjcb_act_bias(cfunc(types.float64(*both, types.int32), error_model="numpy")(drive).ctypes)
 
 
-def _compiled() -> tuple[Any, Any]:
-    """The callbacks of MuJoCo's control and of its actuators' bias, as Numba compiles them."""
-    from numba import carray, cfunc, njit, types
+def _callbacks(at: "_Places") -> tuple[Any, Any]:
+    """The friction of all joints, called before actuators and the solver, and the torque of one drive, to compile."""
+    from numba import carray, njit  # type: ignore[attr-defined]
+
+    dc, dry, pointer = njit(error_model="numpy")(dc_torque), njit(error_model="numpy")(friction_limit), _pointer()
+    actuate, marked, drive_size, friction_size = _function("mj_fwdActuation"), MARK, len(DRIVE), len(FRICTION)
+    model_words, data_words = (ctypes.sizeof(_layout(name)) // 8 for name in ("mjModel", "mjData"))
+
+    @njit
+    def numbers(words: Any, place: int, count: int) -> Any:
+        return carray(pointer(words[place]), count, np.float64)
+
+    @njit
+    def wholes(words: Any, place: int, count: int) -> Any:
+        return carray(pointer(words[place]), count, np.int32)
+
+    def friction(model: Any, data: Any) -> None:
+        m = carray(model, model_words, np.int64)
+        if m[at.nuser_jnt] != friction_size:
+            return
+        actuate(model, data)
+        d, counts = carray(data, data_words, np.int64), carray(data, 2 * data_words, np.int32)
+        first, last, rows, dofs = counts[at.ne], counts[at.ne] + counts[at.nf], counts[at.nefc], m[at.nv]
+        for row in range(first, last):
+            dof = wholes(d, at.efc_id, rows)[row]
+            joint = wholes(m, at.dof_jntid, dofs)[dof]
+            own = numbers(m, at.jnt_user, m[at.njnt] * friction_size)[joint * friction_size :][:friction_size]
+            if wholes(d, at.efc_type, rows)[row] != _FRICTION_DOF or own[0] != marked:
+                continue
+            external = numbers(d, at.qfrc_spring, dofs)[dof] + numbers(d, at.qfrc_applied, dofs)[dof]
+            external -= numbers(d, at.qfrc_bias, dofs)[dof]
+            coulomb, speed = numbers(m, at.dof_frictionloss, dofs)[dof], numbers(d, at.qvel, dofs)[dof]
+            motor = numbers(d, at.qfrc_actuator, dofs)[dof]
+            limit = dry(
+                coulomb, speed, motor, external, own[1], own[2], own[3], own[4], own[5], own[6], own[7], own[8], own[9]
+            )
+            numbers(d, at.efc_frictionloss, rows)[row] = limit
+            if counts[at.nisland] > 0:
+                numbers(d, at.iefc_frictionloss, rows)[wholes(d, at.map_efc2iefc, rows)[row]] = limit
+
+    def drive(model: Any, data: Any, actuator: int) -> float:
+        m, d = carray(model, model_words, np.int64), carray(data, data_words, np.int64)
+        count = m[at.nu]
+        if m[at.nuser_actuator] != drive_size:
+            return 0.0
+        own = numbers(m, at.actuator_user, count * drive_size)[actuator * drive_size :][:drive_size]
+        controls = numbers(d, at.ctrl, count)
+        if own[0] != marked or own[3] == 0.0 or (own[10] >= 0.0 and controls[int(own[10])] < 0.5):
+            return 0.0
+        supply = own[2] if own[11] < 0.0 else controls[int(own[11])]
+        gain = own[5] if own[12] < 0.0 else own[5] * controls[int(own[12])]
+        low, high = numbers(m, at.actuator_ctrlrange, 2 * count)[2 * actuator :][:2]
+        error, speed = min(max(controls[actuator], low), high), numbers(d, at.actuator_velocity, count)[actuator]
+        if own[1] == 0.0:
+            error -= numbers(d, at.actuator_length, count)[actuator]
+        elif own[1] == 1.0:
+            error -= speed
+        return dc(error, speed, supply, own[3], own[4], gain, own[6], own[7], own[8], own[9])
+
+    return friction, drive
+
+
+def _pointer() -> Any:
+    """What makes a pointer of an address, for Numba."""
+    from numba import types
     from numba.core import cgutils
     from numba.extending import intrinsic
 
-    @intrinsic
-    def _at(_: Any, address: Any) -> Any:
-        """An address as a pointer."""
+    def pointer(_: Any, address: Any) -> Any:
         return types.voidptr(types.int64), lambda _, builder, __, args: builder.inttoptr(args[0], cgutils.voidptr_t)
 
-    dc, dry = njit(error_model="numpy")(dc_torque), njit(error_model="numpy")(friction_limit)
-    of_model, of_data = _layout("mjModel"), _layout("mjData")
-    _check(of_model, of_data)
+    return intrinsic(pointer)
 
-    def size(name: str) -> int:
-        return getattr(of_model, name).offset // 8
 
-    def words(name: str) -> int:
-        return (getattr(of_model, name, None) or getattr(of_data, name)).offset // 8
+def _function(name: str) -> Any:
+    """A function of MuJoCo of a model and its data, from the library that is loaded."""
+    folder = Path(mujoco.__file__).parent
+    library = ctypes.CDLL(str(sorted([*folder.glob(f"*mujoco*{mujoco.__version__}*"), *folder.glob("mujoco*.dll")])[0]))
+    function = getattr(library, name)
+    function.argtypes, function.restype = [ctypes.c_void_p, ctypes.c_void_p], None
+    return function
 
-    model_words, data_words = ctypes.sizeof(of_model) // 8, ctypes.sizeof(of_data) // 8
-    nu, nuser_jnt, nuser_actuator = size("nu"), size("nuser_jnt"), size("nuser_actuator")
-    nv, njnt = size("nv"), size("njnt")
-    jnt_user, actuator_user, dof_jntid = words("jnt_user"), words("actuator_user"), words("dof_jntid")
-    dof_frictionloss = words("dof_frictionloss")
-    trntype, trnid, gear = words("actuator_trntype"), words("actuator_trnid"), words("actuator_gear")
-    gaintype, biastype = words("actuator_gaintype"), words("actuator_biastype")
-    gainprm, biasprm = words("actuator_gainprm"), words("actuator_biasprm")
-    limited, limits = words("actuator_forcelimited"), words("actuator_forcerange")
-    bounded, bounds = words("actuator_ctrllimited"), words("actuator_ctrlrange")
-    ctrl, length, velocity = words("ctrl"), words("actuator_length"), words("actuator_velocity")
-    qvel, qfrc_bias, qfrc_spring = words("qvel"), words("qfrc_bias"), words("qfrc_spring")
-    qfrc_applied = words("qfrc_applied")
-    efc_type, efc_id, efc_frictionloss = words("efc_type"), words("efc_id"), words("efc_frictionloss")
-    iefc_frictionloss, map_efc2iefc = words("iefc_frictionloss"), words("map_efc2iefc")
-    ne, nf, nefc = (getattr(of_data, name).offset // 4 for name in ("ne", "nf", "nefc"))
-    nisland = of_data.nisland.offset // 4
-    drive_size, friction_size, prm = len(DRIVE), len(FRICTION), int(mujoco.mjNGAIN)
-    prm_bias = int(mujoco.mjNBIAS)
 
-    @njit(error_model="numpy")
-    def drive_torque(m: Any, d: Any, actuator: int) -> float:
-        """Torque of a d.c. drive; 0 of an actuator that is none."""
-        count, width = m[nu], m[nuser_actuator]
-        if width != drive_size:
-            return 0.0
-        block = carray(_at(m[actuator_user]), (count, width), np.float64)[actuator]
-        if block[0] != MARK or block[3] == 0.0:
-            return 0.0
-        controls = carray(_at(d[ctrl]), count, np.float64)
-        if block[10] >= 0.0 and controls[int(block[10])] < 0.5:
-            return 0.0
-        supply = block[2] if block[11] < 0.0 else controls[int(block[11])]
-        gain = block[5] if block[12] < 0.0 else block[5] * controls[int(block[12])]
-        span = carray(_at(m[bounds]), (count, 2), np.float64)[actuator]
-        error = controls[actuator]
-        if carray(_at(m[bounded]), count, np.bool_)[actuator]:
-            error = min(max(error, span[0]), span[1])
-        speed = carray(_at(d[velocity]), count, np.float64)[actuator]
-        if block[1] == 0.0:
-            error -= carray(_at(d[length]), count, np.float64)[actuator]
-        elif block[1] == 1.0:
-            error -= speed
-        return dc(error, speed, supply, block[3], block[4], gain, block[6], block[7], block[8], block[9])
+class _Places(NamedTuple):
+    """Where the sizes and pointers that are used here lie in mjModel and mjData, in words of their own size."""
 
-    @njit(error_model="numpy")
-    def torque(m: Any, d: Any, actuator: int) -> float:
-        """Torque of an actuator on its joint, as MuJoCo computes it of a fixed gain and an affine bias."""
-        count = m[nu]
-        force = 0.0
-        if carray(_at(m[biastype]), count, np.int32)[actuator] == _USER:
-            force = drive_torque(m, d, actuator)
-        else:
-            control = carray(_at(d[ctrl]), count, np.float64)[actuator]
-            if carray(_at(m[bounded]), count, np.bool_)[actuator]:
-                span = carray(_at(m[bounds]), (count, 2), np.float64)[actuator]
-                control = min(max(control, span[0]), span[1])
-            force = carray(_at(m[gainprm]), (count, prm), np.float64)[actuator, 0] * control
-            if carray(_at(m[biastype]), count, np.int32)[actuator] == _AFFINE:
-                bias = carray(_at(m[biasprm]), (count, prm_bias), np.float64)[actuator]
-                force += bias[0] + bias[1] * carray(_at(d[length]), count, np.float64)[actuator]
-                force += bias[2] * carray(_at(d[velocity]), count, np.float64)[actuator]
-        if carray(_at(m[limited]), count, np.bool_)[actuator]:
-            span = carray(_at(m[limits]), (count, 2), np.float64)[actuator]
-            force = min(max(force, span[0]), span[1])
-        return force * carray(_at(m[gear]), (count, 6), np.float64)[actuator, 0]
+    nu: int
+    nv: int
+    njnt: int
+    nuser_jnt: int
+    nuser_actuator: int
+    jnt_user: int
+    dof_jntid: int
+    dof_frictionloss: int
+    actuator_user: int
+    actuator_ctrlrange: int
+    ne: int
+    nf: int
+    nefc: int
+    nisland: int
+    ctrl: int
+    qvel: int
+    qfrc_spring: int
+    qfrc_applied: int
+    qfrc_bias: int
+    qfrc_actuator: int
+    actuator_length: int
+    actuator_velocity: int
+    efc_type: int
+    efc_id: int
+    efc_frictionloss: int
+    iefc_frictionloss: int
+    map_efc2iefc: int
 
-    def control(model: Any, data: Any) -> None:
-        m = carray(model, model_words, np.int64)
-        if m[nuser_jnt] != friction_size:
-            return
-        d, ints = carray(data, data_words, np.int64), carray(data, 2 * data_words, np.int32)
-        rows, dofs, count = ints[nefc], m[nv], m[nu]
-        blocks = carray(_at(m[jnt_user]), (m[njnt], friction_size), np.float64)
-        for row in range(ints[ne], ints[ne] + ints[nf]):
-            if carray(_at(d[efc_type]), rows, np.int32)[row] != _FRICTION_DOF:
-                continue
-            dof = carray(_at(d[efc_id]), rows, np.int32)[row]
-            joint = carray(_at(m[dof_jntid]), dofs, np.int32)[dof]
-            b = blocks[joint]
-            if b[0] != MARK:
-                continue
-            motor = 0.0
-            for actuator in range(count):
-                kind = carray(_at(m[trntype]), count, np.int32)[actuator]
-                if (kind == _OF_A_JOINT[0] or kind == _OF_A_JOINT[1]) and carray(
-                    _at(m[trnid]), (count, 2), np.int32
-                )[actuator, 0] == joint:
-                    motor += torque(m, d, actuator)
-            external = carray(_at(d[qfrc_spring]), dofs, np.float64)[dof]
-            external += carray(_at(d[qfrc_applied]), dofs, np.float64)[dof]
-            external -= carray(_at(d[qfrc_bias]), dofs, np.float64)[dof]
-            speed = carray(_at(d[qvel]), dofs, np.float64)[dof]
-            coulomb = carray(_at(m[dof_frictionloss]), dofs, np.float64)[dof]
-            limit = dry(
-                coulomb, speed, motor, external, b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8], b[9]
-            )
-            carray(_at(d[efc_frictionloss]), rows, np.float64)[row] = limit
-            if ints[nisland] > 0:
-                place = carray(_at(d[map_efc2iefc]), rows, np.int32)[row]
-                carray(_at(d[iefc_frictionloss]), rows, np.float64)[place] = limit
-
-    def bias(model: Any, data: Any, actuator: int) -> float:
-        m, d = carray(model, model_words, np.int64), carray(data, data_words, np.int64)
-        return drive_torque(m, d, actuator)
-
-    pointers = types.voidptr, types.voidptr
-    return (
-        cfunc(types.void(*pointers), error_model="numpy")(control),
-        cfunc(types.float64(*pointers, types.int32), error_model="numpy")(bias),
-    )
+    @classmethod
+    def found(cls) -> "_Places":
+        """The places by MuJoCo's own declarations; where its views of a small model contradict, RuntimeError."""
+        model, data = _layout("mjModel"), _layout("mjData")
+        _check(model, data)
+        parts = {name: (layout, kind) for layout in (data, model) for name, kind in layout._fields_}
+        return cls(
+            **{name: getattr(parts[name][0], name).offset // ctypes.sizeof(parts[name][1]) for name in cls._fields}
+        )
 
 
 @cache

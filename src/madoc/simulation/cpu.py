@@ -14,6 +14,7 @@ from madoc.parameters import FIELDS, Parameter
 from madoc.runs.machine import usable_cores
 from madoc.simulation.delay import blend, delay_weights, in_effect
 from madoc.simulation.drives import drive_forces
+from madoc.simulation.user_data import install_callbacks, needs_callbacks
 from madoc.simulation.write import find_elements, write_parameters
 from madoc.tasks.base import Task
 
@@ -43,6 +44,8 @@ class CpuSimulator:
         self.task, self.parameters, self.action_size = task, task.parameters, task.action_size
         self.threads = threads or usable_cores()
         self._model = task.model
+        if needs_callbacks(self._model):
+            install_callbacks()
         self.control_step = float(self._model.opt.timestep) * task.frame_skip
         if self._model.na or self._model.nmocap:
             raise MadocError(f"{task.name}: models with actuator activations or mocap bodies are not supported")

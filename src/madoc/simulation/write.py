@@ -9,7 +9,14 @@ import numpy as np
 
 from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter
-from madoc.simulation.callbacks import DRIVE, FRICTION, MARK
+from madoc.simulation.user_data import (
+    LEAST_FRICTION,
+    drive_number,
+    friction_numbers,
+    has_numbers,
+    has_speed_or_load_friction,
+    write_elements,
+)
 
 MASS_FLOOR = 1e-3
 """Mass of a body in kg to which smaller values are raised, as the motion of a massless body diverges; see `LEAST`."""
@@ -19,10 +26,6 @@ INERTIA_FLOOR = 1e-9
 
 LEAST = 1e-3
 """Share of a body's own mass or inertia in the model to which they are raised, where that is less than the floors."""
-
-LEAST_FRICTION = 1e-9
-"""Coulomb friction in N·m to which smaller values are raised at a joint whose friction depends on speed or load: MuJoCo
-makes a constraint only of friction above 0."""
 
 CENTRED = 1e-6
 """Distance of a centre of mass from its body's origin, in radii of gyration, up to which rounding makes it."""
@@ -57,6 +60,7 @@ def write_parameters(
                     _WRITERS[parameter.field](model, element, float(value))
                 else:
                     _NUMBERS[parameter.field](model, element)[:] = value
+    write_elements(model)
     mujoco.mj_setConst(model, data)
 
 
@@ -139,35 +143,6 @@ def _dofs(model: mujoco.MjModel, joint: int) -> slice:
     return slice(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + len(model.joint(joint).damping))
 
 
-def is_drive(model: mujoco.MjModel, actuator: int) -> bool:
-    """Whether an actuator is a drive of its own equation, or brings in a number of one."""
-    return bool(model.nuser_actuator == len(DRIVE) and model.actuator_user[actuator, 0] == MARK)
-
-
-def has_speed_or_load_friction(model: mujoco.MjModel, joint: int) -> bool:
-    """Whether the friction of a joint depends on its speed or its load."""
-    return bool(model.nuser_jnt == len(FRICTION) and model.jnt_user[joint, 0] == MARK)
-
-
-def _drive_number(model: mujoco.MjModel, actuator: int, name: str) -> np.ndarray:
-    if not is_drive(model, actuator) or model.actuator_user[actuator, DRIVE.index("kt")] == 0.0:
-        raise MadocError(
-            f"drive_{name}: actuator {model.actuator(actuator).name!r} has no such drive; say drive: of its action"
-        )
-    return model.actuator_user[actuator, DRIVE.index(name) :][:1]
-
-
-def _friction_numbers(model: mujoco.MjModel, joint: int, name: str) -> np.ndarray:
-    """The numbers of a term of friction; of one for the motor's and the external torque, which are neighbours, both."""
-    if not has_speed_or_load_friction(model, joint):
-        raise MadocError(
-            f"friction_{name}: joint {model.joint(joint).name!r} has no friction of this kind; say it under friction:"
-        )
-    both = name not in FRICTION
-    first = FRICTION.index(f"{name}_motor" if both else name)
-    return model.jnt_user[joint, first : first + 1 + both]
-
-
 def _write_friction_loss(model: mujoco.MjModel, joint: int, value: float) -> None:
     least = LEAST_FRICTION if has_speed_or_load_friction(model, joint) else 0.0
     model.dof_frictionloss[_dofs(model, joint)] = max(value, least)
@@ -230,7 +205,7 @@ def _keep_shapes(model: mujoco.MjModel, body: int, moved: np.ndarray) -> None:
 def has_gain(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether an actuator has a fixed gain; the first number of others is something else."""
     fixed = int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
-    return fixed and not is_drive(model, actuator)
+    return fixed and not has_numbers(model, actuator)
 
 
 def _write_gain(model: mujoco.MjModel, actuator: int, value: float) -> None:
@@ -295,7 +270,7 @@ _NUMBERS: dict[str, Callable[[mujoco.MjModel, int], np.ndarray]] = {
     "actuator_gain": lambda model, actuator: model.actuator_gainprm[actuator, :1],
     "actuator_kv": lambda model, actuator: 0.0 - model.actuator_biasprm[actuator, 2:3],
     **{
-        field: partial(_drive_number if field.startswith("drive_") else _friction_numbers, name=field.partition("_")[2])
+        field: partial(drive_number if field.startswith("drive_") else friction_numbers, name=field.partition("_")[2])
         for field in FIELDS
         if field.startswith(("drive_", "friction_"))
     },

@@ -72,9 +72,7 @@ def assemble(runs: Sequence[Run], robot: Robot, *, origin: str, clip_actions: bo
 
 
 def _with_conditions(run: Run, robot: Robot) -> Run:
-    """A run with a column for each condition that its file's name tells; a value that the spec does not list is
-    refused.
-    """
+    """A run with a column for each condition that its file's name tells; a value not in the spec is refused."""
     tables = run.tables
     for condition in robot.spec.conditions:
         if condition.file_name is None:
