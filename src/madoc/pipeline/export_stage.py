@@ -25,7 +25,7 @@ from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.simulation import Simulator
 from madoc.simulation.drawn import numbers_of_draws
-from madoc.simulation.mjcf import save_mjcf
+from madoc.simulation.mjcf import DRIVES, save_mjcf
 from madoc.simulation.write import nominal_values
 
 DRAWS = 1000
@@ -72,6 +72,8 @@ def export_run(
     if out is not None:
         _require_ours(folder, [*files.values(), *targets.values()])
     changes = save_mjcf(simulator, result.mean, files["model"])
+    if (folder / DRIVES).exists():
+        files["drives and friction"] = folder / DRIVES
     save_patch(files["patch"], exported, provenance, changes=changes, stepping=_stepping(simulator))
     save_randomization(
         files["randomization ranges"], exported, provenance, None if result.covariance is None else covariance.tolist()

@@ -7,7 +7,7 @@ from madoc.parameters import Parameter
 from madoc.robots.document import Place
 from madoc.robots.drive_spec import DriveSpec, FrictionSpec
 from madoc.robots.model import AddedActuator, Draft, JointFriction
-from madoc.simulation.callbacks import DRIVE, FRICTION, MARK, MEANS
+from madoc.simulation.callbacks import DRIVE, FRICTION, MARK, MEANS, UNLIMITED
 from madoc.simulation.user_data import by_own_elements, elements_of_drive
 from madoc.simulation.write import ONE_DOF
 from madoc.tasks.base import ActionChannel
@@ -32,7 +32,7 @@ def drive_numbers(drive: DriveSpec, means: str) -> tuple[float, ...]:
         1.0 if drive.gain is None else drive.gain,
         drive.damping_gain,
         drive.duty_limit,
-        float("inf") if drive.current_limit is None else drive.current_limit,
+        UNLIMITED if drive.current_limit is None else drive.current_limit,
         drive.strength,
         -1.0,
         -1.0,
@@ -50,6 +50,11 @@ def with_inputs(
     inputs: dict[str, AddedActuator] = {}
     channels: dict[str, ActionChannel] = {}
     taken: dict[str, list[float]] = {actuator.name: list(actuator.numbers) for actuator in added}
+    named = {
+        part.name: draft.document.line((kind, at, "name"))
+        for kind in ("signals", "actions")
+        for at, part in enumerate(getattr(draft.spec, kind))
+    }
     first = len(draft.base.actuators) + len(added)
     conditions = {condition.name: condition for condition in draft.spec.conditions}
     for index, action in enumerate(draft.spec.actions):
@@ -61,6 +66,8 @@ def with_inputs(
             place: Place = ("actions", index, "drive", key)
             if key == "gain_from" and column not in conditions:
                 raise draft.document.unknown(place, "the name of a condition", column, conditions)
+            if column in named:
+                raise draft.document.error(place, f"the name {column!r} is taken by line {named[column]}")
             low, high, unit, usual = 0.0, 1.0, "1", 1.0
             if key == "supply_from":
                 high, unit, usual = _WIDEST_SUPPLY * drive.supply, "V", drive.supply

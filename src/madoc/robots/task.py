@@ -105,6 +105,12 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
     if signals.read_sensors & signals.layout.accelerating:
         pending = max(pending, 1)  # such a sensor shows the force of the last action
     names, episode = tuple(signal.name for signal in spec.signals), read_episode(draft, signals, actions)
+    if inputs and episode.rewarded:
+        raise document.error(
+            ("python",) if spec.reward is None else ("reward",),
+            f"a policy cannot be learnt where drives take {', '.join(each.name for each in inputs)} from the log, as "
+            "it would choose them: for that, give the drives fixed numbers",
+        )
     task = Task(
         name=spec.name,
         physics="modern",

@@ -4,12 +4,14 @@ A d.c. drive is an actuator of bias type `user`; the friction of a joint that de
 over the friction loss of the joint's constraint before constraints are solved. Their numbers are user data of the
 actuator and of the joint in the model itself, so that a copy of a model has its own. Nothing is kept between steps.
 
-This file needs MuJoCo and Numba alone: an exported model comes with a copy, whose `install()` a program calls once.
+This file needs MuJoCo and Numba alone. An exported model comes with a copy, which loads it: `drives.load("model.xml")`.
+MuJoCo by itself refuses that file, as it would simulate a drive without torque.
 """
 
 import ctypes
 import math
 from functools import cache
+from inspect import unwrap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,6 +39,8 @@ DRIVE = (
 )
 """User data of an actuator: V, N·m/A, Ω, duty per rad (or per rad/s), duty per rad/s, 1, A, 1; the last three are the
 numbers of other actuators, whose controls they are, or -1. An actuator that only brings in a number has MARK alone."""
+UNLIMITED = 1e12
+"""Current limit in A of a drive that has none."""
 MEANS = ("position", "velocity", "duty")
 """What the control of a d.c. drive is, by the number that is its `means`."""
 
@@ -54,6 +58,8 @@ FRICTION = (
 )
 """User data of a joint: N·m, rad/s, 1; ratios; and 1/(N·m). Its Coulomb and viscous friction are MuJoCo's own."""
 
+GUARD = '  <extension><plugin plugin="madoc.drives"/></extension>\n'
+"""What makes MuJoCo refuse an exported model whose drives or friction it would leave out: no plugin has that name."""
 _FRICTION_DOF = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
 
 
@@ -123,27 +129,31 @@ def install() -> None:
     """
     from numba import cfunc, types
 
-    friction, drive = _callbacks(_Places.found())
+    friction, drive = (unwrap(function) for function in _callbacks(_Places.found()))
     both = types.voidptr, types.voidptr
     mujoco.set_mjcb_control(cfunc(types.void(*both), error_model="numpy")(friction).ctypes)
     mujoco.set_mjcb_act_bias(cfunc(types.float64(*both, types.int32), error_model="numpy")(drive).ctypes)
+
+
+def load(path: str | Path) -> mujoco.MjModel:
+    """An exported model, whose drives and friction MuJoCo computes from then on in this process."""
+    install()
+    spec = mujoco.MjSpec.from_string(Path(path).read_text(encoding="utf-8").replace(GUARD, ""))
+    spec.modelfiledir = str(Path(path).resolve().parent)
+    return spec.compile()
 
 
 def _callbacks(at: "_Places") -> tuple[Any, Any]:
     """The friction of all joints, called before actuators and the solver, and the torque of one drive, to compile."""
     from numba import carray, njit  # type: ignore[attr-defined]
 
-    dc, dry, pointer = njit(error_model="numpy")(dc_torque), njit(error_model="numpy")(friction_limit), _pointer()
+    dc, dry = (njit(error_model="numpy")(unwrap(function)) for function in (dc_torque, friction_limit))
+    pointer = _pointer()
     actuate, marked, drive_size, friction_size = _function("mj_fwdActuation"), MARK, len(DRIVE), len(FRICTION)
     model_words, data_words = (ctypes.sizeof(_layout(name)) // 8 for name in ("mjModel", "mjData"))
 
-    @njit
-    def numbers(words: Any, place: int, count: int) -> Any:
-        return carray(pointer(words[place]), count, np.float64)
-
-    @njit
-    def wholes(words: Any, place: int, count: int) -> Any:
-        return carray(pointer(words[place]), count, np.int32)
+    numbers = njit(lambda words, place, count: carray(pointer(words[place]), count, np.float64))
+    wholes = njit(lambda words, place, count: carray(pointer(words[place]), count, np.int32))
 
     def friction(model: Any, data: Any) -> None:
         m = carray(model, model_words, np.int64)
@@ -200,7 +210,7 @@ def _pointer() -> Any:
     def pointer(_: Any, address: Any) -> Any:
         return types.voidptr(types.int64), lambda _, builder, __, args: builder.inttoptr(args[0], cgutils.voidptr_t)
 
-    return intrinsic(pointer)
+    return intrinsic(unwrap(pointer))
 
 
 def _function(name: str) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 
 from madoc.errors import MadocError
 from madoc.simulation import callbacks
-from madoc.simulation.callbacks import DRIVE, FRICTION, MARK
+from madoc.simulation.callbacks import DRIVE, FRICTION, MARK, UNLIMITED
 
 LEAST_FRICTION = 1e-9
 """Coulomb friction in N·m to which smaller values are raised at a joint whose friction depends on speed or load: MuJoCo
@@ -65,7 +65,7 @@ def drive_number(model: mujoco.MjModel, actuator: int, name: str) -> np.ndarray:
             f"drive_{name}: actuator {model.actuator(actuator).name!r} is no such drive; say drive: of its action"
         )
     found = model.actuator_user[actuator, DRIVE.index(name) :][:1]
-    if np.isinf(found[0]):
+    if name == "current_limit" and found[0] >= UNLIMITED:
         raise MadocError(
             f"drive_{name}: the current of {model.actuator(actuator).name!r} is not limited; give it a current_limit:"
         )
@@ -85,7 +85,7 @@ def friction_numbers(model: mujoco.MjModel, joint: int, name: str) -> np.ndarray
 
 def by_own_elements(numbers: Sequence[float]) -> bool:
     """Whether MuJoCo's own elements say a drive of these numbers (`DRIVE`), where its torque causes no friction."""
-    return max(numbers[DRIVE.index("enable") :]) < 0.0 and bool(np.isinf(numbers[DRIVE.index("current_limit")]))
+    return max(numbers[DRIVE.index("enable") :]) < 0.0 and numbers[DRIVE.index("current_limit")] >= UNLIMITED
 
 
 def elements_of_drive(numbers: Sequence[float]) -> tuple[float, tuple[float, float], float, float]:
@@ -105,8 +105,8 @@ def elements_of_drive(numbers: Sequence[float]) -> tuple[float, tuple[float, flo
 def write_elements(model: mujoco.MjModel) -> None:
     """Bring the numbers of MuJoCo's own elements in line with those of the drives that they stand for."""
     for actuator in range(model.nu if model.nuser_actuator == len(DRIVE) else 0):
-        numbers = model.actuator_user[actuator]
-        if is_drive(model, actuator) and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
+        numbers = model.actuator_user[actuator].tolist()
+        if is_drive(model, actuator) and model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_USER:
             gain, bias, largest, damping = elements_of_drive(numbers)
             model.actuator_gainprm[actuator, 0] = gain
             model.actuator_biasprm[actuator, 1:3] = bias
@@ -122,7 +122,8 @@ def scale_forces(model: mujoco.MjModel, factor: float) -> None:
     for actuator in range(model.nu):
         if is_drive(model, actuator):
             model.actuator_user[actuator, DRIVE.index("resistance")] /= factor
-            model.actuator_user[actuator, DRIVE.index("current_limit")] *= factor
+            if model.actuator_user[actuator, DRIVE.index("current_limit")] < UNLIMITED:
+                model.actuator_user[actuator, DRIVE.index("current_limit")] *= factor
     for joint in range(model.njnt):
         if has_speed_or_load_friction(model, joint):
             model.jnt_user[joint, FRICTION.index("stribeck")] *= factor
