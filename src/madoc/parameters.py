@@ -96,6 +96,7 @@ class Parameter:
         high: Upper end of the range, in `unit`.
         label: The parameter's name; if empty, it is `field.element`.
         measured_in: The unit of a slide joint or of a signal; if empty, it is the field's.
+        when: The condition of a run and its value under which it holds; None holds always.
     """
 
     field: str
@@ -104,6 +105,7 @@ class Parameter:
     high: float
     label: str = ""
     measured_in: str = ""
+    when: tuple[str, float] | None = None
 
     def __post_init__(self) -> None:
         if self.field not in FIELDS:
@@ -135,8 +137,12 @@ class Parameter:
 
     @property
     def name(self) -> str:
-        """The label, or `field.element` such as `dof_damping.foot_joint`; several elements are joined with `+`."""
-        return self.label or ".".join([self.field, *(["+".join(self.elements)] if self.elements else [])])
+        """The label, or `field.element` such as `dof_damping.foot_joint`; several elements are joined with `+`.
+
+        Behind it stands its condition, as in `drive_strength.elbow[supply=12]`.
+        """
+        name = self.label or ".".join([self.field, *(["+".join(self.elements)] if self.elements else [])])
+        return name if self.when is None else f"{name}[{self.when[0]}={self.when[1]:g}]"
 
     @property
     def unit(self) -> str:

@@ -7,7 +7,8 @@ from madoc import robots
 from madoc.data import logs
 from madoc.errors import MadocError
 from madoc.simulation.callbacks import FRICTION
-from own_robots import SERVO, SERVO_SPEC, write_robot
+from madoc.simulation.cpu import CpuSimulator
+from own_robots import CART_SPEC, SERVO, SERVO_SPEC, write_robot
 
 FRICTION_LINE = "friction:\n  - {joint: shaft, model: M1, up_to: 0.2}\nparameters:"
 M1 = SERVO_SPEC.replace("parameters:", FRICTION_LINE)
@@ -109,6 +110,41 @@ def test_a_mistake_in_friction_is_one_sentence_with_its_line(tmp_path, new, sent
 def test_a_policy_cannot_choose_its_supply(tmp_path):
     with pytest.raises(MadocError, match="a policy cannot be learnt where drives take on, volts, p from the log"):
         load(tmp_path, SERVO_SPEC + 'reward: "-angle ** 2"\n')
+
+
+CART_BY = CART_SPEC.replace("parameters:\n", "conditions:\n  - {name: load, values: [0, 3]}\nparameters:\n", 1).replace(
+    "element: cart, low", "element: cart, by: load, low", 1
+)
+
+
+def test_a_parameter_by_a_condition_has_a_value_for_each_that_moves_only_its_runs(tmp_path):
+    """F = m a: of 2 kg where the load is 0, of 4 kg where it is 3, of the model's own 1 kg where it is another."""
+    task = robots.load(write_robot(tmp_path, CART_BY)).task
+    assert [name for name in task.parameters.names if name.startswith("body_mass")] == [
+        "body_mass.cart[load=0]",
+        "body_mass.cart[load=3]",
+    ]
+    simulator = CpuSimulator(task.with_parameters(["body_mass.cart[load=0]", "body_mass.cart[load=3]"]), threads=1)
+    system = simulator.bind(np.array([[2.0, 4.0], [3.0, 4.0]]))
+    middle, half = task.action_ranges
+    action = (np.array([[1.0, 0.0], [1.0, 3.0], [1.0, 1.0]]) - middle) / half
+    for _ in range(2):
+        after = system.step(np.zeros((2, 3, 2)), np.stack([action, action]))
+        np.testing.assert_allclose(after[:, :, 1], 0.02 / np.array([[2.0, 4.0, 1.0], [3.0, 4.0, 1.0]]), rtol=1e-12)
+        system = system.replaced(np.array([1]), np.array([[3.0, 4.0]]))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("by: load", "by: lode", "expected the name of a condition, got 'lode'; nearest: load"),
+        ("field: body_mass, element: cart", "field: action_delay", "by: means nothing beside action_delay"),
+    ],
+)
+def test_a_mistake_in_by_is_one_sentence(tmp_path, old, new, sentence):
+    assert old in CART_BY
+    with pytest.raises(MadocError, match=sentence):
+        robots.load(write_robot(tmp_path, CART_BY.replace(old, new)))
 
 
 def written(folder, name, rate=1.0):

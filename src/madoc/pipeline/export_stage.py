@@ -53,6 +53,12 @@ def export_run(
     except OSError as error:
         raise MadocError(f"could not make the folder {folder}: {error.strerror or error}") from error
     simulator, result = simulation.make(calibrated.task), calibrated.result
+    for parameter in simulator.parameters.parameters:
+        if parameter.when is not None:
+            raise MadocError(
+                f"no model can be exported of which {parameter.name} differs between runs: calibrate the runs of one "
+                f"{parameter.when[0]} by themselves for that, without by: in the spec"
+            )
     provenance = provenance_of(calibrated)
     model = calibrated.task.compile()
     covariance = calibrated.distribution().covariance

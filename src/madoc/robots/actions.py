@@ -45,8 +45,6 @@ def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
     assert action.low is not None and action.high is not None  # the spec requires both beside joint:
     ends = action.low * scale, action.high * scale
     if action.drive is not None:
-        if any(len(other.userdata) for other in draft.base.actuators):
-            raise document.error(place, "the model keeps user data of its actuators (user=), where a drive is kept")
         return AddedActuator(
             action.name, action.joint, *ends, 0.0, numbers=drive_numbers(action.drive, str(action.means))
         )

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from madoc.parameters import Parameter
 from madoc.robots.document import Place
-from madoc.robots.drive_spec import DriveSpec, FrictionSpec
+from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec
 from madoc.robots.model import AddedActuator, Draft, JointFriction
 from madoc.simulation.callbacks import DRIVE, FRICTION, MARK, MEANS, UNLIMITED
 from madoc.simulation.user_data import by_own_elements, elements_of_drive
@@ -68,24 +68,51 @@ def with_inputs(
                 raise draft.document.unknown(place, "the name of a condition", column, conditions)
             if column in named:
                 raise draft.document.error(place, f"the name {column!r} is taken by line {named[column]}")
-            low, high, unit, usual = 0.0, 1.0, "1", 1.0
+            channel = ActionChannel(column, column, 0.0, 1.0, "1", rest=1.0, command=False)
             if key == "supply_from":
-                high, unit, usual = _WIDEST_SUPPLY * drive.supply, "V", drive.supply
+                channel = replace(
+                    channel, high=_WIDEST_SUPPLY * drive.supply, unit="V", rest=2.0 / _WIDEST_SUPPLY - 1.0
+                )
             elif key == "gain_from":
-                values = conditions[column].values
-                low, high, usual = min(0.0, *values), max(0.0, *values), values[0]
-            rest = 2.0 * (usual - low) / (high - low) - 1.0
-            channel = ActionChannel(column, column, low, high, unit, rest=rest, command=False)
+                channel = _condition_channel(conditions[column])
             if channels.setdefault(column, channel) != channel:
                 raise draft.document.error(place, f"the column {column!r} is used for something else already")
-            inputs.setdefault(column, AddedActuator(column, str(action.joint), low, high, 0.0, numbers=(MARK,)))
+            inputs.setdefault(column, _input(channel, str(action.joint)))
             taken[action.name][DRIVE.index(key)] = float(first + list(inputs).index(column))
     loaded = {joint for friction in draft.spec.friction if _friction_numbers(friction) for joint in friction.names}
+    kept = any(len(other.userdata) for other in draft.base.actuators)
+    if kept and (inputs or any(actuator.numbers for actuator in added)):
+        raise draft.document.error(
+            ("actions",), "the model keeps user data of its actuators (user=), where drives are kept"
+        )
+    joints = [joint.name for joint in draft.base.joints if joint.name]
+    for index, parameter in enumerate(draft.spec.parameters):
+        if parameter.by is not None and parameter.by not in channels:
+            if parameter.by not in conditions or not joints:
+                raise draft.document.unknown(
+                    ("parameters", index, "by"), "the name of a condition", parameter.by, conditions
+                )
+            channels[parameter.by] = _condition_channel(conditions[parameter.by])
+            inputs[parameter.by] = _input(channels[parameter.by], joints[0])
     drives = (
         _as_elements(replace(actuator, numbers=tuple(taken[actuator.name])), loaded=actuator.joint in loaded)
         for actuator in added
     )
     return (*drives, *inputs.values()), tuple(channels.values())
+
+
+def _condition_channel(condition: ConditionSpec) -> ActionChannel:
+    """What brings in the value of a condition; at rest it is the first."""
+    low, high = min(0.0, *condition.values), max(0.0, *condition.values)
+    high = high if high > low else low + 1.0
+    rest = 2.0 * (condition.values[0] - low) / (high - low) - 1.0
+    return ActionChannel(condition.name, condition.name, low, high, "1", rest=rest, command=False)
+
+
+def _input(channel: ActionChannel, joint: str) -> AddedActuator:
+    """The actuator without force whose control is what a channel brings in."""
+    numbers = (MARK, *(0.0 for _ in DRIVE[1:]))
+    return AddedActuator(channel.name, joint, channel.low, channel.high, 0.0, numbers=numbers)
 
 
 def _as_elements(actuator: AddedActuator, *, loaded: bool) -> AddedActuator:

@@ -11,6 +11,7 @@ from madoc.robots.document import Document
 from madoc.robots.functions import PythonFile
 from madoc.robots.model_files import ModelFiles
 from madoc.robots.spec import RobotSpec
+from madoc.simulation.callbacks import DRIVE
 from madoc.simulation.user_data import LEAST_FRICTION
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF
 from madoc.tasks.base import compiled_model
@@ -62,7 +63,7 @@ class AddedActuator:
         limit: Largest force; None is unlimited.
         drag: Damping that no limit cuts off, as by back-EMF.
         numbers: Those of a drive (`callbacks.DRIVE`), whose equation is its force where there is no limit; or MARK
-            alone, of an actuator that only brings a logged number in.
+            and zeros, of an actuator that only brings a logged number in.
     """
 
     name: str
@@ -123,7 +124,7 @@ def make_model(
         if actuator.numbers:
             new.userdata = actuator.numbers
             new.damping[0] = actuator.drag
-            if actuator.limit is None and len(actuator.numbers) > 1:
+            if actuator.limit is None and actuator.numbers[DRIVE.index("kt")]:
                 new.biastype = mujoco.mjtBias.mjBIAS_USER
     return spec
 

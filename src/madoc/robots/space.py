@@ -1,5 +1,7 @@
 """Parameters of a spec: their elements in the model, their units, and no quantity calibrated twice."""
 
+from dataclasses import replace
+
 import mujoco
 
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
@@ -23,15 +25,20 @@ SLIDE_UNITS = {
 
 def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
     """The parameters, each with the unit that follows from its elements."""
-    parameters: list[Parameter] = []
+    lines: list[Parameter] = []
     for index, given in enumerate(draft.spec.parameters):
         _check_elements(draft, model, index)
         parameter = given.parameter(_unit_of(draft, model, index))
-        for other, earlier in enumerate(parameters):
+        for other, earlier in enumerate(lines):
             _check_distinct(draft, model, index, parameter, other, earlier)
-        parameters.append(parameter)
-    parameters += friction_parameters(draft)
-    return ParameterSpace(tuple(parameters))
+        lines.append(parameter)
+    values = {condition.name: condition.values for condition in draft.spec.conditions}
+    found = [
+        parameter if given.by is None else replace(parameter, when=(given.by, value))
+        for given, parameter in zip(draft.spec.parameters, lines, strict=True)
+        for value in ([0.0] if given.by is None else values[given.by])
+    ]
+    return ParameterSpace((*found, *friction_parameters(draft)))
 
 
 def _check_distinct(

@@ -103,6 +103,7 @@ class ParameterSpec(Part):
     element: Name | None = Field(None, description="Name of the body, joint, geom, actuator or signal.")
     elements: list[Name] | None = Field(None, min_length=1, description="Several that share one value.")
     name: Name | None = Field(None, description="Its own name. Default: field.element.")
+    by: Name | None = Field(None, description="Condition: a value for each of its values, all in the same range.")
     low: Finite
     high: Finite
 
@@ -116,6 +117,8 @@ class ParameterSpec(Part):
     @model_validator(mode="after")
     def _consistent(self) -> "ParameterSpec":
         refuse(self.element is not None and self.elements is not None, "expected element: or elements:, got both")
+        if self.by is not None and self.field in FIELDS and not FIELDS[self.field].in_model:
+            raise ValueError(f"by: means nothing beside {self.field}, which is not in the model; leave it out")
         self.parameter()  # pydantic reports what it refuses, as a MadocError is a ValueError
         return self
 

@@ -38,7 +38,7 @@ DRIVE = (
     "gain_from",
 )
 """User data of an actuator: V, N·m/A, Ω, duty per rad (or per rad/s), duty per rad/s, 1, A, 1; the last three are the
-numbers of other actuators, whose controls they are, or -1. An actuator that only brings in a number has MARK alone."""
+numbers of other actuators, whose controls they are, or -1. One that only brings in a number has MARK and zeros."""
 UNLIMITED = 1e12
 """Current limit in A of a drive that has none."""
 MEANS = ("position", "velocity", "duty")

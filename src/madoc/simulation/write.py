@@ -1,7 +1,8 @@
 """Parameters into a MuJoCo model: elements found by name, values written, derived constants recomputed."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import product
 from typing import Any
 
 import mujoco
@@ -46,15 +47,34 @@ OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPAR
 _INERTIAL_FRAMES = (mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA, mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT)
 
 
+Conditions = Mapping[str, float | None]
+"""Values of conditions of a run, by name; None is one under which no parameter that names the condition holds."""
+
+
+def conditions_of(parameters: Sequence[Parameter]) -> list[Conditions]:
+    """Every combination of the conditions that parameters name, that of the first value of each first."""
+    values: dict[str, list[float | None]] = {}
+    for name, value in (parameter.when for parameter in parameters if parameter.when is not None):
+        values[name] = list(dict.fromkeys([*values.get(name, []), value]))
+    return [dict(zip(values, each, strict=True)) for each in product(*([*of_one, None] for of_one in values.values()))]
+
+
 def write_parameters(
-    model: mujoco.MjModel, data: mujoco.MjData, parameters: Sequence[Parameter], values: np.ndarray
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    parameters: Sequence[Parameter],
+    values: np.ndarray,
+    conditions: Conditions | None = None,
 ) -> None:
     """Write physical values (d,) into a model in place, then recompute the constants derived from them (`mj_setConst`).
 
-    A parameter that names an element the model does not have, or that scales a mass of 0, is refused.
+    Of parameters that name a condition those that hold under it are written; by default its first value is taken. A
+    parameter that names an element the model does not have, or that scales a mass of 0, is refused.
     """
+    holding = conditions_of(parameters)[0] if conditions is None else conditions
     for parameter, value in zip(parameters, values, strict=True):
-        if FIELDS[parameter.field].in_model:
+        holds = parameter.when is None or holding[parameter.when[0]] == parameter.when[1]
+        if holds and FIELDS[parameter.field].in_model:
             for element in find_elements(model, parameter):
                 if parameter.field in _WRITERS:
                     _WRITERS[parameter.field](model, element, float(value))
