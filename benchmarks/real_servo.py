@@ -1,6 +1,6 @@
 """A Dynamixel XL330 of hardware: how well runs that were never shown are predicted, beside the published models.
 
-    python benchmarks/real_servo.py --data FOLDER [--held-out 400] [--friction M6]
+    python benchmarks/real_servo.py --data FOLDER [--held-out 400] [--friction M6] [--set horizon=200 loss=linear]
 
 FOLDER holds the CSV files that docs/real-servo.md says where from. Calibrated to the runs of the other gains of the
 firmware; those of the gain held out are simulated from the measured state, over windows of one second and as a whole,
@@ -21,7 +21,7 @@ from ruamel.yaml import YAML
 from madoc import pipeline, robots, simulation
 from madoc.data import logs
 
-STUDY = Study(RESULTS / "real_servo.jsonl", ("held_out", "friction"))
+STUDY = Study(RESULTS / "real_servo.jsonl", ("held_out", "friction", "set"))
 SERVO = Path(__file__).parents[1] / "examples" / "xl330"
 WINDOW = 200
 """Length of a window in control steps of 5 ms."""
@@ -52,13 +52,14 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--held-out", type=int, choices=(200, 400, 800), default=400)
     parser.add_argument("--friction", choices=("M1", "M2", "M3", "M4", "M5", "M6"), default="M6")
+    parser.add_argument("--set", nargs="*", default=[], help="hyperparameters of least squares")
     arguments = parser.parse_args()
-    found = compare(arguments.data, arguments.held_out, arguments.friction)
+    found = compare(arguments.data, arguments.held_out, arguments.friction, tuple(arguments.set))
     STUDY.add(found)
     print(json.dumps(found, indent=1))
 
 
-def compare(data: Path, held_out: int, friction: str) -> dict:
+def compare(data: Path, held_out: int, friction: str, settings: tuple[str, ...] = ()) -> dict:
     """The estimate and its verdict, and errors of the runs held out: ours, mid-range's and the published models'."""
     files = sorted(data.glob("gain*.csv"))
     unseen = [file for file in files if file.stem.startswith(f"gain{held_out}_")]
@@ -71,7 +72,7 @@ def compare(data: Path, held_out: int, friction: str) -> dict:
         order = pipeline.CalibrationOrder(
             task=str(spec),
             source=pipeline.Source((str(runs),)),
-            search=pipeline.Search(method="least-squares", budget=BUDGET),
+            search=pipeline.Search(method="least-squares", budget=BUDGET, set=(settings,)),
             holdout=0.2,
         )
         result = pipeline.calibrate_in(Path(folder) / "run", order).to_json()
@@ -85,6 +86,7 @@ def compare(data: Path, held_out: int, friction: str) -> dict:
     return {
         "held_out": held_out,
         "friction": friction,
+        "set": list(settings),
         "unit": "rad, root mean square error of the angle: windows of 1 s, whole run",
         **{name: result[name] for name in kept if name in result},
         "errors": errors,

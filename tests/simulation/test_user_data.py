@@ -1,5 +1,7 @@
 """Drives and friction as numbers in a model: where a parameter writes them, and MuJoCo's own elements that say them."""
 
+import sys
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from madoc import robots
 from madoc.errors import MadocError
 from madoc.parameters import FIELDS, Parameter
+from madoc.simulation import callbacks
 from madoc.simulation.callbacks import DRIVE, FRICTION, dc_torque
 from madoc.simulation.cpu import CpuSimulator
 from madoc.simulation.mjcf import save_mjcf
@@ -55,6 +58,14 @@ def test_a_number_that_is_not_there_is_refused(spring_task, field, element, sent
 def test_a_current_limit_that_is_none_is_refused(tmp_path):
     with pytest.raises(MadocError, match="the current of 'goal' is not limited; give it a current_limit:"):
         simulator_of(tmp_path, PLAIN.replace("drive_strength", "drive_current_limit"))
+
+
+def test_without_numba_the_drive_is_refused_in_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(callbacks, "install", callbacks.install.__wrapped__)  # which has not been called yet
+    monkeypatch.setitem(sys.modules, "numba", None)
+    with pytest.raises(MadocError, match=r"need Numba; install it: pip install 'madoc-calibration\[drives\]'$"):
+        simulator_of(tmp_path, SERVO_SPEC.replace("kt: 0.5", "kt: 0.51"))
+    simulator_of(tmp_path, PLAIN.replace("kt: 0.5", "kt: 0.51"))
 
 
 @pytest.mark.parametrize("means", ["position", "velocity", "duty"])
