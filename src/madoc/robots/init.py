@@ -15,7 +15,7 @@ from madoc.robots.document import yaml_text
 from madoc.robots.expressions import Read
 from madoc.robots.model import compiled, is_single, is_slide, read_model
 from madoc.robots.model_files import ModelFiles
-from madoc.robots.space import SLIDE_UNITS
+from madoc.robots.space import element_unit
 from madoc.runs.files import replacing
 from madoc.simulation.write import OF_A_JOINT, element_names, heavy_bodies, nominal_values
 from madoc.tasks import TASKS
@@ -221,8 +221,7 @@ def _dissipation(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fie
 
 def _unit(model: mujoco.MjModel, field: str, element: str) -> str:
     """The unit of a field of a body or a joint."""
-    slides = field in SLIDE_UNITS and is_slide(model, model.joint(element).id)
-    return SLIDE_UNITS[field] if slides else FIELDS[field].unit
+    return element_unit(model, field, element) or FIELDS[field].unit
 
 
 def _round(value: float) -> float:

@@ -9,16 +9,6 @@ from madoc.robots.signals import signal_unit
 from madoc.robots.spec import ParameterSpec
 from madoc.simulation.write import OF_A_JOINT, element_names, find_elements
 
-SLIDE_UNITS = {
-    "dof_damping": "N·s/m",
-    "dof_drag": "N·s²/m²",
-    "dof_armature": "kg",
-    "dof_frictionloss": "N",
-    "jnt_stiffness": "N/m",
-    "jnt_ref": "m",
-}
-"""Units of the fields of a joint where the joint is a slide."""
-
 
 def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
     """The parameters, each with the unit that follows from its elements."""
@@ -38,11 +28,11 @@ def _check_distinct(
     """Refuse two parameters of one name or of one quantity, of which the one written last would win."""
     line = draft.document.line(("parameters", other))
     shared = set(earlier.elements) & set(parameter.elements)
-    if FIELDS[parameter.field].element == FIELDS[earlier.field].element == "body":  # which a joint's name may mean too
+    if parameter.kind.element == earlier.kind.element == "body":  # which a joint's name may mean too
         held = set(find_elements(model, earlier))
         elements = zip(parameter.elements, find_elements(model, parameter), strict=True)
         shared = {name for name, body in elements if body in held}
-    whole_robot = FIELDS[earlier.field].element is None
+    whole_robot = earlier.kind.element is None
     exclusive = ({"body_mass", "body_mass_and_inertia"}, {"body_inertia", "body_mass_and_inertia"})
     if parameter.name == earlier.name:
         problem = f"the parameter {parameter.name} is on line {line} already; name: one of them"
@@ -85,16 +75,22 @@ def _unit_of(draft: Draft, model: mujoco.MjModel, index: int) -> str:
 
 
 def _element_unit(draft: Draft, model: mujoco.MjModel, given: ParameterSpec, element: str) -> str:
-    if given.field in SLIDE_UNITS:
-        return SLIDE_UNITS[given.field] if is_slide(model, int(model.joint(element).id)) else ""
     if given.field == "signal_bias":
         index = [signal.name for signal in draft.spec.signals].index(element)
         return signal_unit(draft, model, parse(draft.spec.signals[index].reads), index)
-    if given.field == "actuator_kv":
-        driven = model.actuator(element)
-        on_joint = int(driven.trntype[0]) in OF_A_JOINT
-        return "N·s/m" if on_joint and is_slide(model, int(driven.trnid[0])) else ""
-    return _gain_unit(model, int(model.actuator(element).id)) if given.field == "actuator_gain" else ""
+    if given.field == "actuator_gain":
+        return _gain_unit(model, int(model.actuator(element).id))
+    return element_unit(model, given.field, element)
+
+
+def element_unit(model: mujoco.MjModel, field: str, element: str) -> str:
+    """The unit of a field of an element where it is not the field's own, as of a joint that slides; else empty."""
+    kind, joint = FIELDS[field], -1
+    if kind.slide_unit and kind.element == "joint":
+        joint = int(model.joint(element).id)
+    elif kind.slide_unit and int(model.actuator(element).trntype[0]) in OF_A_JOINT:
+        joint = int(model.actuator(element).trnid[0])
+    return kind.slide_unit if joint >= 0 and is_slide(model, joint) else ""
 
 
 def _gain_unit(model: mujoco.MjModel, actuator: int) -> str:

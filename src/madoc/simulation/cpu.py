@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.errors import MadocError, nearest_hint
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import Parameter
 from madoc.runs.machine import usable_cores
 from madoc.simulation.delay import blend, delay_weights, in_effect
 from madoc.simulation.drives import drive_forces
@@ -83,7 +83,7 @@ class CpuSimulator:
         if not np.isfinite(values).all():
             raise MadocError("expected finite parameters, got NaN or infinity")
         for parameter, column in zip(self.parameters.parameters, values.T, strict=True):
-            minimum = FIELDS[parameter.field].minimum
+            minimum = parameter.kind.minimum
             if (column < minimum).any():
                 raise MadocError(
                     f"expected {parameter.name} of at least {minimum} {parameter.unit}, "
@@ -346,7 +346,7 @@ class CpuSystem:
 
 def _check_elements(model: mujoco.MjModel, task: Task, parameter: Parameter) -> None:
     """Refuse a parameter of an element that the model, or for a signal the task, does not have."""
-    if FIELDS[parameter.field].element != "signal":
+    if parameter.kind.element != "signal":
         find_elements(model, parameter)
         return
     for element in parameter.elements:

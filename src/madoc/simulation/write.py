@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from madoc.errors import MadocError, nearest_hint
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import Parameter
 
 MASS_FLOOR = 1e-3
 """Mass of a body in kg to which smaller values are raised, as the motion of a massless body diverges; see `LEAST`."""
@@ -20,6 +20,9 @@ LEAST = 1e-3
 
 CENTRED = 1e-6
 """Distance of a centre of mass from its body's origin, in radii of gyration, up to which rounding makes it."""
+
+SOLREF_FLOOR = 1e-9
+"""Time constant of a contact, s, and damping ratio to which smaller ones are raised, as 0 means another format."""
 
 _KINDS = {
     "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
@@ -45,27 +48,27 @@ def write_parameters(
     A parameter that names an element the model does not have, or that scales a mass of 0, is refused.
     """
     for parameter, value in zip(parameters, values, strict=True):
-        if FIELDS[parameter.field].in_model:
+        if parameter.kind.in_model:
             for element in find_elements(model, parameter):
-                if parameter.field in _WRITERS:
-                    _WRITERS[parameter.field](model, element, float(value))
+                numbers, write = _PLACES[parameter.field]
+                if write is None:
+                    numbers(model, element)[:] = value
                 else:
-                    _NUMBERS[parameter.field](model, element)[:] = value
+                    write(model, element, float(value))
     mujoco.mj_setConst(model, data)
 
 
 def nominal_values(model: mujoco.MjModel, parameter: Parameter) -> tuple[float, ...]:
     """The values in a model that a parameter would replace, one for each element; 0 for a delay and for biases."""
-    if not FIELDS[parameter.field].in_model:
+    if not parameter.kind.in_model:
         return tuple(0.0 for _ in parameter.elements or (0,))
-    return tuple(
-        float(_NUMBERS[parameter.field](model, element).flat[0]) for element in find_elements(model, parameter)
-    )
+    numbers, _ = _PLACES[parameter.field]
+    return tuple(float(numbers(model, element).flat[0]) for element in find_elements(model, parameter))
 
 
 def find_elements(model: mujoco.MjModel, parameter: Parameter) -> list[int]:
     """Indices of a parameter's elements in the model; one -1 for gravity. A body may be named by a joint of its own."""
-    kind = FIELDS[parameter.field].element
+    kind = parameter.kind.element
     return [-1] if kind is None else [_find_element(model, parameter.name, kind, one) for one in parameter.elements]
 
 
@@ -234,32 +237,43 @@ def _write_ref(model: mujoco.MjModel, joint: int, value: float) -> None:
             model.tendon_range[tendon] += longer
 
 
-_NUMBERS: dict[str, Callable[[mujoco.MjModel, int], np.ndarray]] = {
-    "gravity": lambda model, _: model.opt.gravity[2:],
-    "body_mass": lambda model, body: model.body_mass[body : body + 1],
-    "body_mass_and_inertia": lambda model, body: model.body_mass[body : body + 1],
-    "body_inertia": lambda model, body: model.body_inertia[body].max(keepdims=True),
-    "body_com": lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]),
-    "dof_damping": lambda model, joint: model.dof_damping[_dofs(model, joint)],
-    "dof_drag": lambda model, joint: model.dof_dampingpoly[_dofs(model, joint), :1],
-    "dof_armature": lambda model, joint: model.dof_armature[_dofs(model, joint)],
-    "dof_frictionloss": lambda model, joint: model.dof_frictionloss[_dofs(model, joint)],
-    "jnt_stiffness": lambda model, joint: model.jnt_stiffness[joint : joint + 1],
-    "jnt_ref": lambda model, joint: model.qpos0[model.jnt_qposadr[joint] :][:1],
-    "geom_friction": lambda model, geom: model.geom_friction[geom, :1],
-    "actuator_gain": lambda model, actuator: model.actuator_gainprm[actuator, :1],
-    "actuator_kv": lambda model, actuator: 0.0 - model.actuator_biasprm[actuator, 2:3],
-}
-"""The numbers of an element that a field stands for, the first of which is its value. A field without a writer of its
-own is written into all of them."""
+def _write_contact(place: int) -> Callable[[mujoco.MjModel, int, float], None]:
+    """A writer of the time constant (place 0) or the damping ratio (1) of a geom's contacts; both are above 0."""
 
-_WRITERS: dict[str, Callable[[mujoco.MjModel, int, float], None]] = {
-    "body_mass": _write_mass,
-    "body_mass_and_inertia": _write_mass_and_inertia,
-    "body_inertia": _write_inertia,
-    "body_com": _write_centre_of_mass,
-    "jnt_ref": _write_ref,
-    "actuator_gain": _write_gain,
-    "actuator_kv": _write_kv,
+    def write(model: mujoco.MjModel, geom: int, value: float) -> None:
+        if (model.geom_solref[geom] <= 0.0).any():
+            raise MadocError(
+                f"the solref of geom {model.geom(geom).name!r} is a stiffness and a damping, below 0 in the model, and "
+                "has no time constant; give the geom a positive solref in the model"
+            )
+        model.geom_solref[geom, place] = max(value, SOLREF_FLOOR)
+
+    return write
+
+
+Numbers = Callable[[mujoco.MjModel, int], np.ndarray]
+Write = Callable[[mujoco.MjModel, int, float], None]
+_PLACES: dict[str, tuple[Numbers, Write | None]] = {
+    "gravity": (lambda model, _: model.opt.gravity[2:], None),
+    "body_mass": (lambda model, body: model.body_mass[body : body + 1], _write_mass),
+    "body_mass_and_inertia": (lambda model, body: model.body_mass[body : body + 1], _write_mass_and_inertia),
+    "body_inertia": (lambda model, body: model.body_inertia[body].max(keepdims=True), _write_inertia),
+    "body_com": (lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]), _write_centre_of_mass),
+    "dof_frictionloss": (lambda model, joint: model.dof_frictionloss[_dofs(model, joint)], None),
+    "dof_drag": (lambda model, joint: model.dof_dampingpoly[_dofs(model, joint), :1], None),
+    "dof_damping": (lambda model, joint: model.dof_damping[_dofs(model, joint)], None),
+    "dof_armature": (lambda model, joint: model.dof_armature[_dofs(model, joint)], None),
+    "jnt_stiffness": (lambda model, joint: model.jnt_stiffness[joint : joint + 1], None),
+    "jnt_ref": (lambda model, joint: model.qpos0[model.jnt_qposadr[joint] :][:1], _write_ref),
+    "geom_friction": (lambda model, geom: model.geom_friction[geom, :1], None),
+    "geom_friction_torsional": (lambda model, geom: model.geom_friction[geom, 1:2], None),
+    "geom_friction_rolling": (lambda model, geom: model.geom_friction[geom, 2:], None),
+    "contact_time": (lambda model, geom: model.geom_solref[geom, :1], _write_contact(0)),
+    "contact_damping": (lambda model, geom: model.geom_solref[geom, 1:], _write_contact(1)),
+    "actuator_gain": (lambda model, actuator: model.actuator_gainprm[actuator, :1], _write_gain),
+    "actuator_kv": (lambda model, actuator: 0.0 - model.actuator_biasprm[actuator, 2:3], _write_kv),
 }
-"""Fields whose value has a floor, or changes other numbers of the model too."""
+"""Where each field stands in a model: the numbers of an element, the first of which is its value, and what writes one.
+
+Without a writer all of the numbers become the value; a writer is for a value that has a floor, or moves others along.
+"""
