@@ -1,14 +1,16 @@
 """Parameters that can be calibrated: their names, units and ranges, and their scaling to [-1, 1]."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from numpy.typing import ArrayLike
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, nearest_hint
 
 
 @dataclass(frozen=True)
@@ -76,18 +78,55 @@ shapes apart, and 1 where it does so without a bounce.
 """
 
 
+_KINDS = {
+    **{kind: kind for kind in ("body", "geom", "site", "tendon", "actuator", "sensor")},
+    **dict.fromkeys(("dof", "jnt", "qpos", "qpos0"), "joint"),
+    "eq": "equality",
+    "opt": None,
+}
+"""By the first word of the name of a model's array, the kind of element that has a row of it; None for an option."""
+_NUMBER = re.compile(r"(?P<array>(?P<first>opt(?=\.)|[a-z]+0?(?=_)|qpos0)[._]?\w*)(\[(?P<index>\d+)\])?")
+_AT_LEAST_0 = ("mass", "damping", "stiffness", "frictionloss", "armature", "friction", "density", "viscosity")
+"""Ends of the names of arrays whose numbers are not negative."""
+
+
+def array_of(field: str) -> tuple[str, int | None]:
+    """The array of a model, and the place in an element's row, that a field such as `geom_solref[0]` names."""
+    found = _NUMBER.fullmatch(field)
+    if found is None or found["first"] not in _KINDS:
+        raise MadocError(
+            f"unknown parameter field {field!r}; {nearest_hint(field, FIELDS)}; or a number of MuJoCo's model as "
+            f"geom_solref[0], whose array begins with {'_, '.join(_KINDS)}."
+        )
+    return found["array"], None if found["index"] is None else int(found["index"])
+
+
+@lru_cache(maxsize=1024)
+def field_of(name: str) -> Field:
+    """The entry of `FIELDS`, or one for a number of MuJoCo's model: `geom_solref[0]`, `opt.density`.
+
+    Raises:
+        MadocError: It is neither.
+    """
+    if name in FIELDS:
+        return FIELDS[name]
+    array, _ = array_of(name)
+    first = array.partition(".")[0] if "." in array else array.partition("_")[0]
+    return Field(_KINDS[first], "", 0.0 if array.endswith(_AT_LEAST_0) else -np.inf)
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One physical quantity of the simulator that may be calibrated, and the range it is searched in.
 
     Attributes:
-        field: A key of `FIELDS`.
-        element: Name of the body, joint, geom, actuator or signal (a body without a name may be named by its joint).
-            A tuple of names shares one value; a parameter of the whole robot, such as gravity, has an empty name.
+        field: A key of `FIELDS`, or a number of a MuJoCo model such as `geom_solref[0]` or `opt.density`.
+        element: Name of the body, joint, geom, actuator, signal and so on (a body without a name may be named by its
+            joint). A tuple of names shares one value; a parameter of the whole robot, as gravity, has an empty name.
         low: Lower end of the range, in `unit`.
         high: Upper end of the range, in `unit`.
         label: The parameter's name; if empty, it is `field.element`.
-        measured_in: The unit of a slide joint or of a signal; if empty, it is the field's.
+        measured_in: The unit of a slide joint, a signal or a number of the model; if empty, it is the field's.
     """
 
     field: str
@@ -98,8 +137,6 @@ class Parameter:
     measured_in: str = ""
 
     def __post_init__(self) -> None:
-        if self.field not in FIELDS:
-            raise MadocError(f"unknown parameter field {self.field!r}; expected one of {', '.join(FIELDS)}")
         kind = self.kind
         if (kind.element is None) != (self.elements == ()) or "" in self.elements:
             wanted = "no element" if kind.element is None else f"the name of a {kind.element}"
@@ -121,7 +158,7 @@ class Parameter:
     @property
     def kind(self) -> Field:
         """What its field is."""
-        return FIELDS[self.field]
+        return field_of(self.field)
 
     @property
     def elements(self) -> tuple[str, ...]:
@@ -138,7 +175,7 @@ class Parameter:
     @property
     def unit(self) -> str:
         """The physical unit of the value and of its range."""
-        return self.measured_in or self.kind.unit
+        return self.measured_in or self.kind.unit or "1"
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.errors import MadocError, nearest_hint
-from madoc.parameters import Parameter
+from madoc.parameters import FIELDS, Parameter
 from madoc.runs.machine import usable_cores
+from madoc.simulation.arrays import check_field, check_written
 from madoc.simulation.delay import blend, delay_weights, in_effect
 from madoc.simulation.drives import drive_forces
 from madoc.simulation.write import find_elements, write_parameters
@@ -126,9 +127,9 @@ class CpuSimulator:
     ) -> Int[np.ndarray, " rows"]:
         """Number of pairs of geoms in contact in each state, at physical values, which are mid-range unless given.
 
-        No parameter changes the shape of a body; only `jnt_ref` changes where positions place it.
+        No parameter changes the shape of a body; `jnt_ref` and numbers of the model may change where it is placed.
         """
-        placed = any(parameter.field == "jnt_ref" for parameter in self.parameters.parameters)
+        placed = any(row.field == "jnt_ref" or row.field not in FIELDS for row in self.parameters.parameters)
         model = self.model(self.parameters.middle if values is None else values) if placed else self._model
         data, contacts = self._data[0], np.zeros(len(state), dtype=np.int64)
         for row, position in enumerate(state[:, : model.nq]):
@@ -345,9 +346,11 @@ class CpuSystem:
 
 
 def _check_elements(model: mujoco.MjModel, task: Task, parameter: Parameter) -> None:
-    """Refuse a parameter of an element that the model, or for a signal the task, does not have."""
+    """Refuse a parameter of an element or a number that the model, or for a signal the task, does not have."""
     if parameter.kind.element != "signal":
-        find_elements(model, parameter)
+        check_field(model, parameter.field)
+        for index in find_elements(model, parameter):
+            check_written(model, parameter.field, index)
         return
     for element in parameter.elements:
         if element not in task.signals:

@@ -60,7 +60,7 @@ def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], pa
     """
     spec, bound = simulator.task.spec(), simulator.model(values)
     nominal = _compiled(spec)
-    changes = [*_write_gravity(spec, nominal, bound), *_write_inertia(spec, nominal, bound)]
+    changes = [*_write_options(spec, nominal, bound), *_write_inertia(spec, nominal, bound)]
     for kind, array in _changed(nominal, bound):
         changes += _write_rows(spec, nominal, bound, kind=kind, array=array)
     _gather_assets(spec, path.parent)
@@ -110,7 +110,7 @@ def _refuse_difference(wanted: mujoco.MjModel, got: mujoco.MjModel, where: str) 
                 f"the model {where} differs from the bound one in {name} by {difference:.3g}; "
                 "this parameter, or this version of MuJoCo, cannot be written as MJCF exactly"
             )
-    for name in ("timestep", "gravity"):
+    for name in _options(wanted):
         if not np.array_equal(getattr(wanted.opt, name), getattr(got.opt, name)):
             raise MadocError(f"the model {where} differs from the bound one in the option {name}")
 
@@ -176,12 +176,19 @@ def _copied(spec: mujoco.MjSpec, file: str, own_folder: str, folder: Path, copie
     return copies[wanted]
 
 
-def _write_gravity(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
-    old, new = nominal.opt.gravity, bound.opt.gravity
-    if np.array_equal(old, new):
-        return []
-    spec.option.gravity = new
-    return [Change("option", "gravity", old.tolist(), new.tolist())]
+def _write_options(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
+    changes = []
+    for name in _options(bound):
+        old, new = getattr(nominal.opt, name), getattr(bound.opt, name)
+        if not np.array_equal(old, new):
+            setattr(spec.option, name, new)
+            changes.append(Change("option", name, np.atleast_1d(old).tolist(), np.atleast_1d(new).tolist()))
+    return changes
+
+
+def _options(model: mujoco.MjModel) -> list[str]:
+    """Names of the options of a model that are floating-point numbers."""
+    return [name for name in dir(model.opt) if isinstance(getattr(model.opt, name), float | np.ndarray)]
 
 
 def _write_inertia(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
@@ -192,7 +199,7 @@ def _write_inertia(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.M
         for name, attribute in names.items()
         if (new := _row(bound, name, index)) != _row(nominal, name, index)
     ]
-    if changes:
+    if changes or not np.array_equal(bound.geom_pos, nominal.geom_pos):
         spec.compiler.settotalmass = -1.0
         spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
         spec.compiler.balanceinertia = False

@@ -122,7 +122,9 @@ def responses(
 
 def mass_like(parameter: Parameter) -> bool:
     """Whether a value is a mass, an inertia, a force or a torque, or in proportion to one: kg or N is in its unit."""
-    return parameter.field == "actuator_gain" or any(unit in parameter.kind.unit for unit in ("kg", "N"))
+    return parameter.field == "actuator_gain" or any(
+        unit in (parameter.kind.unit or parameter.unit) for unit in ("kg", "N")
+    )
 
 
 def hidden_scales(

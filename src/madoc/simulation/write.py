@@ -7,7 +7,8 @@ import mujoco
 import numpy as np
 
 from madoc.errors import MadocError, nearest_hint
-from madoc.parameters import Parameter
+from madoc.parameters import FIELDS, Parameter
+from madoc.simulation.arrays import numbers_at, write_number
 
 MASS_FLOOR = 1e-3
 """Mass of a body in kg to which smaller values are raised, as the motion of a massless body diverges; see `LEAST`."""
@@ -30,6 +31,9 @@ _KINDS = {
     "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
     "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
     "sensor": (mujoco.mjtObj.mjOBJ_SENSOR, "nsensor"),
+    "site": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
+    "tendon": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
+    "equality": (mujoco.mjtObj.mjOBJ_EQUALITY, "neq"),
 }
 """By kind of element, MuJoCo's object type and the attribute of a model that counts them."""
 
@@ -50,7 +54,7 @@ def write_parameters(
     for parameter, value in zip(parameters, values, strict=True):
         if parameter.kind.in_model:
             for element in find_elements(model, parameter):
-                numbers, write = _PLACES[parameter.field]
+                numbers, write = _place_of(parameter.field)
                 if write is None:
                     numbers(model, element)[:] = value
                 else:
@@ -62,8 +66,18 @@ def nominal_values(model: mujoco.MjModel, parameter: Parameter) -> tuple[float, 
     """The values in a model that a parameter would replace, one for each element; 0 for a delay and for biases."""
     if not parameter.kind.in_model:
         return tuple(0.0 for _ in parameter.elements or (0,))
-    numbers, _ = _PLACES[parameter.field]
+    numbers, _ = _place_of(parameter.field)
     return tuple(float(numbers(model, element).flat[0]) for element in find_elements(model, parameter))
+
+
+def same_numbers(model: mujoco.MjModel, one: Parameter, other: Parameter) -> bool:
+    """Whether two parameters, one of them of a number by its array's name, are written into the same place."""
+    if {one.field, other.field} <= FIELDS.keys() or not (one.kind.in_model and other.kind.in_model):
+        return False
+    here, there = (
+        [_place_of(each.field)[0](model, element) for element in find_elements(model, each)] for each in (one, other)
+    )
+    return any(np.shares_memory(ours, theirs) for ours in here for theirs in there)
 
 
 def find_elements(model: mujoco.MjModel, parameter: Parameter) -> list[int]:
@@ -84,7 +98,7 @@ def _find_element(model: mujoco.MjModel, parameter_name: str, kind: str, element
 
 
 def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Names of the elements of a kind (`body`, `joint`, `geom`, `actuator`, `sensor`) that have one."""
+    """Names of the elements of a kind (`body`, `joint`, `geom`, `site` and so on) that have one."""
     object_type, count = _KINDS[kind]
     names = (mujoco.mj_id2name(model, object_type, index) for index in range(getattr(model, count)))
     return [name for name in names if name]
@@ -249,6 +263,16 @@ def _write_contact(place: int) -> Callable[[mujoco.MjModel, int, float], None]:
         model.geom_solref[geom, place] = max(value, SOLREF_FLOOR)
 
     return write
+
+
+def _place_of(field: str) -> tuple["Numbers", "Write | None"]:
+    """Where a field stands in a model: one of `FIELDS`, or a number by the name of its array."""
+    if field in _PLACES:
+        return _PLACES[field]
+    return (
+        lambda model, element: numbers_at(model, field, element),
+        lambda model, element, value: write_number(model, field, element, value),
+    )
 
 
 Numbers = Callable[[mujoco.MjModel, int], np.ndarray]
