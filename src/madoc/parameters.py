@@ -41,6 +41,10 @@ class Field:
 AT_END = 0.98
 """Position in [-1, 1] of its range; past it, to either side, a parameter is at the end of the range."""
 
+PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z", "payload_gyration")
+"""Fields of a load on a body: its mass, where its centre is in the body's frame, its radius of gyration."""
+INERTIA = tuple(f"inertia_{part}" for part in ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3"))
+"""Fields of a body's ten inertial numbers, as deviations from the model's (Rucker and Wensing 2022); all 0 is that."""
 _DRAG = "drag that grows with the square of the speed"
 _ARMATURE = "inertia that goes with the acceleration of a joint"
 FIELDS: dict[str, Field] = {
@@ -49,6 +53,10 @@ FIELDS: dict[str, Field] = {
     "body_mass_and_inertia": Field("body", "kg", 0.0, words="mass, inertia"),
     "body_inertia": Field("body", "kg·m²", 0.0),
     "body_com": Field("body", "m", 0.0, missing="another centre of mass, as with a payload"),
+    "payload_mass": Field("body", "kg", 0.0, words="payload"),
+    **{f"payload_{axis}": Field("body", "m", words=f"payload's {axis}") for axis in "xyz"},
+    "payload_gyration": Field("body", "m", 0.0, words="payload's radius of gyration"),
+    **{field: Field("body", "1", maximum=3.0, words=field.replace("_", " ")) for field in INERTIA},
     "dof_frictionloss": Field("joint", "N·m", 0.0, "N", "dry friction", "Coulomb friction"),
     "dof_drag": Field("joint", "N·m·s²/rad²", 0.0, "N·s²/m²", "drag", _DRAG),
     "dof_damping": Field("joint", "N·m·s/rad", 0.0, "N·s/m", "damping", "viscous damping"),
@@ -74,7 +82,8 @@ velocity servo is its kp or kv, and moves the servo's bias with it; `actuator_kv
 `jnt_ref` is what a hinge or slide reads, and is commanded to, where the model as drawn has its zero. `action_delay` is
 the time from an action to its effect, `signal_bias` what a sensor reads too much. `dof_drag` is damping that grows with
 the square of the speed. `contact_time` and `contact_damping` are MuJoCo's `solref`: how long a contact takes to push
-shapes apart, and 1 where it does so without a bounce.
+shapes apart, and 1 where it does so without a bounce. A payload adds to the body's own mass and inertia; its moment of
+inertia about each axis is its mass times the square of its radius of gyration.
 """
 
 

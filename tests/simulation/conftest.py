@@ -26,7 +26,7 @@ def hopper():
 
 @pytest.fixture
 def everything():
-    """Hopper with one parameter of every field there is."""
+    """Hopper with one parameter of every field but those of payloads and whole inertias, which act together."""
     parameters = (
         Parameter("gravity", "", -15.0, -5.0),
         Parameter("body_mass", "torso", 3.0, 5.0),

@@ -15,9 +15,10 @@ from madoc.identification.coarseness import FINER
 from madoc.identification.replay import Readings
 from madoc.identification.score_tests import Score
 from madoc.identification.states import LoggedStates
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.base import Simulator
-from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, nominal_values, off_centre
+from madoc.simulation.inertials import off_centre
+from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, nominal_values
 
 DELAY = "actions that take effect later, by a delay or a lag of the actuator"
 EARLY = "actions that take effect before they are logged"
@@ -112,11 +113,12 @@ def candidates(
         if has_gain(model, actuator.id):
             wanted.append(("actuator_gain", actuator.name, abs(float(actuator.gainprm[0])) or 1.0))
     weighed = {element for field, element in calibrated if field in ("body_mass", "body_mass_and_inertia")}
+    loaded = {element for field, element in calibrated if field in (*PAYLOAD, *INERTIA)}
     for body in heavy_bodies(model):
         at = model.body(body) if body in element_names(model, "body") else model.body(model.joint(body).bodyid[0])
         distance = off_centre(model, at.id)
-        wanted += [("body_mass", body, float(at.mass[0]))] * (body not in weighed)
-        wanted += [("body_com", body, distance)] * (distance > 0.0)
+        wanted += [("body_mass", body, float(at.mass[0]))] * (body not in weighed | loaded)
+        wanted += [("body_com", body, distance)] * (distance > 0.0 and body not in loaded)
     if "gravity" not in fields:
         wanted.append(("gravity", "", float(abs(model.opt.gravity[2])) or standard_gravity))
     if task.source is not None:

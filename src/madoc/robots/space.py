@@ -1,6 +1,7 @@
 """Parameters of a spec: their elements in the model, their units, and no quantity calibrated twice."""
 
 from fnmatch import fnmatchcase
+from itertools import product
 
 import mujoco
 
@@ -18,10 +19,10 @@ def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
     lines: list[int] = []
     for index, given in enumerate(draft.spec.parameters):
         with draft.document.at("parameters", index):
-            check_field(model, given.key)
+            check_field(model, given.fields[0])
         elements = _elements(draft, model, index)
-        for shared in ((one,) for one in elements) if given.each else (elements,):
-            parameter = given.parameter(shared, _unit_of(draft, model, index, shared))
+        for field, shared in product(given.fields, [(one,) for one in elements] if given.each else [elements]):
+            parameter = given.parameter(field, shared, _unit_of(draft, model, index, shared))
             for other, earlier in zip(lines, parameters, strict=True):
                 _check_distinct(draft, model, index, parameter, other, earlier)
             parameters.append(parameter)
@@ -62,7 +63,7 @@ def _elements(draft: Draft, model: mujoco.MjModel, index: int) -> tuple[str, ...
     A name or a pattern that finds none is refused with the nearest names.
     """
     given = draft.spec.parameters[index]
-    kind = field_of(given.key).element
+    kind = field_of(given.fields[0]).element
     if kind is None:
         return ()
     names = [signal.name for signal in draft.spec.signals] if kind == "signal" else element_names(model, kind)
@@ -84,11 +85,12 @@ def _unit_of(draft: Draft, model: mujoco.MjModel, index: int, elements: tuple[st
     given = draft.spec.parameters[index]
     if given.field is None:
         return given.unit or ""
-    units = {_element_unit(draft, model, given.field, element) for element in elements}
+    field = given.fields[0]
+    units = {_element_unit(draft, model, field, element) for element in elements}
     if len(units) > 1:
         raise draft.document.error(
             ("parameters", index),
-            f"one value cannot be in {' and in '.join(sorted(unit or FIELDS[given.field].unit for unit in units))}; "
+            f"one value cannot be in {' and in '.join(sorted(unit or FIELDS[field].unit for unit in units))}; "
             "make it two parameters",
         )
     return next(iter(units), "")

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field, WithJsonSchema, field_validator, model_validator
 
 from madoc.errors import UNPRINTABLE, nearest_hint
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import FIELDS, INERTIA, Parameter
 from madoc.robots.document import Document, read_document
 from madoc.robots.validation import Part, refuse, refused_with_line
 from madoc.tasks import TASKS
@@ -102,7 +102,7 @@ class ParameterSpec(Part):
     """One value to calibrate, and the range it is searched in."""
 
     field: str | None = Field(
-        None, description=f"One of: {', '.join(FIELDS)}.", json_schema_extra={"enum": list(FIELDS)}
+        None, description=f"One of: {', '.join(FIELDS)}.", json_schema_extra={"enum": [*FIELDS, "inertia"]}
     )
     model: Name | None = Field(
         None, description="Instead of a field, an array of MuJoCo's mjModel, as geom_solref, or an option, as opt.wind."
@@ -120,7 +120,7 @@ class ParameterSpec(Part):
     @classmethod
     def _known(cls, field: str) -> str:
         hint = nearest_hint(field, FIELDS)
-        refuse(field not in FIELDS, f"expected a field that can be calibrated, got {field!r}; {hint}")
+        refuse(field not in (*FIELDS, "inertia"), f"expected a field that can be calibrated, got {field!r}; {hint}")
         return field
 
     @model_validator(mode="after")
@@ -130,24 +130,28 @@ class ParameterSpec(Part):
         refuse(len(given) > 1, f"expected one of element:, elements: and each:, got {' and '.join(given)}")
         for key in ("index", "unit"):
             refuse(self.model is None and getattr(self, key) is not None, f"{key}: belongs to model:, not to field:")
-        self.parameter(self.names)  # pydantic reports what it refuses, as a MadocError is a ValueError
+        for field in self.fields:
+            self.parameter(field, self.names)  # pydantic reports what it refuses, as a MadocError is a ValueError
         return self
 
     @property
-    def key(self) -> str:
-        """The field, or the number of the model as `geom_solref[0]`."""
-        return self.field or (f"{self.model}" if self.index is None else f"{self.model}[{self.index}]")
+    def fields(self) -> tuple[str, ...]:
+        """The field, the ten of an inertia, or the number of the model as `geom_solref[0]`."""
+        if self.field is not None:
+            return INERTIA if self.field == "inertia" else (self.field,)
+        return (f"{self.model}" if self.index is None else f"{self.model}[{self.index}]",)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the elements, or patterns of them."""
         return (self.element,) if self.element else tuple(self.elements or self.each or ())
 
-    def parameter(self, elements: tuple[str, ...], unit: str = "") -> Parameter:
-        """The parameter of one or of several elements, in the unit of its field or in another."""
+    def parameter(self, field: str, elements: tuple[str, ...], unit: str = "") -> Parameter:
+        """The parameter of a field and of one or several elements, in the unit of its field or in another."""
         element = elements[0] if len(elements) == 1 else elements or ""
-        label = f"{self.name}.{element}" if self.name and self.each else self.name or ""
-        return Parameter(self.key, element, self.low, self.high, label, unit or self.unit or "")
+        added = [self.name, field if len(self.fields) > 1 else "", str(element) if self.each else ""]
+        label = ".".join(filter(None, added)) if self.name else ""
+        return Parameter(field, element, self.low, self.high, label, unit or self.unit or "")
 
 
 class LogSpec(Part):

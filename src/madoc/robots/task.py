@@ -102,7 +102,9 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
             f"expected action_delay of at most {MOST_PENDING:,} control steps, got {pending:,}; is it in seconds?",
         )
     if signals.read_sensors & signals.layout.accelerating:
-        pending = max(pending, 1)  # such a sensor shows the force of the last action
+        # Such a sensor shows the force in the last physics step, where the action before may hold yet.
+        late = max(delays, default=0.0) + float(model.opt.timestep)
+        pending = max(pending, int(np.ceil(late / spec.control_step - 1e-9)))
     names, episode = tuple(signal.name for signal in spec.signals), read_episode(draft, signals, actions)
     task = Task(
         name=spec.name,

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 
 import mujoco
 import mujoco.rollout
@@ -13,7 +14,7 @@ from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, Parameter
 from madoc.runs.machine import usable_cores
 from madoc.simulation.arrays import check_field, check_written
-from madoc.simulation.delay import blend, delay_weights, in_effect
+from madoc.simulation.delay import blend, delay_weights
 from madoc.simulation.drives import drive_forces
 from madoc.simulation.write import find_elements, write_parameters
 from madoc.tasks.base import Task
@@ -162,12 +163,12 @@ class CpuSystem:
         self._simulator, self._delay, self._bias = simulator, delay, bias
         self._physical = models[0].nq + models[0].nv
         self._goals = self._physical + simulator.task.pending * simulator.action_size
-        self._weights = delay_weights(
-            delay,
-            control_step=simulator.control_step,
-            physics_steps=simulator.task.frame_skip,
-            pending=simulator.task.pending,
+        weights = partial(
+            delay_weights, delay, control_step=simulator.control_step, physics_steps=simulator.task.frame_skip
         )
+        self._weights = weights(pending=simulator.task.pending)
+        # What sensors show is the end of a control step, whose own action is the newest of those pending.
+        self._sensed = weights(pending=max(simulator.task.pending - 1, 0))[:, -1:]
 
     def replaced(
         self, systems: Int[np.ndarray, " some"], parameters: Float[np.ndarray, "some parameters"]
@@ -268,9 +269,7 @@ class CpuSystem:
     def _sensordata(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows sensor"]:
         control = np.zeros((*state.shape[:2], 1, self.models[0].nu))
         if self._simulator.task.pending:
-            newest = in_effect(self._delay, self._simulator.control_step)
-            last = self._pending(state)[np.arange(self.count), :, newest]
-            control[:, :, 0] = self._simulator._controls(last)
+            control = self._simulator._controls(blend(self._sensed, self._pending(state)))
         sensors = np.zeros((control.shape[0] * control.shape[1], 1, self.models[0].nsensordata))
         moved = self._simulated(state[..., : self._physical], control, sensors=sensors)
         return np.where(np.isnan(moved[:, :, 0, :1]), np.nan, sensors.reshape(*control.shape[:2], -1))

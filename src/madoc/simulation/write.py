@@ -7,20 +7,15 @@ import mujoco
 import numpy as np
 
 from madoc.errors import MadocError, nearest_hint
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.arrays import numbers_at, write_number
-
-MASS_FLOOR = 1e-3
-"""Mass of a body in kg to which smaller values are raised, as the motion of a massless body diverges; see `LEAST`."""
-
-INERTIA_FLOOR = 1e-9
-"""Moment of inertia in kg·m² to which smaller values are raised for the same reason; see `LEAST`."""
-
-LEAST = 1e-3
-"""Share of a body's own mass or inertia in the model to which they are raised, where that is less than the floors."""
-
-CENTRED = 1e-6
-"""Distance of a centre of mass from its body's origin, in radii of gyration, up to which rounding makes it."""
+from madoc.simulation.inertials import (
+    write_centre_of_mass,
+    write_deviations,
+    write_inertia,
+    write_mass,
+    write_mass_and_inertia,
+)
 
 SOLREF_FLOOR = 1e-9
 """Time constant of a contact, s, and damping ratio to which smaller ones are raised, as 0 means another format."""
@@ -41,7 +36,6 @@ ONE_DOF = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 """Types of joints with one degree of freedom."""
 OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 """Transmissions of actuators that act on one joint; for a hinge or a slide the two are the same."""
-_INERTIAL_FRAMES = (mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA, mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT)
 
 
 def write_parameters(
@@ -51,14 +45,19 @@ def write_parameters(
 
     A parameter that names an element the model does not have, or that scales a mass of 0, is refused.
     """
+    of_bodies: dict[int, dict[str, float]] = {}
     for parameter, value in zip(parameters, values, strict=True):
         if parameter.kind.in_model:
             for element in find_elements(model, parameter):
                 numbers, write = _place_of(parameter.field)
-                if write is None:
+                if parameter.field in (*PAYLOAD, *INERTIA):
+                    of_bodies.setdefault(element, {})[parameter.field] = float(value)
+                elif write is None:
                     numbers(model, element)[:] = value
                 else:
                     write(model, element, float(value))
+    for body, deviations in of_bodies.items():
+        write_deviations(model, body, deviations)
     mujoco.mj_setConst(model, data)
 
 
@@ -146,60 +145,6 @@ def _dofs(model: mujoco.MjModel, joint: int) -> slice:
     return slice(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + len(model.joint(joint).damping))
 
 
-def _write_mass(model: mujoco.MjModel, body: int, value: float) -> None:
-    before = float(model.body_mass[body])
-    model.body_mass[body] = max(value, min(MASS_FLOOR, LEAST * before) if before else MASS_FLOOR)
-
-
-def _write_mass_and_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
-    before = float(model.body_mass[body])
-    if before == 0.0:
-        name = model.body(body).name
-        raise MadocError(f"body_mass_and_inertia: body {name!r} has no mass to scale; use body_mass instead")
-    _write_mass(model, body, value)
-    model.body_inertia[body] *= model.body_mass[body] / before
-
-
-def _write_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
-    largest = model.body_inertia[body].max()
-    if largest == 0.0:
-        name = model.body(body).name
-        raise MadocError(f"body_inertia: body {name!r} has no inertia to scale; give it one in the model")
-    model.body_inertia[body] *= max(value, min(INERTIA_FLOOR, LEAST * largest)) / largest
-
-
-def off_centre(model: mujoco.MjModel, body: int) -> float:
-    """Distance of a body's centre of mass from its origin, m; 0 where it is there but for rounding."""
-    distance = float(np.linalg.norm(model.body_ipos[body]))
-    gyration = np.sqrt(model.body_inertia[body].max() / max(float(model.body_mass[body]), MASS_FLOOR))
-    return distance if distance > CENTRED * gyration else 0.0
-
-
-def _write_centre_of_mass(model: mujoco.MjModel, body: int, value: float) -> None:
-    distance = off_centre(model, body)
-    if distance == 0.0:
-        raise MadocError(
-            f"body_com: the centre of mass of body {model.body(body).name!r} is at its origin, so it has no direction "
-            "to move in; place it in the model"
-        )
-    before = model.body_ipos[body].copy()
-    model.body_ipos[body] *= value / distance
-    _keep_shapes(model, body, model.body_ipos[body] - before)
-
-
-def _keep_shapes(model: mujoco.MjModel, body: int, moved: np.ndarray) -> None:
-    """Leave geoms and sites where they are: MuJoCo keeps some of them, and boxes around them, in the inertial frame."""
-    for owner, frame in ((model.geom_bodyid, model.geom_sameframe), (model.site_bodyid, model.site_sameframe)):
-        in_inertial_frame = (owner == body) & np.isin(frame, _INERTIAL_FRAMES)
-        frame[in_inertial_frame] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-    first, count = model.body_bvhadr[body], model.body_bvhnum[body]
-    if count:
-        back, turned = np.zeros(4), np.zeros(3)
-        mujoco.mju_negQuat(back, model.body_iquat[body])
-        mujoco.mju_rotVecQuat(turned, moved, back)
-        model.bvh_aabb[first : first + count, :3] -= turned
-
-
 def has_gain(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether an actuator has a fixed gain; the first number of others is something else."""
     return int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
@@ -279,10 +224,11 @@ Numbers = Callable[[mujoco.MjModel, int], np.ndarray]
 Write = Callable[[mujoco.MjModel, int, float], None]
 _PLACES: dict[str, tuple[Numbers, Write | None]] = {
     "gravity": (lambda model, _: model.opt.gravity[2:], None),
-    "body_mass": (lambda model, body: model.body_mass[body : body + 1], _write_mass),
-    "body_mass_and_inertia": (lambda model, body: model.body_mass[body : body + 1], _write_mass_and_inertia),
-    "body_inertia": (lambda model, body: model.body_inertia[body].max(keepdims=True), _write_inertia),
-    "body_com": (lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]), _write_centre_of_mass),
+    "body_mass": (lambda model, body: model.body_mass[body : body + 1], write_mass),
+    "body_mass_and_inertia": (lambda model, body: model.body_mass[body : body + 1], write_mass_and_inertia),
+    "body_inertia": (lambda model, body: model.body_inertia[body].max(keepdims=True), write_inertia),
+    "body_com": (lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]), write_centre_of_mass),
+    **dict.fromkeys((*PAYLOAD, *INERTIA), (lambda model, body: np.zeros(1), None)),
     "dof_frictionloss": (lambda model, joint: model.dof_frictionloss[_dofs(model, joint)], None),
     "dof_drag": (lambda model, joint: model.dof_dampingpoly[_dofs(model, joint), :1], None),
     "dof_damping": (lambda model, joint: model.dof_damping[_dofs(model, joint)], None),
@@ -300,4 +246,5 @@ _PLACES: dict[str, tuple[Numbers, Write | None]] = {
 """Where each field stands in a model: the numbers of an element, the first of which is its value, and what writes one.
 
 Without a writer all of the numbers become the value; a writer is for a value that has a floor, or moves others along.
+Payloads and deviations of inertias, 0 in the model, are written together.
 """
