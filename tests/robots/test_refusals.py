@@ -355,7 +355,8 @@ def test_models_that_cannot_be_stepped_yet_are_refused(tmp_path):
         cart=CART.replace("</mujoco>", actuator),
     )
     with pytest.raises(
-        MadocError, match="line 3: cart: models with actuator activations or mocap bodies are not supported"
+        MadocError,
+        match=r"line 3: cart: the actuators a have an activation .*, a state that is not simulated",
     ):
         robots.load(path)
 

@@ -226,9 +226,13 @@ def test_a_sensor_of_acceleration_feels_the_last_action(tmp_path):
 
 def test_a_sensor_feels_the_action_that_has_taken_effect(tmp_path):
     spec = CART_SPEC.replace("velocity(rail)", '"sensor(shake)[0]"') + "  - {field: action_delay, low: 0, high: 0.04}\n"
-    system = CpuSimulator(task_of(tmp_path, spec, cart=SENSED), threads=1).bind(np.array([[1.0, 0.01], [1.0, 0.03]]))
-    seen = system.observe(np.full((2, 1, 4), [0.0, 0.0, 0.4, -0.2]))
-    np.testing.assert_allclose(seen[:, 0, 1], [4.0, -2.0], rtol=1e-12)
+    simulator = CpuSimulator(task_of(tmp_path, spec, cart=SENSED), threads=1)
+    assert simulator.task.pending == 3  # 0.04 s, and the physics step of 0.01 s in which that action still holds
+    delays = (0.01, 0.03, 0.015, 0.035)
+    system = simulator.bind(np.array([[1.0, delay] for delay in delays]))
+    seen = system.observe(np.full((4, 1, 5), [0.0, 0.0, 0.4, -0.2, 0.6]))
+    # Where actions change within the last physics step, it has half of each: (4 - 2) / 2 and (-2 + 6) / 2.
+    np.testing.assert_allclose(seen[:, 0, 1], [4.0, -2.0, 1.0, 2.0], rtol=1e-12)
 
 
 def test_a_urdf(tmp_path):

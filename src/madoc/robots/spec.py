@@ -149,8 +149,13 @@ class ParameterSpec(Part):
     def parameter(self, field: str, elements: tuple[str, ...], unit: str = "") -> Parameter:
         """The parameter of a field and of one or several elements, in the unit of its field or in another."""
         element = elements[0] if len(elements) == 1 else elements or ""
-        added = [self.name, field if len(self.fields) > 1 else "", str(element) if self.each else ""]
-        label = ".".join(filter(None, added)) if self.name else ""
+        if self.elements and len(self.elements) == 1 and len(elements) > 1 and not self.name:
+            label = f"{field}.{self.elements[0]}"  # the pattern says what all of them are
+        elif self.name:
+            added = [self.name, field if len(self.fields) > 1 else "", str(element) if self.each else ""]
+            label = ".".join(filter(None, added))
+        else:
+            label = ""
         return Parameter(field, element, self.low, self.high, label, unit or self.unit or "")
 
 

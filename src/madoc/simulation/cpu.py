@@ -10,7 +10,7 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.errors import MadocError, nearest_hint
+from madoc.errors import MadocError, listed, nearest_hint
 from madoc.parameters import FIELDS, Parameter
 from madoc.runs.machine import usable_cores
 from madoc.simulation.arrays import check_field, check_written
@@ -46,8 +46,13 @@ class CpuSimulator:
         self.threads = threads or usable_cores()
         self._model = task.model
         self.control_step = float(self._model.opt.timestep) * task.frame_skip
-        if self._model.na or self._model.nmocap:
-            raise MadocError(f"{task.name}: models with actuator activations or mocap bodies are not supported")
+        active = np.flatnonzero(self._model.actuator_actnum).tolist()
+        if active:
+            names = listed((self._model.actuator(index).name or f"number {index}" for index in active), most=4)
+            raise MadocError(
+                f"{task.name}: the actuators {names} have an activation (dyntype), a state that is not simulated here; "
+                "take their dyntype out of the model, and calibrate action_delay instead"
+            )
         whole = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if whole != 1 + self._model.nq + self._model.nv:  # time, positions, velocities
             raise MadocError(
