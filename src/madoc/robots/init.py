@@ -17,8 +17,9 @@ from madoc.robots.document import yaml_text
 from madoc.robots.expressions import Read
 from madoc.robots.model import AddedActuator, compiled, is_single, is_slide, make_model, read_model
 from madoc.robots.model_files import ModelFiles
-from madoc.robots.proposals import MOST, Proposal, is_servo, proposals, rounded, strength
+from madoc.robots.proposals import MOST, Proposal, proposals, rounded
 from madoc.robots.recipes import RECIPES, Recipe
+from madoc.robots.strength import is_servo, strengths
 from madoc.runs.files import replacing
 from madoc.simulation.write import element_names, free_joints
 from madoc.tasks import TASKS
@@ -169,11 +170,12 @@ def _actions(
         name = f"{actuator}_command" if actuator in taken else actuator
         ends, comment = _command_ends(model, actuator)
         yield {"name": name, "actuator": actuator, "low": ends[0], "high": ends[1]}, comment
+    strong = strengths(model)
     for joint in joints if not model.nu else ():
         index = model.joint(joint).id
         if not is_single(model, index):
             continue
-        slide, (torque, known) = is_slide(model, index), strength(model, joint)
+        slide, (torque, known) = is_slide(model, index), strong[joint]
         torque = recipe.limit if recipe and recipe.limit and not slide and not known else rounded(torque)
         positioned = bool(model.jnt_limited[index]) and (recipe is None or recipe.means == "position")
         if positioned:
@@ -256,7 +258,10 @@ def _parameters(model: mujoco.MjModel, lines: list[Proposal]) -> Iterator[str]:
             fields["element"] = line.elements[0]
         elif line.elements:
             known = element_names(model, str(FIELDS[line.field].element))
-            fields["elements"] = _pattern(line.elements, known) or list(line.elements)
+            pattern = _pattern(line.elements, known)
+            fields["elements"] = pattern or list(line.elements)
+            if not pattern:
+                fields["name"] = f"{line.field}.{line.elements[0]}+{len(line.elements) - 1}"
         fields |= {"low": line.low, "high": line.high}
         yield f"  {'' if line.wanted else '# '}- {_mapping(**fields)}  # {line.comment}"
     left = sum(not line.wanted for line in lines)

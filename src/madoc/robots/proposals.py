@@ -1,5 +1,6 @@
 """Parameters that a first spec proposes: which, in what order, in what ranges, and with which joints alike."""
 
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -11,22 +12,21 @@ from madoc.parameters import FIELDS, Parameter
 from madoc.robots.model import is_single, is_slide
 from madoc.robots.recipes import Ends, Recipe
 from madoc.robots.space import element_unit
+from madoc.robots.strength import FREE, actuators_of, is_servo, strengths
 from madoc.simulation.write import OF_A_JOINT, element_names, find_elements, has_gain, heavy_bodies, nominal_values
 
 MOST = 40
 """Largest number of parameters proposed; further fields are written as comments, each with all of its lines."""
+_MANY = 10
+"""Largest number of lines of a field, where some of them may be one."""
 _SIDES = frozenset(
     re.findall(r"\w+", "l r left right front rear back hind fl fr rl rr hl hr bl br lf rf lh rh lr")  # of legs, too
 )
 """Words of a name that say which of several legs, arms or wheels something belongs to."""
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
-_REACH = 10.0
-"""rad/s² (of a slide m/s²) that a drive reaches at least, where the model does not say how strong it is."""
 _ARMATURE, _FRICTION, _DAMPING = 0.01, 0.1, 0.03
 """Reflected inertia (s²), Coulomb friction (1) and damping (s) of a drive, as shares of its largest torque: at most
 what the machines of `recipes.py` have."""
-_FREE = 6
-"""Degrees of freedom of a body that moves freely."""
 _SERVO = 3.0
 """Factor by which the stiffness of a servo may be off."""
 _GUESS = 10.0
@@ -93,38 +93,6 @@ def proposals(
     return _limited([list(field) for field in fields])
 
 
-def is_servo(model: mujoco.MjModel, actuator: str) -> bool:
-    """Whether an actuator holds a position: it pulls with a gain times the difference to its command."""
-    index = model.actuator(actuator).id
-    gain = float(model.actuator_gainprm[index, 0])
-    return has_gain(model, index) and gain > 0.0 and float(model.actuator_biasprm[index, 1]) == -gain
-
-
-def strength(model: mujoco.MjModel, joint: str) -> tuple[float, bool]:
-    """The largest torque or force of a joint's drive, N·m or N, and whether the model says it.
-
-    Where it does not, that which holds what hangs on the joint, and accelerates it.
-    """
-    index = model.joint(joint).id
-    limits = [abs(model.jnt_actfrcrange[index]).max()] if model.jnt_actfrclimited[index] else []
-    for actuator in _actuators_of(model, index):
-        gear = abs(float(model.actuator_gear[actuator, 0]))
-        if model.actuator_forcelimited[actuator]:
-            limits.append(gear * abs(model.actuator_forcerange[actuator]).max())
-        elif model.actuator_ctrllimited[actuator] and not model.actuator_biasprm[actuator].any():
-            limits.append(gear * abs(model.actuator_gainprm[actuator, 0] * model.actuator_ctrlrange[actuator]).max())
-    positive = [float(limit) for limit in limits if limit > 0.0]
-    if positive:
-        return min(positive), True
-    data, body = mujoco.MjData(model), model.jnt_bodyid[index]
-    mujoco.mj_forward(model, data)
-    root = model.body_rootid[body]
-    carried = root if model.body_dofnum[root] == _FREE else body  # the legs of a free body carry it
-    weight = float(model.body_subtreemass[carried]) * float(np.linalg.norm(model.opt.gravity))
-    lever = 1.0 if is_slide(model, index) else float(np.linalg.norm(data.subtree_com[body] - data.xanchor[index]))
-    return max(weight * lever, _REACH * float(model.dof_M0[model.jnt_dofadr[index]])), False
-
-
 def rounded(value: float) -> float:
     """The value with two digits, which are enough for a range."""
     return float(np.format_float_positional(value, precision=2, fractional=False)) if value > 0 else value
@@ -145,31 +113,32 @@ def _unwanted(line: Proposal) -> Proposal:
 
 def _moves_freely(model: mujoco.MjModel, body: str) -> bool:
     (index,) = find_elements(model, Parameter("body_mass", body, 0.0, 1.0))
-    return bool(model.body_dofnum[index] == _FREE)
-
-
-def _actuators_of(model: mujoco.MjModel, joint: int) -> list[int]:
-    """The actuators on a joint, or over a fixed tendon of it alone."""
-    on_joint = np.isin(model.actuator_trntype, OF_A_JOINT) & (model.actuator_trnid[:, 0] == joint)
-    return [int(actuator) for actuator in np.flatnonzero(on_joint)]
+    return bool(model.body_dofnum[index] == FREE)
 
 
 def _driven(model: mujoco.MjModel, joints: list[str]) -> list[str]:
     """The joints that actuators drive; all where some act through tendons or sites."""
     if not model.nu or not np.isin(model.actuator_trntype, OF_A_JOINT).all():
         return joints
-    return [joint for joint in joints if _actuators_of(model, model.joint(joint).id)]
+    return [joint for joint in joints if actuators_of(model, model.joint(joint).id)]
 
 
-def _alike(names: Iterable[str], value: Callable[[str], object]) -> Iterator[tuple[str, ...]]:
-    """Elements by groups: those whose names differ by a side alone (`FL_hip`, `FR_hip`), and whose values do not."""
-    groups: dict[object, list[str]] = {}
+def _alike(
+    names: Iterable[str], value: Callable[[str], object], coarse: Callable[[str], object] | None = None
+) -> list[tuple[str, ...]]:
+    """Elements by groups: those whose names differ by a side alone (`FL_hip`, `FR_hip`), and whose values do not.
+
+    Where these are many, as of a hand, all of one `coarse` value are one group.
+    """
+    by_name: dict[object, list[str]] = {}
+    by_value: dict[object, list[str]] = {}
     for name in names:
         words = [word.lower() for word in _WORDS.findall(name)]
         stem = tuple(word for word in words if word not in _SIDES)
         sided = stem and len(stem) < len(words)
-        groups.setdefault((stem, value(name)) if sided else name, []).append(name)
-    yield from map(tuple, groups.values())
+        by_name.setdefault((stem, value(name)) if sided else name, []).append(name)
+        by_value.setdefault(name if coarse is None else coarse(name), []).append(name)
+    return [tuple(group) for group in (by_value if coarse and len(by_name) > _MANY else by_name).values()]
 
 
 def _of_joint(model: mujoco.MjModel, joint: str) -> tuple[object, ...]:
@@ -183,14 +152,16 @@ def _dissipation(
     model: mujoco.MjModel, field: str, joints: list[str], ends: Ends | None, share: float, *, wanted: bool
 ) -> Iterator[Proposal]:
     """A field of joints from 0 up, by the recipe or by a share of the drive's torque; the model's value is inside."""
-    for group in _alike(joints, lambda joint: _of_joint(model, joint)):
-        (value,), (torque, known) = (
-            nominal_values(model, Parameter(field, group[0], 0.0, 1.0)),
-            strength(model, group[0]),
-        )
-        usual = share * torque
-        if field == "dof_armature" and not known:
-            usual = float(model.dof_M0[model.joint(group[0]).dofadr[0]])
+    strong = strengths(model)
+
+    def coarse(joint: str) -> tuple[object, ...]:
+        return (*_of_joint(model, joint), round(math.log2(strong[joint][0] or 1.0)))
+
+    for group in _alike(joints, lambda joint: _of_joint(model, joint), coarse):
+        (value,) = nominal_values(model, Parameter(field, group[0], 0.0, 1.0))
+        usual = share * max(strong[joint][0] for joint in group)
+        if field == "dof_armature" and not strong[group[0]][1]:
+            usual = max(usual, *(float(model.dof_M0[model.joint(joint).dofadr[0]]) for joint in group), 0.0)
         low, high = ends if ends and not is_slide(model, model.joint(group[0]).id) else (0.0, usual)
         low, high = min(low, rounded(value / 2)), max(high, 2 * value)
         unit = element_unit(model, field, group[0]) or FIELDS[field].unit
@@ -200,11 +171,11 @@ def _dissipation(
 def _scaled(model: mujoco.MjModel, field: str, names: Iterable[str], *, wanted: bool) -> Iterator[Proposal]:
     """A field of elements where the model's value is above 0, from half of it to twice."""
     values = {name: nominal_values(model, Parameter(field, name, 0.0, 1.0))[0] for name in names}
-    for group in _alike(values, lambda name: f"{values[name]:.2g}"):
+    coarse = None if FIELDS[field].element == "body" else values.__getitem__
+    for group in _alike(values, lambda name: f"{values[name]:.2g}", coarse):
         if (value := values[group[0]]) > 0:
-            unit = (
-                "" if FIELDS[field].unit == "1" else f"{element_unit(model, field, group[0]) or FIELDS[field].unit}; "
-            )
+            unit = element_unit(model, field, group[0]) or FIELDS[field].unit
+            unit = "" if unit == "1" else f"{unit}; "
             unit = "sliding, in contacts; " if field == "geom_friction" else unit
             yield Proposal(
                 field, group, rounded(value / 2), rounded(value * 2), f"{unit}the model has {value:.4g}", wanted
@@ -214,7 +185,7 @@ def _scaled(model: mujoco.MjModel, field: str, names: Iterable[str], *, wanted: 
 def _gains(model: mujoco.MjModel, servos: list[str], ends: Ends | None, guessed: frozenset[str]) -> Iterator[Proposal]:
     """Stiffness of servos; the ranges of a recipe are made wide enough for the model's."""
     values = {servo: float(model.actuator(servo).gainprm[0]) for servo in servos}
-    for group in _alike(servos, lambda servo: values[servo]):
+    for group in _alike(servos, values.__getitem__, values.__getitem__):
         value = values[group[0]]
         factor = _GUESS if group[0] in guessed else _SERVO
         low, high = (value / factor, value * factor) if ends is None else (min(ends[0], value), max(ends[1], value))
@@ -223,8 +194,8 @@ def _gains(model: mujoco.MjModel, servos: list[str], ends: Ends | None, guessed:
 
 def _brakes(model: mujoco.MjModel, servos: list[str], *, wanted: bool) -> Iterator[Proposal]:
     """Damping of servos; where no servo has any, that of the joints stands for it."""
-    values = {servo: (-model.actuator(servo).biasprm[2], model.actuator(servo).gainprm[0]) for servo in servos}
-    for group in _alike(servos, lambda servo: values[servo]):
+    values = {servo: (0.0 - model.actuator(servo).biasprm[2], model.actuator(servo).gainprm[0]) for servo in servos}
+    for group in _alike(servos, values.__getitem__, values.__getitem__):
         value, kp = (float(number) for number in values[group[0]])
         high = rounded(max(_SERVO * value, _KV * kp))
         yield Proposal("actuator_kv", group, 0.0, high, f"kv; the model has {value:.4g}", wanted)
