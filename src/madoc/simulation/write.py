@@ -10,6 +10,7 @@ from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.arrays import numbers_at, write_number
 from madoc.simulation.inertials import (
+    DIAGONAL,
     write_centre_of_mass,
     write_deviations,
     write_inertia,
@@ -77,6 +78,14 @@ def same_numbers(model: mujoco.MjModel, one: Parameter, other: Parameter) -> boo
         [_place_of(each.field)[0](model, element) for element in find_elements(model, each)] for each in (one, other)
     )
     return any(np.shares_memory(ours, theirs) for ours in here for theirs in there)
+
+
+def diagonal_bodies(model: mujoco.MjModel, parameter: Parameter) -> list[str]:
+    """Elements of a parameter of a payload or an inertia, of whose mass matrix MuJoCo keeps the diagonal alone."""
+    if parameter.field not in (*PAYLOAD, *INERTIA):
+        return []
+    bodies = zip(parameter.elements, find_elements(model, parameter), strict=True)
+    return [name for name, body in bodies if model.body_simple[body] == DIAGONAL]
 
 
 def find_elements(model: mujoco.MjModel, parameter: Parameter) -> list[int]:
