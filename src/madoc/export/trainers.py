@@ -13,7 +13,6 @@ from pathlib import Path
 import jinja2
 
 from madoc.export.parameter_files import Exported
-from madoc.parameters import FIELDS
 from madoc.runs.files import replacing
 from madoc.simulation.configuration import JointActuator
 
@@ -104,7 +103,7 @@ def save_isaac_lab(path: Path, robot: Robot, exported: Sequence[Exported]) -> No
     lost += [
         f"{row.parameter.name} = {row.row.estimate:.6g} {row.row.unit} has to go into the robot's USD file"
         for row in exported
-        if FIELDS[row.parameter.field].in_model and not _drawn(row, robot)
+        if row.parameter.kind.in_model and not _drawn(row, robot)
     ]
     drawn = [(*quantity, column) for column, row in enumerate(exported) if (quantity := _drawn(row, robot))]
     _write(

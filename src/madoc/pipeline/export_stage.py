@@ -22,7 +22,6 @@ from madoc.export import (
     save_sysid_parameters,
 )
 from madoc.numpy_policy import NumpyPolicy
-from madoc.parameters import FIELDS
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
 from madoc.pipeline.keys import stage_key
@@ -98,7 +97,7 @@ def _leave_draws(folder: Path, simulator: Simulator, calibrated: Calibrated) -> 
     """Leave models drawn from the joint distribution of the estimate, and tell the arrays in which they differ."""
     key = stage_key(calibrated.result.seed, "export")
     values = np.asarray(calibrated.distribution().draw(key, DRAWS), np.float64)
-    around = [row.name for row in simulator.parameters.parameters if not FIELDS[row.field].in_model]
+    around = [row.name for row in simulator.parameters.parameters if not row.kind.in_model]
     numbers = numbers_of_draws(simulator, values)
     save_draws(folder, simulator.parameters.names, around, values, numbers)
     return [name for name, (_, rows) in numbers.items() if rows.dtype.kind == "f"]
