@@ -1,31 +1,39 @@
 """Parameters that can be calibrated: their names, units and ranges, and their scaling to [-1, 1]."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from numpy.typing import ArrayLike
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, nearest_hint
 
 
 @dataclass(frozen=True)
 class Field:
-    """A kind of parameter.
+    """A kind of parameter; its place in the model is in `simulation/write.py`.
 
     Attributes:
         element: `body`, `joint`, `geom`, `actuator` or `signal`; None for a parameter of the whole robot.
-        unit: The unit for a hinge joint; for a slide joint N takes the place of N·m, and m that of rad.
+        unit: The unit; of a field of joints, that for a hinge.
+        slide_unit: The unit for a slide joint, where it is another.
         minimum: Smallest value that is physically possible.
         maximum: Largest size of a value that any robot may have.
+        words: What reports call it; if empty, its name.
+        missing: What a model lacks that has no such term, in words; empty where nobody looks for that.
         in_model: Whether the value is written into the MuJoCo model; if not, the simulator applies it around the model.
     """
 
     element: str | None
     unit: str
     minimum: float = -np.inf
+    slide_unit: str = ""
+    words: str = ""
+    missing: str = ""
     maximum: float = 1e12
     in_model: bool = True
 
@@ -33,42 +41,55 @@ class Field:
 AT_END = 0.98
 """Position in [-1, 1] of its range; past it, to either side, a parameter is at the end of the range."""
 
+PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z", "payload_gyration")
+"""Fields of a load on a body: its mass, where its centre is in the body's frame, its radius of gyration."""
+INERTIA = tuple(f"inertia_{part}" for part in ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3"))
+"""Fields of a body's ten inertial numbers, as deviations from the model's (Rucker and Wensing 2022); all 0 is that."""
+_DRAG = "drag that grows with the square of the speed"
+_ARMATURE = "inertia that goes with the acceleration of a joint"
 FIELDS: dict[str, Field] = {
-    "gravity": Field(None, "m/s²", maximum=1e4),
-    "body_mass": Field("body", "kg", 0.0),
-    "body_mass_and_inertia": Field("body", "kg", 0.0),
+    "gravity": Field(None, "m/s²", missing="another gravity", maximum=1e4),
+    "body_mass": Field("body", "kg", 0.0, words="mass", missing="another mass, as of a payload"),
+    "body_mass_and_inertia": Field("body", "kg", 0.0, words="mass, inertia"),
     "body_inertia": Field("body", "kg·m²", 0.0),
-    "body_com": Field("body", "m", 0.0),
-    "dof_damping": Field("joint", "N·m·s/rad", 0.0),
-    "dof_drag": Field("joint", "N·m·s²/rad²", 0.0),
-    "dof_armature": Field("joint", "kg·m²", 0.0),
-    "dof_frictionloss": Field("joint", "N·m", 0.0),
-    "jnt_stiffness": Field("joint", "N·m/rad", 0.0),
-    "jnt_ref": Field("joint", "rad"),
-    "geom_friction": Field("geom", "1", 0.0),
-    "actuator_gain": Field("actuator", "1"),
-    "actuator_kv": Field("actuator", "N·m·s/rad", 0.0),
-    "drive_supply": Field("actuator", "V", 0.0),
-    "drive_kt": Field("actuator", "N·m/A", 0.0),
-    "drive_resistance": Field("actuator", "Ω", 1e-9),
-    "drive_gain": Field("actuator", "1", 0.0),
-    "drive_damping_gain": Field("actuator", "1", 0.0),
-    "drive_duty_limit": Field("actuator", "1", 0.0, 1.0),
-    "drive_current_limit": Field("actuator", "A", 0.0),
-    "drive_strength": Field("actuator", "1", 0.0),
-    "friction_stribeck": Field("joint", "N·m", 0.0),
-    "friction_stribeck_speed": Field("joint", "rad/s", 1e-9),
-    "friction_stribeck_exponent": Field("joint", "1", 0.0, 100.0),
-    "friction_load": Field("joint", "1", 0.0),
-    "friction_load_motor": Field("joint", "1", 0.0),
-    "friction_load_external": Field("joint", "1", 0.0),
-    "friction_stribeck_load": Field("joint", "1", 0.0),
-    "friction_stribeck_load_motor": Field("joint", "1", 0.0),
-    "friction_stribeck_load_external": Field("joint", "1", 0.0),
-    "friction_quadratic_motor": Field("joint", "1/(N·m)", 0.0),
-    "friction_quadratic_external": Field("joint", "1/(N·m)", 0.0),
-    "action_delay": Field(None, "s", 0.0, 10.0, in_model=False),
-    "signal_bias": Field("signal", "1", in_model=False),
+    "body_com": Field("body", "m", 0.0, missing="another centre of mass, as with a payload"),
+    "payload_mass": Field("body", "kg", 0.0, words="payload"),
+    **{f"payload_{axis}": Field("body", "m", words=f"payload's {axis}") for axis in "xyz"},
+    "payload_gyration": Field("body", "m", 0.0, words="payload's radius of gyration"),
+    **{field: Field("body", "1", maximum=3.0, words=field.replace("_", " ")) for field in INERTIA},
+    "dof_frictionloss": Field("joint", "N·m", 0.0, "N", "dry friction", "Coulomb friction"),
+    "dof_drag": Field("joint", "N·m·s²/rad²", 0.0, "N·s²/m²", "drag", _DRAG),
+    "dof_damping": Field("joint", "N·m·s/rad", 0.0, "N·s/m", "damping", "viscous damping"),
+    "dof_armature": Field("joint", "kg·m²", 0.0, "kg", "armature", _ARMATURE),
+    "jnt_stiffness": Field("joint", "N·m/rad", 0.0, "N/m", "stiffness", "a spring"),
+    "jnt_ref": Field("joint", "rad", slide_unit="m", words="zero"),
+    "geom_friction": Field("geom", "1", 0.0, words="friction"),
+    "geom_friction_torsional": Field("geom", "m", 0.0, words="torsional friction"),
+    "geom_friction_rolling": Field("geom", "m", 0.0, words="rolling friction"),
+    "contact_time": Field("geom", "s", 0.0, words="time constant of contacts"),
+    "contact_damping": Field("geom", "1", 0.0, words="damping ratio of contacts"),
+    "actuator_gain": Field("actuator", "1", words="gain", missing="another gain of the actuator"),
+    "actuator_kv": Field("actuator", "N·m·s/rad", 0.0, "N·s/m", "servo damping"),
+    "drive_supply": Field("actuator", "V", 0.0, words="supply"),
+    "drive_kt": Field("actuator", "N·m/A", 0.0, words="kt"),
+    "drive_resistance": Field("actuator", "Ω", 1e-9, words="resistance"),
+    "drive_gain": Field("actuator", "1", 0.0, words="gain"),
+    "drive_damping_gain": Field("actuator", "1", 0.0, words="damping gain"),
+    "drive_duty_limit": Field("actuator", "1", 0.0, words="largest duty", maximum=1.0),
+    "drive_current_limit": Field("actuator", "A", 0.0, words="largest current"),
+    "drive_strength": Field("actuator", "1", 0.0, words="strength", missing="another strength of the drive"),
+    "friction_stribeck": Field("joint", "N·m", 0.0, "N", "Stribeck friction"),
+    "friction_stribeck_speed": Field("joint", "rad/s", 1e-9, "m/s", "Stribeck speed"),
+    "friction_stribeck_exponent": Field("joint", "1", 0.0, words="Stribeck exponent", maximum=100.0),
+    **{
+        f"friction_{rest}load{side}": Field("joint", "1", 0.0, words=f"friction by {side[1:] or 'the'} load{at_rest}")
+        for rest, at_rest in (("", ""), ("stribeck_", " at rest"))
+        for side in ("", "_motor", "_external")
+    },
+    "friction_quadratic_motor": Field("joint", "1/(N·m)", 0.0, "1/N", "quadratic friction, motor"),
+    "friction_quadratic_external": Field("joint", "1/(N·m)", 0.0, "1/N", "quadratic friction, external"),
+    "action_delay": Field(None, "s", 0.0, words="delay", maximum=10.0, in_model=False),
+    "signal_bias": Field("signal", "1", words="bias", missing="an offset of the sensor", in_model=False),
 }
 """Every field a parameter can name.
 
@@ -78,10 +99,49 @@ is how far the centre of mass is from the body's origin, in the direction it has
 velocity servo is its kp or kv, and moves the servo's bias with it; `actuator_kv` is the damping of a position servo.
 `jnt_ref` is what a hinge or slide reads, and is commanded to, where the model as drawn has its zero. `action_delay` is
 the time from an action to its effect, `signal_bias` what a sensor reads too much. `dof_drag` is damping that grows with
-the square of the speed. `drive_*` are the numbers of a d.c. drive, `friction_*` those of friction that depends on speed
-and load (`simulation/callbacks.py` has the equations); `friction_load` and `friction_stribeck_load` are one value for
-the motor's and the external torque.
+the square of the speed. `contact_time` and `contact_damping` are MuJoCo's `solref`: how long a contact takes to push
+shapes apart, and 1 where it does so without a bounce. A payload adds to the body's own mass and inertia; its moment of
+inertia about each axis is its mass times the square of its radius of gyration. `drive_*` are the numbers of a d.c.
+drive, `friction_*` those of friction that depends on speed and load (`simulation/callbacks.py` has the equations);
+`friction_load` and `friction_stribeck_load` are one value for the motor's and the external torque.
 """
+
+
+_KINDS = {
+    **{kind: kind for kind in ("body", "geom", "site", "tendon", "actuator", "sensor")},
+    **dict.fromkeys(("dof", "jnt", "qpos", "qpos0"), "joint"),
+    "eq": "equality",
+    "opt": None,
+}
+"""By the first word of the name of a model's array, the kind of element that has a row of it; None for an option."""
+_NUMBER = re.compile(r"(?P<array>(?P<first>opt(?=\.)|[a-z]+0?(?=_)|qpos0)[._]?\w*)(\[(?P<index>\d+)\])?")
+_AT_LEAST_0 = ("mass", "damping", "stiffness", "frictionloss", "armature", "friction", "density", "viscosity")
+"""Ends of the names of arrays whose numbers are not negative."""
+
+
+def array_of(field: str) -> tuple[str, int | None]:
+    """The array of a model, and the place in an element's row, that a field such as `geom_solref[0]` names."""
+    found = _NUMBER.fullmatch(field)
+    if found is None or found["first"] not in _KINDS:
+        raise MadocError(
+            f"unknown parameter field {field!r}; {nearest_hint(field, FIELDS)}; or a number of MuJoCo's model as "
+            f"geom_solref[0], whose array begins with {'_, '.join(_KINDS)}."
+        )
+    return found["array"], None if found["index"] is None else int(found["index"])
+
+
+@lru_cache(maxsize=1024)
+def field_of(name: str) -> Field:
+    """The entry of `FIELDS`, or one for a number of MuJoCo's model: `geom_solref[0]`, `opt.density`.
+
+    Raises:
+        MadocError: It is neither.
+    """
+    if name in FIELDS:
+        return FIELDS[name]
+    array, _ = array_of(name)
+    first = array.partition(".")[0] if "." in array else array.partition("_")[0]
+    return Field(_KINDS[first], "", 0.0 if array.endswith(_AT_LEAST_0) else -np.inf)
 
 
 @dataclass(frozen=True)
@@ -89,13 +149,13 @@ class Parameter:
     """One physical quantity of the simulator that may be calibrated, and the range it is searched in.
 
     Attributes:
-        field: A key of `FIELDS`.
-        element: Name of the body, joint, geom, actuator or signal (a body without a name may be named by its joint).
-            A tuple of names shares one value; a parameter of the whole robot, such as gravity, has an empty name.
+        field: A key of `FIELDS`, or a number of a MuJoCo model such as `geom_solref[0]` or `opt.density`.
+        element: Name of the body, joint, geom, actuator, signal and so on (a body without a name may be named by its
+            joint). A tuple of names shares one value; a parameter of the whole robot, as gravity, has an empty name.
         low: Lower end of the range, in `unit`.
         high: Upper end of the range, in `unit`.
         label: The parameter's name; if empty, it is `field.element`.
-        measured_in: The unit of a slide joint or of a signal; if empty, it is the field's.
+        measured_in: The unit of a slide joint, a signal or a number of the model; if empty, it is the field's.
         when: The condition of a run and its value under which it holds; None holds always.
     """
 
@@ -108,9 +168,7 @@ class Parameter:
     when: tuple[str, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.field not in FIELDS:
-            raise MadocError(f"unknown parameter field {self.field!r}; expected one of {', '.join(FIELDS)}")
-        kind = FIELDS[self.field]
+        kind = self.kind
         if (kind.element is None) != (self.elements == ()) or "" in self.elements:
             wanted = "no element" if kind.element is None else f"the name of a {kind.element}"
             raise MadocError(f"parameter field {self.field!r} takes {wanted}, got {self.element!r}")
@@ -127,6 +185,11 @@ class Parameter:
                 f"range of {self.name} reaches {max(-self.low, self.high):g} {self.unit}, beyond its physical bound "
                 f"{kind.maximum:g}"
             )
+
+    @property
+    def kind(self) -> Field:
+        """What its field is."""
+        return field_of(self.field)
 
     @property
     def elements(self) -> tuple[str, ...]:
@@ -147,7 +210,7 @@ class Parameter:
     @property
     def unit(self) -> str:
         """The physical unit of the value and of its range."""
-        return self.measured_in or FIELDS[self.field].unit
+        return self.measured_in or self.kind.unit or "1"
 
 
 @dataclass(frozen=True)
@@ -202,7 +265,7 @@ class ParameterSpace:
         return tuple(
             row.name
             for row, value in zip(self.parameters, unit.tolist(), strict=True)
-            if abs(value) > AT_END and not (value < 0.0 and row.low <= FIELDS[row.field].minimum)
+            if abs(value) > AT_END and not (value < 0.0 and row.low <= row.kind.minimum)
         )
 
     def select(self, names: Sequence[str]) -> "ParameterSpace":

@@ -10,13 +10,13 @@ import pytest
 from madoc import robots, simulation
 from madoc.data import Disturbance, disturb, logs, typical_change
 from madoc.identification import missing_terms as terms
-from madoc.identification.candidate_terms import CAUSES, EARLY, LATE_DRIVE, LATE_SENSOR, Candidate, _cut_off, is_late
+from madoc.identification.candidate_terms import EARLY, LATE_DRIVE, LATE_SENSOR, Candidate, _cut_off, is_late
 from madoc.identification.drifts import DRIFT, WITHIN_RUNS, _between_runs, _drifts, _of_fitted_runs, _Part
 from madoc.identification.joint_forces import LOADED
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
 from madoc.identification.term_tests import TermTests
-from madoc.parameters import Parameter, ParameterSpace
+from madoc.parameters import FIELDS, Parameter, ParameterSpace
 
 MODEL = """
 <mujoco>
@@ -292,7 +292,7 @@ def test_friction_that_is_likely_counts_though_it_is_not_significant(noise, coun
     effect, slope = np.ones((16, 2)), np.tile([1.0, 0.0], (16, 1))
     residuals = -0.02 * effect + noise * np.array([[0.0, 1.0], [0.0, -1.0]] * 8)
     products = Products.of(residuals, slope[..., None], effect[..., None])
-    tried = (Candidate(CAUSES["dof_frictionloss"], "dof_frictionloss.hinge", "N·m", 0.0, 1.0, 0.0),)
+    tried = (Candidate(FIELDS["dof_frictionloss"].missing, "dof_frictionloss.hinge", "N·m", 0.0, 1.0, 0.0),)
     space = ParameterSpace((Parameter("gravity", "", -11, -9),))
     tests = TermTests(products, tried, space, np.full(1, 0.01), np.zeros(16, int))
     (name,) = space.names

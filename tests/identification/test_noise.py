@@ -33,7 +33,12 @@ def test_a_slope_divides_what_it_carries_on():
 def test_what_does_not_alternate_is_no_noise():
     same = np.ones((10, 1))
     assert consecutive_noise(same, same, same) == 0.0
-    assert consecutive_noise(same, -same, np.zeros((10, 1))) == 0.0
+
+
+def test_a_reading_that_does_not_depend_on_itself_leaves_its_own_noise():
+    """Residuals of 0.5 and 0.5 ± 0.3 in turn: the constant is the model's error, (0.3)² / 2 the noise's square."""
+    first, second, none = np.full((2, 1), 0.5), np.array([[0.8], [0.2]]), np.zeros((2, 1))
+    assert consecutive_noise(first, second, none) == pytest.approx(0.3 / np.sqrt(2.0))
 
 
 def test_noise_is_told_from_a_line_with_noisy_readings():

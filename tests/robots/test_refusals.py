@@ -141,7 +141,7 @@ CHANGES = [
     (
         DAMPING,
         "  - {field: dof_damping, element: a, elements: [b], low: 0, high: 1}",
-        "expected element: or elements:, got both",
+        "expected one of element:, elements: and each:, got element and elements",
     ),
     (
         DAMPING,
@@ -174,6 +174,68 @@ CHANGES = [
         "a signal, got 'elbow'; nearest: elbow_angle",
     ),
     (DAMPING, "  - {field: action_delay, low: -1, high: 1}", "below its physical bound 0.0"),
+    # Numbers of the model, and patterns.
+    (DAMPING, "  - {low: 0, high: 1}", "expected either field: or model:, got both or neither"),
+    (DAMPING, "  - {field: gravity, index: 1, low: 0, high: 1}", "index: belongs to model:, not to field:"),
+    (DAMPING, "  - {field: gravity, unit: m, low: 0, high: 1}", "unit: belongs to model:, not to field:"),
+    (DAMPING, "  - {model: solref, low: 0, high: 1}", "unknown parameter field 'solref'; .* begins with body_, geom_"),
+    (
+        DAMPING,
+        "  - {model: jnt_solreff, index: 0, element: elbow, low: 0, high: 1}",
+        "MuJoCo's model has no numbers 'jnt_solreff'; nearest: jnt_solref",
+    ),
+    (
+        DAMPING,
+        "  - {model: opt.vind, index: 0, low: 0, high: 1}",
+        "MuJoCo's model has no numbers 'opt.vind'; nearest: wind",
+    ),
+    (DAMPING, "  - {model: opt.density, index: 0, low: 0, high: 1}", "expected no index: with opt.density, got 0"),
+    (
+        DAMPING,
+        "  - {model: jnt_solref, element: elbow, low: 0, high: 1}",
+        "expected index: from 0 to 1 with jnt_solref, got none",
+    ),
+    (
+        DAMPING,
+        "  - {model: jnt_solref, index: 2, element: elbow, low: 0, high: 1}",
+        "expected index: from 0 to 1 with jnt_solref, got 2",
+    ),
+    (DAMPING, "  - {model: jnt_solref, index: -1, element: elbow, low: 0, high: 1}", "expected greater than or equal"),
+    (DAMPING, "  - {model: jnt_type, element: elbow, low: 0, high: 1}", "MuJoCo's model has no numbers 'jnt_type'"),
+    (
+        DAMPING,
+        "  - {model: jnt_margin, element: elbw, low: 0, high: 1}",
+        "the name of a joint, got 'elbw'; nearest: elbow",
+    ),
+    (
+        DAMPING,
+        "  - {model: body_quat, index: 0, element: fore, low: 0, high: 1}",
+        "body_quat cannot be calibrated: a quaternion has a length of 1",
+    ),
+    (DAMPING, "  - {model: opt.timestep, low: 0, high: 1}", "opt.timestep cannot be calibrated: the timestep is given"),
+    (
+        DAMPING,
+        "  - {model: opt.gravity, index: 2, low: -11, high: -9}",
+        r"opt.gravity\[2\] and gravity of line 14 are one number of the model; keep one",
+    ),
+    (
+        DAMPING,
+        "  - {model: body_mass, element: fore, low: 1, high: 2}",
+        "the parameter body_mass.fore is on line 16 already",
+    ),
+    (
+        DAMPING,
+        "  - {field: dof_damping, elements: '*_joint', low: 0, high: 1}",
+        "expected the name of a joint, or a pattern with . for several, got '._joint'; there are: shoulder, elbow",
+    ),
+    (
+        DAMPING,
+        "  - {field: dof_damping, each: [elbow, 'x*'], low: 0, high: 1}",
+        r"expected the name of a joint, or a pattern with . for several, got 'x.'; there are",
+    ),
+    (DAMPING, "  - {field: dof_armature, each: 3, low: 0, high: 1}", "expected a list in parameters.each, got 3"),
+    (DAMPING, "  - {field: gravity, each: '*', low: -11, high: -9}", "'gravity' takes no element, got '.'"),
+    (DAMPING, "  - {field: dof_damping, each: '*', low: 0, high: 1}", "dof_damping.shoulder is on line 17 already"),
     # The rest.
     (
         "groups: 2",
@@ -293,7 +355,8 @@ def test_models_that_cannot_be_stepped_yet_are_refused(tmp_path):
         cart=CART.replace("</mujoco>", actuator),
     )
     with pytest.raises(
-        MadocError, match="line 3: cart: models with actuator activations or mocap bodies are not supported"
+        MadocError,
+        match=r"line 3: cart: of the actuators a with an activation .* the state is not simulated",
     ):
         robots.load(path)
 

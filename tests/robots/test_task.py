@@ -226,9 +226,13 @@ def test_a_sensor_of_acceleration_feels_the_last_action(tmp_path):
 
 def test_a_sensor_feels_the_action_that_has_taken_effect(tmp_path):
     spec = CART_SPEC.replace("velocity(rail)", '"sensor(shake)[0]"') + "  - {field: action_delay, low: 0, high: 0.04}\n"
-    system = CpuSimulator(task_of(tmp_path, spec, cart=SENSED), threads=1).bind(np.array([[1.0, 0.01], [1.0, 0.03]]))
-    seen = system.observe(np.full((2, 1, 4), [0.0, 0.0, 0.4, -0.2]))
-    np.testing.assert_allclose(seen[:, 0, 1], [4.0, -2.0], rtol=1e-12)
+    simulator = CpuSimulator(task_of(tmp_path, spec, cart=SENSED), threads=1)
+    assert simulator.task.pending == 3  # 0.04 s, and the physics step of 0.01 s in which that action still holds
+    delays = (0.01, 0.03, 0.015, 0.035)
+    system = simulator.bind(np.array([[1.0, delay] for delay in delays]))
+    seen = system.observe(np.full((4, 1, 5), [0.0, 0.0, 0.4, -0.2, 0.6]))
+    # Where actions change within the last physics step, it has half of each: (4 - 2) / 2 and (-2 + 6) / 2.
+    np.testing.assert_allclose(seen[:, 0, 1], [4.0, -2.0, 1.0, 2.0], rtol=1e-12)
 
 
 def test_a_urdf(tmp_path):
@@ -440,3 +444,29 @@ def test_limits_that_the_model_gives_are_in_the_unit_of_the_action(tmp_path):
     spec = BOUNCER_SPEC.replace("low: -1, high: 1}", "unit: mm}")
     (action,) = robots.load(write_robot(tmp_path, spec, bouncer=model)).task.actions
     assert (action.low, action.high, action.scale) == (pytest.approx(-20.0), pytest.approx(30.0), 1e-3)
+
+
+def test_a_drone_takes_a_payload_off_its_centre(tmp_path):
+    """By itself MuJoCo keeps its mass matrix diagonal. With 1 kg at 0.2 m of a drone of 1 kg, 19.62 N at the drone's
+    centre turn both about the common centre: at 0.1 m, with 0.004 + 2 · 0.1² kg·m²."""
+    drone = """<mujoco><option timestep="1e-4"/><worldbody><body name="drone"><freejoint name="free"/>
+    <geom size=".1" mass="1" type="sphere"/><site name="rotors"/></body></worldbody>
+    <actuator><motor name="thrust" site="rotors" gear="0 0 1 0 0 0" ctrlrange="0 40"/></actuator></mujoco>"""
+    spec = """\
+madoc: 1
+name: drone
+model: drone.xml
+control_step: 1e-4
+signals:
+  - {name: pitch_rate, reads: "velocity(free)[4]", unit: rad/s}
+actions:
+  - {name: thrust, actuator: thrust}
+parameters:
+  - {field: payload_mass, element: drone, low: 0, high: 2}
+  - {field: payload_x, element: drone, low: -0.3, high: 0.3}
+"""
+    simulator = CpuSimulator(task_of(tmp_path, spec, drone=drone), threads=1)
+    system = simulator.bind(np.array([[1.0, 0.2]]))
+    after = system.step(simulator.initial_state[None, None], np.full((1, 1, 1), 19.62 / 20.0 - 1.0))
+    expected = 1e-4 * 19.62 * 0.1 / (0.004 + 2 * 0.1**2)
+    np.testing.assert_allclose(system.observe(after)[0, 0, 0], expected, rtol=1e-5)

@@ -26,7 +26,7 @@ def hopper():
 
 @pytest.fixture
 def everything():
-    """Hopper with one parameter of every field there is."""
+    """Hopper with one parameter of every field but those of payloads and whole inertias, which act together."""
     parameters = (
         Parameter("gravity", "", -15.0, -5.0),
         Parameter("body_mass", "torso", 3.0, 5.0),
@@ -39,6 +39,10 @@ def everything():
         Parameter("dof_frictionloss", "foot_joint", 0.0, 1.0),
         Parameter("jnt_stiffness", "thigh_joint", 0.0, 5.0),
         Parameter("geom_friction", "foot_geom", 0.5, 3.0),
+        Parameter("geom_friction_torsional", "foot_geom", 0.0, 1.0),
+        Parameter("geom_friction_rolling", "foot_geom", 0.0, 1.0),
+        Parameter("contact_time", "foot_geom", 0.01, 0.1),
+        Parameter("contact_damping", "foot_geom", 0.2, 2.0),
         Parameter("jnt_ref", "leg_joint", 0.1, 0.3),
         Parameter("actuator_gain", "foot", 0.5, 2.0),
         Parameter("actuator_kv", "leg", 1e-6, 1e-5),
@@ -49,6 +53,7 @@ def everything():
     def named() -> mujoco.MjSpec:
         robot = spec()
         robot.actuators[1].name, robot.actuators[2].name = "leg", "foot"
+        robot.geom("foot_geom").condim = 6
         robot.actuators[1].biastype = mujoco.mjtBias.mjBIAS_AFFINE
         return robot
 

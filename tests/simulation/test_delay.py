@@ -7,7 +7,7 @@ from madoc.errors import MadocError
 from madoc.parameters import Parameter
 from madoc.robots import load
 from madoc.simulation.cpu import CpuSimulator
-from madoc.simulation.delay import blend, delay_weights, in_effect
+from madoc.simulation.delay import blend, delay_weights
 from own_robots import CART_SPEC, write_robot
 
 STEP = 0.02
@@ -48,10 +48,6 @@ def test_blending_is_the_weighted_sum():
     shares = np.array([[[0.25, 0.75], [1.0, 0.0]]])
     actions = np.array([[[[1.0, 8.0], [-1.0, 4.0]]]])
     np.testing.assert_array_equal(blend(shares, actions), [[[[-0.5, 5.0], [1.0, 8.0]]]])
-
-
-def test_which_action_is_in_effect_at_the_end():
-    assert in_effect(np.array([0.0, 0.01, 0.02, 0.021, 0.04, 0.05]), STEP).tolist() == [0, 0, 0, 1, 1, 2]
 
 
 @pytest.fixture

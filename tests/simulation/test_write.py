@@ -8,10 +8,10 @@ import pytest
 
 import madoc.tasks
 from madoc.errors import MadocError
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.cpu import CpuSimulator
+from madoc.simulation.inertials import MASS_FLOOR
 from madoc.simulation.write import (
-    MASS_FLOOR,
     body_reach,
     element_names,
     find_elements,
@@ -33,14 +33,22 @@ WRITTEN = {
     "dof_frictionloss": lambda model, joint: model.dof_frictionloss[model.jnt_dofadr[joint]],
     "jnt_stiffness": lambda model, joint: model.jnt_stiffness[joint],
     "geom_friction": lambda model, geom: model.geom_friction[geom, 0],
+    "geom_friction_torsional": lambda model, geom: model.geom_friction[geom, 1],
+    "geom_friction_rolling": lambda model, geom: model.geom_friction[geom, 2],
+    "contact_time": lambda model, geom: model.geom_solref[geom, 0],
+    "contact_damping": lambda model, geom: model.geom_solref[geom, 1],
     "jnt_ref": lambda model, joint: model.qpos0[model.jnt_qposadr[joint]],
     "actuator_gain": lambda model, actuator: model.actuator_gainprm[actuator, 0],
     "actuator_kv": lambda model, actuator: -model.actuator_biasprm[actuator, 2],
 }
 """Where each field's value stands in a model."""
 
-IN_MODEL = [name for name, field in FIELDS.items() if field.in_model and not name.startswith(("drive_", "friction_"))]
-"""Fields of a plain model; test_user_data.py has the others."""
+IN_MODEL = [
+    name
+    for name, field in FIELDS.items()
+    if field.in_model and name not in (*PAYLOAD, *INERTIA) and not name.startswith(("drive_", "friction_"))
+]
+"""Fields of a plain model whose numbers are apart; test_user_data.py has those of drives and friction."""
 
 
 @pytest.fixture
@@ -74,7 +82,8 @@ def test_every_field_is_written_where_it_belongs_and_moves_the_robot(everything,
         assert nominal_values(system.models[0], parameter) == (found,)
         ends.append(system.step(state[None, None], np.full((1, 1, 3), 0.5)))
     assert np.isfinite(ends).all()
-    assert (ends[0] != ends[1]).any()
+    # Hopper does not turn about the vertical.
+    assert (ends[0] != ends[1]).any() == (field != "geom_friction_torsional")
 
 
 @pytest.mark.parametrize("field", IN_MODEL)
@@ -90,6 +99,8 @@ def test_only_the_named_element_changes(everything, field):
         "actuator_kv": "actuator_biasprm",
         "body_com": "body_ipos",
         "dof_drag": "dof_dampingpoly",
+        **dict.fromkeys(("contact_time", "contact_damping"), "geom_solref"),
+        **dict.fromkeys(("geom_friction_torsional", "geom_friction_rolling"), "geom_friction"),
     }
     if field == "gravity":
         np.testing.assert_array_equal(model.opt.gravity, [0.0, 0.0, parameter.high])
@@ -141,6 +152,13 @@ def test_rounding_gives_a_centre_of_mass_no_direction():
     np.testing.assert_allclose(moved.body("ring").ipos, (0.05, 0.0, 0.0), rtol=1e-12)
     with pytest.raises(MadocError, match="has no direction"):
         written(mujoco.MjModel.from_xml_string(text.format(1e-11)), Parameter("body_com", "ring", 0.0, 1.0), 0.05)
+
+
+def test_a_contact_of_given_stiffness_has_no_time_constant():
+    text = """<mujoco><worldbody><body><joint/><geom name="sole" size=".1" solref="-100 -5"/></body>
+    </worldbody></mujoco>"""
+    with pytest.raises(MadocError, match=r"the solref of geom 'sole' is a stiffness and a damping"):
+        written(mujoco.MjModel.from_xml_string(text), Parameter("contact_time", "sole", 0.0, 1.0), 0.05)
 
 
 def test_only_a_position_servo_has_a_damping_of_its_own(two_link_arm):

@@ -24,6 +24,9 @@ class Init:
     """MJCF or URDF."""
     out: Path | None = None
     """The spec file. Default: beside the model, as robot.yaml for robot.xml."""
+    recipe: Annotated[str, arg(metavar="CLASS")] = ""
+    """Ranges of what drives of a class of machines are like: hobby-servo, harmonic-arm, direct-drive-leg, dc-gearmotor,
+    drone or wheeled. Default: those that follow from the model."""
     allow_outside: bool = False
     """Read files outside the folder of the model that it names, as ../meshes."""
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
@@ -34,7 +37,7 @@ class Init:
         from madoc.robots.init import write_spec
 
         out = self.out or self.model.parent / f"{self.model.stem or 'robot'}.yaml"
-        write_spec(self.model, out, allow_outside=self.allow_outside)
+        write_spec(self.model, out, allow_outside=self.allow_outside, recipe=self.recipe)
         robot = robots.load(out, allow_outside=self.allow_outside)
         counts = {
             "signals": len(robot.signals),

@@ -152,7 +152,7 @@ def _without_scale(
     certainty: Uncertainty, around: Linearisation, point: Float[np.ndarray, " d"], space: ParameterSpace
 ) -> tuple[Uncertainty, bool]:
     """Whether scaling all calibrated masses and forces alike changes no residual; if so, without that direction."""
-    scaled = np.array([mass_like(row.field) for row in space.parameters])
+    scaled = np.array([mass_like(row) for row in space.parameters])
     direction = np.where(scaled, space.to_physical(point) / (0.5 * (space.high - space.low)), 0.0)
     parts = around.jacobian * direction
     if (parts.sum(-1) ** 2).sum() >= HIDDEN**2 * (parts**2).sum():
@@ -167,7 +167,7 @@ def excitation_findings(excitation: Excitation, simulator: Simulator) -> list[Fi
     named = " ".join(excitation.sentences)
     for parameter, width in zip(simulator.parameters.parameters, excitation.half_width, strict=True):
         share = width / (parameter.high - parameter.low)
-        scaled = excitation.only_ratios and mass_like(parameter.field)  # that is a finding of its own
+        scaled = excitation.only_ratios and mass_like(parameter)  # that is a finding of its own
         if share > WIDE and parameter.name not in named and not scaled:
             what = (
                 f"the log hardly determines it: expect ± {width:.2g} {parameter.unit} (95 %), {100 * share:.0f} % of "

@@ -32,7 +32,7 @@ def scale_findings(
         point: The parameters in [-1, 1] at which the scales are tried.
         only_ratios: Whether the calibrated parameters alone can be scaled alike without a trace.
     """
-    names = [row.name for row in simulator.parameters.parameters if mass_like(row.field)]
+    names = [row.name for row in simulator.parameters.parameters if mass_like(row)]
     if not names:
         return []
     states, actions = (rows[evenly(np.arange(len(rows)), _ROWS)] for rows in probing_rows(logged, dataset, simulator))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from madoc.calibration.result import ParameterEstimate
 from madoc.identification.information import NORMAL_95
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import Parameter
 from madoc.robots.document import yaml_text
 from madoc.runs.files import read_bytes, replacing
 from madoc.simulation.mjcf import Change
@@ -98,7 +98,7 @@ def save_sysid_parameters(path: Path, exported: Sequence[Exported]) -> None:
 def _patched(exported: Exported) -> dict[str, object]:
     """A parameter's entry in the patch; its old values are several where elements that now share one differed."""
     parameter, row = exported.parameter, exported.row
-    in_model = FIELDS[parameter.field].in_model
+    in_model = parameter.kind.in_model
     fields = {
         "parameter": parameter.name,
         "field": parameter.field,

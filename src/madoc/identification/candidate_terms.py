@@ -15,32 +15,12 @@ from madoc.identification.coarseness import FINER
 from madoc.identification.replay import Readings
 from madoc.identification.score_tests import Score
 from madoc.identification.states import LoggedStates
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.base import Simulator
+from madoc.simulation.inertials import off_centre
 from madoc.simulation.user_data import is_drive
-from madoc.simulation.write import (
-    body_reach,
-    element_names,
-    has_gain,
-    heavy_bodies,
-    nominal_values,
-    off_centre,
-)
+from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, nominal_values
 
-CAUSES = {
-    "dof_frictionloss": "Coulomb friction",
-    "dof_drag": "drag that grows with the square of the speed",
-    "dof_damping": "viscous damping",
-    "dof_armature": "inertia that goes with the acceleration of a joint",
-    "jnt_stiffness": "a spring",
-    "actuator_gain": "another gain of the actuator",
-    "drive_strength": "another strength of the drive",
-    "signal_bias": "an offset of the sensor",
-    "gravity": "another gravity",
-    "body_mass": "another mass, as of a payload",
-    "body_com": "another centre of mass, as with a payload",
-}
-"""What a candidate of each field stands for, in words."""
 DELAY = "actions that take effect later, by a delay or a lag of the actuator"
 EARLY = "actions that take effect before they are logged"
 BELOW_MINIMUM = "a value below the physical minimum of a parameter"
@@ -136,11 +116,12 @@ def candidates(
         elif has_gain(model, actuator.id):
             wanted.append(("actuator_gain", actuator.name, abs(float(actuator.gainprm[0])) or 1.0))
     weighed = {element for field, element in calibrated if field in ("body_mass", "body_mass_and_inertia")}
+    loaded = {element for field, element in calibrated if field in (*PAYLOAD, *INERTIA)}
     for body in heavy_bodies(model):
         at = model.body(body) if body in element_names(model, "body") else model.body(model.joint(body).bodyid[0])
         distance = off_centre(model, at.id)
-        wanted += [("body_mass", body, float(at.mass[0]))] * (body not in weighed)
-        wanted += [("body_com", body, distance)] * (distance > 0.0)
+        wanted += [("body_mass", body, float(at.mass[0]))] * (body not in weighed | loaded)
+        wanted += [("body_com", body, distance)] * (distance > 0.0 and body not in loaded)
     if "gravity" not in fields:
         wanted.append(("gravity", "", float(abs(model.opt.gravity[2])) or standard_gravity))
     if task.source is not None:
@@ -185,10 +166,10 @@ def _candidate(
     parameter = Parameter(field, element, 0.0, reference)
     nominal = nominal_of(parameter)[0]
     parameter = replace(parameter, low=nominal, high=nominal + reference)
-    least, elements = FIELDS[field].minimum, parameter.elements
+    least, elements = parameter.kind.minimum, parameter.elements
     known = field in _KNOWN_BEFORE or (field == "gravity" and nominal == 0.0)
     return Candidate(
-        CAUSES[field], parameter.name, parameter.unit, nominal, reference, least, elements, known
+        parameter.kind.missing, parameter.name, parameter.unit, nominal, reference, least, elements, known
     ), parameter
 
 
@@ -294,7 +275,7 @@ def _of_groups(
     """
     index_of = {(parameter.field, parameter.element): index for index, (_, parameter) in enumerate(added)}
     groups = dict.fromkeys(row.elements for row in simulator.parameters.parameters if len(row.elements) > 1)
-    joint_fields = [field for field in CAUSES if FIELDS[field].element == "joint"]
+    joint_fields = [name for name, field in FIELDS.items() if field.element == "joint" and field.missing]
     gains = {parameter.element: each.nominal for each, parameter in added if parameter.field == "actuator_gain"}
     drives = [("actuator_gain", tuple(gains))] if len(gains) > 1 and len(set(gains.values())) == 1 else []
     for field, group in (*product(joint_fields, groups), *drives):

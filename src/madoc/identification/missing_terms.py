@@ -15,7 +15,6 @@ from madoc import simulation
 from madoc.data.dataset import Dataset
 from madoc.identification.candidate_terms import (
     BELOW_MINIMUM,
-    CAUSES,
     EARLY,
     INTEGRATION,
     Candidate,
@@ -222,9 +221,7 @@ def _below_minimum(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[M
     """
     rows = tests.space.parameters
     pinned = [
-        index
-        for index, row in enumerate(rows)
-        if led[index] <= -1.0 + _AT_MINIMUM and row.low <= FIELDS[row.field].minimum
+        index for index, row in enumerate(rows) if led[index] <= -1.0 + _AT_MINIMUM and row.low <= row.kind.minimum
     ]
     free = [index for index in range(len(rows)) if index not in pinned]
     products = tests.products.with_parameters(free)
@@ -358,7 +355,7 @@ def _of_friction(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
     significant itself. A joint whose friction is among the `chosen` terms has an alternative already.
     """
     for index, candidate in enumerate(tests.tried):
-        if candidate.cause != CAUSES["dof_frictionloss"] or index in chosen:
+        if candidate.cause != FIELDS["dof_frictionloss"].missing or index in chosen:
             continue
         found = tests.score(index)
         if found is None or found.t < LIKELY_FRICTION:

@@ -70,14 +70,17 @@ def consecutive_noise(
 
     A step from a noisy state leaves r_t = A e_t - e_{t+1}, the next r_{t+1} = A e_{t+1} - e_{t+2}. They share one
     reading, with opposite signs: E[r_t r_{t+1}] = -A σ². A model error that does not alternate makes the estimate
-    smaller, so it is never taken for noise.
+    smaller, so it is never taken for noise. A channel that never depends on itself (A is 0 in all pairs), as a sensor
+    of force that tells nothing of the state, leaves -e_{t+1} alone: there it is E[(r_{t+1} - r_t)²] / 2, in which a
+    model error counts by how much it changes from row to row.
 
     `slopes` are A, the derivative of each channel by itself over a control step, as from `own_slopes`.
     """
     slope = np.clip(slopes, -SLOPE_LIMIT, SLOPE_LIMIT)
     weight = (slope**2).sum(0)
     shared = -(slope * first * second).sum(0) / np.where(weight > 0.0, weight, 1.0)
-    return np.sqrt(np.maximum(shared, 0.0))
+    alone = ((second - first) ** 2).mean(0) / 2.0
+    return np.sqrt(np.maximum(np.where(weight > 0.0, shared, alone), 0.0))
 
 
 def residual_noise(

@@ -1,32 +1,37 @@
 """Export as a stage: a finished calibration as files for other tools."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from madoc import simulation
 from madoc.errors import MadocError
 from madoc.export import (
     Exported,
+    Robot,
     is_patch,
     save_draws,
+    save_isaac_lab,
+    save_mjlab,
     save_onnx,
     save_patch,
     save_randomization,
     save_sysid_parameters,
 )
 from madoc.numpy_policy import NumpyPolicy
-from madoc.parameters import FIELDS
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.simulation import Simulator
+from madoc.simulation.configuration import joint_actuators, physics_options, start_position
 from madoc.simulation.drawn import numbers_of_draws
 from madoc.simulation.mjcf import DRIVES, save_mjcf
-from madoc.simulation.write import nominal_values
+from madoc.simulation.user_data import needs_callbacks
+from madoc.simulation.write import element_names, nominal_values
 
 DRAWS = 1000
 """Number of models drawn from the distribution of an estimate; their covariance is within 5 % of its own."""
@@ -74,30 +79,60 @@ def export_run(
         "draws of models": folder / "draws.npz",
         "how to use them": folder / "draws.py",
     }
+    if needs_callbacks(simulator.task.model):  # trainers take a model by MuJoCo alone
+        files["drives and friction"] = folder / DRIVES
+    else:
+        files["robot for mjlab"], files["robot for Isaac Lab"] = (
+            folder / "mjlab_robot.py",
+            folder / "isaac_lab_robot.py",
+        )
     targets = {name: folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx") for name in policies}
     if out is not None:
         _require_ours(folder, [*files.values(), *targets.values()])
     changes = save_mjcf(simulator, result.mean, files["model"])
-    if (folder / DRIVES).exists():
-        files["drives and friction"] = folder / DRIVES
     save_patch(files["patch"], exported, provenance, changes=changes, stepping=_stepping(simulator))
     save_randomization(
         files["randomization ranges"], exported, provenance, None if result.covariance is None else covariance.tolist()
     )
     save_sysid_parameters(files["mujoco.sysid parameters"], exported)
-    _leave_draws(folder, simulator, calibrated)
+    fields = _leave_draws(folder, simulator, calibrated)
+    if "robot for mjlab" in files:
+        robot = _robot(simulator, result.mean, fields)
+        save_mjlab(files["robot for mjlab"], robot, exported)
+        save_isaac_lab(files["robot for Isaac Lab"], robot, exported)
     for name, file in policies.items():
         save_onnx(NumpyPolicy.load(file), targets[name])
         files[f"policy {name}"] = targets[name]
     return files
 
 
-def _leave_draws(folder: Path, simulator: Simulator, calibrated: Calibrated) -> None:
-    """Leave models drawn from the joint distribution of the estimate."""
+def _leave_draws(folder: Path, simulator: Simulator, calibrated: Calibrated) -> list[str]:
+    """Leave models drawn from the joint distribution of the estimate, and tell the arrays in which they differ."""
     key = stage_key(calibrated.result.seed, "export")
     values = np.asarray(calibrated.distribution().draw(key, DRAWS), np.float64)
-    around = [row.name for row in simulator.parameters.parameters if not FIELDS[row.field].in_model]
-    save_draws(folder, simulator.parameters.names, around, values, numbers_of_draws(simulator, values))
+    around = [row.name for row in simulator.parameters.parameters if not row.kind.in_model]
+    numbers = numbers_of_draws(simulator, values)
+    save_draws(folder, simulator.parameters.names, around, values, numbers)
+    return [name for name, (_, rows) in numbers.items() if rows.dtype.kind == "f"]
+
+
+def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], fields: Sequence[str]) -> Robot:
+    """What configurations for training say of the robot at the estimate."""
+    task, model = simulator.task, simulator.model(values)
+    named = [channel.actuator for channel in task.actions] or element_names(model, "actuator")
+    physics, lost = physics_options(model)
+    rows = zip(simulator.parameters.parameters, values.tolist(), strict=True)
+    return Robot(
+        name=task.name,
+        actuators=joint_actuators(model, list(dict.fromkeys(named))),
+        start=start_position(model),
+        physics=physics,
+        decimation=task.frame_skip,
+        timestep=simulator.control_step / task.frame_skip,
+        delay=sum(value for row, value in rows if row.field == "action_delay"),
+        fields=fields,
+        lost=lost,
+    )
 
 
 def _require_ours(folder: Path, files: Iterable[Path]) -> None:

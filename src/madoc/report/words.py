@@ -16,23 +16,6 @@ TONES = {
 }
 """Class in the style sheet of each verdict's colour."""
 
-_FIELD_WORDS = {
-    "body_mass": "mass",
-    "body_mass_and_inertia": "mass, inertia",
-    "dof_damping": "damping",
-    "dof_drag": "drag",
-    "dof_armature": "armature",
-    "dof_frictionloss": "dry friction",
-    "jnt_stiffness": "stiffness",
-    "jnt_ref": "zero",
-    "geom_friction": "friction",
-    "actuator_kv": "servo damping",
-    "actuator_gain": "gain",
-    "action_delay": "delay",
-    "signal_bias": "bias",
-}
-"""Words for the field of a parameter."""
-
 _METRIC_WORDS = {
     "accuracy_sa": "from (s, a)",
     "accuracy_sas": "from (s, a, s′)",
@@ -47,7 +30,7 @@ def parameter_title(name: str) -> str:
     field, _, element = name.partition(".")
     if element and field not in FIELDS:
         return name  # a label that a user gave
-    word = _FIELD_WORDS.get(field, field.replace("_", " "))
+    word = (field in FIELDS and FIELDS[field].words) or field.replace("_", " ")
     return f"{element} {word}" if element else word
 
 

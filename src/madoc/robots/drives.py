@@ -1,9 +1,11 @@
 """Drives, friction and conditions of a spec: the numbers they put into the model, and what a log brings in for them."""
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import replace
 
-from madoc.parameters import Parameter
+import mujoco
+
+from madoc.parameters import FIELDS, Parameter
 from madoc.robots.document import Place
 from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec
 from madoc.robots.model import AddedActuator, Draft, JointFriction
@@ -141,15 +143,18 @@ def joint_frictions(draft: Draft) -> tuple[JointFriction, ...]:
     return tuple(found.values())
 
 
-def friction_parameters(draft: Draft) -> Iterator[Parameter]:
-    """Parameters of the terms of friction that have no number and no line of their own."""
-    own = {(row.field, element) for row in draft.spec.parameters for element in row.parameter().elements}
+def friction_parameters(draft: Draft, given: Sequence[Parameter]) -> list[Parameter]:
+    """Parameters of the terms of friction that have neither a number nor one of the given parameters."""
+    own, found = {(row.field, element) for row in given for element in row.elements}, []
     for index, friction in enumerate(draft.spec.friction):
         for term in (*friction.chosen, *friction.shape):
             field = {"coulomb": "dof_frictionloss", "viscous": "dof_damping"}.get(term, f"friction_{term}")
             for joint in friction.names:
                 if getattr(friction, term) is None and (field, joint) not in own:
-                    yield Parameter(field, joint, *_range(draft, index, term))
+                    slides = int(draft.base.joint(joint).type) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+                    unit = FIELDS[field].slide_unit if slides else ""
+                    found.append(Parameter(field, joint, *_range(draft, index, term), measured_in=unit))
+    return found
 
 
 def _range(draft: Draft, index: int, term: str) -> tuple[float, float]:

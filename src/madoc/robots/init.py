@@ -2,29 +2,33 @@
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
+from fnmatch import fnmatchcase
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from madoc.errors import MadocError
-from madoc.parameters import FIELDS, Parameter
+from madoc.errors import MadocError, listed, nearest_hint
+from madoc.parameters import FIELDS
 from madoc.robots.document import yaml_text
 from madoc.robots.expressions import Read
-from madoc.robots.model import compiled, is_single, is_slide, read_model
+from madoc.robots.model import AddedActuator, compiled, is_single, is_slide, make_model, read_model
 from madoc.robots.model_files import ModelFiles
-from madoc.robots.space import SLIDE_UNITS
+from madoc.robots.proposals import MOST, Proposal, proposals, rounded
+from madoc.robots.recipes import RECIPES, Recipe
+from madoc.robots.strength import is_servo, strengths
 from madoc.runs.files import replacing
-from madoc.simulation.write import OF_A_JOINT, element_names, heavy_bodies, nominal_values
+from madoc.simulation.write import element_names, free_joints
 from madoc.tasks import TASKS
 
-Fields = dict[str, str | float]
+Fields = dict[str, str | float | list[str]]
 _USUAL_STEP = 0.02
 """Proposed time between two actions in s, rounded to a multiple of the model's timestep."""
-_ACTIVE = 16
-"""Largest number of parameters proposed; further ones are written as comments."""
+_STIFF = 10.0
+"""Stiffness of a proposed servo, as a share of its largest torque, 1/rad: it reaches that at a tenth of a radian."""
 _PARTS = {
     mujoco.mjtJoint.mjJNT_FREE: (("x", "y", "z", "qw", "qx", "qy", "qz"), ("vx", "vy", "vz", "wx", "wy", "wz")),
     mujoco.mjtJoint.mjJNT_BALL: (("qw", "qx", "qy", "qz"), ("wx", "wy", "wz")),
@@ -32,15 +36,11 @@ _PARTS = {
 """Names of the values of a joint's position and velocity, where it has several."""
 
 
-_REMARKS = {"actuator_gain": "", "geom_friction": "sliding, in contacts; "}
-"""What stands in a comment instead of the unit of a field."""
-
-
-def write_spec(model: Path, out: Path, *, allow_outside: bool = False) -> None:
+def write_spec(model: Path, out: Path, *, allow_outside: bool = False, recipe: str = "") -> None:
     """Write a first spec for a model to a new file; `allow_outside` reads files outside the model's folder too.
 
     Raises:
-        MadocError: The file exists already, its folder does not, or the model cannot be used.
+        MadocError: The file exists already, its folder does not, there is no such recipe, or the model cannot be used.
     """
     from madoc.robots import load
 
@@ -48,7 +48,9 @@ def write_spec(model: Path, out: Path, *, allow_outside: bool = False) -> None:
         raise MadocError(f"{out} exists already; choose another --out, or delete it")
     if not out.parent.is_dir():
         raise MadocError(f"there is no folder {out.parent} to write {out.name} into; make it first")
-    text = spec_text(model, out, allow_outside=allow_outside)
+    if recipe and recipe not in RECIPES:
+        raise MadocError(f"there is no recipe {recipe!r}; {nearest_hint(recipe, RECIPES)}")
+    text = spec_text(model, out, allow_outside=allow_outside, recipe=recipe)
     with replacing(out) as stream:
         stream.write(text.encode())
     try:
@@ -58,17 +60,24 @@ def write_spec(model: Path, out: Path, *, allow_outside: bool = False) -> None:
         raise MadocError(f"no spec can be made of {model}: {error}") from error
 
 
-def spec_text(model: Path, out: Path, *, allow_outside: bool = False) -> str:
+def spec_text(model: Path, out: Path, *, allow_outside: bool = False, recipe: str = "") -> str:
     """The text of a first spec for a model, with comments, for a file at `out`; a model without names is refused."""
     files = ModelFiles.read(model, allow_outside=allow_outside)
-    made = compiled(partial(read_model, files), files.main)
+    base = read_model(files)
+    made = compiled(partial(make_model, base), files.main)
+    if not made.njnt:
+        raise MadocError(f"nothing in {model} moves: it has no joint; is it part of a model, as a scene or a table?")
     joints = element_names(made, "joint")
     if not joints:
         raise MadocError(f"no joint of {model} has a name, and a spec reads joints by name; name them in the model")
+    chosen = RECIPES.get(recipe)
     signals = list(_signals(made, joints))
-    actions = list(_actions(made, joints, {name for name, *_ in signals}))
+    actions = list(_actions(made, joints, {name for name, *_ in signals}, chosen))
     if not actions:
-        raise MadocError(f"no actuator of {model} has a name, and a spec drives them by name; name them in the model")
+        what = "no actuator has a name" if made.nu else "it has no actuator, and no joint that turns or slides"
+        raise MadocError(f"no action of {model} can be written: {what}; add one to the model, by name")
+    added = tuple(one for one in (_added(made, fields) for fields, _ in actions) if one is not None)
+    driven, guessed = compiled(partial(make_model, base, added), files.main), frozenset(one.name for one in added)
     timestep = float(made.opt.timestep)
     step = timestep * max(1, round(_USUAL_STEP / timestep))
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", model.stem).strip("_-") or "robot"
@@ -78,6 +87,7 @@ def spec_text(model: Path, out: Path, *, allow_outside: bool = False) -> str:
         "madoc: 1",
         f"name: {_quoted('my_' + name if name in TASKS else name)}",
         f"model: {_quoted(relative)}  # MJCF or URDF, relative to this file",
+        *_remarks(made),
         f"control_step: {step:.12g}  # s between two actions; a multiple of the model's timestep, {timestep:.12g} s",
         "",
         "# The observation: one number a line. Each reads position(JOINT), velocity(JOINT) or sensor(NAME), one of",
@@ -96,10 +106,11 @@ def spec_text(model: Path, out: Path, *, allow_outside: bool = False) -> str:
         *(f"  - {_mapping(**fields)}{comment}" for fields, comment in actions),
         "",
         "# What is calibrated, each within its range: wide enough to hold the truth, and only what matters.",
-        "# One value for several: {field: dof_damping, elements: [left, right], name: damping, low: 0, high: 1}",
+        '# One value for several: {field: dof_damping, elements: "*_knee", name: knees, low: 0, high: 1}, or one for',
+        '# each of several: {field: dof_damping, each: "*_knee", low: 0, high: 1}.',
+        *_about(recipe, chosen),
         "parameters:",
-        *_parameters(made, joints),
-        f"  # - {{field: action_delay, low: 0, high: {2 * step:.6g}}}  # s from an action to its effect",
+        *_parameters(driven, proposals(driven, chosen, recipe, guessed=guessed, step=step)),
         f"  # - {_mapping(field='signal_bias', element=signals[0][0], low=-0.1, high=0.1)}  # what it reads too much",
         "",
         "# How a log is laid out, where it is not as above.",
@@ -150,89 +161,133 @@ def _unnamed(model: mujoco.MjModel) -> Iterator[str]:
             yield f"  # {missing} {what}{'s' * (missing > 1)} of the model cannot be used here: give each a name there."
 
 
-def _actions(model: mujoco.MjModel, joints: list[str], taken: set[str]) -> Iterator[tuple[Fields, str]]:
-    """The model's actuators; a torque on every joint where it has none."""
+def _actions(
+    model: mujoco.MjModel, joints: list[str], taken: set[str], recipe: Recipe | None
+) -> Iterator[tuple[Fields, str]]:
+    """The model's actuators; where it has none, a position, a torque or a force of every hinge and slide."""
     for actuator in element_names(model, "actuator"):
         index = model.actuator(actuator).id
         name = f"{actuator}_command" if actuator in taken else actuator
-        limited = bool(model.actuator_ctrllimited[index])
-        low, high = model.actuator_ctrlrange[index] if limited else (-1.0, 1.0)
-        comment = "" if limited else "  # the model has no ctrlrange: write its limits"
-        yield {"name": name, "actuator": actuator, "low": float(low), "high": float(high)}, comment
+        ends, comment = _command_ends(model, actuator)
+        yield {"name": name, "actuator": actuator, "low": ends[0], "high": ends[1]}, comment
+    strong = strengths(model)
     for joint in joints if not model.nu else ():
         index = model.joint(joint).id
         if not is_single(model, index):
             continue
-        limited = bool(model.jnt_actfrclimited[index])
-        low, high = model.jnt_actfrcrange[index] if limited else (-1.0, 1.0)
-        means, unit = ("force", "N") if is_slide(model, index) else ("torque", "N·m")
-        comment = "" if limited else f"  # the model has no limit: write the motor's largest {means}"
+        slide, (torque, known) = is_slide(model, index), strong[joint]
+        torque = recipe.limit if recipe and recipe.limit and not slide and not known else rounded(torque)
+        positioned = bool(model.jnt_limited[index]) and (recipe is None or recipe.means == "position")
+        if positioned:
+            low, high = (float(f"{end:.6g}") for end in model.jnt_range[index])
+            kp = rounded(_STIFF * torque)
+            kd = rounded(float(np.sqrt(kp * model.dof_M0[model.jnt_dofadr[index]])))
+            fields: Fields = {"name": f"{joint}_target", "joint": joint, "means": "position", "kp": kp, "kd": kd}
+            fields |= {"limit": torque} if known or (recipe and recipe.limit) else {}
+            fields |= {"low": low, "high": high, "unit": "m" if slide else "rad"}
+            yield fields, "  # not in the model, so kp and kd are guesses; or means: torque"
+            continue
+        means, unit = ("force", "N") if slide else ("torque", "N·m")
+        comment = "" if known else f"  # the model has no limit: write the motor's largest {means}"
         fields = {"name": f"{joint}_{means}", "joint": joint, "means": means}
-        yield {**fields, "low": float(low), "high": float(high), "unit": unit}, comment
+        yield fields | {"low": -torque, "high": torque, "unit": unit}, comment
 
 
-def _parameters(model: mujoco.MjModel, joints: list[str]) -> Iterator[str]:
-    """Parameters of bodies, joints, actuators and contacts; those less likely to matter are written as comments."""
-    sprung = [joint for joint in joints if is_single(model, model.joint(joint).id)]
-    geoms = [model.geom(name) for name in element_names(model, "geom")]
-    touching = [geom.name for geom in geoms if geom.contype[0] or geom.conaffinity[0]]
-    rows = [
-        *_scaled(model, "body_mass", heavy_bodies(model), wanted=True),
-        *_scaled(model, "jnt_stiffness", sprung, wanted=True),
-        *_dissipation(model, joints),
-        *_scaled(model, "actuator_gain", element_names(model, "actuator")),
-        *_scaled(model, "geom_friction", touching),
-    ]
-    active = 0
-    for fields, comment, wanted in rows:
-        active += wanted
-        yield f"  {'' if wanted and active <= _ACTIVE else '# '}- {_mapping(**fields)}  # {comment}"
+def _command_ends(model: mujoco.MjModel, actuator: str) -> tuple[tuple[float, float], str]:
+    """The limits of an actuator's command, and what to say of them: its own, or those of what it moves."""
+    index = model.actuator(actuator).id
+    if model.actuator_ctrllimited[index]:
+        low, high = model.actuator_ctrlrange[index]
+        return (float(low), float(high)), ""
+    joint = int(model.actuator_trnid[index, 0])
+    if is_servo(model, actuator) and model.jnt_limited[joint]:
+        low, high = model.jnt_range[joint]
+        return (float(f"{low:.6g}"), float(f"{high:.6g}")), "  # the model has no ctrlrange: the range of the joint"
+    most = np.pi if is_servo(model, actuator) else 1.0
+    if model.actuator_forcelimited[index] and not is_servo(model, actuator) and model.actuator_gainprm[index, 0]:
+        most = float(abs(model.actuator_forcerange[index] / model.actuator_gainprm[index, 0]).max())
+    most = float(f"{most:.6g}")
+    return (-most, most), "  # the model has no ctrlrange: write its limits"
 
 
-def _scaled(
-    model: mujoco.MjModel, field: str, names: Iterable[str], *, wanted: bool = False
-) -> Iterator[tuple[Fields, str, bool]]:
-    """A field of elements where the model's value is above 0, from half of it to twice."""
-    for name in names:
-        (value,) = nominal_values(model, Parameter(field, name, 0.0, 1.0))
-        if value > 0:
-            unit = _REMARKS[field] if field in _REMARKS else f"{_unit(model, field, name)}; "
-            fields: Fields = {"field": field, "element": name, "low": _round(value / 2), "high": _round(value * 2)}
-            yield fields, f"{unit}the model has {value:.4g}", wanted
+def _added(model: mujoco.MjModel, fields: Fields) -> AddedActuator | None:
+    """The actuator that an action of this spec adds to the model, so that its gains can be proposed too."""
+    if "joint" not in fields:
+        return None
+    kp, kd, low, high = (float(str(fields.get(key, 0.0))) for key in ("kp", "kd", "low", "high"))
+    limit = float(str(fields["limit"])) if "limit" in fields else None if kp else max(abs(low), abs(high))
+    return AddedActuator(str(fields["name"]), str(fields["joint"]), low, high, kp or 1.0, kp, kd, limit)
 
 
-def _dissipation(model: mujoco.MjModel, joints: list[str]) -> Iterator[tuple[Fields, str, bool]]:
-    """Damping and dry friction of joints; those neither driven nor damped are comments, as they may be a root's."""
-    on_joints = np.isin(model.actuator_trntype, OF_A_JOINT)
-    # Through tendons an actuator may drive any joint.
-    driven = set(model.actuator_trnid[:, 0]) if model.nu and on_joints.all() else set(range(model.njnt))
-    for field, wanted in (("dof_damping", True), ("dof_frictionloss", False)):
-        for joint in joints:
-            index = model.joint(joint).id
-            if int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_FREE:
-                continue
-            (value,) = nominal_values(model, Parameter(field, joint, 0.0, 1.0))
-            # Where the model has none: the damping that would stop the joint and all bodies on it in 0.1 s.
-            high = 2 * value if value > 0 else 10 * float(model.dof_M0[model.jnt_dofadr[index]])
-            fields: Fields = {"field": field, "element": joint, "low": 0.0, "high": _round(high)}
-            comment = f"{_unit(model, field, joint)}; the model has {value:.4g}"
-            yield fields, comment, wanted and (value > 0 or index in driven)
+def _remarks(model: mujoco.MjModel) -> Iterator[str]:
+    """What a user should know of the model before a log of it is read, as comments."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for joint in free_joints(model):
+        yield f"# The body of {joint.name or 'a joint without a name'} moves freely: a log has to tell where it is."
+    grounds = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+    if free_joints(model) and model.opt.gravity.any() and not np.isin(model.geom_type, grounds).any():
+        yield "# The model has no floor: what moves freely falls for ever; add one, or hang the robot in the model too."
+    pairs = sorted({tuple(sorted(_geom_name(model, geom) for geom in pair)) for pair in data.contact.geom.tolist()})
+    if pairs:
+        touching = listed((" and ".join(pair) for pair in pairs), most=4)
+        yield f"# In the model's first pose these touch: {touching}."
+    held = [model.equality(index).name or f"number {index}" for index in range(model.neq) if model.eq_active0[index]]
+    if held:
+        yield f"# Equalities hold: {listed(held, most=8)}. What they tie together moves as one."
+    mocap = [model.body(index).name for index in np.flatnonzero(model.body_mocapid >= 0).tolist()]
+    if mocap:
+        yield f"# Mocap bodies stay where the model has them: {listed(mocap, most=8)}."
 
 
-def _unit(model: mujoco.MjModel, field: str, element: str) -> str:
-    """The unit of a field of a body or a joint."""
-    slides = field in SLIDE_UNITS and is_slide(model, model.joint(element).id)
-    return SLIDE_UNITS[field] if slides else FIELDS[field].unit
+def _geom_name(model: mujoco.MjModel, geom: int) -> str:
+    """The name of a geom, or of its body where it has none."""
+    return model.geom(geom).name or model.body(int(model.geom_bodyid[geom])).name or f"geom {geom}"
 
 
-def _round(value: float) -> float:
-    """The value with two digits, which are enough for a range."""
-    return float(np.format_float_positional(value, precision=2, fractional=False)) if value > 0 else value
+def _about(recipe: str, chosen: Recipe | None) -> Iterator[str]:
+    if chosen is not None:
+        yield f"# Ranges of {recipe}: of {chosen.about}."
 
 
-def _mapping(**fields: str | float) -> str:
+def _parameters(model: mujoco.MjModel, lines: list[Proposal]) -> Iterator[str]:
+    """Lines of parameters; those less likely to matter are comments."""
+    for line in lines:
+        fields: Fields = {"field": line.field}
+        if len(line.elements) == 1:
+            fields["element"] = line.elements[0]
+        elif line.elements:
+            known = element_names(model, str(FIELDS[line.field].element))
+            pattern = _pattern(line.elements, known)
+            fields["elements"] = pattern or list(line.elements)
+            if not pattern:
+                fields["name"] = f"{line.field}.{line.elements[0]}+{len(line.elements) - 1}"
+        fields |= {"low": line.low, "high": line.high}
+        yield f"  {'' if line.wanted else '# '}- {_mapping(**fields)}  # {line.comment}"
+    left = sum(not line.wanted for line in lines)
+    if left:
+        yield f"  # The {left} lines that are comments matter less, or are more than the {MOST} that init proposes."
+
+
+def _pattern(wanted: tuple[str, ...], known: list[str]) -> str:
+    """A pattern that all of these names and no others match, from what they begin and end with; empty without one."""
+    begin = _beginning(wanted)
+    end = _beginning([name[len(begin) :][::-1] for name in wanted])[::-1]
+    for pattern in (f"*{end}" * (not end[:1].isalnum()), f"{begin}*" * (not begin[-1:].isalnum()), f"{begin}*{end}"):
+        if begin + end and tuple(name for name in known if fnmatchcase(name, pattern)) == wanted:
+            return pattern
+    return ""
+
+
+def _beginning(names: Sequence[str]) -> str:
+    """What all names begin with."""
+    alike = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+    return "".join(letters[0] for letters in alike)
+
+
+def _mapping(**fields: str | float | list[str]) -> str:
     """A YAML mapping on one line."""
-    return _quoted({key: value if isinstance(value, str) else _number(value) for key, value in fields.items()})
+    return _quoted({key: _number(value) if isinstance(value, int | float) else value for key, value in fields.items()})
 
 
 def _number(value: float) -> float:

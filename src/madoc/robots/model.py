@@ -129,6 +129,17 @@ def make_model(
     return spec
 
 
+def with_whole_inertia(spec: Callable[[], mujoco.MjSpec], bodies: tuple[str, ...]) -> mujoco.MjSpec:
+    """A spec in which MuJoCo keeps the whole mass matrix of bodies that move freely by themselves, for loads off them.
+
+    A body, named by itself or by its joint, gets an empty one on it: one without any has a diagonal mass matrix.
+    """
+    changed = spec()
+    for name in bodies:
+        (changed.body(name) or changed.joint(name).parent).add_body()
+    return changed
+
+
 def compiled(spec: Callable[[], mujoco.MjSpec], file: str) -> mujoco.MjModel:
     """The shared model of a spec (`tasks.base.compiled_model`); an error of MuJoCo is passed on as a refusal."""
     try:

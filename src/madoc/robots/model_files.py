@@ -44,7 +44,7 @@ class ModelFiles:
         while waiting:
             name = waiting.pop(0)
             for reference in xmls[name].references():
-                folders = xmls[name].folders(reference.kind) or xmls[path.name].folders(reference.kind)
+                folders = [*xmls[name].folders(reference.kind), *xmls[path.name].folders(reference.kind)]
                 key, file = disk.found(reference, name, folders, urdf=xmls[name].is_urdf)
                 if key in contents:
                     continue

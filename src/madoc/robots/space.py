@@ -1,44 +1,45 @@
 """Parameters of a spec: their elements in the model, their units, and no quantity calibrated twice."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from fnmatch import fnmatchcase
+from itertools import product, zip_longest
 
 import mujoco
 
-from madoc.parameters import FIELDS, Parameter, ParameterSpace
+from madoc.parameters import FIELDS, Parameter, ParameterSpace, field_of
 from madoc.robots.drives import friction_parameters
 from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_slide
 from madoc.robots.signals import signal_unit
-from madoc.robots.spec import ParameterSpec
-from madoc.simulation.write import OF_A_JOINT, element_names, find_elements
-
-SLIDE_UNITS = {
-    "dof_damping": "N·s/m",
-    "dof_drag": "N·s²/m²",
-    "dof_armature": "kg",
-    "dof_frictionloss": "N",
-    "jnt_stiffness": "N/m",
-    "jnt_ref": "m",
-}
-"""Units of the fields of a joint where the joint is a slide."""
+from madoc.simulation.arrays import check_field
+from madoc.simulation.write import OF_A_JOINT, element_names, find_elements, same_numbers
 
 
 def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
-    """The parameters, each with the unit that follows from its elements."""
-    lines: list[Parameter] = []
+    """The parameters, each with the unit that follows from its elements; `each` makes one of every element."""
+    parameters: list[Parameter] = []
+    lines: list[int] = []
     for index, given in enumerate(draft.spec.parameters):
-        _check_elements(draft, model, index)
-        parameter = given.parameter(_unit_of(draft, model, index))
-        for other, earlier in enumerate(lines):
-            _check_distinct(draft, model, index, parameter, other, earlier)
-        lines.append(parameter)
+        with draft.document.at("parameters", index):
+            check_field(model, given.fields[0])
+        elements = _elements(draft, model, index)
+        for field, shared in product(given.fields, [(one,) for one in elements] if given.each else [elements]):
+            parameter = given.parameter(field, shared, _unit_of(draft, model, index, shared))
+            for other, earlier in zip(lines, parameters, strict=True):
+                _check_distinct(draft, model, index, parameter, other, earlier)
+            parameters.append(parameter)
+            lines.append(index)
+    parameters += friction_parameters(draft, parameters)
+    return ParameterSpace(tuple(by_condition(draft, parameters, lines)))
+
+
+def by_condition(draft: Draft, parameters: list[Parameter], lines: list[int]) -> Iterator[Parameter]:
+    """The parameters, those of lines with `by` once for each value of their condition."""
     values = {condition.name: condition.values for condition in draft.spec.conditions}
-    found = [
-        parameter if given.by is None else replace(parameter, when=(given.by, value))
-        for given, parameter in zip(draft.spec.parameters, lines, strict=True)
-        for value in ([0.0] if given.by is None else values[given.by])
-    ]
-    return ParameterSpace((*found, *friction_parameters(draft)))
+    for parameter, line in zip_longest(parameters, lines):
+        by = None if line is None else draft.spec.parameters[line].by
+        yield from [parameter] if by is None else (replace(parameter, when=(by, value)) for value in values[by])
 
 
 def _check_distinct(
@@ -47,14 +48,16 @@ def _check_distinct(
     """Refuse two parameters of one name or of one quantity, of which the one written last would win."""
     line = draft.document.line(("parameters", other))
     shared = set(earlier.elements) & set(parameter.elements)
-    if FIELDS[parameter.field].element == FIELDS[earlier.field].element == "body":  # which a joint's name may mean too
+    if parameter.kind.element == earlier.kind.element == "body":  # which a joint's name may mean too
         held = set(find_elements(model, earlier))
         elements = zip(parameter.elements, find_elements(model, parameter), strict=True)
         shared = {name for name, body in elements if body in held}
-    whole_robot = FIELDS[earlier.field].element is None
+    whole_robot = earlier.kind.element is None
     exclusive = ({"body_mass", "body_mass_and_inertia"}, {"body_inertia", "body_mass_and_inertia"})
     if parameter.name == earlier.name:
         problem = f"the parameter {parameter.name} is on line {line} already; name: one of them"
+    elif same_numbers(model, parameter, earlier):
+        problem = f"{parameter.name} and {earlier.name} of line {line} are one number of the model; keep one"
     elif parameter.field == earlier.field and shared:
         problem = f"{parameter.field} of {min(shared)!r} is calibrated by line {line} already; keep one of them"
     elif ({earlier.field, parameter.field} in exclusive and shared) or (
@@ -66,44 +69,62 @@ def _check_distinct(
     raise draft.document.error(("parameters", index), problem)
 
 
-def _check_elements(draft: Draft, model: mujoco.MjModel, index: int) -> None:
-    """Refuse elements that the model or the signals do not have, with the nearest that they have."""
+def _elements(draft: Draft, model: mujoco.MjModel, index: int) -> tuple[str, ...]:
+    """Names of the elements that the model or the signals have, each once; a pattern matches whole names of a kind.
+
+    A name or a pattern that finds none is refused with the nearest names.
+    """
     given = draft.spec.parameters[index]
-    kind = FIELDS[given.field].element
+    kind = field_of(given.fields[0]).element
     if kind is None:
-        return
+        return ()
     names = [signal.name for signal in draft.spec.signals] if kind == "signal" else element_names(model, kind)
     also = element_names(model, "joint") if kind == "body" else []  # a joint names its body
-    for position, element in enumerate(given.parameter().elements):
-        if element not in names and element not in also:
-            place = ("parameters", index, *(("elements", position) if given.elements else ("element",)))
-            raise draft.document.unknown(place, f"the name of a {kind}", element, names)
+    found: list[str] = []
+    key = next((key for key in ("element", "elements", "each") if getattr(given, key)), "")
+    for position, wanted in enumerate(given.names):
+        known = wanted in names or wanted in also
+        matching = [name for name in names if fnmatchcase(name, wanted) and name != "world"]
+        if not known and (key == "element" or not matching):
+            what = f"the name of a {kind}" + ("" if key == "element" else ", or a pattern with * for several")
+            raise draft.document.unknown(("parameters", index, key, position), what, wanted, names)
+        found += [wanted] if known else [name for name in matching if name not in found]
+    return tuple(found)
 
 
-def _unit_of(draft: Draft, model: mujoco.MjModel, index: int) -> str:
+def _unit_of(draft: Draft, model: mujoco.MjModel, index: int, elements: tuple[str, ...]) -> str:
     """The unit of a parameter where it is not its field's; elements with different units are refused."""
     given = draft.spec.parameters[index]
-    units = {_element_unit(draft, model, given, element) for element in given.parameter().elements}
+    if given.field is None:
+        return given.unit or ""
+    field = given.fields[0]
+    units = {_element_unit(draft, model, field, element) for element in elements}
     if len(units) > 1:
         raise draft.document.error(
             ("parameters", index),
-            f"one value cannot be in {' and in '.join(sorted(unit or FIELDS[given.field].unit for unit in units))}; "
+            f"one value cannot be in {' and in '.join(sorted(unit or FIELDS[field].unit for unit in units))}; "
             "make it two parameters",
         )
     return next(iter(units), "")
 
 
-def _element_unit(draft: Draft, model: mujoco.MjModel, given: ParameterSpec, element: str) -> str:
-    if given.field in SLIDE_UNITS:
-        return SLIDE_UNITS[given.field] if is_slide(model, int(model.joint(element).id)) else ""
-    if given.field == "signal_bias":
+def _element_unit(draft: Draft, model: mujoco.MjModel, field: str, element: str) -> str:
+    if field == "signal_bias":
         index = [signal.name for signal in draft.spec.signals].index(element)
         return signal_unit(draft, model, parse(draft.spec.signals[index].reads), index)
-    if given.field == "actuator_kv":
-        driven = model.actuator(element)
-        on_joint = int(driven.trntype[0]) in OF_A_JOINT
-        return "N·s/m" if on_joint and is_slide(model, int(driven.trnid[0])) else ""
-    return _gain_unit(model, int(model.actuator(element).id)) if given.field == "actuator_gain" else ""
+    if field == "actuator_gain":
+        return _gain_unit(model, int(model.actuator(element).id))
+    return element_unit(model, field, element)
+
+
+def element_unit(model: mujoco.MjModel, field: str, element: str) -> str:
+    """The unit of a field of an element where it is not the field's own, as of a joint that slides; else empty."""
+    kind, joint = FIELDS[field], -1
+    if kind.slide_unit and kind.element == "joint":
+        joint = int(model.joint(element).id)
+    elif kind.slide_unit and int(model.actuator(element).trntype[0]) in OF_A_JOINT:
+        joint = int(model.actuator(element).trnid[0])
+    return kind.slide_unit if joint >= 0 and is_slide(model, joint) else ""
 
 
 def _gain_unit(model: mujoco.MjModel, actuator: int) -> str:

@@ -4,10 +4,10 @@ import math
 from functools import lru_cache
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, WithJsonSchema, field_validator, model_validator
 
 from madoc.errors import nearest_hint
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import FIELDS, INERTIA, Parameter
 from madoc.robots.document import Document, read_document
 from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec
 from madoc.robots.validation import File, Finite, Name, Part, Positive, Unit, refuse, refused_with_line
@@ -32,6 +32,12 @@ SCALES: dict[str, float] = {
 }
 """Units that are converted, each as a multiple of its SI unit."""
 
+Names = Annotated[
+    list[Name],
+    Field(min_length=1),
+    BeforeValidator(lambda given: [given] if isinstance(given, str) else given),
+    WithJsonSchema({"type": ["string", "array"], "items": {"type": "string"}, "minItems": 1}),
+]
 Duration = Annotated[float, Field(allow_inf_nan=False, ge=SHORTEST_TIMESTEP, le=LONGEST_STEP)]
 
 
@@ -99,10 +105,18 @@ class ActionSpec(Part):
 class ParameterSpec(Part):
     """One value to calibrate, and the range it is searched in."""
 
-    field: str = Field(description=f"One of: {', '.join(FIELDS)}.", json_schema_extra={"enum": list(FIELDS)})
-    element: Name | None = Field(None, description="Name of the body, joint, geom, actuator or signal.")
-    elements: list[Name] | None = Field(None, min_length=1, description="Several that share one value.")
-    name: Name | None = Field(None, description="Its own name. Default: field.element.")
+    field: str | None = Field(
+        None, description=f"One of: {', '.join(FIELDS)}.", json_schema_extra={"enum": [*FIELDS, "inertia"]}
+    )
+    model: Name | None = Field(
+        None, description="Instead of a field, an array of MuJoCo's mjModel, as geom_solref, or an option, as opt.wind."
+    )
+    index: Annotated[int, Field(ge=0)] | None = Field(None, description="With `model`: which number of an element.")
+    unit: Unit | None = Field(None, description="With `model`: the unit of that number, for people. Default: 1.")
+    element: Name | None = Field(None, description="Name of the body, joint, geom, actuator, signal and so on.")
+    elements: Names | None = Field(None, description="Several that share one value: a list of names or patterns.")
+    each: Names | None = Field(None, description="Several that have a value each: a list of names or patterns.")
+    name: Name | None = Field(None, description="Its own name; with `each`, what the element's comes behind.")
     by: Name | None = Field(None, description="Condition: a value for each of its values, all in the same range.")
     low: Finite
     high: Finite
@@ -111,21 +125,45 @@ class ParameterSpec(Part):
     @classmethod
     def _known(cls, field: str) -> str:
         hint = nearest_hint(field, FIELDS)
-        refuse(field not in FIELDS, f"expected a field that can be calibrated, got {field!r}; {hint}")
+        refuse(field not in (*FIELDS, "inertia"), f"expected a field that can be calibrated, got {field!r}; {hint}")
         return field
 
     @model_validator(mode="after")
     def _consistent(self) -> "ParameterSpec":
-        refuse(self.element is not None and self.elements is not None, "expected element: or elements:, got both")
+        refuse((self.field is None) == (self.model is None), "expected either field: or model:, got both or neither")
+        given = [key for key in ("element", "elements", "each") if getattr(self, key) is not None]
+        refuse(len(given) > 1, f"expected one of element:, elements: and each:, got {' and '.join(given)}")
+        for key in ("index", "unit"):
+            refuse(self.model is None and getattr(self, key) is not None, f"{key}: belongs to model:, not to field:")
         if self.by is not None and self.field in FIELDS and not FIELDS[self.field].in_model:
             raise ValueError(f"by: means nothing beside {self.field}, which is not in the model; leave it out")
-        self.parameter()  # pydantic reports what it refuses, as a MadocError is a ValueError
+        for field in self.fields:
+            self.parameter(field, self.names)  # pydantic reports what it refuses, as a MadocError is a ValueError
         return self
 
-    def parameter(self, unit: str = "") -> Parameter:
-        """The parameter, in the unit of its field or in another."""
-        element = tuple(self.elements) if self.elements else self.element or ""
-        return Parameter(self.field, element, self.low, self.high, self.name or "", unit)
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The field, the ten of an inertia, or the number of the model as `geom_solref[0]`."""
+        if self.field is not None:
+            return INERTIA if self.field == "inertia" else (self.field,)
+        return (f"{self.model}" if self.index is None else f"{self.model}[{self.index}]",)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the elements, or patterns of them."""
+        return (self.element,) if self.element else tuple(self.elements or self.each or ())
+
+    def parameter(self, field: str, elements: tuple[str, ...], unit: str = "") -> Parameter:
+        """The parameter of a field and of one or several elements, in the unit of its field or in another."""
+        element = elements[0] if len(elements) == 1 else elements or ""
+        if self.elements and len(self.elements) == 1 and len(elements) > 1 and not self.name:
+            label = f"{field}.{self.elements[0]}"  # the pattern says what all of them are
+        elif self.name:
+            added = [self.name, field if len(self.fields) > 1 else "", str(element) if self.each else ""]
+            label = ".".join(filter(None, added))
+        else:
+            label = ""
+        return Parameter(field, element, self.low, self.high, label, unit or self.unit or "")
 
 
 class LogSpec(Part):

@@ -16,7 +16,7 @@ from madoc.robots.actions import action_channel, added_actuator, idle_actuators
 from madoc.robots.drives import joint_frictions, with_inputs
 from madoc.robots.episodes import Episode, no_reward, read_episode
 from madoc.robots.functions import PythonFile
-from madoc.robots.model import Draft, compiled, make_model, read_model
+from madoc.robots.model import Draft, compiled, make_model, read_model, with_whole_inertia
 from madoc.robots.model_files import ModelFiles
 from madoc.robots.signals import attitudes_of, quaternion_of, read_signals, signal_unit, turn_of
 from madoc.robots.space import parameter_space
@@ -28,6 +28,7 @@ from madoc.robots.spec import (
     RobotSpec,
     read_spec,
 )
+from madoc.simulation.write import diagonal_bodies
 from madoc.tasks.base import ActionChannel, Batch, Task, never_terminated
 
 
@@ -95,6 +96,10 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
     signals = read_signals(draft, model)
     actions = (*(action_channel(draft, model, index) for index in range(len(spec.actions))), *inputs)
     space, frame_skip = parameter_space(draft, model), _frame_skip(draft, model)
+    single = tuple(dict.fromkeys(name for row in space.parameters for name in diagonal_bodies(model, row)))
+    if single:
+        factory = partial(with_whole_inertia, factory, single)
+        model = compiled(factory, files.main)
     delays = [row.high for row in space.parameters if row.field == "action_delay"]
     pending = max([int(np.ceil(high / spec.control_step - 1e-9)) for high in delays], default=0)
     if pending > MOST_PENDING:
@@ -103,7 +108,9 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
             f"expected action_delay of at most {MOST_PENDING:,} control steps, got {pending:,}; is it in seconds?",
         )
     if signals.read_sensors & signals.layout.accelerating:
-        pending = max(pending, 1)  # such a sensor shows the force of the last action
+        # Such a sensor shows the force in the last physics step, where the action before may hold yet.
+        late = max(delays, default=0.0) + float(model.opt.timestep)
+        pending = max(pending, int(np.ceil(late / spec.control_step - 1e-9)))
     names, episode = tuple(signal.name for signal in spec.signals), read_episode(draft, signals, actions)
     if inputs and episode.rewarded:
         raise document.error(

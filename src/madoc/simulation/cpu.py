@@ -3,16 +3,18 @@
 import copy
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 
 import mujoco
 import mujoco.rollout
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.errors import MadocError, nearest_hint
+from madoc.errors import MadocError, listed, nearest_hint
 from madoc.parameters import FIELDS, Parameter
 from madoc.runs.machine import usable_cores
-from madoc.simulation.delay import blend, delay_weights, in_effect
+from madoc.simulation.arrays import check_field, check_written
+from madoc.simulation.delay import blend, delay_weights
 from madoc.simulation.drives import drive_forces
 from madoc.simulation.user_data import install_callbacks, needs_callbacks
 from madoc.simulation.write import conditions_of, find_elements, write_parameters
@@ -47,8 +49,13 @@ class CpuSimulator:
         if needs_callbacks(self._model):
             install_callbacks()
         self.control_step = float(self._model.opt.timestep) * task.frame_skip
-        if self._model.na or self._model.nmocap:
-            raise MadocError(f"{task.name}: models with actuator activations or mocap bodies are not supported")
+        active = np.flatnonzero(self._model.actuator_actnum).tolist()
+        if active:
+            names = listed((self._model.actuator(index).name or f"number {index}" for index in active), most=4)
+            raise MadocError(
+                f"{task.name}: of the actuators {names} with an activation (dyntype) the state is not simulated here; "
+                "take the dyntype out of the model, and calibrate action_delay instead"
+            )
         whole = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if whole != 1 + self._model.nq + self._model.nv:  # time, positions, velocities
             raise MadocError(
@@ -87,7 +94,7 @@ class CpuSimulator:
         if not np.isfinite(values).all():
             raise MadocError("expected finite parameters, got NaN or infinity")
         for parameter, column in zip(self.parameters.parameters, values.T, strict=True):
-            minimum = FIELDS[parameter.field].minimum
+            minimum = parameter.kind.minimum
             if (column < minimum).any():
                 raise MadocError(
                     f"expected {parameter.name} of at least {minimum} {parameter.unit}, "
@@ -141,9 +148,9 @@ class CpuSimulator:
     ) -> Int[np.ndarray, " rows"]:
         """Number of pairs of geoms in contact in each state, at physical values, which are mid-range unless given.
 
-        No parameter changes the shape of a body; only `jnt_ref` changes where positions place it.
+        No parameter changes the shape of a body; `jnt_ref` and numbers of the model may change where it is placed.
         """
-        placed = any(parameter.field == "jnt_ref" for parameter in self.parameters.parameters)
+        placed = any(row.field == "jnt_ref" or row.field not in FIELDS for row in self.parameters.parameters)
         model = self.model(self.parameters.middle if values is None else values) if placed else self._model
         data, contacts = self._data[0], np.zeros(len(state), dtype=np.int64)
         for row, position in enumerate(state[:, : model.nq]):
@@ -176,12 +183,12 @@ class CpuSystem:
         self._simulator, self._delay, self._bias = simulator, delay, bias
         self._physical = self.models[0].nq + self.models[0].nv
         self._goals = self._physical + simulator.task.pending * simulator.action_size
-        self._weights = delay_weights(
-            delay,
-            control_step=simulator.control_step,
-            physics_steps=simulator.task.frame_skip,
-            pending=simulator.task.pending,
+        weights = partial(
+            delay_weights, delay, control_step=simulator.control_step, physics_steps=simulator.task.frame_skip
         )
+        self._weights = weights(pending=simulator.task.pending)
+        # What sensors show is the end of a control step, whose own action is the newest of those pending.
+        self._sensed = weights(pending=max(simulator.task.pending - 1, 0))[:, -1:]
 
     def replaced(
         self, systems: Int[np.ndarray, " some"], parameters: Float[np.ndarray, "some parameters"]
@@ -283,9 +290,7 @@ class CpuSystem:
     def _sensordata(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows sensor"]:
         control = np.zeros((*state.shape[:2], 1, self.models[0].nu))
         if self._simulator.task.pending:
-            newest = in_effect(self._delay, self._simulator.control_step)
-            last = self._pending(state)[np.arange(self.count), :, newest]
-            control[:, :, 0] = self._simulator._controls(last)
+            control = self._simulator._controls(blend(self._sensed, self._pending(state)))
         sensors = np.zeros((control.shape[0] * control.shape[1], 1, self.models[0].nsensordata))
         moved = self._simulated(state[..., : self._physical], control, sensors=sensors)
         return np.where(np.isnan(moved[:, :, 0, :1]), np.nan, sensors.reshape(*control.shape[:2], -1))
@@ -367,9 +372,11 @@ class CpuSystem:
 
 
 def _check_elements(model: mujoco.MjModel, task: Task, parameter: Parameter) -> None:
-    """Refuse a parameter of an element that the model, or for a signal the task, does not have."""
-    if FIELDS[parameter.field].element != "signal":
-        find_elements(model, parameter)
+    """Refuse a parameter of an element or a number that the model, or for a signal the task, does not have."""
+    if parameter.kind.element != "signal":
+        check_field(model, parameter.field)
+        for index in find_elements(model, parameter):
+            check_written(model, parameter.field, index)
         return
     for element in parameter.elements:
         if element not in task.signals:

@@ -38,8 +38,3 @@ def blend(
     for index in range(1, terms.shape[-2]):
         total = total + terms[..., index, :]
     return total
-
-
-def in_effect(delay: Float[np.ndarray, " systems"], control_step: float) -> np.ndarray:
-    """Index of the pending action in effect at the end of a control step; 0 is the newest."""
-    return np.maximum(np.ceil(delay / control_step - 1e-9).astype(int) - 1, 0)

@@ -66,9 +66,9 @@ def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], pa
     """
     spec, bound = simulator.task.spec(), simulator.model(values)
     nominal = _compiled(spec)
-    changes = [*_write_gravity(spec, nominal, bound), *_write_inertia(spec, nominal, bound)]
-    for kind, attribute, array in _ROWS:
-        changes += _write_rows(spec, nominal, bound, kind=kind, attribute=attribute, array=array)
+    changes = [*_write_options(spec, nominal, bound), *_write_inertia(spec, nominal, bound)]
+    for kind, array in _changed(nominal, bound):
+        changes += _write_rows(spec, nominal, bound, kind=kind, array=array)
     _gather_assets(spec, path.parent)
     # MuJoCo writes what was compiled last.
     _refuse_difference(bound, _compiled(spec), "written into its spec")
@@ -121,7 +121,7 @@ def _refuse_difference(wanted: mujoco.MjModel, got: mujoco.MjModel, where: str) 
                 f"the model {where} differs from the bound one in {name} by {difference:.3g}; "
                 "this parameter, or this version of MuJoCo, cannot be written as MJCF exactly"
             )
-    for name in ("timestep", "gravity"):
+    for name in _options(wanted):
         if not np.array_equal(getattr(wanted.opt, name), getattr(got.opt, name)):
             raise MadocError(f"the model {where} differs from the bound one in the option {name}")
 
@@ -187,12 +187,19 @@ def _copied(spec: mujoco.MjSpec, file: str, own_folder: str, folder: Path, copie
     return copies[wanted]
 
 
-def _write_gravity(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
-    old, new = nominal.opt.gravity, bound.opt.gravity
-    if np.array_equal(old, new):
-        return []
-    spec.option.gravity = new
-    return [Change("option", "gravity", old.tolist(), new.tolist())]
+def _write_options(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
+    changes = []
+    for name in _options(bound):
+        old, new = getattr(nominal.opt, name), getattr(bound.opt, name)
+        if not np.array_equal(old, new):
+            setattr(spec.option, name, new)
+            changes.append(Change("option", name, np.atleast_1d(old).tolist(), np.atleast_1d(new).tolist()))
+    return changes
+
+
+def _options(model: mujoco.MjModel) -> list[str]:
+    """Names of the options of a model that are floating-point numbers."""
+    return [name for name in dir(model.opt) if isinstance(getattr(model.opt, name), float | np.ndarray)]
 
 
 def _write_inertia(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
@@ -203,7 +210,7 @@ def _write_inertia(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.M
         for name, attribute in names.items()
         if (new := _row(bound, name, index)) != _row(nominal, name, index)
     ]
-    if changes:
+    if changes or not np.array_equal(bound.geom_pos, nominal.geom_pos):
         spec.compiler.settotalmass = -1.0
         spec.compiler.boundmass = spec.compiler.boundinertia = 0.0
         spec.compiler.balanceinertia = False
@@ -211,15 +218,30 @@ def _write_inertia(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.M
     return changes
 
 
+def _changed(nominal: mujoco.MjModel, bound: mujoco.MjModel) -> Iterator[tuple[str, str]]:
+    """Kind of element and name of the arrays, with a row for each, in which two models differ, besides inertias."""
+    for array in dir(bound):
+        kind = _KINDS.get(array.split("_")[0], "")
+        if not kind or array in _INERTIAL or array.endswith("poly"):
+            continue
+        for one in (array, f"{array}poly"):
+            ours = getattr(bound, one, None)
+            if isinstance(ours, np.ndarray) and not np.array_equal(ours, getattr(nominal, one)):
+                yield kind, array
+                break
+
+
 def _write_rows(
-    spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel, *, kind: str, attribute: str, array: str
+    spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel, *, kind: str, array: str
 ) -> list[Change]:
-    """Write an attribute of all elements of a kind, which is equal to their rows of an array of the model."""
+    """Write what differs in an array of the model to the attribute of each element; nothing where MJCF has none."""
     changes = []
-    for element in spec.bodies if kind == "body" else getattr(spec, f"{kind}s"):
+    attribute = _ATTRIBUTES.get(array, array.partition("_")[2])
+    plural = {"body": "bodies", "equality": "equalities"}.get(kind, f"{kind}s")
+    for element in getattr(spec, plural):
         index = _index(bound, array, element.id)
         old, new = _row(nominal, array, index), _row(bound, array, index)
-        if old == new:
+        if old == new or not hasattr(element, attribute):
             continue
         turns = kind == "joint" and int(element.type) == int(mujoco.mjtJoint.mjJNT_HINGE)
         if attribute in _ANGLES and spec.compiler.degree and turns:
@@ -242,9 +264,9 @@ def _index(model: mujoco.MjModel, array: str, element: int) -> int:
 
 
 def _row(model: mujoco.MjModel, array: str, index: int) -> list[float]:
-    """The numbers of an element; those of a joint's damping are followed by its quadratic and cubic ones, if any."""
+    """The numbers of an element; a damping or stiffness is followed by its quadratic and cubic ones, if any."""
     row = [float(value) for value in np.atleast_1d(getattr(model, array)[index])]
-    higher = model.dof_dampingpoly[index].tolist() if array == "dof_damping" else []
+    higher = getattr(model, f"{array}poly")[index].tolist() if hasattr(model, f"{array}poly") else []
     return [*row, *higher] if any(higher) else row
 
 
@@ -255,31 +277,32 @@ def _body_name(model: mujoco.MjModel, index: int) -> str:
     return body.name or (model.joint(joint).name if joint >= 0 else "") or str(index)
 
 
-_ROWS = (
-    ("body", "pos", "body_pos"),
-    ("body", "quat", "body_quat"),
-    ("joint", "damping", "dof_damping"),
-    ("joint", "armature", "dof_armature"),
-    ("joint", "frictionloss", "dof_frictionloss"),
-    ("joint", "stiffness", "jnt_stiffness"),
-    ("joint", "pos", "jnt_pos"),
-    ("joint", "ref", "qpos0"),
-    ("joint", "springref", "qpos_spring"),
-    ("joint", "range", "jnt_range"),
-    ("joint", "userdata", "jnt_user"),
-    ("tendon", "springlength", "tendon_lengthspring"),
-    ("tendon", "range", "tendon_range"),
-    ("geom", "friction", "geom_friction"),
-    ("geom", "size", "geom_size"),
-    ("geom", "pos", "geom_pos"),
-    ("site", "pos", "site_pos"),
-    ("actuator", "gainprm", "actuator_gainprm"),
-    ("actuator", "biasprm", "actuator_biasprm"),
-    ("actuator", "forcerange", "actuator_forcerange"),
-    ("actuator", "damping", "actuator_damping"),
-    ("actuator", "userdata", "actuator_user"),
-)
-"""What a parameter may change, besides gravity and inertias: kind of element, attribute in MJCF, array of the model."""
+_KINDS = {
+    **{kind: kind for kind in ("body", "geom", "site", "tendon", "actuator", "sensor")},
+    **dict.fromkeys(("dof", "jnt", "qpos0", "qpos"), "joint"),
+    "eq": "equality",
+}
+"""By the first word of an array's name, the kind of element in MJCF that has a row of it."""
+
+_ATTRIBUTES = {
+    "qpos0": "ref",
+    "jnt_user": "userdata",
+    "actuator_user": "userdata",
+    "qpos_spring": "springref",
+    "dof_solref": "solref_friction",
+    "dof_solimp": "solimp_friction",
+    "jnt_solref": "solref_limit",
+    "jnt_solimp": "solimp_limit",
+    "tendon_solref_lim": "solref_limit",
+    "tendon_solimp_lim": "solimp_limit",
+    "tendon_solref_fri": "solref_friction",
+    "tendon_solimp_fri": "solimp_friction",
+    "tendon_lengthspring": "springlength",
+}
+"""Attributes in MJCF of arrays whose name is not that of the attribute behind the kind of element."""
+
+_INERTIAL = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
+"""Arrays that are written as the inertial frame of a body."""
 
 _ANGLES = ("ref", "springref", "range")
 """Attributes of a hinge that are in degrees where the other angles of a model's file are."""

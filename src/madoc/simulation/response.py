@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from madoc.parameters import FIELDS
+from madoc.parameters import Parameter
 from madoc.simulation.base import Simulator
 from madoc.simulation.cpu import without_warnings
 from madoc.simulation.user_data import scale_forces
@@ -123,9 +123,11 @@ def responses(
     return np.stack(found, axis=-1)
 
 
-def mass_like(field: str) -> bool:
-    """Whether a field is a mass, an inertia, a force or a torque, or in proportion to one: kg or N is in its unit."""
-    return field == "actuator_gain" or any(unit in FIELDS[field].unit for unit in ("kg", "N"))
+def mass_like(parameter: Parameter) -> bool:
+    """Whether a value is a mass, an inertia, a force or a torque, or in proportion to one: kg or N is in its unit."""
+    return parameter.field == "actuator_gain" or any(
+        unit in (parameter.kind.unit or parameter.unit) for unit in ("kg", "N")
+    )
 
 
 def hidden_scales(

@@ -9,7 +9,16 @@ import mujoco
 import numpy as np
 
 from madoc.errors import MadocError, nearest_hint
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
+from madoc.simulation.arrays import numbers_at, write_number
+from madoc.simulation.inertials import (
+    DIAGONAL,
+    write_centre_of_mass,
+    write_deviations,
+    write_inertia,
+    write_mass,
+    write_mass_and_inertia,
+)
 from madoc.simulation.user_data import (
     LEAST_FRICTION,
     drive_number,
@@ -19,17 +28,8 @@ from madoc.simulation.user_data import (
     write_elements,
 )
 
-MASS_FLOOR = 1e-3
-"""Mass of a body in kg to which smaller values are raised, as the motion of a massless body diverges; see `LEAST`."""
-
-INERTIA_FLOOR = 1e-9
-"""Moment of inertia in kg·m² to which smaller values are raised for the same reason; see `LEAST`."""
-
-LEAST = 1e-3
-"""Share of a body's own mass or inertia in the model to which they are raised, where that is less than the floors."""
-
-CENTRED = 1e-6
-"""Distance of a centre of mass from its body's origin, in radii of gyration, up to which rounding makes it."""
+SOLREF_FLOOR = 1e-9
+"""Time constant of a contact, s, and damping ratio to which smaller ones are raised, as 0 means another format."""
 
 _KINDS = {
     "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
@@ -37,6 +37,9 @@ _KINDS = {
     "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
     "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
     "sensor": (mujoco.mjtObj.mjOBJ_SENSOR, "nsensor"),
+    "site": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
+    "tendon": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
+    "equality": (mujoco.mjtObj.mjOBJ_EQUALITY, "neq"),
 }
 """By kind of element, MuJoCo's object type and the attribute of a model that counts them."""
 
@@ -44,7 +47,6 @@ ONE_DOF = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 """Types of joints with one degree of freedom."""
 OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 """Transmissions of actuators that act on one joint; for a hinge or a slide the two are the same."""
-_INERTIAL_FRAMES = (mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA, mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT)
 
 
 Conditions = Mapping[str, float | None]
@@ -72,34 +74,57 @@ def write_parameters(
     parameter that names an element the model does not have, or that scales a mass of 0, is refused.
     """
     holding = conditions_of(parameters)[0] if conditions is None else conditions
+    of_bodies: dict[int, dict[str, float]] = {}
     for parameter, value in zip(parameters, values, strict=True):
         holds = parameter.when is None or holding[parameter.when[0]] == parameter.when[1]
-        if holds and FIELDS[parameter.field].in_model:
+        if holds and parameter.kind.in_model:
             for element in find_elements(model, parameter):
-                if parameter.field in _WRITERS:
-                    _WRITERS[parameter.field](model, element, float(value))
+                numbers, write = _place_of(parameter.field)
+                if parameter.field in (*PAYLOAD, *INERTIA):
+                    of_bodies.setdefault(element, {})[parameter.field] = float(value)
+                elif write is None:
+                    numbers(model, element)[:] = value
                 else:
-                    _NUMBERS[parameter.field](model, element)[:] = value
+                    write(model, element, float(value))
+    for body, deviations in of_bodies.items():
+        write_deviations(model, body, deviations)
     write_elements(model)
     mujoco.mj_setConst(model, data)
 
 
 def nominal_values(model: mujoco.MjModel, parameter: Parameter) -> tuple[float, ...]:
     """The values in a model that a parameter would replace, one for each element; 0 for a delay and for biases."""
-    if not FIELDS[parameter.field].in_model:
+    if not parameter.kind.in_model:
         return tuple(0.0 for _ in parameter.elements or (0,))
-    return tuple(
-        float(_NUMBERS[parameter.field](model, element).flat[0]) for element in find_elements(model, parameter)
+    numbers, _ = _place_of(parameter.field)
+    return tuple(float(numbers(model, element).flat[0]) for element in find_elements(model, parameter))
+
+
+def same_numbers(model: mujoco.MjModel, one: Parameter, other: Parameter) -> bool:
+    """Whether two parameters, one of them of a number by its array's name, are written into the same place."""
+    if {one.field, other.field} <= FIELDS.keys() or not (one.kind.in_model and other.kind.in_model):
+        return False
+    here, there = (
+        [_place_of(each.field)[0](model, element) for element in find_elements(model, each)] for each in (one, other)
     )
+    return any(np.shares_memory(ours, theirs) for ours in here for theirs in there)
+
+
+def diagonal_bodies(model: mujoco.MjModel, parameter: Parameter) -> list[str]:
+    """Elements of a parameter of a payload or an inertia, of whose mass matrix MuJoCo keeps the diagonal alone."""
+    if parameter.field not in (*PAYLOAD, *INERTIA):
+        return []
+    bodies = zip(parameter.elements, find_elements(model, parameter), strict=True)
+    return [name for name, body in bodies if model.body_simple[body] == DIAGONAL]
 
 
 def find_elements(model: mujoco.MjModel, parameter: Parameter) -> list[int]:
     """Indices of a parameter's elements in the model; one -1 for gravity. A body may be named by a joint of its own."""
-    kind = FIELDS[parameter.field].element
+    kind = parameter.kind.element
     found = [-1] if kind is None else [_find_element(model, parameter.name, kind, one) for one in parameter.elements]
     if parameter.field.startswith(("drive_", "friction_")):
         for element in found:
-            _NUMBERS[parameter.field](model, element)
+            _place_of(parameter.field)[0](model, element)  # refuses what has no such number
     return found
 
 
@@ -115,7 +140,7 @@ def _find_element(model: mujoco.MjModel, parameter_name: str, kind: str, element
 
 
 def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Names of the elements of a kind (`body`, `joint`, `geom`, `actuator`, `sensor`) that have one."""
+    """Names of the elements of a kind (`body`, `joint`, `geom`, `site` and so on) that have one."""
     object_type, count = _KINDS[kind]
     names = (mujoco.mj_id2name(model, object_type, index) for index in range(getattr(model, count)))
     return [name for name in names if name]
@@ -166,60 +191,6 @@ def _dofs(model: mujoco.MjModel, joint: int) -> slice:
 def _write_friction_loss(model: mujoco.MjModel, joint: int, value: float) -> None:
     least = LEAST_FRICTION if has_speed_or_load_friction(model, joint) else 0.0
     model.dof_frictionloss[_dofs(model, joint)] = max(value, least)
-
-
-def _write_mass(model: mujoco.MjModel, body: int, value: float) -> None:
-    before = float(model.body_mass[body])
-    model.body_mass[body] = max(value, min(MASS_FLOOR, LEAST * before) if before else MASS_FLOOR)
-
-
-def _write_mass_and_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
-    before = float(model.body_mass[body])
-    if before == 0.0:
-        name = model.body(body).name
-        raise MadocError(f"body_mass_and_inertia: body {name!r} has no mass to scale; use body_mass instead")
-    _write_mass(model, body, value)
-    model.body_inertia[body] *= model.body_mass[body] / before
-
-
-def _write_inertia(model: mujoco.MjModel, body: int, value: float) -> None:
-    largest = model.body_inertia[body].max()
-    if largest == 0.0:
-        name = model.body(body).name
-        raise MadocError(f"body_inertia: body {name!r} has no inertia to scale; give it one in the model")
-    model.body_inertia[body] *= max(value, min(INERTIA_FLOOR, LEAST * largest)) / largest
-
-
-def off_centre(model: mujoco.MjModel, body: int) -> float:
-    """Distance of a body's centre of mass from its origin, m; 0 where it is there but for rounding."""
-    distance = float(np.linalg.norm(model.body_ipos[body]))
-    gyration = np.sqrt(model.body_inertia[body].max() / max(float(model.body_mass[body]), MASS_FLOOR))
-    return distance if distance > CENTRED * gyration else 0.0
-
-
-def _write_centre_of_mass(model: mujoco.MjModel, body: int, value: float) -> None:
-    distance = off_centre(model, body)
-    if distance == 0.0:
-        raise MadocError(
-            f"body_com: the centre of mass of body {model.body(body).name!r} is at its origin, so it has no direction "
-            "to move in; place it in the model"
-        )
-    before = model.body_ipos[body].copy()
-    model.body_ipos[body] *= value / distance
-    _keep_shapes(model, body, model.body_ipos[body] - before)
-
-
-def _keep_shapes(model: mujoco.MjModel, body: int, moved: np.ndarray) -> None:
-    """Leave geoms and sites where they are: MuJoCo keeps some of them, and boxes around them, in the inertial frame."""
-    for owner, frame in ((model.geom_bodyid, model.geom_sameframe), (model.site_bodyid, model.site_sameframe)):
-        in_inertial_frame = (owner == body) & np.isin(frame, _INERTIAL_FRAMES)
-        frame[in_inertial_frame] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-    first, count = model.body_bvhadr[body], model.body_bvhnum[body]
-    if count:
-        back, turned = np.zeros(4), np.zeros(3)
-        mujoco.mju_negQuat(back, model.body_iquat[body])
-        mujoco.mju_rotVecQuat(turned, moved, back)
-        model.bvh_aabb[first : first + count, :3] -= turned
 
 
 def has_gain(model: mujoco.MjModel, actuator: int) -> bool:
@@ -274,38 +245,61 @@ def _write_ref(model: mujoco.MjModel, joint: int, value: float) -> None:
             model.tendon_range[tendon] += longer
 
 
-_NUMBERS: dict[str, Callable[[mujoco.MjModel, int], np.ndarray]] = {
-    "gravity": lambda model, _: model.opt.gravity[2:],
-    "body_mass": lambda model, body: model.body_mass[body : body + 1],
-    "body_mass_and_inertia": lambda model, body: model.body_mass[body : body + 1],
-    "body_inertia": lambda model, body: model.body_inertia[body].max(keepdims=True),
-    "body_com": lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]),
-    "dof_damping": lambda model, joint: model.dof_damping[_dofs(model, joint)],
-    "dof_drag": lambda model, joint: model.dof_dampingpoly[_dofs(model, joint), :1],
-    "dof_armature": lambda model, joint: model.dof_armature[_dofs(model, joint)],
-    "dof_frictionloss": lambda model, joint: model.dof_frictionloss[_dofs(model, joint)],
-    "jnt_stiffness": lambda model, joint: model.jnt_stiffness[joint : joint + 1],
-    "jnt_ref": lambda model, joint: model.qpos0[model.jnt_qposadr[joint] :][:1],
-    "geom_friction": lambda model, geom: model.geom_friction[geom, :1],
-    "actuator_gain": lambda model, actuator: model.actuator_gainprm[actuator, :1],
-    "actuator_kv": lambda model, actuator: 0.0 - model.actuator_biasprm[actuator, 2:3],
+def _write_contact(place: int) -> Callable[[mujoco.MjModel, int, float], None]:
+    """A writer of the time constant (place 0) or the damping ratio (1) of a geom's contacts; both are above 0."""
+
+    def write(model: mujoco.MjModel, geom: int, value: float) -> None:
+        if (model.geom_solref[geom] <= 0.0).any():
+            raise MadocError(
+                f"the solref of geom {model.geom(geom).name!r} is a stiffness and a damping, below 0 in the model, and "
+                "has no time constant; give the geom a positive solref in the model"
+            )
+        model.geom_solref[geom, place] = max(value, SOLREF_FLOOR)
+
+    return write
+
+
+def _place_of(field: str) -> tuple["Numbers", "Write | None"]:
+    """Where a field stands in a model: one of `FIELDS`, or a number by the name of its array."""
+    if field in _PLACES:
+        return _PLACES[field]
+    return (
+        lambda model, element: numbers_at(model, field, element),
+        lambda model, element, value: write_number(model, field, element, value),
+    )
+
+
+Numbers = Callable[[mujoco.MjModel, int], np.ndarray]
+Write = Callable[[mujoco.MjModel, int, float], None]
+_PLACES: dict[str, tuple[Numbers, Write | None]] = {
+    "gravity": (lambda model, _: model.opt.gravity[2:], None),
+    "body_mass": (lambda model, body: model.body_mass[body : body + 1], write_mass),
+    "body_mass_and_inertia": (lambda model, body: model.body_mass[body : body + 1], write_mass_and_inertia),
+    "body_inertia": (lambda model, body: model.body_inertia[body].max(keepdims=True), write_inertia),
+    "body_com": (lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]), write_centre_of_mass),
+    **dict.fromkeys((*PAYLOAD, *INERTIA), (lambda model, body: np.zeros(1), None)),
+    "dof_frictionloss": (lambda model, joint: model.dof_frictionloss[_dofs(model, joint)], _write_friction_loss),
+    "dof_drag": (lambda model, joint: model.dof_dampingpoly[_dofs(model, joint), :1], None),
+    "dof_damping": (lambda model, joint: model.dof_damping[_dofs(model, joint)], None),
+    "dof_armature": (lambda model, joint: model.dof_armature[_dofs(model, joint)], None),
+    "jnt_stiffness": (lambda model, joint: model.jnt_stiffness[joint : joint + 1], None),
+    "jnt_ref": (lambda model, joint: model.qpos0[model.jnt_qposadr[joint] :][:1], _write_ref),
+    "geom_friction": (lambda model, geom: model.geom_friction[geom, :1], None),
+    "geom_friction_torsional": (lambda model, geom: model.geom_friction[geom, 1:2], None),
+    "geom_friction_rolling": (lambda model, geom: model.geom_friction[geom, 2:], None),
+    "contact_time": (lambda model, geom: model.geom_solref[geom, :1], _write_contact(0)),
+    "contact_damping": (lambda model, geom: model.geom_solref[geom, 1:], _write_contact(1)),
+    "actuator_gain": (lambda model, actuator: model.actuator_gainprm[actuator, :1], _write_gain),
+    "actuator_kv": (lambda model, actuator: 0.0 - model.actuator_biasprm[actuator, 2:3], _write_kv),
+    **{field: (partial(drive_number, name=field.partition("_")[2]), None) for field in FIELDS if "drive_" in field},
     **{
-        field: partial(drive_number if field.startswith("drive_") else friction_numbers, name=field.partition("_")[2])
+        field: (partial(friction_numbers, name=field.partition("_")[2]), None)
         for field in FIELDS
-        if field.startswith(("drive_", "friction_"))
+        if field[:9] == "friction_"
     },
 }
-"""The numbers of an element that a field stands for, the first of which is its value. A field without a writer of its
-own is written into all of them."""
+"""Where each field stands in a model: the numbers of an element, the first of which is its value, and what writes one.
 
-_WRITERS: dict[str, Callable[[mujoco.MjModel, int, float], None]] = {
-    "body_mass": _write_mass,
-    "body_mass_and_inertia": _write_mass_and_inertia,
-    "body_inertia": _write_inertia,
-    "body_com": _write_centre_of_mass,
-    "dof_frictionloss": _write_friction_loss,
-    "jnt_ref": _write_ref,
-    "actuator_gain": _write_gain,
-    "actuator_kv": _write_kv,
-}
-"""Fields whose value has a floor, or changes other numbers of the model too."""
+Without a writer all of the numbers become the value; a writer is for a value that has a floor, or moves others along.
+Payloads and deviations of inertias, 0 in the model, are written together.
+"""

@@ -16,7 +16,7 @@ from madoc.diagnosis.channels import signal_names
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, rows_that_fit, windows_at
-from madoc.parameters import FIELDS, Parameter, ParameterSpace
+from madoc.parameters import Parameter, ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.simulation.write import nominal_values
 from madoc.verdict.bench import Bench
@@ -56,7 +56,7 @@ def as_given(simulator: Simulator) -> Simulator:
 def _own(parameter: Parameter, values: tuple[float, ...]) -> list[Parameter]:
     """A parameter for each element of a shared one, whose range begins at the element's value in the model."""
     width = parameter.high - parameter.low
-    if not FIELDS[parameter.field].in_model or not parameter.elements:
+    if not parameter.kind.in_model or not parameter.elements:
         return [replace(parameter, low=values[0], high=values[0] + width)]
     pairs = zip(parameter.elements, values, strict=True)
     return [
