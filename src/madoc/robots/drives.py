@@ -16,11 +16,11 @@ from madoc.tasks.base import ActionChannel
 
 _WIDEST_SUPPLY = 2.0
 """Largest measured supply over the nominal one."""
-_SHAPE = {"stribeck_speed": (0.1, 10.0), "stribeck_exponent": (0.2, 10.0)}
+_SHAPE = {"stribeck_speed": (0.1, 10.0), "stribeck_exponent": (0.5, 10.0)}
 """Ranges of how friction falls with the speed, in rad/s and 1: those of Rhoban/bam's fits of servos, and wider."""
-_LOAD = {"load": 0.5, "stribeck_load": 1.0, "quadratic": 1.0}
-"""Largest ratio of friction to load, as Rhoban/bam's fits have it, and the largest quadratic one in 1/(N·m), where
-theirs end at 0.01 and an XL330's logs ask for more than 0.1."""
+_LOAD = {"load": 0.5, "stribeck_load": 1.0, "quadratic": 0.1}
+"""Largest ratio of friction to load, as Rhoban/bam's fits have it, and the largest quadratic one in 1/(N·m), ten
+times theirs."""
 
 
 def drive_numbers(drive: DriveSpec, means: str) -> tuple[float, ...]:
