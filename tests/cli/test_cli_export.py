@@ -16,7 +16,8 @@ read_yaml = YAML(typ="safe").load
 def test_a_run_is_exported_beside_itself(whole, tmp_path, capsys):
     told, code = asked_for_json(capsys, ["export", whole, "--out", tmp_path / "out"])
     assert code == 0
-    names = ["draws.npz", "draws.py", "model.xml", "patch.yaml", "randomization.yaml", "sysid_parameters.yaml"]
+    names = ["draws.npz", "draws.py", "isaac_lab_robot.py", "mjlab_robot.py", "model.xml", "patch.yaml"]
+    names += ["randomization.yaml", "sysid_parameters.yaml"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     assert told["files"]["model"] == str(tmp_path / "out" / "model.xml")
     calibrated = read_calibration(whole)

@@ -119,7 +119,13 @@ def load_spec(block):
     robots.load("part.yaml")
 
 
-RUN = {"shell": run_shell, "python": run_python, "yaml": load_yaml}
+RUN = {
+    "shell": run_shell,
+    "python": run_python,
+    "yaml": load_yaml,
+    "py": lambda block, _: compile(block, "docs", "exec"),
+}
+"""What is done with a block of each language; `py` needs packages that are not installed here, and is compiled."""
 
 
 def test_every_field_of_a_parameter_is_explained():

@@ -2,6 +2,7 @@
 
 import importlib.util
 
+import gymnasium
 import jax
 import mujoco
 import numpy as np
@@ -53,3 +54,23 @@ def test_drawn_models_have_the_covariance_of_the_estimate_and_are_those_bound(si
         data.qpos[0] = 0.3
         mujoco.mj_step(each, data, 50)
     assert moved[0].qpos[0] == moved[1].qpos[0]
+
+
+def test_a_gymnasium_environment_has_another_draw_in_every_episode(simulator, tmp_path):
+    mean = simulator.parameters.vector(SPRING_TRUTH)
+    values = mean + 0.1 * np.arange(20)[:, None]
+    save_draws(tmp_path, simulator.parameters.names, (), values, numbers_of_draws(simulator, values))
+
+    class Environment(gymnasium.Env):
+        model = simulator.task.compile()
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return np.zeros(1), {}
+
+    environment = used(tmp_path).randomized(Environment())
+    seen = []
+    for seed in (3, None, 3, None):
+        environment.reset(seed=seed)
+        seen.append(float(environment.unwrapped.model.jnt_stiffness[0]))
+    assert seen[0] == seen[2] and seen[1] == seen[3] and seen[0] != seen[1]

@@ -356,7 +356,7 @@ def test_models_that_cannot_be_stepped_yet_are_refused(tmp_path):
     )
     with pytest.raises(
         MadocError,
-        match=r"line 3: cart: the actuators a have an activation .*, a state that is not simulated",
+        match=r"line 3: cart: of the actuators a with an activation .* the state is not simulated",
     ):
         robots.load(path)
 

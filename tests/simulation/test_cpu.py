@@ -291,7 +291,7 @@ def test_models_with_activations_are_refused(spring_task):
         robot.actuators[0].dyntype = mujoco.mjtDyn.mjDYN_INTEGRATOR
         return robot
 
-    with pytest.raises(MadocError, match="spring: models with actuator activations or mocap bodies are not supported"):
+    with pytest.raises(MadocError, match="spring: of the actuators push with an activation"):
         CpuSimulator(replace(task, spec=with_activation))
 
 

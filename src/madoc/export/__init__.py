@@ -3,11 +3,15 @@
 from madoc.export.draws import save_draws
 from madoc.export.onnx_policy import save_onnx
 from madoc.export.parameter_files import Exported, is_patch, save_patch, save_randomization, save_sysid_parameters
+from madoc.export.trainers import Robot, save_isaac_lab, save_mjlab
 
 __all__ = [
     "Exported",
+    "Robot",
     "is_patch",
     "save_draws",
+    "save_isaac_lab",
+    "save_mjlab",
     "save_onnx",
     "save_patch",
     "save_randomization",

@@ -55,6 +55,22 @@ def put(model, row, table=TABLE):
     return dict(zip(stored["names"].tolist(), stored["values"][row].tolist()))
 
 
+def randomized(environment, table=TABLE):
+    """A Gymnasium environment of MuJoCo whose model is another draw in every episode."""
+    import gymnasium
+
+    class Randomized(gymnasium.Wrapper):
+        random = np.random.default_rng()
+
+        def reset(self, *, seed=None, options=None):
+            if seed is not None:
+                self.random = np.random.default_rng(seed)
+            put(self.unwrapped.model, self.random.integers(count(table)), table)
+            return super().reset(seed=seed, options=options)
+
+    return Randomized(environment)
+
+
 def domain_randomize(model, rng, table=TABLE):
     """Batched models for MuJoCo Playground 0.2: a row for each key of `rng`, as (model, in_axes) of an mjx.Model."""
     import jax
@@ -74,7 +90,7 @@ def domain_randomize(model, rng, table=TABLE):
     in_axes = jax.tree_util.tree_map(lambda part: None, model).tree_replace({field: 0 for field in changed})
     return model.tree_replace(changed), in_axes
 '''
-"""The file `draws.py` of an export: it needs NumPy alone, and JAX for Playground."""
+"""The file `draws.py` of an export: it needs NumPy alone, JAX for Playground, and Gymnasium for its environments."""
 
 
 def save_draws(

@@ -1,17 +1,21 @@
 """Export as a stage: a finished calibration as files for other tools."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from madoc import simulation
 from madoc.errors import MadocError
 from madoc.export import (
     Exported,
+    Robot,
     is_patch,
     save_draws,
+    save_isaac_lab,
+    save_mjlab,
     save_onnx,
     save_patch,
     save_randomization,
@@ -23,9 +27,10 @@ from madoc.pipeline.evaluation_stage import find_policies
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.simulation import Simulator
+from madoc.simulation.configuration import joint_actuators, physics_options, start_position
 from madoc.simulation.drawn import numbers_of_draws
 from madoc.simulation.mjcf import save_mjcf
-from madoc.simulation.write import nominal_values
+from madoc.simulation.write import element_names, nominal_values
 
 DRAWS = 1000
 """Number of models drawn from the distribution of an estimate; their covariance is within 5 % of its own."""
@@ -66,6 +71,8 @@ def export_run(
         "mujoco.sysid parameters": folder / "sysid_parameters.yaml",
         "draws of models": folder / "draws.npz",
         "how to use them": folder / "draws.py",
+        "robot for mjlab": folder / "mjlab_robot.py",
+        "robot for Isaac Lab": folder / "isaac_lab_robot.py",
     }
     targets = {name: folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx") for name in policies}
     if out is not None:
@@ -76,19 +83,43 @@ def export_run(
         files["randomization ranges"], exported, provenance, None if result.covariance is None else covariance.tolist()
     )
     save_sysid_parameters(files["mujoco.sysid parameters"], exported)
-    _leave_draws(folder, simulator, calibrated)
+    fields = _leave_draws(folder, simulator, calibrated)
+    robot = _robot(simulator, result.mean, fields)
+    save_mjlab(files["robot for mjlab"], robot, exported)
+    save_isaac_lab(files["robot for Isaac Lab"], robot, exported)
     for name, file in policies.items():
         save_onnx(NumpyPolicy.load(file), targets[name])
         files[f"policy {name}"] = targets[name]
     return files
 
 
-def _leave_draws(folder: Path, simulator: Simulator, calibrated: Calibrated) -> None:
-    """Leave models drawn from the joint distribution of the estimate."""
+def _leave_draws(folder: Path, simulator: Simulator, calibrated: Calibrated) -> list[str]:
+    """Leave models drawn from the joint distribution of the estimate, and tell the arrays in which they differ."""
     key = stage_key(calibrated.result.seed, "export")
     values = np.asarray(calibrated.distribution().draw(key, DRAWS), np.float64)
     around = [row.name for row in simulator.parameters.parameters if not row.kind.in_model]
-    save_draws(folder, simulator.parameters.names, around, values, numbers_of_draws(simulator, values))
+    numbers = numbers_of_draws(simulator, values)
+    save_draws(folder, simulator.parameters.names, around, values, numbers)
+    return [name for name, (_, rows) in numbers.items() if rows.dtype.kind == "f"]
+
+
+def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], fields: Sequence[str]) -> Robot:
+    """What configurations for training say of the robot at the estimate."""
+    task, model = simulator.task, simulator.model(values)
+    named = [channel.actuator for channel in task.actions] or element_names(model, "actuator")
+    physics, lost = physics_options(model)
+    rows = zip(simulator.parameters.parameters, values.tolist(), strict=True)
+    return Robot(
+        name=task.name,
+        actuators=joint_actuators(model, list(dict.fromkeys(named))),
+        start=start_position(model),
+        physics=physics,
+        decimation=task.frame_skip,
+        timestep=simulator.control_step / task.frame_skip,
+        delay=sum(value for row, value in rows if row.field == "action_delay"),
+        fields=fields,
+        lost=lost,
+    )
 
 
 def _require_ours(folder: Path, files: Iterable[Path]) -> None:

@@ -1,0 +1,113 @@
+"""What a model is in the terms of those who configure robots for training: actuators, options, the start."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from madoc.simulation.write import OF_A_JOINT, ONE_DOF, has_gain
+
+
+@dataclass(frozen=True)
+class JointActuator:
+    """An actuator, and the joint that it drives.
+
+    Attributes:
+        name: Its name in the model.
+        joint: The hinge or slide that it drives; empty where it drives something else.
+        servo: Whether it is a position servo without a gear ratio, whose force is
+            stiffness · (command - position) - damping · velocity.
+        stiffness: Its kp in N·m/rad, or in N/m of a slide; 0 of what is no position servo.
+        damping: Its kd in N·m·s/rad, or in N·s/m of a slide; 0 of what is no position servo.
+        effort_limit: Its largest force to either side in N·m or N; None where it has none, or another to each side.
+        armature: Of the joint, kg·m² or kg.
+        friction: Coulomb friction of the joint, N·m or N.
+        viscous: Viscous damping of the joint, N·m·s/rad or N·s/m.
+    """
+
+    name: str
+    joint: str
+    servo: bool
+    stiffness: float
+    damping: float
+    effort_limit: float | None
+    armature: float
+    friction: float
+    viscous: float
+
+
+def joint_actuators(model: mujoco.MjModel, names: Sequence[str]) -> list[JointActuator]:
+    """The named actuators of a model, in the order given."""
+    return [_joint_actuator(model, model.actuator(name).id) for name in names]
+
+
+def _joint_actuator(model: mujoco.MjModel, index: int) -> JointActuator:
+    name, joint = model.actuator(index).name, int(model.actuator_trnid[index, 0])
+    single = int(model.actuator_trntype[index]) in OF_A_JOINT and int(model.jnt_type[joint]) in ONE_DOF
+    if not single:
+        return JointActuator(name, "", False, 0.0, 0.0, None, 0.0, 0.0, 0.0)
+    dof = int(model.jnt_dofadr[joint])
+    gain, (offset, position, velocity) = float(model.actuator_gainprm[index, 0]), model.actuator_biasprm[index, :3]
+    servo = (
+        has_gain(model, index)
+        and int(model.actuator_biastype[index]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+        and int(model.actuator_dyntype[index]) == int(mujoco.mjtDyn.mjDYN_NONE)
+        and gain > 0.0
+        and position == -gain
+        and offset == 0.0
+        and np.array_equal(model.actuator_gear[index], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    )
+    low, high = model.actuator_forcerange[index].tolist()
+    limited = bool(model.actuator_forcelimited[index]) and low == -high
+    return JointActuator(
+        name=name,
+        joint=model.joint(joint).name,
+        servo=servo and (limited or not model.actuator_forcelimited[index]),
+        stiffness=gain if servo else 0.0,
+        damping=float(-velocity) if servo else 0.0,
+        effort_limit=high if limited else None,
+        armature=float(model.dof_armature[dof]),
+        friction=float(model.dof_frictionloss[dof]),
+        viscous=float(model.dof_damping[dof]),
+    )
+
+
+def physics_options(model: mujoco.MjModel) -> tuple[dict[str, str], list[str]]:
+    """A model's options by their names in mjlab's `MujocoCfg`, as source, and what these names cannot say."""
+    option = model.opt
+    names = {
+        "integrator": mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_").lower(),
+        "cone": mujoco.mjtCone(option.cone).name.removeprefix("mjCONE_").lower(),
+        "jacobian": mujoco.mjtJacobian(option.jacobian).name.removeprefix("mjJAC_").lower(),
+        "solver": mujoco.mjtSolver(option.solver).name.removeprefix("mjSOL_").lower(),
+    }
+    lost = []
+    if names["integrator"] not in _INTEGRATORS:
+        lost.append(f"the integrator is {names['integrator']} and mjlab has {' and '.join(_INTEGRATORS)}")
+        names["integrator"] = "implicitfast"
+    numbers = ("timestep", "impratio", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "ccd_iterations")
+    source = {name: repr(getattr(option, name)) for name in numbers} | {name: repr(it) for name, it in names.items()}
+    source["gravity"] = repr(tuple(option.gravity.tolist()))
+    for flags, kind, prefix in (
+        ("disableflags", mujoco.mjtDisableBit, "mjDSBL_"),
+        ("enableflags", mujoco.mjtEnableBit, "mjENBL_"),
+    ):
+        known = {name: int(bit) for name, bit in kind.__members__.items() if name.startswith(prefix)}
+        held = tuple(name.removeprefix(prefix).lower() for name, bit in known.items() if getattr(option, flags) & bit)
+        source |= {flags: repr(held)} if held else {}
+    lost += [
+        f"the option {name} is {getattr(option, name)!r} and mjlab has none"
+        for name in ("density", "viscosity")
+        if getattr(option, name)
+    ]
+    return source, lost
+
+
+def start_position(model: mujoco.MjModel) -> dict[str, float]:
+    """Where the hinges and slides that have a name are in a model's reference pose, rad or m."""
+    joints = [(model.joint(index).name, index) for index in range(model.njnt) if int(model.jnt_type[index]) in ONE_DOF]
+    return {name: float(model.qpos0[model.jnt_qposadr[index]]) for name, index in joints if name}
+
+
+_INTEGRATORS = ("euler", "implicitfast")
