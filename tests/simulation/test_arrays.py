@@ -102,6 +102,7 @@ def test_a_joint_of_many_degrees_has_a_row_for_each():
         ("body_subtreemass", "shin", "body_subtreemass cannot be calibrated: MuJoCo computes it from other numbers"),
         ("dof_M0", "knee", "dof_M0 cannot be calibrated: MuJoCo computes it"),
         ("geom_size[0]", "foot", "geom_size cannot be calibrated: bounds of shapes are computed"),
+        ("body_ipos[0]", "shin", "body_ipos cannot be calibrated: .* use payload_x or inertia"),
         ("jnt_axis[0]", "knee", "jnt_axis cannot be calibrated: a direction has a length of 1"),
         ("geom_user[0]", "foot", "MuJoCo's model has no numbers 'geom_user'"),
         ("site_pos[0]", "imuu", "the model has no site 'imuu'; nearest: imu"),

@@ -14,7 +14,7 @@ import pytest
 
 from madoc import robots, simulation, tasks
 from madoc.errors import MadocError
-from madoc.parameters import Parameter
+from madoc.parameters import INERTIA, Parameter, ParameterSpace
 from madoc.simulation import mjcf
 from madoc.simulation.mjcf import Change, save_mjcf, shortest_numbers
 from robots import spring, two_link_arm
@@ -290,3 +290,17 @@ def test_a_missing_file_is_named(tmp_path):
     (tmp_path / "shapes" / "wheel" / "box.obj").unlink()
     with pytest.raises(MadocError, match=r"no longer compiles: .*wheel/box.obj"):
         save_mjcf(simulator, np.array([0.5]), tmp_path / "model.xml")
+
+
+def test_a_payload_and_a_whole_inertia_leave_as_inertial_frames(lift, tmp_path):
+    fields = [("payload_mass", "rod", 0.0, 1.0), ("payload_y", "rod", 0.0, 0.1)]
+    fields += [(field, "block", -0.2, 0.2) for field in INERTIA]
+    space = ParameterSpace(tuple(Parameter(*each) for each in fields))
+    simulator = simulation.make(replace(lift.task, parameters=space, ranges={}), threads=1)
+    changes = save_mjcf(simulator, somewhere(simulator), tmp_path / "written.xml")
+    assert {change.element for change in changes} == {"inertial of body rod", "inertial of body block"}
+    bound, read_back = (
+        simulator.model(somewhere(simulator)),
+        mujoco.MjModel.from_xml_path(str(tmp_path / "written.xml")),
+    )
+    np.testing.assert_allclose(read_back.dof_M0, bound.dof_M0, rtol=1e-12)

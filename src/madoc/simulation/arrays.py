@@ -10,6 +10,7 @@ from madoc.parameters import FIELDS, array_of
 
 _NOT_FREE = {
     "opt.timestep": "the timestep is given by timestep: in the spec",
+    "body_ipos": "shapes may stand in the inertial frame, which it is the place of; use payload_x or inertia",
     "body_inertia": "the moments of inertia of a body bound each other; use the field inertia",
     "geom_size": "bounds of shapes are computed when a model is compiled; change the size in the model's file",
     "geom_aabb": "bounds of shapes are computed when a model is compiled; change the size in the model's file",
@@ -18,7 +19,7 @@ _NOT_FREE = {
 }
 """Arrays whose numbers cannot be calibrated one by one, and why."""
 _QUATERNION = "a quaternion has a length of 1, so that its numbers are not free; turn it in the model's file"
-_PLACED = {"geom_pos": "geom_sameframe", "site_pos": "site_sameframe", "body_ipos": "body_sameframe"}
+_PLACED = {"geom_pos": "geom_sameframe", "site_pos": "site_sameframe"}
 """Arrays of places, and the flags by which MuJoCo takes another frame's place instead."""
 
 
