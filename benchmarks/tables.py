@@ -145,8 +145,8 @@ def verdicts() -> str:
         "`python benchmarks/rates.py`: one log of a double pendulum with coarse encoders at three rates, all defaults. "
         "Windows of 0.5 s are simulated from true states; values 5 % off the truth stand for a data sheet's.\n\n"
         f"{rates.table(rates.STUDY.rows())}\n\n"
-        "`python benchmarks/payload.py`: an arm of seven joints, driven by torques that arrive 8 ms late, with an unknown "
-        "load of 0.5 kg off its axis and unknown dry friction, all defaults.\n\n"
+        "`python benchmarks/payload.py`: an arm of seven joints, driven by torques that arrive 8 ms late, with an "
+        "unknown load of 0.5 kg off its axis and unknown dry friction, all defaults.\n\n"
         f"{payload.table(payload.STUDY.rows())}\n"
     )
 
