@@ -53,7 +53,9 @@ def test_least_squares_is_exact_on_exact_encoders(arm):
     result = calibrate(method, problem_of(arm, ARM, rows=1000), key=jax.random.key(0), budget=400_000)
     assert (off(result, arm, ARM) < EXACT).all(), off(result, arm, ARM)
     assert result.status == "converged"
-    said = r"initial states of windows of \d+ control steps were estimated with the parameters, as states cannot be"
+    said = (
+        r"the initial state of each window of \d+ control steps was estimated with the parameters, as states cannot be"
+    )
     assert re.match(said + " rebuilt from the data", result.warnings[0])
 
 

@@ -150,6 +150,11 @@ def test_what_is_hardly_better_at_an_end_or_contradicted_stays_a_mismatch(good, 
     assert judge(replace(lacking, open_loop=())).word == "MODEL_MISMATCH"
 
 
+def test_what_predicts_certainly_worse_over_another_time_stays_a_mismatch():
+    over = (predicted_over(0.1, 0.4, (0.3, 0.6)), predicted_over(1.0, 1.5, (1.2, 1.8)))
+    assert judge(changed(PREDICTED, LEFT_OVER, explained=0.6, open_loop=over)).word == "MODEL_MISMATCH"
+
+
 def test_a_few_windows_show_nothing():
     few = predicted_over(1.0, 0.4, (0.4, 0.4), windows=4)
     assert judge(changed(PREDICTED, LEFT_OVER, explained=0.6, open_loop=(few,))).word == "MODEL_MISMATCH"

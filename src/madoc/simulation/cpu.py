@@ -50,8 +50,8 @@ class CpuSimulator:
         if active:
             names = listed((self._model.actuator(index).name or f"number {index}" for index in active), most=4)
             raise MadocError(
-                f"{task.name}: of the actuators {names} with an activation (dyntype) the state is not simulated here; take "
-                "the dyntype out of the model, and calibrate action_delay instead"
+                f"{task.name}: of the actuators {names} with an activation (dyntype) the state is not simulated here; "
+                "take the dyntype out of the model, and calibrate action_delay instead"
             )
         whole = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if whole != 1 + self._model.nq + self._model.nv:  # time, positions, velocities

@@ -88,11 +88,12 @@ def judge(
 def _usable(holdout: HoldOut, lacking: Verdict) -> Verdict | None:
     """An estimate that predicts much better than the model as given, though the model lacks something.
 
-    An estimate at an end of its range is none: a wider range would give another one.
+    It is none where it predicts certainly worse over another time, nor at an end of its range: a wider range would give
+    another one.
     """
-    enough = (each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS)
+    enough = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
     better = [each for each in enough if each.relative <= MUCH_BETTER and each.relative_interval[1] < 1.0]
-    if holdout.at_end or not better:
+    if holdout.at_end or not better or any(each.relative_interval[0] > 1.0 for each in enough):
         return None
     found = max(better, key=lambda each: (not each.whole, each.seconds))  # whole runs are often few
     return Verdict(

@@ -159,7 +159,7 @@ class LeastSquares:
         if not state.finished:
             return state, epoch
         steps = (state.unknown[state.best] if state.estimates_starts else search).epochs
-        converged = f"after {steps} steps on all windows the next would change nothing worth a simulation"
+        converged = f"after {steps} steps on all windows a further step would change no estimate that matters"
         return state, replace(epoch, converged=converged)
 
     def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:

@@ -32,14 +32,16 @@ def about_estimated_states(problem: CalibrationProblem, search: SearchState, hor
     elif problem.dataset.disturbance.noise:
         why = "the data is noisy"
     else:
-        why = "residuals of consecutive rows alternate as noise does"
-    sentence = f"initial states of windows of {horizon} control steps were estimated with the parameters, as {why}"
+        why = "the log is noisy: residuals of consecutive rows alternate in sign"
+    sentence = (
+        f"the initial state of each window of {horizon} control steps was estimated with the parameters, as {why}"
+    )
     if not search.refining:
         return sentence
     noise = 100.0 * float(np.median(search.deviation))
     rows = stride(problem.dataset)
     change = "a step's typical change" if rows == 1 else f"the typical change in {rows} steps"
-    return f"{sentence}; the noise it finds is {noise:.2g} % of {change}"
+    return f"{sentence}; the noise found is {noise:.2g} % of {change}, and the intervals allow for it"
 
 
 def have_long_tails(problem: CalibrationProblem, search: SearchState) -> bool:
