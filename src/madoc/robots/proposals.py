@@ -184,10 +184,9 @@ def _scaled(model: mujoco.MjModel, field: str, names: Iterable[str], *, wanted: 
 
 def _unit(model: mujoco.MjModel, field: str, element: str) -> str:
     """The unit of a field of an element; elements of different units share no value."""
-    gain = field == "actuator_gain"
-    return (gain_unit(model, model.actuator(element).id) if gain else element_unit(model, field, element)) or FIELDS[
-        field
-    ].unit
+    if field == "actuator_gain":
+        return gain_unit(model, int(model.actuator(element).id)) or FIELDS[field].unit
+    return element_unit(model, field, element) or FIELDS[field].unit
 
 
 def _gains(model: mujoco.MjModel, servos: list[str], ends: Ends | None, guessed: frozenset[str]) -> Iterator[Proposal]:
@@ -204,8 +203,14 @@ def _gains(model: mujoco.MjModel, servos: list[str], ends: Ends | None, guessed:
 
 def _brakes(model: mujoco.MjModel, servos: list[str], *, wanted: bool) -> Iterator[Proposal]:
     """Damping of servos; where no servo has any, that of the joints stands for it."""
-    held = {one: (0.0 - model.actuator(one).biasprm[2], model.actuator(one).gainprm[0]) for one in servos}
-    values = {one: (*map(float, held[one]), _unit(model, "actuator_kv", one)) for one in servos}
+    values = {
+        one: (
+            float(0.0 - model.actuator(one).biasprm[2]),
+            float(model.actuator(one).gainprm[0]),
+            _unit(model, "actuator_kv", one),
+        )
+        for one in servos
+    }
     for group in _alike(servos, values.__getitem__, values.__getitem__):
         value, kp, _ = values[group[0]]
         high = rounded(max(_SERVO * value, _KV * kp))
