@@ -14,6 +14,7 @@ import adversary_table
 import interval_coverage
 import method_page
 import numpy as np
+import payload
 import planted
 import rates
 from disturbances import disturbed, settled_wrongly
@@ -132,7 +133,7 @@ def planted_truths() -> str:
 
 
 def verdicts() -> str:
-    """What `adversary.py`, `interval_coverage.py` and `rates.py` found."""
+    """What `adversary.py`, `interval_coverage.py`, `rates.py` and `payload.py` found."""
     cases = adversary.STUDY.rows()
     return (
         "## Verdicts and intervals\n\n"
@@ -143,7 +144,10 @@ def verdicts() -> str:
         f"{interval_coverage.table(interval_coverage.STUDY.rows())}\n\n"
         "`python benchmarks/rates.py`: one log of a double pendulum with coarse encoders at three rates, all defaults. "
         "Windows of 0.5 s are simulated from true states; values 5 % off the truth stand for a data sheet's.\n\n"
-        f"{rates.table(rates.STUDY.rows())}\n"
+        f"{rates.table(rates.STUDY.rows())}\n\n"
+        "`python benchmarks/payload.py`: an arm of seven joints, driven by torques that arrive 8 ms late, with an "
+        "unknown load of 0.5 kg off its axis and unknown dry friction, all defaults.\n\n"
+        f"{payload.table(payload.STUDY.rows())}\n"
     )
 
 

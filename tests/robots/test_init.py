@@ -212,12 +212,14 @@ def test_joints_of_a_hand_share_what_they_have_in_common(tmp_path):
     finger = '<body><joint name="f{0}" axis="0 1 0" armature="{1}"/><geom size=".02" mass=".1" pos="0 0 .1"/></body>'
     servo = '<position name="f{0}" joint="f{0}" kp="2" kv=".1" ctrlrange="-1 1" forcerange="-1 1"/>'
     fingers = "".join(finger.format(number, 0.01 if number else 0.02) for number in range(11))
-    servos = "".join(servo.format(number) for number in range(11))
+    fingers += '<body><joint name="rail" type="slide" range="-1 1" limited="true"/><geom size=".02"/></body>'
+    servos = "".join(servo.format(number) for number in [*range(11)]) + servo.replace("f{0}", "rail")
     text = f"<mujoco><worldbody>{fingers}</worldbody><actuator>{servos}</actuator></mujoco>"
     found = robots.load(written(tmp_path, text)).task.parameters.parameters
     armatures = {row.name: len(row.elements) for row in found if row.field == "dof_armature"}
-    assert armatures == {"dof_armature.f0": 1, "dof_armature.f1+9": 10}
-    assert [len(row.elements) for row in found if row.field == "actuator_gain"] == [11]
+    assert armatures == {"dof_armature.f0": 1, "dof_armature.f1+9": 10, "dof_armature.rail": 1}
+    gains = [(len(row.elements), row.unit) for row in found if row.field == "actuator_gain"]
+    assert gains == [(11, "N·m/rad"), (1, "N/m")], "of one number, but not of one unit"
 
 
 def test_a_recipe_gives_the_ranges_of_its_machines(tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 from madoc.parameters import FIELDS, Parameter
 from madoc.robots.model import is_single, is_slide
 from madoc.robots.recipes import Ends, Recipe
-from madoc.robots.space import element_unit
+from madoc.robots.space import element_unit, gain_unit
 from madoc.robots.strength import FREE, actuators_of, is_servo, strengths
 from madoc.simulation.write import OF_A_JOINT, element_names, find_elements, has_gain, heavy_bodies, nominal_values
 
@@ -171,32 +171,48 @@ def _dissipation(
 def _scaled(model: mujoco.MjModel, field: str, names: Iterable[str], *, wanted: bool) -> Iterator[Proposal]:
     """A field of elements where the model's value is above 0, from half of it to twice."""
     values = {name: nominal_values(model, Parameter(field, name, 0.0, 1.0))[0] for name in names}
-    coarse = None if FIELDS[field].element == "body" else values.__getitem__
-    for group in _alike(values, lambda name: f"{values[name]:.2g}", coarse):
+    units = {name: _unit(model, field, name) for name in values}
+    about = {name: (f"{values[name]:.2g}", units[name]) for name in values}
+    for group in _alike(values, about.__getitem__, None if FIELDS[field].element == "body" else about.__getitem__):
         if (value := values[group[0]]) > 0:
-            unit = element_unit(model, field, group[0]) or FIELDS[field].unit
-            unit = "" if unit == "1" else f"{unit}; "
+            unit = "" if units[group[0]] == "1" else f"{units[group[0]]}; "
             unit = "sliding, in contacts; " if field == "geom_friction" else unit
             yield Proposal(
                 field, group, rounded(value / 2), rounded(value * 2), f"{unit}the model has {value:.4g}", wanted
             )
 
 
+def _unit(model: mujoco.MjModel, field: str, element: str) -> str:
+    """The unit of a field of an element; elements of different units share no value."""
+    if field == "actuator_gain":
+        return gain_unit(model, int(model.actuator(element).id)) or FIELDS[field].unit
+    return element_unit(model, field, element) or FIELDS[field].unit
+
+
 def _gains(model: mujoco.MjModel, servos: list[str], ends: Ends | None, guessed: frozenset[str]) -> Iterator[Proposal]:
     """Stiffness of servos; the ranges of a recipe are made wide enough for the model's."""
-    values = {servo: float(model.actuator(servo).gainprm[0]) for servo in servos}
+    values = {one: (float(model.actuator(one).gainprm[0]), _unit(model, "actuator_gain", one)) for one in servos}
     for group in _alike(servos, values.__getitem__, values.__getitem__):
-        value = values[group[0]]
+        value, unit = values[group[0]]
         factor = _GUESS if group[0] in guessed else _SERVO
         low, high = (value / factor, value * factor) if ends is None else (min(ends[0], value), max(ends[1], value))
-        yield Proposal("actuator_gain", group, rounded(low), rounded(high), f"kp; the model has {value:.4g}", True)
+        yield Proposal(
+            "actuator_gain", group, rounded(low), rounded(high), f"kp, {unit}; the model has {value:.4g}", True
+        )
 
 
 def _brakes(model: mujoco.MjModel, servos: list[str], *, wanted: bool) -> Iterator[Proposal]:
     """Damping of servos; where no servo has any, that of the joints stands for it."""
-    values = {servo: (0.0 - model.actuator(servo).biasprm[2], model.actuator(servo).gainprm[0]) for servo in servos}
+    values = {
+        one: (
+            float(0.0 - model.actuator(one).biasprm[2]),
+            float(model.actuator(one).gainprm[0]),
+            _unit(model, "actuator_kv", one),
+        )
+        for one in servos
+    }
     for group in _alike(servos, values.__getitem__, values.__getitem__):
-        value, kp = (float(number) for number in values[group[0]])
+        value, kp, _ = values[group[0]]
         high = rounded(max(_SERVO * value, _KV * kp))
         yield Proposal("actuator_kv", group, 0.0, high, f"kv; the model has {value:.4g}", wanted)
 

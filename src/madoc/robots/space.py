@@ -113,7 +113,7 @@ def _element_unit(draft: Draft, model: mujoco.MjModel, field: str, element: str)
         index = [signal.name for signal in draft.spec.signals].index(element)
         return signal_unit(draft, model, parse(draft.spec.signals[index].reads), index)
     if field == "actuator_gain":
-        return _gain_unit(model, int(model.actuator(element).id))
+        return gain_unit(model, int(model.actuator(element).id))
     return element_unit(model, field, element)
 
 
@@ -127,7 +127,7 @@ def element_unit(model: mujoco.MjModel, field: str, element: str) -> str:
     return kind.slide_unit if joint >= 0 and is_slide(model, joint) else ""
 
 
-def _gain_unit(model: mujoco.MjModel, actuator: int) -> str:
+def gain_unit(model: mujoco.MjModel, actuator: int) -> str:
     """The unit of a servo on a joint: force per position or velocity. Other gains have no unit of their own."""
     if int(model.actuator_trntype[actuator]) not in OF_A_JOINT:
         return ""
