@@ -11,7 +11,7 @@ from typing import Any
 
 import adversary
 import adversary_table
-import coverage
+import interval_coverage
 import method_page
 import numpy as np
 import payload
@@ -133,15 +133,15 @@ def planted_truths() -> str:
 
 
 def verdicts() -> str:
-    """What `adversary.py`, `coverage.py`, `rates.py` and `payload.py` found."""
+    """What `adversary.py`, `interval_coverage.py`, `rates.py` and `payload.py` found."""
     cases = adversary.STUDY.rows()
     return (
         "## Verdicts and intervals\n\n"
         "`python benchmarks/adversary.py`: problems of seven robots, by the commit of the tool; each problem with "
         "`--table --commit`. Invisible deceptions are those that no data can show; `madoc check` names them.\n\n"
         f"{adversary_table.summary(cases)}\n\n"
-        "`python benchmarks/coverage.py`: honest problems, least squares, 95 % intervals.\n\n"
-        f"{coverage.table(coverage.STUDY.rows())}\n\n"
+        "`python benchmarks/interval_coverage.py`: honest problems, least squares, 95 % intervals.\n\n"
+        f"{interval_coverage.table(interval_coverage.STUDY.rows())}\n\n"
         "`python benchmarks/rates.py`: one log of a double pendulum with coarse encoders at three rates, all defaults. "
         "Windows of 0.5 s are simulated from true states; values 5 % off the truth stand for a data sheet's.\n\n"
         f"{rates.table(rates.STUDY.rows())}\n\n"

@@ -119,6 +119,42 @@ parameters:
 max_episode_steps: 200
 """
 
+SERVO = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.001"/>
+  <worldbody>
+    <body name="rod">
+      <joint name="shaft" axis="0 1 0"/>
+      <inertial pos="0 0 -1" mass="1" diaginertia="1e-6 1e-6 1e-6"/>
+      <geom size=".01" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""A point mass of 1 kg on a rod of 1 m that hangs, to be driven by a servo."""
+
+SERVO_SPEC = """\
+madoc: 1
+name: servo
+model: servo.xml
+control_step: 0.01
+signals:
+  - {name: angle, reads: position(shaft)}
+  - {name: rate, reads: velocity(shaft)}
+actions:
+  - name: goal
+    joint: shaft
+    means: position
+    low: -1
+    high: 1
+    drive: {kind: dc, supply: 12, kt: 0.5, resistance: 2, gain: 0.2, enable: "on", supply_from: volts, gain_from: p}
+conditions:
+  - {name: p, values: [2, 5]}
+parameters:
+  - {field: drive_strength, element: goal, low: 0.5, high: 1.5}
+"""
+
 MODELS = {"arm.xml": ARM, "spring.xml": SPRING, "cart.xml": CART, "pendulum.xml": PENDULUM}
 
 

@@ -70,6 +70,24 @@ FIELDS: dict[str, Field] = {
     "contact_damping": Field("geom", "1", 0.0, words="damping ratio of contacts"),
     "actuator_gain": Field("actuator", "1", words="gain", missing="another gain of the actuator"),
     "actuator_kv": Field("actuator", "N·m·s/rad", 0.0, "N·s/m", "servo damping"),
+    "drive_supply": Field("actuator", "V", 0.0, words="supply"),
+    "drive_kt": Field("actuator", "N·m/A", 0.0, words="kt"),
+    "drive_resistance": Field("actuator", "Ω", 1e-9, words="resistance"),
+    "drive_gain": Field("actuator", "1", 0.0, words="gain"),
+    "drive_damping_gain": Field("actuator", "1", 0.0, words="damping gain"),
+    "drive_duty_limit": Field("actuator", "1", 0.0, words="largest duty", maximum=1.0),
+    "drive_current_limit": Field("actuator", "A", 0.0, words="largest current"),
+    "drive_strength": Field("actuator", "1", 0.0, words="strength", missing="another strength of the drive"),
+    "friction_stribeck": Field("joint", "N·m", 0.0, "N", "Stribeck friction"),
+    "friction_stribeck_speed": Field("joint", "rad/s", 1e-9, "m/s", "Stribeck speed"),
+    "friction_stribeck_exponent": Field("joint", "1", 0.0, words="Stribeck exponent", maximum=100.0),
+    **{
+        f"friction_{rest}load{side}": Field("joint", "1", 0.0, words=f"friction by {side[1:] or 'the'} load{at_rest}")
+        for rest, at_rest in (("", ""), ("stribeck_", " at rest"))
+        for side in ("", "_motor", "_external")
+    },
+    "friction_quadratic_motor": Field("joint", "1/(N·m)", 0.0, "1/N", "quadratic friction, motor"),
+    "friction_quadratic_external": Field("joint", "1/(N·m)", 0.0, "1/N", "quadratic friction, external"),
     "action_delay": Field(None, "s", 0.0, words="delay", maximum=10.0, in_model=False),
     "signal_bias": Field("signal", "1", words="bias", missing="an offset of the sensor", in_model=False),
 }
@@ -83,7 +101,9 @@ velocity servo is its kp or kv, and moves the servo's bias with it; `actuator_kv
 the time from an action to its effect, `signal_bias` what a sensor reads too much. `dof_drag` is damping that grows with
 the square of the speed. `contact_time` and `contact_damping` are MuJoCo's `solref`: how long a contact takes to push
 shapes apart, and 1 where it does so without a bounce. A payload adds to the body's own mass and inertia; its moment of
-inertia about each axis is its mass times the square of its radius of gyration.
+inertia about each axis is its mass times the square of its radius of gyration. `drive_*` are the numbers of a d.c.
+drive, `friction_*` those of friction that depends on speed and load (`simulation/callbacks.py` has the equations);
+`friction_load` and `friction_stribeck_load` are one value for the motor's and the external torque.
 """
 
 
@@ -136,6 +156,7 @@ class Parameter:
         high: Upper end of the range, in `unit`.
         label: The parameter's name; if empty, it is `field.element`.
         measured_in: The unit of a slide joint, a signal or a number of the model; if empty, it is the field's.
+        when: The condition of a run and its value under which it holds; None holds always.
     """
 
     field: str
@@ -144,6 +165,7 @@ class Parameter:
     high: float
     label: str = ""
     measured_in: str = ""
+    when: tuple[str, float] | None = None
 
     def __post_init__(self) -> None:
         kind = self.kind
@@ -178,8 +200,12 @@ class Parameter:
 
     @property
     def name(self) -> str:
-        """The label, or `field.element` such as `dof_damping.foot_joint`; several elements are joined with `+`."""
-        return self.label or ".".join([self.field, *(["+".join(self.elements)] if self.elements else [])])
+        """The label, or `field.element` such as `dof_damping.foot_joint`; several elements are joined with `+`.
+
+        Behind it stands its condition, as in `drive_strength.elbow[supply=12]`.
+        """
+        name = self.label or ".".join([self.field, *(["+".join(self.elements)] if self.elements else [])])
+        return name if self.when is None else f"{name}[{self.when[0]}={self.when[1]:g}]"
 
     @property
     def unit(self) -> str:

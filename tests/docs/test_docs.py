@@ -22,10 +22,12 @@ read_yaml = YAML(typ="safe").load
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PENDULUM = Path(os.environ.get("MADOC_PENDULUM", ROOT.parent / "shared" / "data" / "dfki_simple_pendulum"))
+SERVO = Path(os.environ.get("MADOC_XL330", ROOT.parent / "shared" / "data" / "xl330"))
 ARM = Path(os.environ.get("MADOC_SO101", ROOT.parent / "shared" / "data" / "so101"))
 SLOW = {
     "real-arm.md",
     "real-pendulum.md",
+    "real-servo.md",
     "how-to/cluster.md",
     "how-to/compare-methods.md",
     "how-to/export.md",
@@ -53,6 +55,9 @@ def test_the_blocks_run(page, tmp_path, monkeypatch):
         pytest.skip("the logs of the SO-101 arm are not here; name their folder in MADOC_SO101")
     monkeypatch.setenv("PENDULUM", str(PENDULUM))
     monkeypatch.setenv("SO101", str(ARM))
+    if "$XL330" in text and not SERVO.is_dir():
+        pytest.skip("the logs of the XL330 servo are not here; name their folder in MADOC_XL330")
+    monkeypatch.setenv("XL330", str(SERVO))
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     names = {}
     for language, block in BLOCK.findall(text):

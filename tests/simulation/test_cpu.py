@@ -65,7 +65,7 @@ def test_a_machine_without_actuators_falls():
     cart = '<body name="cart"><joint name="slide" type="slide"/><geom size="1"/></body>'
     spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{cart}</worldbody></mujoco>")
     simulator = CpuSimulator(replace(spring(), spec=lambda: spec), threads=1)
-    system = CpuSystem(simulator, [simulator.task.model], np.zeros(1), np.zeros((1, 1)))
+    system = CpuSystem(simulator, [[simulator.task.model]], np.zeros(1), np.zeros((1, 1)))
     fallen = system._simulated(np.zeros((1, 2, 2)), np.zeros((1, 2, 5, 0)))
     np.testing.assert_allclose(fallen[0, :, :, 1], 2 * [-9.81 * 0.002 * np.arange(1, 6)])
 
@@ -354,7 +354,7 @@ def test_what_actuators_exert_on_joints_and_by_sites():
       <actuator>{motor}{servo}{other}</actuator></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
     state, control = np.array([[0.3, 0.1, 0.5, -0.2]]), np.array([[2.0, 0.2, 0.5]])
-    each = drive_forces(model, state, control)[0]
+    each = drive_forces([model], state, control)[0]
     np.testing.assert_allclose(each[1:], [[0.0, 1.4], [0.5 * 2.5 / 3.5, 0.5]])
     found = each.sum(0)[None]
     # The motor is asked for more than it can, and its joint bears less still. The servo: 10 (0.2 - 0.1) - 2 (-0.2) N.

@@ -33,8 +33,9 @@ _TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "°": 360.0}
 
 @dataclass(frozen=True)
 class Channel:
-    """A signal or an action over the whole log, in its own unit, which is empty where the spec does not give it.
+    """A signal, an action, or an input that only tells of a drive, over the whole log.
 
+    Its `unit` is its own, and empty where the spec does not give it.
     `low` and `high` are the smallest and the largest value, `step` is the standard deviation of changes from row to
     row, `at_limits` the share of rows in which an action is at an end of its range, and `resolution` the step in which
     a signal is read, 0 where none can be seen.
@@ -89,8 +90,9 @@ def channels_of(dataset: Dataset, task: Task, robot: Robot | None = None) -> tup
     units = [channel.unit for channel in task.actions] or [""] * task.action_size
     limits = (np.abs(scaled_action) >= AT_LIMIT).mean(0)
     numbers = np.column_stack([physical.min(0), physical.max(0), step, limits]).tolist()
-    columns = zip(action_names(task), units, numbers, strict=True)
-    return (*signals, *(Channel(name, "action", unit, *values) for name, unit, values in columns))
+    kinds = ["action" if channel.command else "input" for channel in task.actions] or ["action"] * task.action_size
+    columns = zip(action_names(task), kinds, units, numbers, strict=True)
+    return (*signals, *(Channel(name, kind, unit, *values) for name, kind, unit, values in columns))
 
 
 def channel_findings(dataset: Dataset, parameters: int, channels: tuple[Channel, ...]) -> list[Finding]:
@@ -105,7 +107,7 @@ def channel_findings(dataset: Dataset, parameters: int, channels: tuple[Channel,
             dead = "a dead sensor, or the wrong column?"
             remedy = dead if channel.kind == "signal" else "is it the column of the command?"
             findings.append(Finding(level, what, channel.name, remedy))
-    for channel, column in zip(actions, np.asarray(dataset.transitions.action).T, strict=True):
+    for channel, column in zip(actions, np.asarray(dataset.transitions.action).T, strict=False):  # inputs are last
         if channel.moves:
             findings += _limit_findings(channel, column)
     return findings + [

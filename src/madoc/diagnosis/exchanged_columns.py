@@ -129,7 +129,9 @@ def _corrections(dataset: Dataset, simulator: Simulator, *, exchanged: bool) -> 
     action, names = np.asarray(dataset.transitions.action, np.float64), action_names(simulator.task)
     ends = np.stack([action.min(0), action.max(0)])
     limit = _BEYOND * max(1.0, float(np.abs(ends).max()))
-    of_actions = _of_columns("action", {name: [index] for index, name in enumerate(names)}, len(names), exchanged)
+    told = [channel.command for channel in simulator.task.actions] or [True] * len(names)
+    commands = {name: [index] for index, (name, command) in enumerate(zip(names, told, strict=True)) if command}
+    of_actions = _of_columns("action", commands, len(names), exchanged)
     of_joints = _of_columns("joint", _joints(simulator), simulator.task.observation_size, exchanged)
     possible = (each for each in of_actions if np.abs(_corrected_actions(ends, simulator, each)).max() <= limit)
     return [*possible, *of_joints]

@@ -18,6 +18,7 @@ from madoc.identification.states import LoggedStates
 from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.base import Simulator
 from madoc.simulation.inertials import off_centre
+from madoc.simulation.user_data import is_drive
 from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, nominal_values
 
 DELAY = "actions that take effect later, by a delay or a lag of the actuator"
@@ -110,7 +111,9 @@ def candidates(
             references = references_of(logged, simulator, model.joint(name))
             wanted += [(field, name, reference) for field, reference in references.items()]
     for actuator in (model.actuator(channel.actuator) for channel in task.actions):
-        if has_gain(model, actuator.id):
+        if is_drive(model, actuator.id):
+            wanted.append(("drive_strength", actuator.name, 1.0))
+        elif has_gain(model, actuator.id):
             wanted.append(("actuator_gain", actuator.name, abs(float(actuator.gainprm[0])) or 1.0))
     weighed = {element for field, element in calibrated if field in ("body_mass", "body_mass_and_inertia")}
     loaded = {element for field, element in calibrated if field in (*PAYLOAD, *INERTIA)}
@@ -218,7 +221,8 @@ def effects(
             moved = inputs.residuals(other, point[None], states[None])[0, 0]
             tried.append(candidate)
             found.append((moved - base) / change)
-    for place, channel in enumerate(simulator.task.actions if len(simulator.task.actions) > 1 else ()):
+    commands = [(place, channel) for place, channel in enumerate(simulator.task.actions) if channel.command]
+    for place, channel in commands if len(commands) > 1 else ():
         actions = readings.actions.copy()
         actions[..., place] = late.actions[..., place]
         moved = replace(readings, actions=actions).residuals(simulator, point[None], states[None])[0, 0]
@@ -256,6 +260,7 @@ def _cut_off(
     middle, half = simulator.task.action_ranges
     asked = actions * half + middle
     most = (1.0 - _SATURATED) * np.abs(asked).max((0, 1))
+    most[[not channel.command for channel in simulator.task.actions] or slice(0)] = np.inf
     return (np.clip(asked, -most, most) - middle) / half
 
 

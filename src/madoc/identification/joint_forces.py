@@ -161,7 +161,7 @@ def force_effects(
             forces.append(size * shape[..., None] * (np.arange(model.nv) == dof))
     speed = motion[..., model.nq : model.nq + model.nv]
     bodies = list(free_bodies(simulator, responses))
-    if responses.drives.shape[2] > 1:
+    if (np.nan_to_num(responses.drives) != 0.0).any((0, 1, 3)).sum() > 1:
         height = bodies[0].height if len(bodies) == 1 else None
         for cause, force in of_all_drives(responses.drives, speed, height).items():
             tried.append(Candidate(cause, "", "of what they exert", 0.0, 1.0, -np.inf, known_before=True))

@@ -90,7 +90,7 @@ def families(simulator: Simulator, responses: Responses) -> Iterator[Family]:
                 pull, torque = (nothing, shape) if turning else (shape, nothing)
                 direction = body.generalised(pull, torque, dofs)
                 yield _family(f"{body.name}, {kind} its {letter} axis", unit, basis, direction)
-    if responses.drives.shape[2] > 1:
+    if (np.nan_to_num(responses.drives) != 0.0).any((0, 1, 3)).sum() > 1:
         yield _of_drives(simulator, responses, speed, bodies)
 
 

@@ -29,7 +29,8 @@ from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.simulation import Simulator
 from madoc.simulation.configuration import joint_actuators, physics_options, start_position
 from madoc.simulation.drawn import numbers_of_draws
-from madoc.simulation.mjcf import save_mjcf
+from madoc.simulation.mjcf import DRIVES, save_mjcf
+from madoc.simulation.user_data import needs_callbacks
 from madoc.simulation.write import element_names, nominal_values
 
 DRAWS = 1000
@@ -57,6 +58,12 @@ def export_run(
     except OSError as error:
         raise MadocError(f"could not make the folder {folder}: {error.strerror or error}") from error
     simulator, result = simulation.make(calibrated.task), calibrated.result
+    for parameter in simulator.parameters.parameters:
+        if parameter.when is not None:
+            raise MadocError(
+                f"no model can be exported of which {parameter.name} differs between runs: calibrate the runs of one "
+                f"{parameter.when[0]} by themselves for that, without by: in the spec"
+            )
     provenance = provenance_of(calibrated)
     model = calibrated.task.compile()
     covariance = calibrated.distribution().covariance
@@ -71,9 +78,14 @@ def export_run(
         "mujoco.sysid parameters": folder / "sysid_parameters.yaml",
         "draws of models": folder / "draws.npz",
         "how to use them": folder / "draws.py",
-        "robot for mjlab": folder / "mjlab_robot.py",
-        "robot for Isaac Lab": folder / "isaac_lab_robot.py",
     }
+    if needs_callbacks(simulator.task.model):  # trainers take a model by MuJoCo alone
+        files["drives and friction"] = folder / DRIVES
+    else:
+        files["robot for mjlab"], files["robot for Isaac Lab"] = (
+            folder / "mjlab_robot.py",
+            folder / "isaac_lab_robot.py",
+        )
     targets = {name: folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx") for name in policies}
     if out is not None:
         _require_ours(folder, [*files.values(), *targets.values()])
@@ -84,9 +96,10 @@ def export_run(
     )
     save_sysid_parameters(files["mujoco.sysid parameters"], exported)
     fields = _leave_draws(folder, simulator, calibrated)
-    robot = _robot(simulator, result.mean, fields)
-    save_mjlab(files["robot for mjlab"], robot, exported)
-    save_isaac_lab(files["robot for Isaac Lab"], robot, exported)
+    if "robot for mjlab" in files:
+        robot = _robot(simulator, result.mean, fields)
+        save_mjlab(files["robot for mjlab"], robot, exported)
+        save_isaac_lab(files["robot for Isaac Lab"], robot, exported)
     for name, file in policies.items():
         save_onnx(NumpyPolicy.load(file), targets[name])
         files[f"policy {name}"] = targets[name]

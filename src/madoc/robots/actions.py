@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 
+from madoc.robots.drives import drive_numbers
 from madoc.robots.model import AddedActuator, Draft, is_slide
 from madoc.robots.spec import SCALES, ActionSpec
 from madoc.simulation.write import OF_A_JOINT
@@ -29,6 +30,8 @@ def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
     slide = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
     if not slide and joint.type != mujoco.mjtJoint.mjJNT_HINGE:
         raise document.error(place, f"expected a hinge or a slide, got {action.joint!r}, which is a ball or free")
+    if action.drive is not None and slide:
+        raise document.error(place, f"expected a hinge beside drive:, got {action.joint!r}, which is a slide")
     if action.means == ("torque" if slide else "force"):
         right, kind = ("force", "slide") if slide else ("torque", "hinge")
         raise document.error(("actions", index, "means"), f"expected means: {right} of the {kind} {action.joint!r}")
@@ -41,6 +44,10 @@ def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
     scale = SCALES.get(action.unit or "", 1.0)
     assert action.low is not None and action.high is not None  # the spec requires both beside joint:
     ends = action.low * scale, action.high * scale
+    if action.drive is not None:
+        return AddedActuator(
+            action.name, action.joint, *ends, 0.0, numbers=drive_numbers(action.drive, str(action.means))
+        )
     stiffness, damping = action.kp or 0.0, action.kd or 0.0
     gain = {"position": stiffness, "velocity": damping}.get(str(action.means), 1.0)
     return AddedActuator(action.name, action.joint, *ends, gain, stiffness, damping, action.limit)
@@ -77,7 +84,7 @@ def _action_unit(action: ActionSpec, model: mujoco.MjModel, actuator: int) -> st
     if action.joint is None:
         return ""
     position = "m" if is_slide(model, int(model.actuator_trnid[actuator, 0])) else "rad"
-    units = {"torque": "N·m", "force": "N", "position": position, "velocity": f"{position}/s"}
+    units = {"torque": "N·m", "force": "N", "position": position, "velocity": f"{position}/s", "duty": "1"}
     return units[str(action.means)]
 
 

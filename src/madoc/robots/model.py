@@ -11,6 +11,8 @@ from madoc.robots.document import Document
 from madoc.robots.functions import PythonFile
 from madoc.robots.model_files import ModelFiles
 from madoc.robots.spec import RobotSpec
+from madoc.simulation.callbacks import DRIVE
+from madoc.simulation.user_data import LEAST_FRICTION
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF
 from madoc.tasks.base import compiled_model
 from madoc.tasks.mujoco_versions import refuse_unfit_mujoco
@@ -59,6 +61,9 @@ class AddedActuator:
         stiffness: Force per position, in SI units.
         damping: Force per velocity, in SI units.
         limit: Largest force; None is unlimited.
+        drag: Damping that no limit cuts off, as by back-EMF.
+        numbers: Those of a drive (`callbacks.DRIVE`), whose equation is its force where there is no limit; or MARK
+            and zeros, of an actuator that only brings a logged number in.
     """
 
     name: str
@@ -69,13 +74,40 @@ class AddedActuator:
     stiffness: float = 0.0
     damping: float = 0.0
     limit: float | None = None
+    drag: float = 0.0
+    numbers: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class JointFriction:
+    """The friction that a spec says of a joint: Coulomb (N·m), viscous (N·m·s/rad), None where it is the model's.
+
+    `numbers` are those of its terms that depend on speed and load (`callbacks.FRICTION`), empty where it has none.
+    """
+
+    joint: str
+    coulomb: float | None
+    viscous: float | None
+    numbers: tuple[float, ...] = ()
 
 
 def make_model(
-    base: mujoco.MjSpec, added: tuple[AddedActuator, ...] = (), timestep: float | None = None
+    base: mujoco.MjSpec,
+    added: tuple[AddedActuator, ...] = (),
+    timestep: float | None = None,
+    frictions: tuple[JointFriction, ...] = (),
 ) -> mujoco.MjSpec:
-    """A copy of a spec with added actuators, and with another timestep if one is given."""
+    """A copy of a spec with added actuators and frictions, and with another timestep if one is given."""
     spec = base.copy()
+    for friction in frictions:
+        joint = spec.joint(friction.joint)
+        if friction.viscous is not None:
+            joint.damping[0] = friction.viscous
+        if friction.coulomb is not None:
+            joint.frictionloss = friction.coulomb
+        if friction.numbers:
+            joint.userdata = friction.numbers
+            joint.frictionloss = max(joint.frictionloss, LEAST_FRICTION)
     if timestep is not None:
         spec.option.timestep = timestep
     for actuator in added:
@@ -89,6 +121,11 @@ def make_model(
         if actuator.limit is not None:
             new.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             new.forcerange = np.array([-actuator.limit, actuator.limit])
+        if actuator.numbers:
+            new.userdata = actuator.numbers
+            new.damping[0] = actuator.drag
+            if actuator.limit is None and actuator.numbers[DRIVE.index("kt")]:
+                new.biastype = mujoco.mjtBias.mjBIAS_USER
     return spec
 
 

@@ -1,11 +1,14 @@
 """Parameters of a spec: their elements in the model, their units, and no quantity calibrated twice."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from fnmatch import fnmatchcase
-from itertools import product
+from itertools import product, zip_longest
 
 import mujoco
 
 from madoc.parameters import FIELDS, Parameter, ParameterSpace, field_of
+from madoc.robots.drives import friction_parameters
 from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_slide
 from madoc.robots.signals import signal_unit
@@ -27,7 +30,16 @@ def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
                 _check_distinct(draft, model, index, parameter, other, earlier)
             parameters.append(parameter)
             lines.append(index)
-    return ParameterSpace(tuple(parameters))
+    parameters += friction_parameters(draft, parameters)
+    return ParameterSpace(tuple(by_condition(draft, parameters, lines)))
+
+
+def by_condition(draft: Draft, parameters: list[Parameter], lines: list[int]) -> Iterator[Parameter]:
+    """The parameters, those of lines with `by` once for each value of their condition."""
+    values = {condition.name: condition.values for condition in draft.spec.conditions}
+    for parameter, line in zip_longest(parameters, lines):
+        by = None if line is None else draft.spec.parameters[line].by
+        yield from [parameter] if by is None else (replace(parameter, when=(by, value)) for value in values[by])
 
 
 def _check_distinct(

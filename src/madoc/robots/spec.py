@@ -6,10 +6,11 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, WithJsonSchema, field_validator, model_validator
 
-from madoc.errors import UNPRINTABLE, nearest_hint
+from madoc.errors import nearest_hint
 from madoc.parameters import FIELDS, INERTIA, Parameter
 from madoc.robots.document import Document, read_document
-from madoc.robots.validation import Part, refuse, refused_with_line
+from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec
+from madoc.robots.validation import File, Finite, Name, Part, Positive, Unit, refuse, refused_with_line
 from madoc.tasks import TASKS
 
 SHORTEST_TIMESTEP = 1e-6
@@ -31,20 +32,12 @@ SCALES: dict[str, float] = {
 }
 """Units that are converted, each as a multiple of its SI unit."""
 
-LARGEST = 1e12
-"""Largest size of a number, in any unit: no range or limit of a robot reaches further."""
-_PRINTABLE = f"^[^{UNPRINTABLE}]+$"
-Name = Annotated[str, Field(min_length=1, max_length=100, pattern=_PRINTABLE)]
-File = Annotated[str, Field(min_length=1, max_length=4096, pattern=_PRINTABLE)]
 Names = Annotated[
     list[Name],
     Field(min_length=1),
     BeforeValidator(lambda given: [given] if isinstance(given, str) else given),
     WithJsonSchema({"type": ["string", "array"], "items": {"type": "string"}, "minItems": 1}),
 ]
-Unit = Annotated[str, Field(max_length=40, pattern=f"^[^{UNPRINTABLE}]*$")]
-Finite = Annotated[float, Field(allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=LARGEST)]
 Duration = Annotated[float, Field(allow_inf_nan=False, ge=SHORTEST_TIMESTEP, le=LONGEST_STEP)]
 
 
@@ -65,14 +58,16 @@ class ActionSpec(Part):
     name: Name
     joint: Name | None = Field(None, description="The joint it drives; an actuator is added to the model.")
     actuator: Name | None = Field(None, description="The model's own actuator that gets it as its control.")
-    means: Literal["torque", "force", "position", "velocity"] | None = Field(
-        None, description="With `joint`: torque (N·m; of a slide, force in N), or the target of a servo."
+    means: Literal["torque", "force", "position", "velocity", "duty"] | None = Field(
+        None,
+        description="With `joint`: torque (N·m; of a slide, force in N), a servo's target, or a drive's duty.",
     )
     low: Finite | None = Field(None, description="Smallest value, in `unit`. Default: the actuator's ctrlrange.")
     high: Finite | None = Field(None, description="Largest value, in `unit`. Default: the actuator's ctrlrange.")
     kp: Positive | None = Field(None, description="Stiffness of a position servo, N·m/rad (of a slide, N/m).")
     kd: Finite | None = Field(None, ge=0, description="Damping of a servo, N·m·s/rad (of a slide, N·s/m).")
     limit: Positive | None = Field(None, description="Largest torque or force of a servo, N·m (of a slide, N).")
+    drive: DriveSpec | None = Field(None, description="What drives the joint, where it is no ideal servo or motor.")
     unit: Unit | None = Field(
         None, description="Of low, high and the log: deg, deg/s, mm, mm/s, cm, mN·m are converted, others are SI's."
     )
@@ -81,21 +76,30 @@ class ActionSpec(Part):
     def _consistent(self) -> "ActionSpec":
         neither_or_both = (self.joint is None) == (self.actuator is None)
         refuse(neither_or_both, "expected either joint: or actuator:, got both or neither")
-        given = [key for key in ("means", "kp", "kd", "limit") if getattr(self, key) is not None]
+        given = [key for key in ("means", "kp", "kd", "limit", "drive") if getattr(self, key) is not None]
         if self.actuator is not None and given:
             raise ValueError(f"{given[0]}: belongs to joint:, the actuator {self.actuator!r} has its own in the model")
         if self.joint is not None:
             refuse(self.means is None, "expected means: torque, force, position or velocity beside joint:")
             refuse(self.low is None or self.high is None, "expected low: and high: beside joint:")
-            refuse(self.means == "position" and self.kp is None, "expected kp: of a position servo")
-            refuse(self.means == "velocity" and not self.kd, "expected kd: above 0 of a velocity servo")
-            refuse(self.means == "velocity" and self.kp is not None, "kp: means nothing beside means: velocity")
-            if self.means in ("torque", "force") and len(given) > 1:
-                raise ValueError(f"{given[1]}: means nothing beside means: {self.means}")
+            self._check_servo([key for key in given if key != "means"])
         refuse((self.low is None) != (self.high is None), "expected both low: and high:, got one of them")
         if self.low is not None and self.high is not None:
             refuse(self.low >= self.high, f"expected low below high, got {self.low:g} and {self.high:g}")
         return self
+
+    def _check_servo(self, given: list[str]) -> None:
+        """Refuse what a drive, a servo or a motor lacks, and what means nothing beside it."""
+        if self.drive is not None:
+            refuse(given != ["drive"], f"{given[0]}: means nothing beside drive:, which has the numbers of its loop")
+            self.drive.check(str(self.means))
+            return
+        refuse(self.means == "duty", "expected drive: beside means: duty")
+        refuse(self.means == "position" and self.kp is None, "expected kp: of a position servo, or drive:")
+        refuse(self.means == "velocity" and not self.kd, "expected kd: above 0 of a velocity servo, or drive:")
+        refuse(self.means == "velocity" and self.kp is not None, "kp: means nothing beside means: velocity")
+        if self.means in ("torque", "force") and given:
+            raise ValueError(f"{given[0]}: means nothing beside means: {self.means}")
 
 
 class ParameterSpec(Part):
@@ -113,6 +117,7 @@ class ParameterSpec(Part):
     elements: Names | None = Field(None, description="Several that share one value: a list of names or patterns.")
     each: Names | None = Field(None, description="Several that have a value each: a list of names or patterns.")
     name: Name | None = Field(None, description="Its own name; with `each`, what the element's comes behind.")
+    by: Name | None = Field(None, description="Condition: a value for each of its values, all in the same range.")
     low: Finite
     high: Finite
 
@@ -130,6 +135,8 @@ class ParameterSpec(Part):
         refuse(len(given) > 1, f"expected one of element:, elements: and each:, got {' and '.join(given)}")
         for key in ("index", "unit"):
             refuse(self.model is None and getattr(self, key) is not None, f"{key}: belongs to model:, not to field:")
+        if self.by is not None and self.field in FIELDS and not FIELDS[self.field].in_model:
+            raise ValueError(f"by: means nothing beside {self.field}, which is not in the model; leave it out")
         for field in self.fields:
             self.parameter(field, self.names)  # pydantic reports what it refuses, as a MadocError is a ValueError
         return self
@@ -194,6 +201,8 @@ class RobotSpec(Part):
     timestep: Duration | None = Field(None, description="Of the physics, s. Default: the model's.")
     signals: list[SignalSpec] = Field(min_length=1, description="The observation, in this order.")
     actions: list[ActionSpec] = Field(min_length=1, description="The action, in this order.")
+    friction: list[FrictionSpec] = Field([], description="Friction of joints, whose terms are calibrated too.")
+    conditions: list[ConditionSpec] = Field([], description="What differs between runs and is known.")
     parameters: list[ParameterSpec] = Field(min_length=1, description="What can be calibrated.")
     groups: Annotated[int, Field(ge=1, le=1000)] | None = Field(
         None, description="Groups Madoc's VAE forms. Default: min(4, d)."
@@ -235,6 +244,9 @@ class RobotSpec(Part):
 _PARTS: dict[str | int, type] = {
     "signals": SignalSpec,
     "actions": ActionSpec,
+    "drive": DriveSpec,
+    "friction": FrictionSpec,
+    "conditions": ConditionSpec,
     "parameters": ParameterSpec,
     "log": LogSpec,
     "goals": GoalSpec,

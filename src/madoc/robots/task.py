@@ -13,6 +13,7 @@ from jaxtyping import PRNGKeyArray
 from madoc import simulation
 from madoc.errors import MadocError
 from madoc.robots.actions import action_channel, added_actuator, idle_actuators
+from madoc.robots.drives import joint_frictions, with_inputs
 from madoc.robots.episodes import Episode, no_reward, read_episode
 from madoc.robots.functions import PythonFile
 from madoc.robots.model import Draft, compiled, make_model, read_model, with_whole_inertia
@@ -87,13 +88,13 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
         draft = Draft(spec, document, read_model(files), python)
     _check_names(draft)
     try:
-        factory, model = _model(draft, files.main)
+        factory, model, inputs = _model(draft, files.main)
     except MadocError:
         with document.at("model"):  # where the file does not compile by itself, the mistake is there
             compiled(draft.base.copy, files.main)
         raise
     signals = read_signals(draft, model)
-    actions = tuple(action_channel(draft, model, index) for index in range(len(spec.actions)))
+    actions = (*(action_channel(draft, model, index) for index in range(len(spec.actions))), *inputs)
     space, frame_skip = parameter_space(draft, model), _frame_skip(draft, model)
     single = tuple(dict.fromkeys(name for row in space.parameters for name in diagonal_bodies(model, row)))
     if single:
@@ -111,6 +112,12 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
         late = max(delays, default=0.0) + float(model.opt.timestep)
         pending = max(pending, int(np.ceil(late / spec.control_step - 1e-9)))
     names, episode = tuple(signal.name for signal in spec.signals), read_episode(draft, signals, actions)
+    if inputs and episode.rewarded:
+        raise document.error(
+            ("python",) if spec.reward is None else ("reward",),
+            f"a policy cannot be learnt where drives take {', '.join(each.name for each in inputs)} from the log, as "
+            "it would choose them: for that, give the drives fixed numbers",
+        )
     task = Task(
         name=spec.name,
         physics="modern",
@@ -158,13 +165,13 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
     return Robot(Path(file), spec, task, shown, signals.undetermined(), idle, kept)
 
 
-def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco.MjModel]:
-    """The function that builds the MuJoCo spec with the added actuators, and its model."""
+def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco.MjModel, tuple[ActionChannel, ...]]:
+    """The function that builds the MuJoCo spec with the added actuators, its model, and what drives take from a log."""
     actuators = [added_actuator(draft, index) for index in range(len(draft.spec.actions))]
-    added = tuple(actuator for actuator in actuators if actuator is not None)
-    factory = partial(make_model, draft.base, added, draft.spec.timestep)
+    added, inputs = with_inputs(draft, tuple(actuator for actuator in actuators if actuator is not None))
+    factory = partial(make_model, draft.base, added, draft.spec.timestep, joint_frictions(draft))
     with draft.document.at("actions"):
-        return factory, compiled(factory, file)
+        return factory, compiled(factory, file), inputs
 
 
 def _check_names(draft: Draft) -> None:

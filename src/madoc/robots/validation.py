@@ -4,11 +4,12 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from madoc.errors import nearest_hint
+from madoc.errors import UNPRINTABLE, nearest_hint
 from madoc.robots.document import Document, Place
 
 _WORDS = {
@@ -26,6 +27,16 @@ _WORDS = {
     "string_pattern_mismatch": "a printable name",
 }
 """What was expected, by pydantic's name of the mistake."""
+
+
+LARGEST = 1e12
+"""Largest size of a number, in any unit: no range or limit of a robot reaches further."""
+_PRINTABLE = f"^[^{UNPRINTABLE}]+$"
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=_PRINTABLE)]
+File = Annotated[str, Field(min_length=1, max_length=4096, pattern=_PRINTABLE)]
+Unit = Annotated[str, Field(max_length=40, pattern=f"^[^{UNPRINTABLE}]*$")]
+Finite = Annotated[float, Field(allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=LARGEST)]
 
 
 class Part(BaseModel):
@@ -58,7 +69,7 @@ def refused_with_line(document: Document, whole: type, parts: Mapping[str | int,
         )
         more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
         place = _place(details[0])
-        part = parts.get(place[0], whole) if len(place) > 1 else whole
+        part = next((parts[key] for key in reversed(place[:-1]) if key in parts), whole)
         raise document.error(place, mistake(details[0], place, _keys(part)) + more) from error
 
 

@@ -16,7 +16,8 @@ from madoc.runs.machine import usable_cores
 from madoc.simulation.arrays import check_field, check_written
 from madoc.simulation.delay import blend, delay_weights
 from madoc.simulation.drives import drive_forces
-from madoc.simulation.write import find_elements, write_parameters
+from madoc.simulation.user_data import install_callbacks, needs_callbacks
+from madoc.simulation.write import conditions_of, find_elements, write_parameters
 from madoc.tasks.base import Task
 
 _CLOCK = 1.0
@@ -45,6 +46,8 @@ class CpuSimulator:
         self.task, self.parameters, self.action_size = task, task.parameters, task.action_size
         self.threads = threads or usable_cores()
         self._model = task.model
+        if needs_callbacks(self._model):
+            install_callbacks()
         self.control_step = float(self._model.opt.timestep) * task.frame_skip
         active = np.flatnonzero(self._model.actuator_actnum).tolist()
         if active:
@@ -66,6 +69,7 @@ class CpuSimulator:
             np.array([getattr(channel, name) for channel in task.actions]) for name in ("low", "high", "scale")
         )
         self._centre, self._half = scale * (low + high) / 2.0, scale * (high - low) / 2.0
+        self._conditions = conditions_of(task.parameters.parameters)
         self._biased = any(parameter.field == "signal_bias" for parameter in task.parameters.parameters)
         self._data = [mujoco.MjData(self._model) for _ in range(self.threads)]
         self._pool = mujoco.rollout.Rollout(nthread=self.threads if self.threads > 1 else 0)
@@ -98,8 +102,9 @@ class CpuSimulator:
                 )
         models = []
         for row in values:
-            models.append(copy.copy(self._model))
-            write_parameters(models[-1], self._data[0], self.parameters.parameters, row)
+            models.append([copy.copy(self._model) for _ in self._conditions])
+            for model, conditions in zip(models[-1], self._conditions, strict=True):
+                write_parameters(model, self._data[0], self.parameters.parameters, row, conditions)
         delay, longest = self._summed(values, "action_delay")[:, 0], self.task.pending * self.control_step
         if (delay > longest + 1e-9).any():
             raise MadocError(
@@ -127,6 +132,16 @@ class CpuSimulator:
         control = np.zeros((*action.shape[:-1], self._model.nu))
         control[..., self._actuators] = self._centre + self._half * action
         return control
+
+    def _under(self, control: Float[np.ndarray, "systems rows control"]) -> Int[np.ndarray, "systems rows"]:
+        """Index of the conditions under which each row runs, which its controls bring in."""
+        under = np.zeros(control.shape[:2], dtype=np.int64)
+        for name in self._conditions[0]:
+            values = [value for value in dict.fromkeys(each[name] for each in self._conditions) if value is not None]
+            same = np.isclose(control[..., self._model.actuator(name).id, None], values, rtol=1e-9, atol=1e-12)
+            place = np.where(same.any(-1), same.argmax(-1), len(values))  # the last is that of any other value
+            under = under * (len(values) + 1) + place
+        return under
 
     def contacts(
         self, state: Float[np.ndarray, "rows state"], values: Float[np.ndarray, " parameters"] | None = None
@@ -160,13 +175,13 @@ class CpuSystem:
     def __init__(
         self,
         simulator: CpuSimulator,
-        models: list[mujoco.MjModel],
+        models: list[list[mujoco.MjModel]],
         delay: Float[np.ndarray, " systems"],
         bias: Float[np.ndarray, "systems signals"],
     ) -> None:
-        self.models, self.count = models, len(models)
+        self.models, self.count, self._models = [row[0] for row in models], len(models), models
         self._simulator, self._delay, self._bias = simulator, delay, bias
-        self._physical = models[0].nq + models[0].nv
+        self._physical = self.models[0].nq + self.models[0].nv
         self._goals = self._physical + simulator.task.pending * simulator.action_size
         weights = partial(
             delay_weights, delay, control_step=simulator.control_step, physics_steps=simulator.task.frame_skip
@@ -179,8 +194,8 @@ class CpuSystem:
         self, systems: Int[np.ndarray, " some"], parameters: Float[np.ndarray, "some parameters"]
     ) -> "CpuSystem":
         """These systems, with those of the given indices bound to other parameters."""
-        new, models = self._simulator.bind(parameters), list(self.models)
-        for index, model in zip(systems, new.models, strict=True):
+        new, models = self._simulator.bind(parameters), list(self._models)
+        for index, model in zip(systems, new._models, strict=True):
             models[index] = model
         delay, bias = self._delay.copy(), self._bias.copy()
         delay[systems], bias[systems] = new._delay, new._bias
@@ -260,7 +275,8 @@ class CpuSystem:
         """
         history = self._histories(state, action[:, :, None])[:, :, 0]
         control = self._simulator._controls(blend(self._weights, history))[:, :, 0]
-        return np.stack([drive_forces(*each) for each in zip(self.models, state, control, strict=True)])
+        models = self._models_of(control)
+        return np.stack([drive_forces(*each) for each in zip(models, state, control, strict=True)])
 
     def unbiased(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows state"]:
         """States rebuilt from logged observations, corrected for the bias of each system's sensors."""
@@ -278,6 +294,11 @@ class CpuSystem:
         sensors = np.zeros((control.shape[0] * control.shape[1], 1, self.models[0].nsensordata))
         moved = self._simulated(state[..., : self._physical], control, sensors=sensors)
         return np.where(np.isnan(moved[:, :, 0, :1]), np.nan, sensors.reshape(*control.shape[:2], -1))
+
+    def _models_of(self, control: Float[np.ndarray, "systems rows control"]) -> list[list[mujoco.MjModel]]:
+        """The model of every row."""
+        under = self._simulator._under(control).tolist()
+        return [[own[index] for index in rows] for own, rows in zip(self._models, under, strict=True)]
 
     def _histories(
         self, state: Float[np.ndarray, "systems rows state"], actions: Float[np.ndarray, "systems rows steps action"]
@@ -311,6 +332,7 @@ class CpuSystem:
             control = np.concatenate([control, force], axis=-1)
         if not total:
             return np.zeros((count, rows, physics_steps, self._physical))
+        models = [model for row in self._models_of(control[:, :, 0]) for model in row]
         control = control.reshape(total, physics_steps, -1)
         start = np.full((total, 1 + self._physical), _CLOCK)
         start[:, 1:] = state.reshape(total, -1)
@@ -321,7 +343,7 @@ class CpuSystem:
         trajectory = np.zeros((total, physics_steps, 1 + self._physical))
         with without_warnings():
             (simulator._pool if many else simulator._alone).rollout(
-                [model for model in self.models for _ in range(rows)],
+                models,
                 simulator._data if many else simulator._data[:1],
                 start,
                 control,

@@ -2,6 +2,7 @@
 
 import ctypes
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,12 +14,16 @@ from jaxtyping import Float
 
 from madoc.errors import MadocError
 from madoc.runs.files import replacing
+from madoc.simulation import callbacks
 from madoc.simulation.base import Simulator
+from madoc.simulation.user_data import needs_callbacks
 from madoc.tasks.physics import write_inertia
 
 DIGITS = 17
 """Number of significant digits that determine a float64; MuJoCo by itself writes 6."""
 
+DRIVES = "drives.py"
+"""Name of the Python file beside a model that has drives or friction of its own."""
 ASSETS = "assets"
 """Folder of meshes, height fields and textures beside a written model."""
 
@@ -44,6 +49,7 @@ class Change:
 def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], path: Path) -> list[Change]:
     """Write the calibrated model as MJCF, its assets in a folder beside it, and check it by loading it again.
 
+    A model with drives or friction that MuJoCo's own elements do not say comes with `DRIVES`, whose `load` reads it.
     Where an inertia changes, all inertias are made explicit, so that compiling the file does not infer them again from
     geoms, total masses or bounds.
 
@@ -68,10 +74,15 @@ def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], pa
     _refuse_difference(bound, _compiled(spec), "written into its spec")
     with _precision(DIGITS):
         text = shortest_numbers(spec.to_xml())
+    by_callback = needs_callbacks(bound)
+    if by_callback:
+        head, line, rest = text.partition("\n")
+        text = head + line + callbacks.GUARD + rest
+        shutil.copyfile(callbacks.__file__, path.with_name(DRIVES))
     with replacing(path) as stream:
         stream.write(text.encode())
     try:
-        read_back = mujoco.MjModel.from_xml_path(str(path))
+        read_back = (callbacks.load if by_callback else mujoco.MjModel.from_xml_path)(str(path))
     except ValueError as error:
         raise MadocError(f"MuJoCo does not read back the model it wrote to {path}: {error}") from error
     _refuse_difference(bound, read_back, f"read back from {path}")
@@ -235,7 +246,9 @@ def _write_rows(
         turns = kind == "joint" and int(element.type) == int(mujoco.mjtJoint.mjJNT_HINGE)
         if attribute in _ANGLES and spec.compiler.degree and turns:
             old, new = np.rad2deg(old).tolist(), np.rad2deg(new).tolist()
-        if np.ndim(getattr(element, attribute)):
+        if attribute == "userdata":
+            element.userdata = new
+        elif np.ndim(getattr(element, attribute)):
             getattr(element, attribute)[: max(len(old), len(new))] = [*new, *[0.0] * (len(old) - len(new))]
         else:
             setattr(element, attribute, new[0])
@@ -273,6 +286,8 @@ _KINDS = {
 
 _ATTRIBUTES = {
     "qpos0": "ref",
+    "jnt_user": "userdata",
+    "actuator_user": "userdata",
     "qpos_spring": "springref",
     "dof_solref": "solref_friction",
     "dof_solimp": "solimp_friction",

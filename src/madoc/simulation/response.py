@@ -9,6 +9,7 @@ from jaxtyping import Float
 from madoc.parameters import Parameter
 from madoc.simulation.base import Simulator
 from madoc.simulation.cpu import without_warnings
+from madoc.simulation.user_data import scale_forces
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF, single_joints
 
 _PUSH = 1e-3
@@ -71,6 +72,8 @@ def driven_joints(simulator: Simulator) -> tuple[DrivenJoint, ...]:
     found = []
     for action, actuator in enumerate(actuators):
         joint = int(model.actuator_trnid[actuator, 0])
+        if channels and not channels[action].command:
+            continue
         if int(model.actuator_trntype[actuator]) in OF_A_JOINT and int(model.jnt_type[joint]) in ONE_DOF:
             hinge = bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE)
             found.append(DrivenJoint(action, model.joint(joint).name, hinge, *_place(model, joint)))
@@ -142,6 +145,7 @@ def hidden_scales(
     model, heavier = simulator.model(values), simulator.model(values)
     for name in _FORCES:
         getattr(heavier, name)[:] *= _SCALE
+    scale_forces(heavier, _SCALE)
     heavier.opt.density *= _SCALE
     heavier.opt.viscosity *= _SCALE
     mujoco.mj_setConst(heavier, mujoco.MjData(heavier))
@@ -162,6 +166,11 @@ def _stepped(
     """States after a control step of a model, with its sensors where signals read them."""
     task, data = simulator.task, mujoco.MjData(model)
     driven = [model.actuator(channel.actuator).id for channel in task.actions] or slice(None)
+    inputs = [not channel.command for channel in task.actions]
+    if any(inputs):
+        middle, half = task.action_ranges
+        rest = middle + half * [channel.rest for channel in task.actions]
+        controls = np.where(inputs, rest, controls)
     seen = []
     with without_warnings():
         for state, control in zip(states, controls, strict=True):

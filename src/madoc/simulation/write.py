@@ -1,6 +1,8 @@
 """Parameters into a MuJoCo model: elements found by name, values written, derived constants recomputed."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import product
 from typing import Any
 
 import mujoco
@@ -16,6 +18,14 @@ from madoc.simulation.inertials import (
     write_inertia,
     write_mass,
     write_mass_and_inertia,
+)
+from madoc.simulation.user_data import (
+    LEAST_FRICTION,
+    drive_number,
+    friction_numbers,
+    has_numbers,
+    has_speed_or_load_friction,
+    write_elements,
 )
 
 SOLREF_FLOOR = 1e-9
@@ -39,16 +49,35 @@ OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPAR
 """Transmissions of actuators that act on one joint; for a hinge or a slide the two are the same."""
 
 
+Conditions = Mapping[str, float | None]
+"""Values of conditions of a run, by name; None is one under which no parameter that names the condition holds."""
+
+
+def conditions_of(parameters: Sequence[Parameter]) -> list[Conditions]:
+    """Every combination of the conditions that parameters name, that of the first value of each first."""
+    values: dict[str, list[float | None]] = {}
+    for name, value in (parameter.when for parameter in parameters if parameter.when is not None):
+        values[name] = list(dict.fromkeys([*values.get(name, []), value]))
+    return [dict(zip(values, each, strict=True)) for each in product(*([*of_one, None] for of_one in values.values()))]
+
+
 def write_parameters(
-    model: mujoco.MjModel, data: mujoco.MjData, parameters: Sequence[Parameter], values: np.ndarray
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    parameters: Sequence[Parameter],
+    values: np.ndarray,
+    conditions: Conditions | None = None,
 ) -> None:
     """Write physical values (d,) into a model in place, then recompute the constants derived from them (`mj_setConst`).
 
-    A parameter that names an element the model does not have, or that scales a mass of 0, is refused.
+    Of parameters that name a condition those that hold under it are written; by default its first value is taken. A
+    parameter that names an element the model does not have, or that scales a mass of 0, is refused.
     """
+    holding = conditions_of(parameters)[0] if conditions is None else conditions
     of_bodies: dict[int, dict[str, float]] = {}
     for parameter, value in zip(parameters, values, strict=True):
-        if parameter.kind.in_model:
+        holds = parameter.when is None or holding[parameter.when[0]] == parameter.when[1]
+        if holds and parameter.kind.in_model:
             for element in find_elements(model, parameter):
                 numbers, write = _place_of(parameter.field)
                 if parameter.field in (*PAYLOAD, *INERTIA):
@@ -59,6 +88,7 @@ def write_parameters(
                     write(model, element, float(value))
     for body, deviations in of_bodies.items():
         write_deviations(model, body, deviations)
+    write_elements(model)
     mujoco.mj_setConst(model, data)
 
 
@@ -91,7 +121,11 @@ def diagonal_bodies(model: mujoco.MjModel, parameter: Parameter) -> list[str]:
 def find_elements(model: mujoco.MjModel, parameter: Parameter) -> list[int]:
     """Indices of a parameter's elements in the model; one -1 for gravity. A body may be named by a joint of its own."""
     kind = parameter.kind.element
-    return [-1] if kind is None else [_find_element(model, parameter.name, kind, one) for one in parameter.elements]
+    found = [-1] if kind is None else [_find_element(model, parameter.name, kind, one) for one in parameter.elements]
+    if parameter.field.startswith(("drive_", "friction_")):
+        for element in found:
+            _place_of(parameter.field)[0](model, element)  # refuses what has no such number
+    return found
 
 
 def _find_element(model: mujoco.MjModel, parameter_name: str, kind: str, element: str) -> int:
@@ -154,9 +188,15 @@ def _dofs(model: mujoco.MjModel, joint: int) -> slice:
     return slice(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + len(model.joint(joint).damping))
 
 
+def _write_friction_loss(model: mujoco.MjModel, joint: int, value: float) -> None:
+    least = LEAST_FRICTION if has_speed_or_load_friction(model, joint) else 0.0
+    model.dof_frictionloss[_dofs(model, joint)] = max(value, least)
+
+
 def has_gain(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether an actuator has a fixed gain; the first number of others is something else."""
-    return int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    fixed = int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    return fixed and not has_numbers(model, actuator)
 
 
 def _write_gain(model: mujoco.MjModel, actuator: int, value: float) -> None:
@@ -238,7 +278,7 @@ _PLACES: dict[str, tuple[Numbers, Write | None]] = {
     "body_inertia": (lambda model, body: model.body_inertia[body].max(keepdims=True), write_inertia),
     "body_com": (lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]), write_centre_of_mass),
     **dict.fromkeys((*PAYLOAD, *INERTIA), (lambda model, body: np.zeros(1), None)),
-    "dof_frictionloss": (lambda model, joint: model.dof_frictionloss[_dofs(model, joint)], None),
+    "dof_frictionloss": (lambda model, joint: model.dof_frictionloss[_dofs(model, joint)], _write_friction_loss),
     "dof_drag": (lambda model, joint: model.dof_dampingpoly[_dofs(model, joint), :1], None),
     "dof_damping": (lambda model, joint: model.dof_damping[_dofs(model, joint)], None),
     "dof_armature": (lambda model, joint: model.dof_armature[_dofs(model, joint)], None),
@@ -251,6 +291,12 @@ _PLACES: dict[str, tuple[Numbers, Write | None]] = {
     "contact_damping": (lambda model, geom: model.geom_solref[geom, 1:], _write_contact(1)),
     "actuator_gain": (lambda model, actuator: model.actuator_gainprm[actuator, :1], _write_gain),
     "actuator_kv": (lambda model, actuator: 0.0 - model.actuator_biasprm[actuator, 2:3], _write_kv),
+    **{field: (partial(drive_number, name=field.partition("_")[2]), None) for field in FIELDS if "drive_" in field},
+    **{
+        field: (partial(friction_numbers, name=field.partition("_")[2]), None)
+        for field in FIELDS
+        if field[:9] == "friction_"
+    },
 }
 """Where each field stands in a model: the numbers of an element, the first of which is its value, and what writes one.
 

@@ -68,6 +68,7 @@ class ActionChannel:
         unit: The unit of `low`, `high` and the log's column.
         scale: Ratio of the actuator's control to the value in `unit`.
         rest: The action assumed before an episode begins, in [-1, 1].
+        command: Whether it asks the robot for something; a supply that was measured, say, only tells of the drive.
     """
 
     name: str
@@ -77,6 +78,7 @@ class ActionChannel:
     unit: str
     scale: float = 1.0
     rest: float = 0.0
+    command: bool = True
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from madoc.identification.candidate_terms import (
     UNLISTED,
     is_late,
 )
-from madoc.identification.joint_forces import is_joint_force
+from madoc.identification.joint_forces import LOADED, SLOW, WEAKENING, is_joint_force
 from madoc.identification.term_tests import MissingTerm
 from madoc.parameters import FIELDS
 
@@ -18,7 +18,8 @@ REMEDIES = {
     EARLY: "log each action with what was seen just before it",
     BELOW_MINIMUM: "look for what acts against it: a force, a gain or a sign that the model has wrong",
     SPACING: "check control_step of the spec against the log's time column",
-    SATURATION: "narrow low and high of the spec's actions to what the drive follows, or log smaller actions",
+    SATURATION: "say what drives the joint (drive: of its action), or narrow low and high of the actions to what it "
+    "follows, or log smaller actions",
     **dict.fromkeys(TILTS, "level it, or tilt the gravity of the model (its option gravity) as the base is"),
 }
 """What to do about terms that no further parameter of a spec adds."""
@@ -28,6 +29,12 @@ CHANGE_MACHINE = "no parameter of a spec adds it: take it out of the machine, or
 """The same for a force at a joint."""
 LOOK = "look there for what the model leaves out; a parameter that acts like it would be wrong in its place"
 """The same for a force that no listed term describes."""
+OF_JOINTS = {
+    LOADED: "say under friction: of the spec that it grows with the load (model: M3, or M4 where Stribeck's is there)",
+    SLOW: "say under friction: of the spec that it is larger at rest (model: M2, or M4 where it grows with the load)",
+    WEAKENING: "say what drives the joint (drive: of its action, whose back-EMF weakens it)",
+}
+"""What to do about forces at a joint that the spec has words for."""
 CHANGE_LOG = "log it without its filter, or shift its column by that time"
 CHANGE_DRIVE = "no parameter of a spec adds the lag of one drive (action_delay is that of all): take out its filter"
 """The same for a sensor and for a drive that are late."""
@@ -49,7 +56,7 @@ def remedy(term: MissingTerm) -> str:
     if term.cause.startswith(UNLISTED):
         return LOOK
     if is_joint_force(term.cause):
-        return CHANGE_MACHINE
+        return next((told for cause, told in OF_JOINTS.items() if term.cause.startswith(cause)), CHANGE_MACHINE)
     high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
     low = 0.0 if term.value >= 0.0 else max(-high, FIELDS[field].minimum)
     high = 0.0 if field == "gravity" and term.value < 0.0 else high  # it points downwards

@@ -66,7 +66,28 @@ def assemble(runs: Sequence[Run], robot: Robot, *, origin: str, clip_actions: bo
     """
     if not runs:
         raise MadocError(f"expected at least one episode in {origin}, got none; record it again")
-    return join([_episodes(run, robot, origin, clip_actions=clip_actions) for run in runs], origin)
+    return join(
+        [_episodes(_with_conditions(run, robot), robot, origin, clip_actions=clip_actions) for run in runs], origin
+    )
+
+
+def _with_conditions(run: Run, robot: Robot) -> Run:
+    """A run with a column for each condition that its file's name tells; a value not in the spec is refused."""
+    tables = run.tables
+    for condition in robot.spec.conditions:
+        if condition.file_name is None:
+            continue
+        value = condition.value_in(run.name)
+        if value not in condition.values:
+            got = "no number there" if value is None else f"{value:g}"
+            raise MadocError(
+                f"expected {condition.name} in the file name {run.name}, as {condition.file_name}, to be one of "
+                f"{', '.join(f'{one:g}' for one in condition.values)}, got {got}; add it to values: in the spec"
+            )
+        tables = tuple(
+            replace(table, columns={**table.columns, condition.name: np.full(len(table), value)}) for table in tables
+        )
+    return replace(run, tables=tables)
 
 
 def _episodes(run: Run, robot: Robot, origin: str, *, clip_actions: bool) -> Dataset:

@@ -1,7 +1,7 @@
 """How often 95 % intervals hold the truth: problems of the adversary whose model is right, in many seeds each.
 
-    python benchmarks/coverage.py --conditions process-little --seeds 0 100 --results runs/coverage
-    python benchmarks/coverage.py --table
+    python benchmarks/interval_coverage.py --conditions process-little --seeds 0 100 --results runs/coverage
+    python benchmarks/interval_coverage.py --table
 
 A row of results/coverage.jsonl for each problem; those already there are skipped. Least squares calibrates in this
 process, as `madoc calibrate --method least-squares --holdout 0.2` does, and the intervals are those that it tells.

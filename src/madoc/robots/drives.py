@@ -1,0 +1,197 @@
+"""Drives, friction and conditions of a spec: the numbers they put into the model, and what a log brings in for them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import mujoco
+
+from madoc.parameters import FIELDS, Parameter
+from madoc.robots.document import Place
+from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec
+from madoc.robots.model import AddedActuator, Draft, JointFriction
+from madoc.simulation.callbacks import DRIVE, FRICTION, MARK, MEANS, UNLIMITED
+from madoc.simulation.user_data import by_own_elements, elements_of_drive
+from madoc.simulation.write import ONE_DOF
+from madoc.tasks.base import ActionChannel
+
+_WIDEST_SUPPLY = 2.0
+"""Largest measured supply over the nominal one."""
+_SHAPE = {"stribeck_speed": (0.1, 10.0), "stribeck_exponent": (0.5, 10.0)}
+"""Ranges of how friction falls with the speed, in rad/s and 1: those of Rhoban/bam's fits of servos, and wider."""
+_LOAD = {"load": 0.5, "stribeck_load": 1.0, "quadratic": 0.1}
+"""Largest ratio of friction to load, as Rhoban/bam's fits have it, and the largest quadratic one in 1/(N·m), ten
+times theirs."""
+
+
+def drive_numbers(drive: DriveSpec, means: str) -> tuple[float, ...]:
+    """The numbers of a drive in the model, in the order of `DRIVE`; what it takes from the log comes in later."""
+    return (
+        MARK,
+        float(MEANS.index(means)),
+        drive.supply,
+        drive.kt,
+        drive.resistance,
+        1.0 if drive.gain is None else drive.gain,
+        drive.damping_gain,
+        drive.duty_limit,
+        UNLIMITED if drive.current_limit is None else drive.current_limit,
+        drive.strength,
+        -1.0,
+        -1.0,
+        -1.0,
+    )
+
+
+def with_inputs(
+    draft: Draft, added: tuple[AddedActuator, ...]
+) -> tuple[tuple[AddedActuator, ...], tuple[ActionChannel, ...]]:
+    """The actuators, and behind them one for each number that a log brings in, without force; and their channels.
+
+    A drive gets the numbers of those that it takes something from.
+    """
+    inputs: dict[str, AddedActuator] = {}
+    channels: dict[str, ActionChannel] = {}
+    taken: dict[str, list[float]] = {actuator.name: list(actuator.numbers) for actuator in added}
+    named = {
+        part.name: draft.document.line((kind, at, "name"))
+        for kind in ("signals", "actions")
+        for at, part in enumerate(getattr(draft.spec, kind))
+    }
+    first = len(draft.base.actuators) + len(added)
+    conditions = {condition.name: condition for condition in draft.spec.conditions}
+    for index, action in enumerate(draft.spec.actions):
+        drive = action.drive
+        for key in ("enable", "supply_from", "gain_from"):
+            column = None if drive is None else getattr(drive, key)
+            if drive is None or column is None:
+                continue
+            place: Place = ("actions", index, "drive", key)
+            if key == "gain_from" and column not in conditions:
+                raise draft.document.unknown(place, "the name of a condition", column, conditions)
+            if column in named:
+                raise draft.document.error(place, f"the name {column!r} is taken by line {named[column]}")
+            channel = ActionChannel(column, column, 0.0, 1.0, "1", rest=1.0, command=False)
+            if key == "supply_from":
+                channel = replace(
+                    channel, high=_WIDEST_SUPPLY * drive.supply, unit="V", rest=2.0 / _WIDEST_SUPPLY - 1.0
+                )
+            elif key == "gain_from":
+                channel = _condition_channel(conditions[column])
+            if channels.setdefault(column, channel) != channel:
+                raise draft.document.error(place, f"the column {column!r} is used for something else already")
+            inputs.setdefault(column, _input(channel, str(action.joint)))
+            taken[action.name][DRIVE.index(key)] = float(first + list(inputs).index(column))
+    loaded = {joint for friction in draft.spec.friction if _friction_numbers(friction) for joint in friction.names}
+    kept = any(len(other.userdata) for other in draft.base.actuators)
+    if kept and (inputs or any(actuator.numbers for actuator in added)):
+        raise draft.document.error(
+            ("actions",), "the model keeps user data of its actuators (user=), where drives are kept"
+        )
+    joints = [joint.name for joint in draft.base.joints if joint.name]
+    for index, parameter in enumerate(draft.spec.parameters):
+        if parameter.by is not None and parameter.by not in channels:
+            if parameter.by not in conditions or not joints:
+                raise draft.document.unknown(
+                    ("parameters", index, "by"), "the name of a condition", parameter.by, conditions
+                )
+            channels[parameter.by] = _condition_channel(conditions[parameter.by])
+            inputs[parameter.by] = _input(channels[parameter.by], joints[0])
+    drives = (
+        _as_elements(replace(actuator, numbers=tuple(taken[actuator.name])), loaded=actuator.joint in loaded)
+        for actuator in added
+    )
+    return (*drives, *inputs.values()), tuple(channels.values())
+
+
+def _condition_channel(condition: ConditionSpec) -> ActionChannel:
+    """What brings in the value of a condition; at rest it is the first."""
+    low, high = min(0.0, *condition.values), max(0.0, *condition.values)
+    high = high if high > low else low + 1.0
+    rest = 2.0 * (condition.values[0] - low) / (high - low) - 1.0
+    return ActionChannel(condition.name, condition.name, low, high, "1", rest=rest, command=False)
+
+
+def _input(channel: ActionChannel, joint: str) -> AddedActuator:
+    """The actuator without force whose control is what a channel brings in."""
+    numbers = (MARK, *(0.0 for _ in DRIVE[1:]))
+    return AddedActuator(channel.name, joint, channel.low, channel.high, 0.0, numbers=numbers)
+
+
+def _as_elements(actuator: AddedActuator, *, loaded: bool) -> AddedActuator:
+    """A drive that MuJoCo's own elements say, as these; any other actuator as it is.
+
+    So is one whose whole torque, with its back-EMF, the friction of its joint grows with.
+    """
+    if loaded or not actuator.numbers or not by_own_elements(actuator.numbers):
+        return actuator
+    gain, (position, speed), largest, drag = elements_of_drive(actuator.numbers)
+    return replace(actuator, gain=gain, stiffness=-position, damping=-speed, limit=largest, drag=drag)
+
+
+def joint_frictions(draft: Draft) -> tuple[JointFriction, ...]:
+    """What the spec says of the friction of joints, each joint once."""
+    found: dict[str, JointFriction] = {}
+    for index, friction in enumerate(draft.spec.friction):
+        for joint in friction.names:
+            _check_joint(draft, index, joint)
+            if joint in found:
+                raise draft.document.error(
+                    ("friction", index), f"the friction of {joint!r} is said already; say it once"
+                )
+            numbers = _friction_numbers(friction)
+            found[joint] = JointFriction(joint, friction.coulomb, friction.viscous, numbers)
+    return tuple(found.values())
+
+
+def friction_parameters(draft: Draft, given: Sequence[Parameter]) -> list[Parameter]:
+    """Parameters of the terms of friction that have neither a number nor one of the given parameters."""
+    own, found = {(row.field, element) for row in given for element in row.elements}, []
+    for index, friction in enumerate(draft.spec.friction):
+        for term in (*friction.chosen, *friction.shape):
+            field = {"coulomb": "dof_frictionloss", "viscous": "dof_damping"}.get(term, f"friction_{term}")
+            for joint in friction.names:
+                if getattr(friction, term) is None and (field, joint) not in own:
+                    slides = int(draft.base.joint(joint).type) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+                    unit = FIELDS[field].slide_unit if slides else ""
+                    found.append(Parameter(field, joint, *_range(draft, index, term), measured_in=unit))
+    return found
+
+
+def _range(draft: Draft, index: int, term: str) -> tuple[float, float]:
+    """The range of a term of friction."""
+    if term in _SHAPE:
+        return _SHAPE[term]
+    ratio = next((most for begin, most in _LOAD.items() if term.startswith(begin)), None)
+    if ratio is not None:
+        return 0.0, ratio
+    up_to = draft.spec.friction[index].up_to
+    if up_to is None:
+        raise draft.document.error(
+            ("friction", index), f"expected up_to:, the largest friction in N·m, as {term} is to be calibrated"
+        )
+    return 0.0, up_to
+
+
+def _friction_numbers(friction: FrictionSpec) -> tuple[float, ...]:
+    """The numbers of a joint's friction in the model, in the order of `FRICTION`; empty where MuJoCo's own say it."""
+    if set(friction.chosen) <= {"coulomb", "viscous"}:
+        return ()
+
+    def number(name: str) -> float:
+        both = name.removesuffix("_motor").removesuffix("_external")
+        given = (getattr(friction, name, None), getattr(friction, both, None))
+        return next((value for value in given if value is not None), 1.0 if name in _SHAPE else 0.0)
+
+    return (MARK, *(number(name) for name in FRICTION[1:]))
+
+
+def _check_joint(draft: Draft, index: int, name: str) -> None:
+    joint = draft.base.joint(name)
+    place = ("friction", index)
+    if joint is None:
+        names = [joint.name for joint in draft.base.joints if joint.name]
+        raise draft.document.unknown(place, "the name of a joint", name, names)
+    if int(joint.type) not in ONE_DOF:
+        raise draft.document.error(place, f"expected a hinge or a slide, got {name!r}, which is a ball or free")
+    if any(len(other.userdata) for other in draft.base.joints):
+        raise draft.document.error(place, "the model keeps user data of its joints (user=), where friction is kept")

@@ -1,0 +1,167 @@
+"""Drives, friction and conditions of a spec: what they make of the model, what they calibrate, what is refused."""
+
+import numpy as np
+import pytest
+
+from madoc import robots
+from madoc.data import logs
+from madoc.errors import MadocError
+from madoc.simulation.callbacks import FRICTION
+from madoc.simulation.cpu import CpuSimulator
+from own_robots import CART_SPEC, SERVO, SERVO_SPEC, write_robot
+
+FRICTION_LINE = "friction:\n  - {joint: shaft, model: M1, up_to: 0.2}\nparameters:"
+M1 = SERVO_SPEC.replace("parameters:", FRICTION_LINE)
+NAMED = SERVO_SPEC.replace("values: [2, 5]}", "values: [2, 5], file_name: p*_}")
+
+
+def load(folder, spec):
+    return robots.load(write_robot(folder, spec, servo=SERVO))
+
+
+@pytest.mark.parametrize(
+    ("model", "terms"),
+    [
+        ("M1", []),
+        ("M2", ["stribeck", "stribeck_speed", "stribeck_exponent"]),
+        ("M3", ["load"]),
+        ("M4", ["stribeck", "load", "stribeck_load", "stribeck_speed", "stribeck_exponent"]),
+    ],
+)
+def test_another_model_of_friction_is_one_word(tmp_path, model, terms):
+    names = load(tmp_path, M1.replace("M1", model)).task.parameters.names
+    base = ("drive_strength.goal", "dof_frictionloss.shaft", "dof_damping.shaft")
+    assert names == (*base, *(f"friction_{term}.shaft" for term in terms))
+
+
+def test_a_term_with_a_number_is_not_calibrated_and_one_with_a_line_has_its_range(tmp_path):
+    spec = M1.replace("M1, up_to: 0.2", "M3, up_to: 0.2, viscous: 0.03, load: 0.1") + (
+        "  - {field: dof_frictionloss, element: shaft, low: 0.01, high: 0.05}\n"
+    )
+    robot = load(tmp_path, spec)
+    assert [(row.name, row.high) for row in robot.task.parameters.parameters[1:]] == [("dof_frictionloss.shaft", 0.05)]
+    assert robot.task.model.dof_damping[0] == 0.03
+    numbers = dict(zip(FRICTION, robot.task.model.jnt_user[0], strict=True))
+    assert (numbers["load_motor"], numbers["load_external"], numbers["stribeck"]) == (0.1, 0.1, 0.0)
+
+
+def test_terms_may_be_chosen_one_by_one(tmp_path):
+    spec = M1.replace("model: M1", "terms: [viscous, load_motor]")
+    assert load(tmp_path, spec).task.parameters.names[1:] == ("dof_damping.shaft", "friction_load_motor.shaft")
+
+
+def line_of(text, spec):
+    return next(number for number, line in enumerate(spec.splitlines(), 1) if text in line)
+
+
+DRIVE = "drive: {kind: dc"
+PARAMETER = "  - {field: drive_strength, element: goal, low: 0.5, high: 1.5}"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("kind: dc", "kind: ac", "expected 'dc' in actions.drive.kind, got 'ac'"),
+        (", gain: 0.2", "", "expected gain: of the drive, duty per error of position"),
+        ("kt: 0.5", "ktt: 0.5", "unknown key 'ktt'; nearest: kt"),
+        ("resistance: 2", "resistance: 0", "expected greater than 0 in actions.drive.resistance, got 0"),
+        ("gain: 0.2", "gain: 0.2, duty_limit: 1.5", "expected less than or equal to 1 in actions.drive.duty_limit"),
+        ("means: position", "means: torque", "expected means: position, velocity or duty beside drive:"),
+        ("means: position", "means: duty", "gain: means nothing beside means: duty"),
+        ("means: position", "means: position\n    kp: 3", "kp: means nothing beside drive:"),
+        ("gain_from: p", "gain_from: q", "expected the name of a condition, got 'q'; there are: p"),
+        ("supply_from: volts", 'supply_from: "on"', "the column 'on' is used for something else already"),
+        ("supply_from: volts", "supply_from: angle", "the name 'angle' is taken"),
+        ("values: [2, 5]", "values: [2, 2]", "values: of p has one twice"),
+        ("values: [2, 5]", "values: [2, 5], file_name: p", "expected one \\* in file_name:, got 'p'"),
+        (PARAMETER, PARAMETER.replace("goal", "volts"), "drive_strength: actuator 'volts' is no such drive"),
+        (PARAMETER, PARAMETER.replace("drive_strength", "drive_current_limit"), "give it a current_limit:"),
+    ],
+)
+def test_a_mistake_in_a_drive_is_one_sentence_with_its_line(tmp_path, old, new, sentence):
+    spec = SERVO_SPEC.replace(old, new)
+    assert spec != SERVO_SPEC
+    with pytest.raises(MadocError, match=sentence) as refusal:
+        load(tmp_path, spec)
+    assert str(refusal.value).startswith("robot.yaml, line ")
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("new", "sentence"),
+    [
+        ("{joint: shaft, up_to: 1}", "expected either model: or terms:, got both or neither"),
+        ("{model: M4, up_to: 1}", "expected either joint: or joints:, got both or neither"),
+        ("{joint: shaft, model: M7}", "expected 'M1', 'M2', 'M3', 'M4', 'M5' or 'M6' in friction.model, got 'M7'"),
+        ("{joint: shaft, model: M4}", "expected up_to:, the largest friction in N·m, as coulomb is to be calibrated"),
+        ("{joint: shft, model: M1, up_to: 1}", "expected the name of a joint, got 'shft'; nearest: shaft"),
+        ("{joint: shaft, model: M1, up_to: 1, load: 0.1}", "load: is no term of M1, which are coulomb, viscous"),
+        ("{joint: shaft, terms: [load, load_motor], up_to: 1}", "load is load_motor in one; keep one"),
+        ("{joints: [shaft, shaft], model: M1, up_to: 1}", "the friction of 'shaft' is said already; say it once"),
+    ],
+)
+def test_a_mistake_in_friction_is_one_sentence_with_its_line(tmp_path, new, sentence):
+    spec = M1.replace("{joint: shaft, model: M1, up_to: 0.2}", new)
+    with pytest.raises(MadocError, match=sentence) as refusal:
+        load(tmp_path, spec)
+    assert str(refusal.value).startswith(f"robot.yaml, line {line_of(new, spec)}: ")
+
+
+def test_a_policy_cannot_choose_its_supply(tmp_path):
+    with pytest.raises(MadocError, match="a policy cannot be learnt where drives take on, volts, p from the log"):
+        load(tmp_path, SERVO_SPEC + 'reward: "-angle ** 2"\n')
+
+
+CART_BY = CART_SPEC.replace("parameters:\n", "conditions:\n  - {name: load, values: [0, 3]}\nparameters:\n", 1).replace(
+    "element: cart, low", "element: cart, by: load, low", 1
+)
+
+
+def test_a_parameter_by_a_condition_has_a_value_for_each_that_moves_only_its_runs(tmp_path):
+    """F = m a: of 2 kg where the load is 0, of 4 kg where it is 3, of the model's own 1 kg where it is another."""
+    task = robots.load(write_robot(tmp_path, CART_BY)).task
+    assert [name for name in task.parameters.names if name.startswith("body_mass")] == [
+        "body_mass.cart[load=0]",
+        "body_mass.cart[load=3]",
+    ]
+    simulator = CpuSimulator(task.with_parameters(["body_mass.cart[load=0]", "body_mass.cart[load=3]"]), threads=1)
+    system = simulator.bind(np.array([[2.0, 4.0], [3.0, 4.0]]))
+    middle, half = task.action_ranges
+    action = (np.array([[1.0, 0.0], [1.0, 3.0], [1.0, 1.0]]) - middle) / half
+    for _ in range(2):
+        after = system.step(np.zeros((2, 3, 2)), np.stack([action, action]))
+        np.testing.assert_allclose(after[:, :, 1], 0.02 / np.array([[2.0, 4.0, 1.0], [3.0, 4.0, 1.0]]), rtol=1e-12)
+        system = system.replaced(np.array([1]), np.array([[3.0, 4.0]]))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("by: load", "by: lode", "expected the name of a condition, got 'lode'; nearest: load"),
+        ("field: body_mass, element: cart", "field: action_delay", "by: means nothing beside action_delay"),
+    ],
+)
+def test_a_mistake_in_by_is_one_sentence(tmp_path, old, new, sentence):
+    assert old in CART_BY
+    with pytest.raises(MadocError, match=sentence):
+        robots.load(write_robot(tmp_path, CART_BY.replace(old, new)))
+
+
+def written(folder, name, rate=1.0):
+    rows = "".join(f"{0.01 * row:.2f},{0.01 * row * rate},{rate},{row % 2},1,12\n" for row in range(5))
+    (folder / name).write_text("time,angle,rate,goal,on,volts\n" + rows)
+    return folder / name
+
+
+def test_a_condition_is_read_from_the_name_of_its_file(tmp_path):
+    robot = load(tmp_path, NAMED)
+    data = logs.read([written(tmp_path, "p2_a.csv"), written(tmp_path, "swing-p5_.csv", rate=2.0)], robot)
+    low, high = robot.actions[3].low, robot.actions[3].high
+    given = low + (np.asarray(data.transitions.action)[:, 3] + 1.0) / 2.0 * (high - low)
+    np.testing.assert_allclose(given, [2.0] * 4 + [5.0] * 4, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "got"), [("p3_a.csv", "got 3;"), ("other.csv", "got no number there;")])
+def test_a_file_of_a_condition_that_the_spec_does_not_list_is_refused(tmp_path, name, got):
+    with pytest.raises(MadocError, match=f"expected p in the file name {name}, as p\\*_, to be one of 2, 5, {got}"):
+        logs.read(written(tmp_path, name), load(tmp_path, NAMED))

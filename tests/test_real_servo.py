@@ -1,0 +1,80 @@
+"""A servo of hardware, where its logs are: named by the variable MADOC_XL330, or in shared/data beside the repository.
+They are not Madoc's to copy."""
+
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from madoc import robots
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[1]
+DATA = Path(os.environ.get("MADOC_XL330", ROOT.parent / "shared" / "data" / "xl330")) / "logs"
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    if not DATA.is_dir():
+        pytest.skip("the logs of the XL330 servo are not here; name their folder in MADOC_XL330")
+    place = ROOT / "benchmarks" / "real_servo.py"
+    sys.path.insert(0, str(place.parent))
+    try:
+        spec = importlib.util.spec_from_file_location("real_servo", place)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(place.parent))
+    return module
+
+
+def integrated(log, gain, values):
+    """The angle by the published equations, in steps of 1 ms from rest, with the logged supply: no MuJoCo."""
+    rows = np.genfromtxt(log, delimiter=",", names=True)
+    grid = np.arange(rows["time"][0], rows["time"][-1], 0.001)
+    last = np.searchsorted(rows["time"], grid + 1e-9) - 1
+    of = {name: 0.0 for name in ("stribeck", "load_motor", "load_external", "stribeck_load_motor")} | {
+        "stribeck_load_external": 0.0,
+        "stribeck_speed": 1.0,
+        "stribeck_exponent": 1.0,
+        "quadratic_motor": 0.0,
+        "quadratic_external": 0.0,
+    }
+    of |= values
+    angle, speed, inertia, found = rows["position"][0], 0.0, 0.49 * 0.1**2 + of["armature"], []
+    for goal, volts, on in zip(rows["goal"][last], rows["volts"][last], rows["torque_enable"][last], strict=True):
+        found.append(angle)
+        external = -0.49 * 9.81 * 0.1 * np.sin(angle - of["zero"])
+        duty = np.clip(gain * 0.0028774 * (goal - angle), -1, 1)
+        motor = on * of["kt"] * (duty * volts - of["kt"] * speed) / of["resistance"]
+        at_rest = of["stribeck"] + abs(of["stribeck_load_external"] * external - of["stribeck_load_motor"] * motor)
+        if motor * external < 0:
+            drives = abs(external) < abs(motor)
+            at_rest += of["quadratic_external"] * external**2 if drives else of["quadratic_motor"] * motor**2
+        most = of["coulomb"] + abs(of["load_external"] * external - of["load_motor"] * motor)
+        most += at_rest * np.exp(-(abs(speed / of["stribeck_speed"]) ** of["stribeck_exponent"]))
+        most += of["viscous"] * abs(speed)
+        stopping = inertia / 0.001 * speed + motor + external
+        speed += 0.001 / inertia * (motor + external - np.sign(stopping) * min(abs(stopping), most))
+        angle += 0.001 * speed
+    return grid, np.array(found)
+
+
+@pytest.mark.parametrize("model", ["M1", "M6"])
+def test_the_published_models_move_as_their_equations_do(benchmark, tmp_path, model):
+    robot = robots.load(benchmark.written(tmp_path, model, benchmark.PUBLISHED[model]))
+    log = DATA / "gain200_sin_time_square.csv"
+    _, whole = benchmark.errors_of(robot, {}, [log])[log.stem]
+    grid, angle = integrated(log, 200, benchmark.PUBLISHED[model])
+    rows = np.genfromtxt(log, delimiter=",", names=True)
+    error = np.sqrt(np.mean((angle - np.interp(grid, rows["time"], rows["position"])) ** 2))
+    assert whole == pytest.approx(error, rel=0.1)
+
+
+def test_runs_of_a_gain_that_was_never_shown_are_predicted_better_than_by_the_published_models(benchmark):
+    found = benchmark.compare(DATA, 400, "M6", ("horizon=200", "loss=linear"))
+    of_each = {name: np.mean(list(errors.values()), axis=0) for name, errors in found["errors"].items()}
+    assert (of_each["madoc"] < 0.7 * of_each["published M6"]).all()
