@@ -20,7 +20,7 @@ from madoc.simulation.outlines import outlines
 
 LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 """The ways to OpenGL without a screen, as MuJoCo's `MUJOCO_GL` names them, and the library that each needs."""
-TIMEOUT = 60.0
+TIMEOUT = 30.0
 """Longest time in s that drawing may take with each of them."""
 PAPER, BODY, GHOST = (255, 255, 255), ((31, 111, 214), 230), ((13, 153, 102), 100)
 """Colours of outlines: what is behind them, and their own with an opacity of 255."""

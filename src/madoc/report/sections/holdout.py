@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Int
 from markupsafe import Markup
 
 from madoc.calibration.holdout import Fitted, PredictionError, ToldApart
@@ -64,14 +65,15 @@ def signals(run: Run) -> dict[str, object] | str:
     worst = np.argsort(-_error(evidence.after - evidence.measured, evidence.scale))[:SIGNALS_SHOWN]
     every = -(-evidence.measured[..., worst].size * len(_LINES) // NUMBERS)
     names = [(index, evidence.signals[index]) for index in sorted(worst.tolist())]
+    whole = np.isfinite(evidence.measured).all(-1).sum(1)
     charts = [
-        {"title": name, "unit": run.units.get(name, ""), "chart": _replayed(evidence, index, every)}
+        {"title": name, "unit": run.units.get(name, ""), "chart": _replayed(evidence, index, every, whole)}
         for index, name in names
     ]
     legend = [("measured", "measured"), ("before", "your model as given"), ("after", "calibrated")]
     fitted = evidence.fitted * float(evidence.time[1])
     shown = {"charts": charts, "legend": legend, "omitted": len(evidence.signals) - len(worst), "every": every}
-    return shown | {"names": evidence.names, "fitted": fitted}
+    return shown | {"names": evidence.names, "chosen": int(whole.argmax()), "fitted": fitted}
 
 
 _LINES = (
@@ -84,13 +86,18 @@ _LINES = (
 """Array and colour of each line of a signal, what it is, pen, opacity and axis; the last on top."""
 
 
-def _replayed(evidence: Evidence, signal: int, every: int) -> Markup:
-    """One signal in all runs, of which the page shows the first until a reader chooses another."""
+def _replayed(evidence: Evidence, signal: int, every: int, whole: Int[np.ndarray, " runs"]) -> Markup:
+    """One signal in all runs, of which the page shows the longest until a reader chooses another.
+
+    `whole` is the number of readings of each run.
+    """
     arrays = {"measured": evidence.measured, "before": evidence.before, "after": evidence.after}
     of_signal = {name: each[:, :, signal] for name, each in arrays.items() if each is not None}
     data: list[Mapping[str, object]] = []
-    ranges: dict[str, list[tuple[float, float]]] = {"yaxis": [], "yaxis2": []}
+    chosen = int(whole.argmax())
+    ranges: dict[str, list[tuple[float, float]]] = {"xaxis": [], "yaxis": [], "yaxis2": []}
     for run in range(len(evidence.measured)):
+        ranges["xaxis"].append((0.0, float(evidence.time[max(whole[run] - 1, 1)])))
         values = {name: each[run] for name, each in of_signal.items()}
         missed = {name: values[name] - values["measured"] for name in ("before", "after")}
         width = float(np.ptp(values["measured"][np.isfinite(values["measured"])]))
@@ -100,13 +107,13 @@ def _replayed(evidence: Evidence, signal: int, every: int) -> Markup:
             y = rounded((values if axis == "y" else missed)[array][::every])
             step = {"x0": 0.0, "dx": float(evidence.time[1]) * every, "y": y, "yaxis": axis}
             look = {"mode": "lines", "line": pen | {"color": f"var(--{array})"}, "opacity": opacity}
-            data.append(step | look | {"name": name, "meta": run, "visible": run == 0})
+            data.append(step | look | {"name": name, "meta": run, "visible": run == chosen})
     layout = {
         "height": 300,
         "hovermode": "x unified",
-        "xaxis": {"title": {"text": "time, s"}, "anchor": "y2"},
-        "yaxis": {"domain": [0.36, 1.0], "range": ranges["yaxis"][0]},
-        "yaxis2": {"domain": [0.0, 0.26], "range": ranges["yaxis2"][0], "nticks": 3},
+        "xaxis": {"title": {"text": "time, s"}, "anchor": "y2", "range": ranges["xaxis"][chosen]},
+        "yaxis": {"domain": [0.36, 1.0], "range": ranges["yaxis"][chosen]},
+        "yaxis2": {"domain": [0.0, 0.26], "range": ranges["yaxis2"][chosen], "nticks": 3},
         "meta": ranges,
     }
     return drawn({"data": data, "layout": layout}, f"{evidence.signals[signal]}: measured and simulated")

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from madoc.report.film import read_film
 from madoc.report.reading import Run
 from madoc.report.sections.outcome import POLICIES
@@ -23,11 +25,12 @@ def robustness(run: Run) -> dict[str, object] | str:
 def motion(run: Run) -> dict[str, object] | str:
     """A held-out run, measured over simulated."""
     seen = read_film(run.folder / "motion.npz")
-    return (
-        "No film was made: no held-out run could be replayed, or the robot has no shape."
-        if seen is None
-        else {"film": seen}
-    )
+    if seen is None or run.evidence is None:
+        return "No film was made: no held-out run could be replayed, or the robot has no shape."
+    whole = np.isfinite(run.evidence.measured).all(-1).sum(1)
+    longest, shown = float(run.evidence.time[whole.max() - 1]), float(seen.time[-1])
+    cut = shown if shown < longest - 1e-9 else None
+    return {"film": seen, "name": run.evidence.names[int(whole.argmax())], "cut": cut}
 
 
 def film(run: Run) -> dict[str, object] | str:
