@@ -12,12 +12,12 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from drawing import scatter_chart
 from jaxtyping import Float
 from kept import RESULTS, Study
 from paper_cells import planned
 
 from madoc import tasks
-from madoc.report.charts import scatter_chart
 from madoc.report.reading import read_arrays
 from madoc.report.sections.estimates import plane_of
 from madoc.report.words import parameter_title
@@ -94,12 +94,11 @@ def _drawn(task: Task, found: Mapping) -> str:
         points,
         [parameter_title(name) for name in found["names"]],
         [colour[name] for name in found["names"]],
-        label="parameters in the plane of their embeddings",
         titles=(f"first component, {100 * shares[0]:.0f} % of the variance", f"second, {100 * shares[1]:.0f} %"),
         width=PLANE,
         height=HEIGHT,
     )
-    placed = str(chart).replace("<svg ", f'<svg x="{ROBOT}" y="{HEAD}" width="{PLANE}" height="{HEIGHT}" ', 1)
+    placed = f'<g transform="translate({ROBOT} {HEAD})">{chart}</g>'
     return (
         f'<g>\n<text class="title" x="12" y="22">{TITLE}: {len(found["groups"])} groups, '
         f"adjusted Rand index of its votes {found['stability']:.2f}</text>\n{robot(task, colour)}{placed}</g>\n"

@@ -27,7 +27,7 @@ def wait_for(place, process):
 def test_a_run_leaves_everything(whole):
     found = {file.name for file in whole.iterdir()} - {".lock"}
     policies = {"policy-calibrated", "policy-midrange", "policy-truth"}
-    files = {"data.npz", "evaluation.json", "film.npz", "summary.json", "spec.json", "report.html"}
+    files = {"data.npz", "evaluation.json", "film.npz", "film.webp", "summary.json", "spec.json", "report.html"}
     assert found == files | {"calibration", "export"} | policies
     assert all((whole / name / "policy.npz").exists() for name in policies)
     summary = summary_of(whole)

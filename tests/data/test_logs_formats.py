@@ -1,6 +1,8 @@
 """Every format is written here and read back to the same numbers."""
 
+import contextlib
 import json
+import sqlite3
 import sys
 import warnings
 import zipfile
@@ -14,27 +16,14 @@ import pyarrow.parquet as pq
 import pytest
 from logged_arm import ACTIONS, SIGNALS, arm_of, columns_of, write_csv
 from mcap.writer import Writer
-from mcap_ros2.writer import Writer as RosWriter
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosWriter
+from rosbags.typesys import Stores, get_typestore
 
 from madoc.data import logs
 from madoc.data.findings import Finding
 from madoc.data.logs import mcap_reader, parquet_reader
 from madoc.errors import MadocError
-
-ROS_JOINT_STATE = """\
-std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
 
 
 @pytest.fixture(scope="module")
@@ -200,6 +189,53 @@ def test_lerobot(columns, tmp_path, together):
     np.testing.assert_allclose(dataset.transitions.observation[49:], expected + 1, rtol=1e-6)
 
 
+def test_lerobot_in_files_of_many_episodes_with_their_list_beside(columns, tmp_path):
+    """Version 3.0 as its library writes it: lists of a fixed length, several files, a table of episodes."""
+    lerobot(tmp_path / "logs", columns, together=True)
+    chunk = tmp_path / "logs" / "data" / "chunk-000"
+    table = pq.read_table(chunk / "file-000.parquet")
+    for name, width in (("observation.state", 4), ("action", 2)):
+        place = table.schema.get_field_index(name)
+        table = table.set_column(place, name, table.column(name).cast(pa.list_(pa.float32(), width)))
+    for file in (0, 1):  # 25 rows of the second episode are in each
+        pq.write_table(table.slice(75 * file, 75 - 50 * file), chunk / f"file-{file:03d}.parquet")
+    episodes = tmp_path / "logs" / "meta" / "episodes" / "chunk-000"
+    episodes.mkdir(parents=True)
+    pq.write_table(pa.table({"episode_index": [0, 1], "length": [50, 50]}), episodes / "file-000.parquet")
+    robot = arm_of(tmp_path, log=named("observation.state", "action"))
+    dataset = logs.read(tmp_path / "logs", robot)
+    assert dataset.run_names == ("logs/episode_0", "logs/episode_1") and dataset.episode_starts.tolist() == [0, 49]
+    expected = matrix(columns, SIGNALS)[:-1].astype(np.float32)
+    np.testing.assert_allclose(dataset.transitions.observation, np.concatenate([expected, expected + 1]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("separator", [", ", " "])
+def test_csv_with_lists_in_its_cells(columns, tmp_path, separator):
+    def cells(names):
+        return [f'"[{separator.join(repr(float(columns[name][row])) for name in names)}]"' for row in range(50)]
+
+    times = map(repr, columns["time"].tolist())
+    rows = zip(times, cells(SIGNALS), cells(ACTIONS), strict=True)
+    file = tmp_path / "log.csv"
+    file.write_text("\n".join(["time,state,action", *map(",".join, rows)]))
+    robot = arm_of(tmp_path, log=named("state", "action"))
+    assert_same(logs.read(file, robot), columns)
+    file.write_text(file.read_text() + '\n1.0,,"[0.0 0.0]"')  # a list that is missing
+    with pytest.raises(
+        MadocError, match=r"as many values in every list of column 'action'.* 2 in line 52 and 3 in line 53"
+    ):
+        logs.read(_with(file, '\n1.02,,"[0.0 0.0 0.0]"'), robot)
+    with pytest.raises(MadocError, match=r"expected a number in column 'action\[1\]' of more.csv, got 'x' in line 53"):
+        logs.read(_with(file, '\n1.02,,"[0.0 x]"'), robot)
+
+
+def _with(file, text):
+    """The file with something behind it, beside it."""
+    more = file.with_name("more.csv")
+    more.write_text(file.read_text() + text)
+    return more
+
+
 def test_minari(columns, tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     robot = arm_of(tmp_path, log=named("observations", "actions"))
@@ -266,39 +302,92 @@ def test_mcap_of_json(columns, tmp_path):
     assert_same(logs.read(tmp_path / "log.mcap", robot), columns)
 
 
-def ros_bag(path, columns, *, commands_every=1, offset=0):
-    """Joint states every row; commands on a topic of their own, `offset` ns later."""
-    with path.open("wb") as file:
-        writer = RosWriter(file)
-        joints = writer.register_msgdef("sensor_msgs/msg/JointState", ROS_JOINT_STATE)
-        command = writer.register_msgdef("std_msgs/msg/Float64MultiArray", "float64[] data\n")
+def ros_bag(folder, columns, *, commands_every=1, storage=StoragePlugin.MCAP, version=9):
+    """Joint states every row, commands on a topic of their own: the file, as `ros2 bag record` leaves it."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    state, time, header, torques = (
+        store.types[name]
+        for name in (
+            "sensor_msgs/msg/JointState",
+            "builtin_interfaces/msg/Time",
+            "std_msgs/msg/Header",
+            "std_msgs/msg/Float64MultiArray",
+        )
+    )
+    layout = store.types["std_msgs/msg/MultiArrayLayout"]([], 0)
+    with RosWriter(folder, version=version, storage_plugin=storage) as writer:
+        joints = writer.add_connection("/joints", state.__msgtype__, typestore=store)
+        command = writer.add_connection("/command", torques.__msgtype__, typestore=store)
         for row in range(50):
-            at = row * 20_000_000
-            state = {
-                "header": {"stamp": {"sec": 0, "nanosec": at}, "frame_id": ""},
-                "name": ["hinge_1", "hinge_2"],
-                "position": [columns["shoulder"][row], columns["elbow"][row]],
-                "velocity": [columns["shoulder_speed"][row], columns["elbow_speed"][row]],
-            }
-            writer.write_message("/joints", joints, state, log_time=at, publish_time=at)
+            at, pair = row * 20_000_000, lambda *names, row=row: np.array([columns[name][row] for name in names])
+            stamped, none = header(time(0, at), ""), np.zeros(0)
+            message = state(
+                stamped, ["hinge_1", "hinge_2"], pair("shoulder", "elbow"), pair("shoulder_speed", "elbow_speed"), none
+            )
+            writer.write(joints, at, store.serialize_cdr(message, state.__msgtype__))
             if row % commands_every == 0:
-                torques = {"data": [columns["shoulder_torque"][row], columns["elbow_torque"][row]]}
-                writer.write_message("/command", command, torques, log_time=at + offset, publish_time=at)
-        writer.finish()
+                message = torques(layout, pair("shoulder_torque", "elbow_torque"))
+                writer.write(command, at, store.serialize_cdr(message, torques.__msgtype__))
+    return next(file for file in folder.iterdir() if file.suffix in (".mcap", ".db3"))
 
 
-def test_mcap_of_ros_2_with_commands_of_their_own(columns, tmp_path):
+COMMANDS = ", shoulder_torque: '/command.data[0]', elbow_torque: '/command.data[1]'}}"
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+def test_ros_2_with_commands_of_their_own(columns, tmp_path, storage):
     """Commands change every fifth row and are only sent then: held, they are those of every row."""
-    commands = ", shoulder_torque: '/command.data[0]', elbow_torque: '/command.data[1]'}}"
-    ros_bag(tmp_path / "log.mcap", columns, commands_every=5)
+    file = ros_bag(tmp_path / "bag", columns, commands_every=5, storage=storage)
     with pytest.raises(MadocError, match=r"not logged together.*ask for log: resample: hold or linear"):
-        logs.read(tmp_path / "log.mcap", arm_of(tmp_path, log=joints_log() + commands))
-    robot = arm_of(tmp_path, log=joints_log("resample: hold, ") + commands)
-    dataset = logs.read(tmp_path / "log.mcap", robot)
+        logs.read(file, arm_of(tmp_path, log=joints_log() + COMMANDS))
+    robot = arm_of(tmp_path, log=joints_log("resample: hold, ") + COMMANDS)
+    dataset = logs.read(tmp_path / "bag", robot)
     assert_same(dataset, columns)  # the last command holds to the end
     (note,) = dataset.findings
     assert note.level == "note"
     assert "signals held, actions held" in note.what
+
+
+@pytest.mark.parametrize("definitions", ["kept", "as of before ROS 2 Iron"])
+def test_a_bag_in_sqlite_by_the_stamps_of_its_messages(columns, tmp_path, definitions):
+    """Bags of before Iron have no definitions; those of common types are known."""
+    file = ros_bag(tmp_path / "bag", columns, storage=StoragePlugin.SQLITE3)
+    with contextlib.closing(sqlite3.connect(file)) as bag:
+        if definitions != "kept":
+            bag.execute("DROP TABLE message_definitions")
+        bag.execute("UPDATE messages SET timestamp = timestamp + 3000000 * (id % 2)")  # late in every second row
+        bag.commit()
+    stamped = joints_log("time: header.stamp, resample: hold, ") + COMMANDS
+    with pytest.raises(MadocError, match=r"header\.stamp"):  # commands have none
+        logs.read(file, arm_of(tmp_path, log=stamped))
+    assert_same(logs.read(file, arm_of(tmp_path, log=joints_log("resample: hold, ") + COMMANDS)), columns)
+
+
+def test_what_is_no_bag_is_named(tmp_path, columns, robot):
+    file = tmp_path / "log.db3"
+    file.write_bytes(b"SQLite format 3\0" + bytes(200))
+    with pytest.raises(MadocError, match=r"cannot read log.db3 as a ROS 2 bag .*ros2 bag convert"):
+        logs.read(file, robot)
+    with contextlib.closing(sqlite3.connect(tmp_path / "other.db3")) as other:
+        other.execute("CREATE TABLE songs (name TEXT)")
+    with pytest.raises(MadocError, match=r"cannot read other.db3 as a ROS 2 bag .no such table: messages"):
+        logs.read(tmp_path / "other.db3", robot)
+    whole = ros_bag(tmp_path / "bag", columns, storage=StoragePlugin.SQLITE3)
+    with contextlib.closing(sqlite3.connect(whole)) as bag:
+        bag.execute("UPDATE messages SET data = x'00' WHERE id = 7")
+        bag.commit()
+    with pytest.raises(MadocError, match="cannot decode message 3 of /joints"):
+        logs.read(whole, arm_of(tmp_path, log=joints_log("resample: hold, ") + COMMANDS))
+
+
+def test_messages_of_a_type_that_nothing_defines_are_told_of(tmp_path, columns, robot):
+    file = ros_bag(tmp_path / "bag", columns, storage=StoragePlugin.SQLITE3)
+    with contextlib.closing(sqlite3.connect(file)) as bag:
+        bag.execute("DROP TABLE message_definitions")
+        bag.execute("UPDATE topics SET type = 'my_msgs/msg/Joints'")
+        bag.commit()
+    with pytest.raises(MadocError, match=r"expected topics of JSON or ROS 2 messages in bag.db3, got /joints"):
+        logs.read(file, robot)
 
 
 @pytest.mark.parametrize("how", ["hold", "linear"])
@@ -396,3 +485,10 @@ def test_a_missing_extra_names_its_command(tmp_path, monkeypatch, reader, packag
     (tmp_path / file).write_bytes(b"anything")
     with pytest.raises(MadocError, match=r'pip install "madoc-calibration\[logs\]"'):
         reader.read(tmp_path / file, ())
+
+
+def test_ros_2_without_its_library_names_the_extra(columns, tmp_path, robot, monkeypatch):
+    file = ros_bag(tmp_path / "bag", columns, storage=StoragePlugin.SQLITE3)
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    with pytest.raises(MadocError, match=r'ROS 2 messages, which need: pip install "madoc-calibration\[logs\]"'):
+        logs.read(file, robot)

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,13 @@ class Page:
         answer = self._ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
+
+    def wait_for(self, script: str, seconds: float = 20.0) -> None:
+        """Until an expression in the page is true."""
+        end = time.monotonic() + seconds
+        while not self.ask_script(f"Boolean({script})"):
+            assert time.monotonic() < end, f"in vain: {script}"
+            time.sleep(0.05)
 
     def move_pointer(self, x: float, y: float) -> None:
         """Put the pointer there."""

@@ -107,10 +107,13 @@ def metrics():
 
 
 def evidence():
-    """Two stretches of two signals, three times each."""
+    """Two runs of two signals, three times each, but for the last of the second."""
     measured = np.arange(12.0).reshape(2, 3, 2)
+    measured[1, 2] = np.nan
     return {
         "signals": np.array(SIGNALS),
+        "names": np.array(["first.csv", "<second>.csv"]),
+        "fitted": np.array(0),
         "scale": np.array([2.0, 4.0]),
         "time": np.array([0.0, 0.01, 0.02]),
         "measured": measured,
@@ -118,6 +121,17 @@ def evidence():
         "after": measured + 0.1,
         "residual_before": np.array([[1.0, -2.0], [-1.0, 2.0], [np.nan, np.nan]]),
         "residual_after": np.array([[0.1, 0.0], [0.1, 0.0], [0.1, 0.0]]),
+    }
+
+
+def film(*names):
+    """A film of three pictures of 4 × 2 pixels, two in a row."""
+    sheets = {f"sheet_{index}": np.frombuffer(b"WebP" + bytes([index]), np.uint8) for index in range(len(names))}
+    return sheets | {
+        "names": np.array(names),
+        "time": np.array([0.0, 0.5, 1.0]),
+        "size": np.array([4, 2]),
+        "columns": np.array(2),
     }
 
 
@@ -149,9 +163,8 @@ def whole_folder(path):
             "error_costs": {"calibrated": {name: cost(2.0 * index) for index, name in enumerate(PARAMETERS)}},
         },
     )
-    ends = np.arange(24.0).reshape(2, 2, 1, 2, 3)
-    names = np.array(["calibrated", "truth"])
-    np.savez(path / "film.npz", names=names, time=np.array([0.0, 1.0]), ends=ends, radius=np.array([0.1]))
+    np.savez(folder / "motion.npz", **film("your model as given", "calibrated"))
+    np.savez(path / "film.npz", **film("calibrated", "truth"))
     return path
 
 

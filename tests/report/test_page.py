@@ -2,6 +2,8 @@
 
 import json
 import re
+import sys
+from html import unescape
 
 import pytest
 from browser import CHROMIUM, chromium
@@ -156,9 +158,41 @@ def test_nothing_from_a_folder_becomes_markup(tmp_path):
 
 
 def test_a_page_asks_for_nothing_outside_of_itself(whole):
-    text = write_report(whole).read_text()
+    text = re.sub(r"[A-Za-z0-9+/=]{500,}", "packed", write_report(whole).read_text())  # Plotly; a browser looks into it
     assert re.findall(r"(?:https?:)?//[a-z0-9]", text) == []
-    assert re.findall(r"<link[^>]*>|<script[^>]+>|url\([^)]*\)|@import", text) == ['<link rel="icon" href="data:,">']
+    asked = re.findall(r"<link[^>]*>|<script[^>]+>|url\((?!data:)[^)]*\)|@import", text)
+    assert asked == ['<link rel="icon" href="data:,">', '<script type="text/plain" id="plotly">']
+
+
+def test_a_page_without_charts_has_no_library_of_them(whole, bare):
+    assert write_report(bare).stat().st_size < 100_000 < 2_000_000 < write_report(whole).stat().st_size < 5_000_000
+
+
+def test_signals_are_drawn_in_whole_runs_with_residuals(whole):
+    shown = content(whole, "signals")
+    assert shown["names"] == ("first.csv", "<second>.csv") and shown["every"] == 1
+    figure = json.loads(unescape(re.search('data-figure="(.*?)"', shown["charts"][0]["chart"]).group(1)))
+    lines = [line for line in figure["data"] if line["meta"] == 1]
+    assert [line["y"] for line in lines] == [
+        [6.0, 8.0, None],  # measured, up to its end
+        [7.0, 9.0, None],
+        [6.1, 8.1, None],
+        [1.0, 1.0, None],  # less what was measured
+        [0.1, 0.1, None],
+    ]
+    assert [line["visible"] for line in figure["data"]] == [True] * 5 + [False] * 5
+    # 0 to 4 measured, and 5 in the model as given, with 6 % of air; residuals of 0.1 and of 1
+    low, high = figure["layout"]["meta"]["yaxis"][0]
+    assert (low, high) == (pytest.approx(-0.3), pytest.approx(5.3))
+    assert figure["layout"]["meta"]["yaxis2"][0] == pytest.approx([0.1 - 0.054, 1.0 + 0.054])
+    assert "<option>&lt;second&gt;.csv</option>" in drawn(whole, "signals")
+
+
+def test_of_long_runs_every_so_many_rows_are_drawn(whole, monkeypatch):
+    monkeypatch.setattr(sys.modules["madoc.report.sections.holdout"], "NUMBERS", 40)  # a function has its name
+    shown = content(whole, "signals")
+    assert shown["every"] == 2  # 2 runs, 3 times, 2 signals and 5 lines of them: 60 values
+    assert '"dx":0.02' in unescape(shown["charts"][0]["chart"]) and "One row of 2 is drawn." in drawn(whole, "signals")
 
 
 def test_a_comparison_puts_estimates_side_by_side(whole, bare):
@@ -196,14 +230,29 @@ def test_a_browser_shows_pages_without_complaint_or_network(whole, bare, tmp_pat
                 )
                 assert page.ask_script(f"{ids!r}.filter(id => !{shown}(id))") == []
                 assert page.ask_script("document.documentElement.scrollWidth") <= width, "wider than the window"
-                small = "[...document.querySelectorAll('svg text')].filter(e => e.getBoundingClientRect().height < 9)"
+                page.ask_script("document.querySelector('[data-figure]')?.scrollIntoView()")  # drawn when it comes near
+                page.wait_for("document.querySelector('[data-figure]') === null || document.querySelector('svg text')")
+                heights = "[...document.querySelectorAll('svg text')].map(e => e.getBoundingClientRect().height)"
+                small = f"{heights}.filter(height => 0 < height && height < 9)"
                 assert page.ask_script(f"{small}.length") == 0, "words too small to read"
         page.open(write_report(whole))
-        point = "(box => [box.x + box.width - 20, box.y + box.height / 2])"
-        chart = "document.querySelector('#signals svg')"
-        page.ask_script(f"document.documentElement.style.scrollBehavior = 'auto'; {chart}.scrollIntoView()")
-        page.move_pointer(*page.ask_script(f"{point}({chart}.getBoundingClientRect())"))
-        told = page.ask_script("document.querySelector('.told').innerText")
-        assert "measured" in told and "calibrated" in told
-        assert set(page.requests) == {file.resolve().as_uri() for file in pages}
+        page.ask_script("document.documentElement.style.scrollBehavior = 'auto'; signals.scrollIntoView()")
+        page.wait_for("document.querySelector('#signals .nsewdrag')")
+        point = "(box => [box.x + box.width / 2, box.y + box.height / 2])"
+        page.move_pointer(
+            *page.ask_script(f"{point}(document.querySelector('#signals .nsewdrag').getBoundingClientRect())")
+        )
+        page.wait_for("document.querySelector('#signals .hoverlayer').textContent.includes('calibrated')")
+        page.ask_script(
+            "(box => (box.selectedIndex = 1, box.dispatchEvent(new Event('change'))))(signals.querySelector('select'))"
+        )
+        shown = "signals.querySelector('[data-figure]').data.filter(line => line.visible).map(line => line.meta)"
+        assert page.ask_script(shown) == [1] * 5
+        place = "motion.querySelector('.sheet').style.backgroundPosition"
+        assert page.ask_script(place) == "0% 0%"
+        page.ask_script("motion.querySelector('button').click()")
+        page.wait_for("motion.querySelector('output').textContent === '1.00 s'")
+        assert page.ask_script(place) == "0% 100%"  # the third of three pictures, two in a row
+        asked = {request for request in page.requests if not request.startswith("data:image/webp;base64,")}
+        assert asked == {file.resolve().as_uri() for file in pages}
         assert page.complaints == []

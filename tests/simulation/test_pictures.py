@@ -1,4 +1,4 @@
-"""Pictures by MuJoCo's renderer where OpenGL is to be had, none where it is broken, and the camera worked by hand."""
+"""Pictures by MuJoCo's renderer where OpenGL is to be had, outlines where it is broken, and the camera by hand."""
 
 import ctypes.util
 
@@ -14,7 +14,8 @@ MODEL = """
   <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.05" rgba="1 0 0 1"/></body></worldbody></mujoco>
 """
 
-CAMERA = Camera(np.tile([0.0, 0.0, 0.75], (2, 1)), 90.0, 1.5)
+CAMERA = Camera(np.tile([0.0, 0.0, 0.75], (1, 2, 1)), 90.0, 1.5)
+HANGS, LIES, GONE = [0.0, 0.0], [np.pi / 2, 0.0], [np.nan, np.nan]
 
 
 @pytest.fixture(scope="module")
@@ -22,34 +23,56 @@ def model():
     return mujoco.MjModel.from_xml_string(MODEL)
 
 
-def test_a_rod_that_hangs_and_one_that_lies(model, monkeypatch):
-    monkeypatch.delenv("MUJOCO_GL")
-    if not any(map(ctypes.util.find_library, LIBRARIES.values())):
-        pytest.skip("there is no OpenGL without a screen")
-    drawn = pictures(model, np.array([[0.0, 0.0], [np.pi / 2, 0.0]]), CAMERA, width=80, height=60)
-    if drawn is None:
-        pytest.skip("OpenGL is broken here")
-    assert drawn.shape == (2, 60, 80, 4)
-    for (columns, rows), picture in zip(((True, False), (False, True)), drawn, strict=True):
-        seen = np.argwhere(picture[..., 3])
-        tall, wide = np.ptp(seen, axis=0)
-        assert (tall > 3 * wide, wide > 3 * tall) == (columns, rows)
-        assert (picture[picture[..., 3] > 0][:, 0].mean() > 50) & (picture[..., 1].max() < 100)  # red, not white
+@pytest.fixture(params=["MuJoCo", "outlines"])
+def way(request, monkeypatch):
+    """How pictures are drawn."""
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    if request.param == "MuJoCo":
+        monkeypatch.delenv("MUJOCO_GL")
+        if not any(map(ctypes.util.find_library, LIBRARIES.values())):
+            pytest.skip("there is no OpenGL without a screen")
+    return request.param
+
+
+def seen(picture):
+    """Whether there is something in each pixel, and its mean colour."""
+    there = (picture < 225).any(-1)
+    return there, picture[there].mean(0) if there.any() else None
+
+
+def is_tall(there):
+    """Whether what is seen is higher than wide, or else wider than high."""
+    tall, wide = np.ptp(np.argwhere(there), axis=0)
+    assert max(tall, wide) > 3 * min(tall, wide)
+    return tall > wide
+
+
+def test_a_rod_that_hangs_and_one_that_lies(model, way):
+    (drawn,) = pictures(model, np.array([[HANGS, LIES]]), CAMERA, width=80, height=60)
+    assert drawn.shape == (2, 60, 80, 3)
+    assert [is_tall(seen(picture)[0]) for picture in drawn] == [True, False]
+    red, green, blue = seen(drawn[0])[1]
+    assert (red > 2 * max(green, blue)) if way == "MuJoCo" else (blue > red)
+
+
+def test_a_ghost_shines_where_it_is_and_a_failed_simulation_is_nowhere(model, way):
+    (drawn,) = pictures(model, np.array([[HANGS, GONE]]), CAMERA, ghost=np.array([GONE, LIES]), width=80, height=60)
+    assert [is_tall(seen(picture)[0]) for picture in drawn] == [True, False]
+    red, green, blue = seen(drawn[1])[1]
+    assert green > blue > red
 
 
 @pytest.mark.parametrize("process", ["import os; os.abort()", "import sys; sys.exit(1)", "import time; time.sleep(60)"])
-def test_a_process_that_dies_of_opengl_leaves_no_pictures(process, model, tmp_path, monkeypatch):
+def test_a_process_that_dies_of_opengl_leaves_outlines(process, model, tmp_path, monkeypatch):
     script = tmp_path / "render_process.py"
     script.write_text(process)
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setattr(drawing, "TIMEOUT", 0.5)
     monkeypatch.setattr(drawing, "__file__", str(tmp_path / "pictures.py"))
-    assert pictures(model, np.zeros((2, 2)), CAMERA, width=8, height=8) is None
-
-
-def test_who_wants_no_opengl_gets_none(model, monkeypatch):
+    asked = model, np.array([[HANGS, LIES]]), CAMERA
+    drawn = pictures(*asked, width=8, height=8)
     monkeypatch.setenv("MUJOCO_GL", "disable")
-    assert pictures(model, np.zeros((2, 2)), CAMERA, width=8, height=8) is None
+    np.testing.assert_array_equal(drawn, pictures(*asked, width=8, height=8))
 
 
 def test_the_camera_sees_all_from_the_side_that_moves():

@@ -30,12 +30,13 @@ class Calibrate:
 
     def run(self) -> Answer:
         """Calibrate, and leave the run folder."""
-        from madoc.pipeline import calibrate_in, default_folder, split_name
+        from madoc.pipeline import calibrate_in, default_folder, leave_motion, split_name
         from madoc.report import leave_report
 
         if split_name(self.order.task)[1]:
             raise MadocError(f"expected the name of a robot, got {self.order.task!r}; the data is given with --data")
         out = self.out or default_folder(self.order)
         result = calibrate_in(out, self.order, resume=self.resume, quiet=self.output.quiet, permission=self.permission)
+        leave_motion(out, permission=self.permission)
         lines = (*calibration_text(result), f"run folder: {out}", *page_line(leave_report(out)))
         return Answer(result.to_json(), lines, calibration_status(result))

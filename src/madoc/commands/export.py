@@ -24,6 +24,8 @@ class Export:
     """Folder for the files. Default: export in the run folder."""
     onnx: bool = False
     """Write the run's policies as ONNX too; needs the package onnx."""
+    rerun: bool = False
+    """Write each held-out run for the viewer Rerun too: signals and the robot; needs the package rerun-sdk."""
     permission: OmitArgPrefixes[Permission] = field(default_factory=Permission)
     output: OmitArgPrefixes[Output] = field(default_factory=Output)
 
@@ -31,6 +33,6 @@ class Export:
         """Write the files."""
         from madoc.pipeline import export_run
 
-        files = export_run(self.folder, self.out, onnx=self.onnx, permission=self.permission)
+        files = export_run(self.folder, self.out, onnx=self.onnx, rerun=self.rerun, permission=self.permission)
         lines = tuple(f"{what}: {path}" for what, path in files.items())
         return Answer({"files": {what: str(path) for what, path in files.items()}}, lines)

@@ -24,6 +24,7 @@ from madoc.commands.run import Run
 from madoc.commands.selftest import Selftest
 from madoc.commands.spec import Init, Spec
 from madoc.commands.suite import Suite
+from madoc.commands.view import View
 from madoc.commands.worker import Worker
 from madoc.errors import MadocError, printable
 from madoc.runs.files import json_text
@@ -45,6 +46,7 @@ Commands = (
     | Spec
     | Check
     | Report
+    | View
     | Export
     | Tasks
     | Methods

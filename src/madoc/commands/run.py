@@ -34,7 +34,7 @@ class Run:
     def run(self) -> Answer:
         """Do all stages, and leave the folder."""
         from madoc.calibration import CalibrationResult
-        from madoc.pipeline import run_all
+        from madoc.pipeline import leave_motion, run_all
         from madoc.report import leave_report
         from madoc.robots import is_spec_path
 
@@ -43,6 +43,7 @@ class Run:
         )
         summary = run_all(self.order, out, resume=self.resume, quiet=self.output.quiet, permission=self.permission)
         result = CalibrationResult.from_json(summary.calibration)
+        leave_motion(out, permission=self.permission)
         lines = (*calibration_text(result), *_rest(summary, out), *page_line(leave_report(out)))
         status = calibration_status(result) if summary.status == "finished" else summary.status
         return Answer(summary.to_json() | {"folder": str(out)}, lines, status)

@@ -20,10 +20,14 @@ if TYPE_CHECKING:
 class Init:
     """Write the spec file of a robot of your own from its model, with comments that explain every part."""
 
-    model: Annotated[Positional[Path], arg(metavar="MODEL")]
-    """MJCF or URDF."""
+    model: Annotated[Positional[str], arg(metavar="MODEL")]
+    """MJCF or URDF, or the name of a robot that MuJoCo Menagerie has, as go2."""
     out: Path | None = None
-    """The spec file. Default: beside the model, as robot.yaml for robot.xml."""
+    """The spec file. Default: beside the model, as robot.yaml for robot.xml; of a robot by name, go2.yaml here."""
+    menagerie: Path | None = None
+    """A checkout of MuJoCo Menagerie. Default: the one that robot_descriptions keeps in its cache."""
+    download: bool = False
+    """Let the package robot_descriptions fetch a robot that is not here, from GitHub."""
     recipe: Annotated[str, arg(metavar="CLASS")] = ""
     """Ranges of what drives of a class of machines are like: hobby-servo, harmonic-arm, direct-drive-leg, dc-gearmotor,
     drone or wheeled. Default: those that follow from the model."""
@@ -34,10 +38,13 @@ class Init:
     def run(self) -> Answer:
         """Write the file."""
         from madoc import robots
+        from madoc.commands.robot_names import model_of
         from madoc.robots.init import write_spec
 
-        out = self.out or self.model.parent / f"{self.model.stem or 'robot'}.yaml"
-        write_spec(self.model, out, allow_outside=self.allow_outside, recipe=self.recipe)
+        model = model_of(self.model, menagerie=self.menagerie, download=self.download)
+        beside = model.parent if model == Path(self.model).expanduser() else Path()
+        out = self.out or beside / f"{model.stem or 'robot'}.yaml"
+        write_spec(model, out, allow_outside=self.allow_outside, recipe=self.recipe)
         robot = robots.load(out, allow_outside=self.allow_outside)
         counts = {
             "signals": len(robot.signals),

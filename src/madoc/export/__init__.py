@@ -3,6 +3,7 @@
 from madoc.export.draws import save_draws
 from madoc.export.onnx_policy import save_onnx
 from madoc.export.parameter_files import Exported, is_patch, save_patch, save_randomization, save_sysid_parameters
+from madoc.export.recording import save_recordings, serve_recordings
 from madoc.export.trainers import Robot, save_isaac_lab, save_mjlab
 
 __all__ = [
@@ -15,5 +16,7 @@ __all__ = [
     "save_onnx",
     "save_patch",
     "save_randomization",
+    "save_recordings",
     "save_sysid_parameters",
+    "serve_recordings",
 ]

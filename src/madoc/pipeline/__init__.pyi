@@ -11,6 +11,8 @@ from .data_stage import record_named as record_named
 from .data_stage import split_name as split_name
 from .evaluation_stage import evaluate_folder as evaluate_folder
 from .export_stage import export_run as export_run
+from .export_stage import view_run as view_run
+from .film_stage import leave_motion as leave_motion
 from .learning_stage import learn_in as learn_in
 from .learning_stage import policy_folder_name as policy_folder_name
 from .orders import AUTO as AUTO

@@ -9,7 +9,7 @@ from madoc.pipeline.folders import ENDED, working_folder
 from madoc.pipeline.keys import seed_key
 from madoc.pipeline.methods import choose, hyperparameters, methods_for
 from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, Permission
-from madoc.pipeline.preparation import Prepared, prepare
+from madoc.pipeline.preparation import prepare
 from madoc.pipeline.refusals import check_order, method_of
 from madoc.runs.budget import Seconds
 from madoc.runs.progress import waiting
@@ -62,7 +62,9 @@ def calibrate_in(
             with waiting("judging the estimate on the rows held out", quiet=quiet) as tell:
                 bench = replace(prepared.bench, until=judged_by, rate=max(rate, 1.0), tell=tell)
                 result = assess(result, bench).result
-            _leave_evidence(out, prepared, result)
+                tell("whole runs")
+                arrays = evidence(bench, result.mean, control_step=prepared.simulator.control_step)
+            save_evidence(out / "evidence.npz", arrays)
         folder.write_json("result.json", result.to_json())
         return result
 
@@ -78,9 +80,3 @@ def _for_search(budget: Seconds, spent: float) -> Seconds:
 def default_folder(order: CalibrationOrder) -> Path:
     """The run folder of an order that names none: `runs/TASK-METHOD-SEED`."""
     return Path("runs") / f"{Path(order.task).stem}-{method_of(order)}-{order.search.seed}"
-
-
-def _leave_evidence(out: Path, prepared: Prepared, result: CalibrationResult) -> None:
-    """Leave `evidence.npz`: windows of the hold-out beside their simulation."""
-    arrays = evidence(prepared.bench, result.mean, control_step=prepared.simulator.control_step)
-    save_evidence(out / "evidence.npz", arrays)

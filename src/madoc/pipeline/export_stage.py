@@ -19,13 +19,16 @@ from madoc.export import (
     save_onnx,
     save_patch,
     save_randomization,
+    save_recordings,
     save_sysid_parameters,
+    serve_recordings,
 )
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
+from madoc.report.reading import read_arrays
 from madoc.simulation import Simulator
 from madoc.simulation.configuration import joint_actuators, physics_options, start_position
 from madoc.simulation.drawn import numbers_of_draws
@@ -38,11 +41,17 @@ DRAWS = 1000
 
 
 def export_run(
-    run: Path, out: Path | None = None, *, onnx: bool = False, permission: Permission = NO_PERMISSION
+    run: Path,
+    out: Path | None = None,
+    *,
+    onnx: bool = False,
+    rerun: bool = False,
+    permission: Permission = NO_PERMISSION,
 ) -> dict[str, Path]:
     """Leave a finished calibration as MJCF, patch, ranges, draws of models and parameters for `mujoco.sysid`.
 
-    Policies are written too, as ONNX, if asked. The folder `out` is `export` in the run folder by default.
+    If asked, policies are written too, as ONNX, and held-out runs as recordings of Rerun. The folder `out` is `export`
+    in the run folder by default.
 
     Returns:
         The path of each file by its description.
@@ -82,10 +91,9 @@ def export_run(
     if needs_callbacks(simulator.task.model):  # trainers take a model by MuJoCo alone
         files["drives and friction"] = folder / DRIVES
     else:
-        files["robot for mjlab"], files["robot for Isaac Lab"] = (
-            folder / "mjlab_robot.py",
-            folder / "isaac_lab_robot.py",
-        )
+        files["robot for mjlab"] = folder / "mjlab_robot.py"
+        files["robot for Isaac Lab"] = folder / "isaac_lab_robot.py"
+    evidence = _evidence(calibrated) if rerun else {}
     targets = {name: folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx") for name in policies}
     if out is not None:
         _require_ours(folder, [*files.values(), *targets.values()])
@@ -103,7 +111,26 @@ def export_run(
     for name, file in policies.items():
         save_onnx(NumpyPolicy.load(file), targets[name])
         files[f"policy {name}"] = targets[name]
+    if rerun:
+        recordings = save_recordings(folder, evidence, simulator, result.mean)
+        files |= {f"held-out run {name}": file for name, file in zip(evidence["names"], recordings, strict=True)}
     return files
+
+
+def view_run(run: Path, *, port: int, permission: Permission = NO_PERMISSION) -> tuple[str, Sequence[object]]:
+    """Serve the held-out runs of a calibration to a browser, on a port and the next: the address, and what to keep.
+
+    Raises:
+        MadocError: There is no finished calibration with a hold-out, Rerun is not installed, or a port is taken.
+    """
+    calibrated = read_calibration(run, permission=permission)
+    simulator, evidence = simulation.make(calibrated.task), _evidence(calibrated)
+    return serve_recordings(evidence, simulator, calibrated.result.mean, port=port)
+
+
+def _evidence(calibrated: Calibrated) -> dict[str, np.ndarray]:
+    """The held-out runs that a calibration has left; empty where it held nothing out."""
+    return read_arrays(calibrated.folder / "evidence.npz", "signals", "names", "time", "measured") or {}
 
 
 def _leave_draws(folder: Path, simulator: Simulator, calibrated: Calibrated) -> list[str]:

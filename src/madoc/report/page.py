@@ -1,4 +1,4 @@
-"""The page of a run: one HTML file with all it needs inside, and no script needed to read it."""
+"""The page of a run: one HTML file with all it needs inside; words and tables need no script, charts and films do."""
 
 import datetime
 import warnings
@@ -8,7 +8,7 @@ from pathlib import Path
 from madoc.calibration.holdout import HoldOut, ToldApart
 from madoc.errors import MadocError
 from madoc.report.reading import Run, read_run
-from madoc.report.rendering import GENERATOR, templates
+from madoc.report.rendering import GENERATOR, plotly, templates
 from madoc.report.sections import SECTIONS
 from madoc.report.words import TONES, count, duration, number, percent
 from madoc.runs.files import replacing
@@ -66,6 +66,8 @@ class Headline:
     note: str
 
 
+_LIBRARY = "PLOTLY IS NOT NEEDED"
+"""What stands in the template where the library of charts goes, on pages that have any."""
 _UNJUDGED = {
     "interrupted": ("doubtful", "The run was interrupted: the estimate is that of the moment."),
     "diverged": ("bad", "The run stopped as a value became NaN or infinite: do not use the estimate."),
@@ -137,5 +139,7 @@ def write_page(page: Path, template: str, context: dict[str, object]) -> None:
     if page.exists() and not _is_ours(page):
         raise MadocError(f"{page} exists and is no page of madoc report; choose another --out")
     text = templates().get_template(template).render(context)
+    if "data-figure=" in text:
+        text = text.replace(_LIBRARY, plotly(), 1)
     with replacing(page) as stream:
         stream.write(text.encode())

@@ -63,14 +63,16 @@ class MetricLog:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Windows of held-out data beside their simulation in the model as given (before) and at the estimate (after).
+    """Held-out runs beside their simulation in the model as given (before) and at the estimate (after).
 
-    Simulations are NaN once they have failed, and None where no state can be rebuilt to start from.
+    Runs are NaN behind their end, and simulations once they have failed; these are None where no position is known.
 
     Attributes:
         signals: Names of the signals.
+        names: Names of the runs.
+        fitted: Number of rows to which the start of each run was fitted; 0 where it is the first logged state.
         scale: Typical change of each signal in a stride of rows (`data.timescale`), in its unit.
-        time: Time since the beginning of a window, s.
+        time: Time since the beginning of a run, s.
         measured: What was logged.
         before: Simulated in the model as given.
         after: Simulated at the estimate.
@@ -79,11 +81,13 @@ class Evidence:
     """
 
     signals: tuple[str, ...]
+    names: tuple[str, ...]
+    fitted: int
     scale: Float[np.ndarray, " signals"]
     time: Float[np.ndarray, " times"]
-    measured: Float[np.ndarray, "windows times signals"]
-    before: Float[np.ndarray, "windows times signals"] | None
-    after: Float[np.ndarray, "windows times signals"] | None
+    measured: Float[np.ndarray, "runs times signals"]
+    before: Float[np.ndarray, "runs times signals"] | None
+    after: Float[np.ndarray, "runs times signals"] | None
     residual_before: Float[np.ndarray, "rows signals"] | None
     residual_after: Float[np.ndarray, "rows signals"] | None
 
@@ -110,7 +114,7 @@ class Run:
         status: How it ended; None while it has not.
         sentence: The status in words.
         log: Its metrics.
-        evidence: Held-out windows beside their simulation.
+        evidence: Held-out runs beside their simulation.
         embeddings: What it learnt about which parameters act alike.
         evaluation: Returns of policies, in the target where it is known and at the estimate.
     """
@@ -245,13 +249,15 @@ def read_metrics(path: Path) -> MetricLog | None:
 
 
 def _read_evidence(path: Path) -> Evidence | None:
-    """Held-out windows; None where the run held nothing out."""
+    """Held-out runs; None where the run held nothing out."""
     arrays = read_arrays(path, "signals", "scale", "time", "measured")
     if arrays is None:
         return None
     simulated = ("before", "after", "residual_before", "residual_after")
     return Evidence(
         tuple(map(str, arrays["signals"])),
+        tuple(map(str, arrays.get("names", range(1, 1 + len(arrays["measured"]))))),
+        int(arrays.get("fitted", 0)),
         *(np.asarray(arrays[name], float) for name in ("scale", "time", "measured")),
         *(np.asarray(arrays[name], float) if name in arrays else None for name in simulated),
     )

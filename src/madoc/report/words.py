@@ -68,12 +68,6 @@ def count(value: float) -> str:
     return f"{value:,.0f}".replace(",", " ").replace("-", "−")
 
 
-def short_count(value: float) -> str:
-    """`60k`, `1.5M`: for the ticks of an axis."""
-    size, letter = next(unit for unit in ((1e6, "M"), (1e3, "k"), (0.0, "")) if abs(value) >= unit[0])
-    return f"{value / (size or 1.0):g}{letter}".replace("-", "−")
-
-
 def duration(seconds: float) -> str:
     """`0.8 s`, `42 s`, `3 min 5 s`, `2 h 10 min`."""
     if seconds < 10:

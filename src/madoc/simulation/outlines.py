@@ -13,7 +13,7 @@ _LENGTHWISE = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYL
 def outlines(
     model: mujoco.MjModel, states: Float[np.ndarray, "frames state"]
 ) -> tuple[Float[np.ndarray, "frames geoms ends xyz"], Float[np.ndarray, " geoms"]]:
-    """The two ends of each geom in m, in world coordinates, and its radius in m; planes are left out.
+    """The two ends of each geom in m, in world coordinates, and its radius in m; planes are left out, NaN stays NaN.
 
     A capsule is itself. A sphere's ends coincide. Of any other geom the longest side of its bounding box is the
     segment, and half the mean of the others its radius.
@@ -22,12 +22,12 @@ def outlines(
     shapes = [_segment(model, geom) for geom in geoms]
     data, frames = mujoco.MjData(model), []
     for state in states:
-        data.qpos[:] = state[: model.nq]
+        known = np.isfinite(state[: model.nq]).all()
+        data.qpos[:] = state[: model.nq] if known else model.qpos0
         mujoco.mj_kinematics(model, data)
         placed = zip(geoms, shapes, strict=True)
-        frames.append(
-            [data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T for geom, (local, _) in placed]
-        )
+        at = [data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T for geom, (local, _) in placed]
+        frames.append(at if known else [np.full((2, 3), np.nan)] * len(geoms))
     ends = np.array(frames, dtype=np.float64).reshape(len(states), len(geoms), 2, 3)
     return ends, np.array([radius for _, radius in shapes], dtype=np.float64)
 

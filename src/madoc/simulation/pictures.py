@@ -1,4 +1,4 @@
-"""Pictures of a model by MuJoCo's renderer, where OpenGL is to be had without a screen; else there are none.
+"""Pictures of a model by MuJoCo's renderer, where OpenGL is to be had without a screen; else outlines drawn by Pillow.
 
 A broken OpenGL library ends its process, so `render_process.py` draws in one of its own.
 """
@@ -16,10 +16,14 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from madoc.simulation.outlines import outlines
+
 LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 """The ways to OpenGL without a screen, as MuJoCo's `MUJOCO_GL` names them, and the library that each needs."""
-TIMEOUT = 60.0
+TIMEOUT = 30.0
 """Longest time in s that drawing may take with each of them."""
+PAPER, BODY, GHOST = (255, 255, 255), ((31, 111, 214), 230), ((13, 153, 102), 100)
+"""Colours of outlines: what is behind them, and their own with an opacity of 255."""
 
 
 @dataclass(frozen=True)
@@ -27,34 +31,76 @@ class Camera:
     """A camera that looks at a robot from the side, at a point of its own in each frame.
 
     Attributes:
-        centre: The points, m.
+        centre: The points, m; of several panels a row for each.
         azimuth: Direction of view about the vertical, deg: 90 has x to the right, 180 has y to the right.
         distance: From the camera to the point, m.
     """
 
-    centre: Float[np.ndarray, "frames xyz"]
+    centre: Float[np.ndarray, "*panels frames xyz"]
     azimuth: float
     distance: float
 
 
 def pictures(
-    model: mujoco.MjModel, states: Float[np.ndarray, "frames state"], camera: Camera, *, width: int, height: int
-) -> UInt8[np.ndarray, "frames height width 4"] | None:
-    """What a camera sees of a model in each state, in RGBA, transparent where nothing is; None without OpenGL.
+    model: mujoco.MjModel,
+    states: Float[np.ndarray, "panels frames state"],
+    camera: Camera,
+    *,
+    ghost: Float[np.ndarray, "frames state"] | None = None,
+    width: int,
+    height: int,
+) -> UInt8[np.ndarray, "panels frames height width 3"]:
+    """What a camera sees of a model in each state, in RGB, and of a `ghost` of it in another state that shines through.
 
-    The way to OpenGL is that of the environment's `MUJOCO_GL` alone where that is set, so `MUJOCO_GL=disable` draws
-    nothing.
+    Nothing is drawn of a state that is NaN. The way to OpenGL is that of the environment's `MUJOCO_GL` alone where that
+    is set, so `MUJOCO_GL=disable` draws outlines.
     """
-    # No room for its files, or no process: then there are no pictures, which is no reason for a run to fail.
+    beside = np.full(states.shape[1:], np.nan) if ghost is None else ghost
+    # No room for its files, or no process: then outlines have to do, as that is no reason for a run to fail.
     with contextlib.suppress(OSError), tempfile.TemporaryDirectory(prefix="madoc-") as place:
         folder = Path(place)
         for library in _ways():
             if not (folder / "model.mjb").exists():
                 mujoco.mj_saveModel(model, str(folder / "model.mjb"))
-                np.savez(folder / "asked.npz", states=states, size=np.array([width, height]), **vars(camera))
+                asked = {"states": states, "ghost": beside, "size": np.array([width, height])} | vars(camera)
+                np.savez(folder / "asked.npz", allow_pickle=False, **asked)
             if _draw(folder, library):
                 return np.load(folder / "pictures.npy", allow_pickle=False)
-    return None
+    of_ghost = outlines(model, beside)[0]
+    each = zip(states, camera.centre, strict=True)
+    return np.stack([_sketches(model, *part, of_ghost, camera=camera, width=width, height=height) for part in each])
+
+
+def _sketches(
+    model: mujoco.MjModel,
+    states: Float[np.ndarray, "frames state"],
+    centre: Float[np.ndarray, "frames xyz"],
+    ghost: Float[np.ndarray, "frames geoms ends xyz"],
+    *,
+    camera: Camera,
+    width: int,
+    height: int,
+) -> UInt8[np.ndarray, "frames height width 3"]:
+    """Outlines of each geom from the side, at twice the size and made smaller, so that edges are smooth."""
+    from PIL import Image, ImageDraw
+
+    ends, radius = outlines(model, states)
+    scale = height / (camera.distance * np.tan(np.radians(float(model.vis.global_.fovy)) / 2.0))
+    along, drawn = int(camera.azimuth > 135.0), []
+    for point, *bodies in zip(centre, ends, ghost, strict=True):
+        picture = Image.new("RGB", (2 * width, 2 * height), PAPER)
+        for body, (colour, opacity) in zip(bodies, (BODY, GHOST), strict=True):
+            shape = Image.new("L", picture.size)
+            pen = ImageDraw.Draw(shape)
+            flat = (body - point)[..., [along, 2]] * scale * (1.0, -1.0) + (width, height)
+            for line, thick in zip(flat, (radius * scale).tolist(), strict=True):
+                if np.isfinite(line).all():
+                    pen.line([tuple(end) for end in line.tolist()], opacity, max(1, round(2.0 * thick)))
+                    for x, y in line.tolist():
+                        pen.ellipse((x - thick, y - thick, x + thick, y + thick), opacity)
+            picture.paste(colour, mask=shape)
+        drawn.append(np.asarray(picture.reduce(2)))
+    return np.stack(drawn)
 
 
 def side_camera(

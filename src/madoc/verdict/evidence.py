@@ -1,65 +1,153 @@
-"""What the hold-out looks like before and after calibration, as arrays for plots: `evidence.npz`."""
+"""What the hold-out looks like before and after calibration, as arrays for plots and films: `evidence.npz`."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from madoc.data import stride
 from madoc.diagnosis.channels import signal_names
-from madoc.identification.states import logged_states
-from madoc.identification.windows import evenly, first_rows, longest_fit, readings_at, windows_at
+from madoc.identification.replay import Readings
+from madoc.identification.states import logged_states, states_of
+from madoc.identification.windows import evenly
 from madoc.runs.files import replacing
-from madoc.simulation.attitudes import moved
+from madoc.simulation.attitudes import differences, moved
+from madoc.simulation.base import Simulator
 from madoc.verdict.bench import Bench
+from madoc.verdict.fitted_starts import FITTED, FittedReplays
 from madoc.verdict.open_loop import as_given
 
-TRACES = 6
-"""Largest number of stretches of the hold-out that are drawn."""
-TRACE_STRIDES = 100
-"""Largest length of a stretch of the hold-out in strides (`data.timescale`); shorter where no episode is as long."""
+SECONDS = 2.0
+"""Time in s that simulating the runs may take, by what simulating took in the search."""
+ROWS = (2_000, 20_000)
+"""Least and largest number of rows that are simulated, whatever time they take; a longer run is cut."""
+
+Runs = tuple[Float[np.ndarray, "told state"], Int[np.ndarray, " runs"], Int[np.ndarray, " runs"]]
+"""The state of each run at its first row, if the log tells states; that row, and the number of control steps."""
 
 
 def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float) -> dict[str, np.ndarray]:
-    """Arrays of the hold-out by name.
+    """Arrays of whole held-out runs by name, as many runs as there is time for; NaN behind the end of a run.
 
-    There are always `signals` (names), `scale` (typical change in a stride, in each signal's unit), `time` (s),
-    `episode` and `row` (where each stretch begins in the hold-out) and `measured` (stretches, times, signals). Where
-    states can be rebuilt there are also `before` and `after`, the same stretches simulated in the user's model as it
-    was given and at the estimate from the first measured state under the logged actions (NaN once a simulation has
-    failed), and `residual_before` and `residual_after` (windows, signals), simulated minus measured observations after
-    the shortest horizon.
+    There are always `signals` (names), `scale` (typical change in a stride, in each signal's unit), `time` (s) since
+    the start of a run, `names` of the runs, `row` (where each begins in the hold-out) and `measured` (runs, times,
+    signals). Where the log tells positions there are also `before` and `after`, the same runs simulated in the user's
+    model as it was given and at the estimate under the logged actions, without another look at the log (NaN once a
+    simulation has failed), and `posture_measured`, `posture_before` and `posture_after` (runs, times, qpos). Runs start
+    at the first logged state, or where velocities are hidden or noisy at one fitted to the first `fitted` rows. Where
+    states are known there are `residual_before` and `residual_after` (windows, signals), simulated minus measured
+    observations after the shortest horizon.
     `mean` is the estimate in physical units, `control_step` the time between two rows in s.
     """
-    held, replays = bench.held_out, bench.replays if bench.states_known else None
-    states, rows = logged_states(held, bench.simulator.task) if replays else (np.empty(0), np.arange(len(held)))
-    steps = longest_fit(held, rows, TRACE_STRIDES * stride(bench.problem.dataset))
-    chosen = evenly(first_rows(held, rows, steps), TRACES)
-    first = rows[chosen]
+    held, simulator = bench.held_out, bench.simulator
+    most = int(np.clip(SECONDS * bench.rate, *ROWS))
+    fitted = 0 if bench.states_known else FITTED * stride(bench.problem.dataset)
+    states, first, lengths = _runs(bench, fitted, most)
+    steps = int(lengths.max())
+    kept = np.minimum(np.arange(steps), lengths[:, None] - 1)  # the last row again, behind the end of a run
+    over = np.arange(steps + 1) > lengths[:, None]
+    logged = held.transitions
+    following = np.asarray(logged.next_observation)[first[:, None] + kept]
+    measured = np.concatenate([np.asarray(logged.observation)[first][:, None], following], axis=1)
+    named = held.run_names or tuple(f"run {1 + index}" for index in range(len(held.episode_starts)))
     arrays = {
-        "signals": np.array(signal_names(bench.simulator.task)),
+        "signals": np.array(signal_names(simulator.task)),
         "scale": bench.change,
         "time": control_step * np.arange(steps + 1),
-        "episode": held.episode_of(first),
+        "names": np.array([named[episode] for episode in held.episode_of(first)]),
         "row": first,
-        "measured": readings_at(held, first, steps),
+        "measured": _until(over, measured),
     }
-    if replays is None:
+    if bench.states.kind == "unknown" or steps < 1 or not len(states):
         return arrays
-    point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
-    given = as_given(bench.simulator)
-    models = (
-        ("before", replace(replays, simulator=given), -np.ones((1, len(given.parameters)))),
-        ("after", replays, point[None]),
-    )
-    start, windows = arrays["measured"][:, :1], windows_at(held, states[chosen], first, steps)
-    for when, replayed, at in models:
-        simulated = replayed.residuals(at, windows)[0] * bench.change
-        seen = moved(bench.simulator.task.attitudes, arrays["measured"][:, 1:], simulated)
-        arrays[when] = np.concatenate([start, seen], axis=1)
-        arrays[f"residual_{when}"] = replayed.residuals(at, replays.single_steps())[0, :, 0] * bench.change
+    given, actions = as_given(simulator), np.asarray(logged.action, dtype=np.float64)[first[:, None] + kept]
+    point = np.clip(simulator.parameters.to_unit(mean), -1.0, 1.0)
+    for when, model, at in (("before", given, -np.ones(len(given.parameters))), ("after", simulator, point)):
+        starts = states if not fitted else _fitted(bench, model, at, states, first, fitted)
+        visited, seen = _simulated(model, at, starts, actions, exact=not fitted)
+        seen = moved(simulator.task.attitudes, measured, differences(simulator.task.attitudes, seen, measured))
+        arrays |= {when: _until(over, seen), f"posture_{when}": _until(over, visited[..., : simulator.task.model.nq])}
+        if bench.states_known:
+            replays = replace(bench.replays, simulator=model)
+            residuals = replays.residuals(at[None], replays.single_steps())
+            arrays[f"residual_{when}"] = residuals[0, :, 0] * bench.change
+    arrays["fitted"] = np.array(fitted)
+    arrays["posture_measured"] = _until(over, _posture(simulator, measured, visited))
     return arrays
+
+
+def _runs(bench: Bench, fitted: int, most: int) -> Runs:
+    """The held-out runs from the first state that can be rebuilt, of at most so many rows together.
+
+    There are no states where the log tells none. Runs too short to fit a start to are left out, unless all are.
+    """
+    held, states = bench.held_out, np.zeros((0, 0))
+    rows = held.episode_starts
+    if bench.states_known:
+        states, rows = logged_states(held, bench.simulator.task)
+    elif bench.states.kind == "approximate":
+        states, rows = states_of(held, bench.simulator).guesses()
+    first = np.unique(held.episode_of(rows), return_index=True)[1]
+    lengths = held.episode_ends[held.episode_of(rows[first])] - rows[first]
+    enough = lengths > fitted
+    if not enough.any():
+        states = states[:0]
+    elif len(states):
+        first, lengths = first[enough], lengths[enough]
+    count = max(1, int((np.cumsum(lengths) <= most).sum()))
+    chosen = evenly(np.arange(len(first)), count)
+    return states[first[chosen]] if len(states) else states, rows[first[chosen]], np.minimum(lengths[chosen], most)
+
+
+def _fitted(
+    bench: Bench,
+    model: Simulator,
+    point: Float[np.ndarray, " d"],
+    states: Float[np.ndarray, "runs state"],
+    first: Int[np.ndarray, " runs"],
+    steps: int,
+) -> Float[np.ndarray, "runs state"]:
+    """The states from which a model comes nearest to the first readings of each run."""
+    held = bench.held_out
+    readings = Readings.at(held, states_of(held, model), first, steps, bench.change)
+    moving = stride(bench.problem.dataset)
+    return FittedReplays(model, readings, states, first, held.episode_of(first), moving, ()).starts(point[None])[0][0]
+
+
+def _simulated(
+    model: Simulator,
+    point: Float[np.ndarray, " d"],
+    states: Float[np.ndarray, "runs state"],
+    actions: Float[np.ndarray, "runs steps action"],
+    *,
+    exact: bool,
+) -> tuple[Float[np.ndarray, "runs times state"], Float[np.ndarray, "runs times signals"]]:
+    """The states that a model goes through and what its sensors show; exact states are those that sensors told."""
+    system = model.bind(model.parameters.to_physical(point)[None])
+    start = np.ascontiguousarray(states[None])
+    start = system.unbiased(start) if exact else start
+    visited = np.concatenate([start[0, :, None], system.roll_out(start, actions[None])[0]], axis=1)
+    return visited, system.observe(visited.reshape(1, -1, visited.shape[-1])).reshape(*visited.shape[:2], -1)
+
+
+def _posture(
+    simulator: Simulator,
+    measured: Float[np.ndarray, "runs times signals"],
+    simulated: Float[np.ndarray, "runs times state"],
+) -> Float[np.ndarray, "runs times qpos"]:
+    """The positions that readings tell; those of the simulation where they tell none, as of a base that is not seen."""
+    task = simulator.task
+    told = task.state_from_observation or task.posture
+    assert told is not None  # else the log's states are unknown
+    positions = np.array(told(measured), dtype=np.float64)[..., : task.model.nq]
+    unseen = np.isnan(positions).any((0, 1)) | (np.ptp(positions, axis=(0, 1)) == 0.0)
+    return np.where(unseen, simulated[..., : task.model.nq], positions)
+
+
+def _until(over: np.ndarray, values: Float[np.ndarray, "runs times values"]) -> Float[np.ndarray, "runs times values"]:
+    """The values up to the end of each run, in single precision, which is enough to draw them."""
+    return np.where(over[..., None], np.nan, values).astype(np.float32)
 
 
 def save_evidence(path: Path, arrays: dict[str, np.ndarray]) -> None:

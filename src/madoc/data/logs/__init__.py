@@ -12,7 +12,15 @@ from pathlib import Path
 
 from madoc.data.dataset import Dataset
 from madoc.data.findings import Finding
-from madoc.data.logs import csv_reader, hdf5_reader, lerobot_reader, mcap_reader, minari_runs, parquet_reader
+from madoc.data.logs import (
+    csv_reader,
+    hdf5_reader,
+    lerobot_reader,
+    mcap_reader,
+    minari_runs,
+    parquet_reader,
+    rosbag_reader,
+)
 from madoc.data.logs.assembly import assemble, wanted_columns
 from madoc.data.logs.jumps import split_episodes, without_copies
 from madoc.data.logs.tables import Run, Stored, asked_tables
@@ -53,6 +61,7 @@ LOG_FORMATS: dict[str, LogFormat] = {
     "hdf5": LogFormat(hdf5_reader.read, (".h5", ".hdf5", ".hdf")),
     "parquet": LogFormat(parquet_reader.read, (".parquet", ".pq")),
     "mcap": LogFormat(mcap_reader.read, (".mcap",)),
+    "rosbag": LogFormat(rosbag_reader.read, (".db3",)),
     "minari": LogFormat(minari_runs.read, ()),
     "lerobot": LogFormat(lerobot_reader.read, ()),
 }

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from madoc.data.logs.tables import Run, Table
+from madoc.data.logs.tables import MISSING, WIDEST, Run, Table
 from madoc.data.sizes import LARGEST, check_size
 from madoc.errors import MadocError
 
@@ -16,7 +16,8 @@ SEPARATORS = (",", ";", "\t")
 def read(path: Path, wanted: Collection[str]) -> list[Run]:
     """One run. A comma, semicolon or tab separates, whichever the header has most of; `#` begins a comment.
 
-    A header may itself begin with `#`, as NumPy writes it. Cells stay text where not all of the file is numbers.
+    A header may itself begin with `#`, as NumPy writes it. Cells stay text where not all of the file is numbers. Cells
+    that are lists, as "[0.1, 0.2]" or "[0.1 0.2]" in a column `position`, are the columns `position[0]`, `position[1]`.
     """
     check_size(path.stat().st_size, f"the text of {path.name}", LARGEST)
     try:
@@ -105,8 +106,26 @@ def _cells(lines: Sequence[str], names: list[str], separator: str, first: int, p
         rows[line] = cells
     if not rows:
         raise MadocError(f"expected rows below the header of {path.name}, got none; record it again")
-    columns = {
-        name: np.array(column, dtype=object)
-        for name, column in zip(names, zip(*rows.values(), strict=True), strict=True)
-    }
+    columns: dict[str, np.ndarray] = {}
+    for name, column in zip(names, zip(*rows.values(), strict=True), strict=True):
+        columns |= _elements(name, column, list(rows), path)
     return Table(columns, lines=np.array(list(rows)))
+
+
+def _elements(name: str, cells: Sequence[str], lines: Sequence[int], path: Path) -> dict[str, np.ndarray]:
+    """A column by its name, or the columns of its elements where its cells are lists; a missing list lacks them all."""
+    bare = [cell.strip() for cell in cells]
+    lists = [None if cell.lower() in MISSING else cell[1:-1].replace(",", " ").split() for cell in bare]
+    lengths = {len(values): line for values, line in zip(lists, lines, strict=True) if values is not None}
+    listed = all(values is None or (cell[0], cell[-1]) == ("[", "]") for cell, values in zip(bare, lists, strict=True))
+    if not lengths or not listed or max(lengths) > WIDEST:
+        return {name: np.array(cells, dtype=object)}
+    if len(lengths) > 1:
+        few, many = min(lengths), max(lengths)
+        raise MadocError(
+            f"expected as many values in every list of column {name!r} of {path.name}, got {few} in line "
+            f"{lengths[few]} and {many} in line {lengths[many]}; pad them, or leave the column out"
+        )
+    (length,) = lengths
+    table = np.array([[""] * length if values is None else values for values in lists], dtype=object)
+    return {f"{name}[{index}]": table[:, index] for index in range(length)}

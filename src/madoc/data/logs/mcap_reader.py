@@ -1,108 +1,28 @@
-"""MCAP: topics of JSON or ROS 2 messages, each with its own clock."""
+"""MCAP: topics of JSON or ROS 2 messages."""
 
-import json
-from array import array
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-import numpy as np
-
-from madoc.data.logs.tables import WIDEST, Run, Table
-from madoc.data.sizes import LARGEST, check_size
+from madoc.data.logs.messages import EXTRA, Kind, Message, run_of
+from madoc.data.logs.tables import Run
 from madoc.errors import MadocError
 
 if TYPE_CHECKING:
-    from mcap.records import Channel, Chunk, Message, Schema
+    from mcap.records import Chunk
 
-CLOCK = "log_time"
 LARGEST_CHUNK = 200_000_000
 """Largest size of a chunk, bytes when unpacked; recorders write chunks of a million or less."""
-MOST_NAMES = 10_000
-"""Number of columns of a topic that are known by name, beside those that are asked for."""
 _MOST_OF_LZ4 = 255
 """Largest ratio by which LZ4 packs."""
-_OF_TIMES = 200
-"""Size of the three times of a message, bytes in memory."""
-EXTRA = 'pip install "madoc-calibration[logs]"'
-
-
-@dataclass(frozen=True)
-class _Topic:
-    """Messages of one topic.
-
-    Attributes:
-        decode: The decoder of its messages.
-        columns: The wanted numbers by path, NaN where a message lacks one.
-        times: Times in ns at which each message was logged, published and measured; None for one without a stamp.
-        names: Paths of the numbers of the first message.
-    """
-
-    decode: Callable[[bytes], object]
-    columns: dict[str, "array[float]"] = field(default_factory=dict)
-    times: list[tuple[int, int, int | None]] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
-
-    def add(self, name: str, message: "Message", wanted: Collection[str]) -> None:
-        """Take over the wanted numbers of a message; those of the first are named all."""
-        content, count = self.decode(message.data), len(self.times)
-        for path, number in _flat(name, content):
-            if not count and len(self.names) < MOST_NAMES:
-                self.names.append(path)
-            if path in wanted:
-                self.columns.setdefault(path, array("d", [np.nan]) * count).append(number)
-        for column in self.columns.values():
-            column.extend([np.nan] * (count + 1 - len(column)))
-            del column[count + 1 :]  # of a name that is there twice
-        self.times.append((message.log_time, message.publish_time, _stamp(content)))
-
-    @property
-    def size(self) -> int:
-        """Size of what was taken over, bytes in memory."""
-        return sum(8 * len(column) for column in self.columns.values()) + _OF_TIMES * len(self.times)
 
 
 def read(path: Path, wanted: Collection[str]) -> list[Run]:
-    """One run with a table for each topic. A column is named by topic and path of a field: `/joints.position[0]`.
-
-    Where a message names its elements, as sensor_msgs/JointState does in `name`, the names are in the brackets:
-    `/joints.position[shoulder]`. Each topic has `log_time`, `publish_time` and, where it is stamped, `header.stamp`, in
-    s since the first message of the file. All messages of topics with a wanted column are decoded, and one message of
-    every other topic, for the names of its columns.
-    """
-    topics: dict[str, _Topic] = {}
-    unknown: dict[str, str] = {}
-    for channel, schema, message in _messages(path):
-        name = channel.topic
-        if name not in topics:
-            decode = _decoder(channel, schema)
-            if decode is None:
-                unknown[name] = channel.message_encoding or "no"
-                continue
-            topics[name] = _Topic(decode)
-        topic = topics[name]
-        if topic.times and not any(f"{column}.".startswith((f"{name}.", f"{name}[")) for column in wanted):
-            continue
-        try:
-            topic.add(name, message, wanted)
-        except Exception as error:  # decoders raise anything from KeyError to struct.error on a damaged message
-            raise MadocError(
-                f"cannot decode message {len(topic.times)} of {name} in {path.name} ({error}); it is damaged, "
-                "record it again"
-            ) from error
-        if len(topic.times) % 1000 == 0:
-            size = sum(topic.size for topic in topics.values())
-            check_size(size, f"the columns of {path.name} that are asked for", LARGEST)
-    if not topics:
-        what = ", ".join(f"{topic} ({encoding} encoding)" for topic, encoding in unknown.items()) or "no messages"
-        raise MadocError(f"expected topics of JSON or ROS 2 messages in {path.name}, got {what}; convert it to CSV")
-    others = {topic: f"a topic of {encoding} encoding" for topic, encoding in unknown.items()}
-    origin = min(topic.times[0][0] for topic in topics.values())
-    return [Run(path.name, tuple(_table(name, topic, origin, others) for name, topic in topics.items()))]
+    """One run with a table for each topic, as `messages.run_of` makes them."""
+    return [run_of(path, _messages(path), wanted)]
 
 
-def _messages(path: Path) -> Iterator[tuple["Channel", "Schema | None", "Message"]]:
+def _messages(path: Path) -> Iterator[Message]:
     try:
         from mcap.reader import make_reader
     except ImportError as error:
@@ -111,8 +31,11 @@ def _messages(path: Path) -> Iterator[tuple["Channel", "Schema | None", "Message
         with path.open("rb") as file:
             _check_chunks(file)
             file.seek(0)
-            for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
-                yield channel, schema, message
+            for schema, channel, found in make_reader(file, validate_crcs=True).iter_messages():
+                kind = Kind(channel.message_encoding)
+                if schema is not None and kind.encoding == "cdr":
+                    kind = Kind("cdr", schema.name, schema.data.decode(), schema.encoding == "ros2idl")
+                yield Message(channel.topic, kind, found.data, found.log_time, found.publish_time)
     except Exception as error:  # the reader passes on what its decompressors and unpackers raise
         raise MadocError(
             f"cannot read {path.name} as MCAP ({type(error).__name__}: {error}); it is damaged or was cut short, "
@@ -142,73 +65,3 @@ def _unpacked_size(chunk: "Chunk") -> int:
 
         return len(LZ4FrameDecompressor().decompress(chunk.data, max_length=LARGEST_CHUNK + 1))
     return 0
-
-
-def _decoder(channel: "Channel", schema: "Schema | None") -> Callable[[bytes], object] | None:
-    """The decoder of a channel's messages; None for an unknown encoding."""
-    if channel.message_encoding == "json":
-        return json.loads
-    if channel.message_encoding == "cdr" and schema is not None:
-        try:
-            from mcap_ros2.decoder import DecoderFactory
-        except ImportError as error:
-            raise MadocError(f"topic {channel.topic} holds ROS 2 messages, which need: {EXTRA} ({error})") from error
-        return DecoderFactory().decoder_for(channel.message_encoding, schema)
-    return None
-
-
-def _flat(name: str, value: object, elements: list[str] | None = None) -> Iterator[tuple[str, float]]:
-    """Numbers in a message by path; text and empty fields are left out."""
-    if isinstance(value, bool | int | float):
-        yield name, _float(value)
-    elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        if len(value) > WIDEST:
-            return  # a picture
-        labels = elements if elements is not None and len(elements) == len(value) else range(len(value))
-        for label, part in zip(labels, value, strict=True):
-            yield from _flat(f"{name}[{label}]", part)
-    elif not isinstance(value, str | bytes):
-        parts = _parts(value)
-        names = parts.get("name")
-        inner = names if isinstance(names, list) and all(isinstance(text, str) for text in names) else None
-        for key, part in parts.items():
-            if key == "stamp" and {"sec", "nanosec"} <= _parts(part).keys():
-                continue  # in whole nanoseconds, by `_stamp`
-            yield from _flat(f"{name}.{key}", part, inner)
-
-
-def _float(value: float) -> float:
-    """A number as float; a whole number beyond its range is infinite."""
-    try:
-        return float(value)
-    except OverflowError:
-        return float("inf") if value > 0 else float("-inf")
-
-
-def _parts(value: object) -> dict[str, object]:
-    """Fields of a decoded message."""
-    if value is None:
-        return {}
-    if isinstance(value, Mapping):
-        return {str(key): part for key, part in value.items()}
-    slots: Collection[str] = getattr(value, "__slots__", ())
-    fields = getattr(value, "__dict__", None) or {key: getattr(value, key) for key in slots}
-    return {key: part for key, part in fields.items() if not key.startswith("_")}
-
-
-def _stamp(content: object) -> int | None:
-    """Time in ns at which a ROS message says it was measured; None for a message without a stamp."""
-    parts = _parts(_parts(_parts(content).get("header")).get("stamp"))
-    seconds, nanoseconds = parts.get("sec"), parts.get("nanosec")
-    if not isinstance(seconds, int | float) or not isinstance(nanoseconds, int | float):
-        return None
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
-
-
-def _table(name: str, topic: _Topic, origin: int, others: Mapping[str, str]) -> Table:
-    """Messages as columns, in the order of logging."""
-    columns = {key: np.array(values) for key, values in topic.columns.items()}
-    for clock, times in zip((CLOCK, "publish_time", "header.stamp"), zip(*topic.times, strict=True), strict=True):
-        if None not in times:
-            columns[clock] = (np.array(times, dtype=np.int64) - origin) / 1e9
-    return Table(columns, CLOCK, others=others, unread=[key for key in topic.names if key not in columns])

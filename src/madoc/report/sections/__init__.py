@@ -11,13 +11,14 @@ from madoc.report.sections.course import curves, trace
 from madoc.report.sections.estimates import correlations, estimates, grouping
 from madoc.report.sections.holdout import holdout, residuals, signals
 from madoc.report.sections.outcome import asked, cost, policies
-from madoc.report.sections.robustness import film, robustness
+from madoc.report.sections.robustness import film, motion, robustness
 
 SECTIONS: Mapping[str, tuple[str, Callable[[Run], dict[str, object] | str]]] = {
-    "estimates": ("Estimates", estimates),
-    "holdout": ("On data it has not seen", holdout),
-    "lacks": ("What the model may lack", lacks),
+    "motion": ("The robot in a held-out run", motion),
     "signals": ("Measured and simulated", signals),
+    "estimates": ("Estimates", estimates),
+    "lacks": ("What the model may lack", lacks),
+    "holdout": ("On data it has not seen", holdout),
     "residuals": ("Residual by signal", residuals),
     "trace": ("The way there", trace),
     "grouping": ("What acts alike", grouping),

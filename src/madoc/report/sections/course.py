@@ -6,7 +6,7 @@ import numpy as np
 
 from madoc.report.charts import Level, Line, line_chart, thinned
 from madoc.report.reading import MetricLog, Run
-from madoc.report.words import metric_title, parameter_title, short_count
+from madoc.report.words import metric_title, parameter_title
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,6 @@ def _trace_chart(run: Run, log: MetricLog, name: str, low: float, high: float, u
         [line],
         label=f"{name} over the run",
         x_title=x_title,
-        x_words=short_count,
         y_range=(low, high),
         levels=[Level(run.truth[name], "truth")] if name in run.truth else [],
     )
@@ -114,7 +113,6 @@ def _panel(log: MetricLog, panel: Panel) -> dict[str, object] | None:
         lines,
         label=panel.title,
         x_title=x_title,
-        x_words=short_count,
         y_range=panel.y_range,
         levels=panel.levels,
         log=log_scale,

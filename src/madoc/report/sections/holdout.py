@@ -1,18 +1,20 @@
 """The estimate on held-out data: the verdict's numbers, replays and residuals."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Int
+from markupsafe import Markup
 
 from madoc.calibration.holdout import Fitted, PredictionError, ToldApart
-from madoc.report.charts import Line, line_chart
-from madoc.report.reading import Run
+from madoc.report.charts import Line, drawn, line_chart, rounded
+from madoc.report.reading import Evidence, Run
 from madoc.report.words import count, number
 
 SIGNALS_SHOWN = 24
 """Largest number of signals that are drawn; of more, those with the largest residuals at the estimate are."""
-WINDOWS_SHOWN = 3
-"""Largest number of held-out windows in one chart, one after another."""
+NUMBERS = 250_000
+"""Largest number of values of all lines of signals, 2 MB of the page; of more, every second row is drawn, or third."""
 
 
 def holdout(run: Run) -> dict[str, object] | str:
@@ -39,7 +41,6 @@ def holdout(run: Run) -> dict[str, object] | str:
         lines,
         label="prediction error by horizon",
         x_title="control steps ahead" + (" of a fitted start" if isinstance(held, Fitted) else ""),
-        x_words=number,
         log=True,
     )
     unit = "a step" if errors.stride == 1 else f"{errors.stride} steps"
@@ -53,60 +54,79 @@ def _error_line(name: str, errors: Sequence[PredictionError], colour: str, *, da
 
 
 def signals(run: Run) -> dict[str, object] | str:
-    """Measured against simulated on the hold-out, signal by signal."""
+    """Measured against simulated in whole held-out runs, signal by signal, with residuals."""
     evidence = run.evidence
     if evidence is None:
         return "Nothing was held out, so there is nothing to replay."
     if evidence.before is None or evidence.after is None:
-        return "States cannot be rebuilt from what was measured, so no stretch of the log can be replayed."
-    order = np.argsort(-_error(evidence.after - evidence.measured, evidence.scale))[:SIGNALS_SHOWN]
-    windows = min(WINDOWS_SHOWN, len(evidence.measured))
-    charts = []
-    for signal in order:
-        lines = [
-            Line(name, _joined(values[:windows, :, signal]), colour, dashed=dashed)
-            for name, values, colour, dashed in (
-                ("your model as given", evidence.before, "before", True),
-                ("measured", evidence.measured, "measured", False),
-                ("calibrated", evidence.after, "after", False),
-            )
-        ]
-        name = evidence.signals[signal]
-        chart = line_chart(
-            _in_a_row(evidence.time, windows),
-            lines,
-            label=f"{name}: measured and simulated",
-            x_title="time, s (one stretch after another)",
-            y_range=_fit(lines),
-        )
-        charts.append({"title": name, "unit": run.units.get(name, ""), "chart": chart})
-    legend = [("measured", "measured"), ("before", "your model as given"), ("after", "simulated, calibrated")]
-    return {"charts": charts, "legend": legend, "omitted": len(evidence.signals) - len(order)}
+        return "Positions cannot be told from what was measured, so no run can be replayed."
+    if len(evidence.time) < 3:
+        return "The rows of the log are not in order, so no run can be replayed."
+    worst = np.argsort(-_error(evidence.after - evidence.measured, evidence.scale))[:SIGNALS_SHOWN]
+    every = -(-evidence.measured[..., worst].size * len(_LINES) // NUMBERS)
+    names = [(index, evidence.signals[index]) for index in sorted(worst.tolist())]
+    whole = np.isfinite(evidence.measured).all(-1).sum(1)
+    charts = [
+        {"title": name, "unit": run.units.get(name, ""), "chart": _replayed(evidence, index, every, whole)}
+        for index, name in names
+    ]
+    legend = [("measured", "measured"), ("before", "your model as given"), ("after", "calibrated")]
+    fitted = evidence.fitted * float(evidence.time[1])
+    shown = {"charts": charts, "legend": legend, "omitted": len(evidence.signals) - len(worst), "every": every}
+    return shown | {"names": evidence.names, "chosen": int(whole.argmax()), "fitted": fitted}
 
 
-def _in_a_row(time: np.ndarray, windows: int) -> np.ndarray:
-    """The times of windows one after another, and of a gap after each."""
-    step = float(np.diff(time).mean()) if len(time) > 1 else 1.0
-    one = np.append(time, time[-1] + step)
-    return np.concatenate([one + window * (one[-1] - one[0] + step) for window in range(windows)])
+_LINES = (
+    ("measured", "measured", {"width": 6}, 0.4, "y"),
+    ("before", "your model as given", {"width": 1.5, "dash": "dash"}, 1.0, "y"),
+    ("after", "calibrated", {"width": 2}, 1.0, "y"),
+    ("before", "your model as given, less measured", {"width": 1.5, "dash": "dash"}, 1.0, "y2"),
+    ("after", "calibrated, less measured", {"width": 2}, 1.0, "y2"),
+)
+"""Array and colour of each line of a signal, what it is, pen, opacity and axis; the last on top."""
 
 
-def _joined(windows: np.ndarray) -> np.ndarray:
-    """Windows one after another, a gap after each."""
-    return np.concatenate([np.append(window, np.nan) for window in windows])
+def _replayed(evidence: Evidence, signal: int, every: int, whole: Int[np.ndarray, " runs"]) -> Markup:
+    """One signal in all runs, of which the page shows the longest until a reader chooses another.
+
+    `whole` is the number of readings of each run.
+    """
+    arrays = {"measured": evidence.measured, "before": evidence.before, "after": evidence.after}
+    of_signal = {name: each[:, :, signal] for name, each in arrays.items() if each is not None}
+    data: list[Mapping[str, object]] = []
+    chosen = int(whole.argmax())
+    ranges: dict[str, list[tuple[float, float]]] = {"xaxis": [], "yaxis": [], "yaxis2": []}
+    for run in range(len(evidence.measured)):
+        ranges["xaxis"].append((0.0, float(evidence.time[max(whole[run] - 1, 1)])))
+        values = {name: each[run] for name, each in of_signal.items()}
+        missed = {name: values[name] - values["measured"] for name in ("before", "after")}
+        width = float(np.ptp(values["measured"][np.isfinite(values["measured"])]))
+        ranges["yaxis"].append(_fit([values["measured"], values["after"]], values["before"], width))
+        ranges["yaxis2"].append(_fit([missed["after"]], missed["before"], width))
+        for array, name, pen, opacity, axis in _LINES:
+            y = rounded((values if axis == "y" else missed)[array][::every])
+            step = {"x0": 0.0, "dx": float(evidence.time[1]) * every, "y": y, "yaxis": axis}
+            look = {"mode": "lines", "line": pen | {"color": f"var(--{array})"}, "opacity": opacity}
+            data.append(step | look | {"name": name, "meta": run, "visible": run == chosen})
+    layout = {
+        "height": 300,
+        "hovermode": "x unified",
+        "xaxis": {"title": {"text": "time, s"}, "anchor": "y2", "range": ranges["xaxis"][chosen]},
+        "yaxis": {"domain": [0.36, 1.0], "range": ranges["yaxis"][chosen]},
+        "yaxis2": {"domain": [0.0, 0.26], "range": ranges["yaxis2"][chosen], "nticks": 3},
+        "meta": ranges,
+    }
+    return drawn({"data": data, "layout": layout}, f"{evidence.signals[signal]}: measured and simulated")
 
 
-def _fit(lines: Sequence[Line]) -> tuple[float, float] | None:
-    """The range of all but the model as given, which may extend it by its own width at most to either side."""
-    near = np.concatenate([line.y for line in lines if line.colour != "before"])
-    every = np.concatenate([line.y for line in lines])
-    near, every = near[np.isfinite(near)], every[np.isfinite(every)]
-    if not len(near):
-        return None
-    span = max(float(np.ptp(near)), 1e-12)
-    low = max(float(every.min()), float(near.min()) - span)
-    high = min(float(every.max()), float(near.max()) + span)
-    air = 0.06 * max(high - low, 1e-12)
+def _fit(near: Sequence[np.ndarray], far: np.ndarray, most: float) -> tuple[float, float]:
+    """The range of what is near, and of what is far as much as extends it by `most` to either side."""
+    shown, far = (part[np.isfinite(part)] for part in (np.concatenate(near), far))
+    if not len(shown):
+        return -1.0, 1.0
+    every = np.append(shown, np.clip(far, shown.min() - most, shown.max() + most))
+    low, high = float(every.min()), float(every.max())
+    air = 0.06 * max(high - low, 1e-9)
     return low - air, high + air
 
 

@@ -1,6 +1,10 @@
 """Policies where the estimate is not sure, which parameter errors matter, and what the policies look like."""
 
-from madoc.report.film import read_film, rendered, strip
+from dataclasses import replace
+
+import numpy as np
+
+from madoc.report.film import read_film
 from madoc.report.reading import Run
 from madoc.report.sections.outcome import POLICIES
 
@@ -18,21 +22,22 @@ def robustness(run: Run) -> dict[str, object] | str:
     return {"draws": run.evaluation.over_draws, "titles": titles, "costs": costs, "largest": largest or 1.0}
 
 
+def motion(run: Run) -> dict[str, object] | str:
+    """A held-out run, measured over simulated."""
+    seen = read_film(run.folder / "motion.npz")
+    if seen is None or run.evidence is None:
+        return "No film was made: no held-out run could be replayed, or the robot has no shape."
+    whole = np.isfinite(run.evidence.measured).all(-1).sum(1)
+    longest, shown = float(run.evidence.time[whole.max() - 1]), float(seen.time[-1])
+    cut = shown if shown < longest - 1e-9 else None
+    return {"film": seen, "name": run.evidence.names[int(whole.argmax())], "cut": cut}
+
+
 def film(run: Run) -> dict[str, object] | str:
-    """An episode of each policy, as a strip of pictures; else as one of outlines, those of the truth in grey beside."""
-    seen = read_film(run.whole)
+    """An episode of each policy."""
+    seen = read_film(run.whole / "film.npz")
     if seen is None:
         return "No policy of this run was filmed."
-    names = seen.names
-    beside = names.index("truth") if "truth" in names else None
-    shown = rendered(seen)
-    strips = [
-        {
-            "title": POLICIES.get(name, (name, ""))[0],
-            "chart": shown[index] if shown else strip(seen, index, beside=beside),
-        }
-        for index, name in enumerate(names)
-    ]
     known = run.evaluation is not None and bool(run.evaluation.policies)
-    where = "the target" if known else "the calibrated simulator"
-    return {"strips": strips, "where": where, "ghost": not shown and len(names) > 1 and beside is not None}
+    named = replace(seen, sheets={POLICIES.get(name, (name, ""))[0]: sheet for name, sheet in seen.sheets.items()})
+    return {"film": named, "where": "the target" if known else "the calibrated simulator"}
