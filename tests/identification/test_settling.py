@@ -58,7 +58,7 @@ def test_states_of_a_smooth_robot_settle_in_two_steps_at_any_width():
     np.testing.assert_allclose(narrow.states, wide.states, atol=2e-4)
     np.testing.assert_allclose(narrow.deviation, 0.1, rtol=0.3)
     assert not narrow.unexplained(readings.observed[0].size, "cauchy").any()
-    assert narrow.simulations == len(readings) * 5
+    assert narrow.simulations == len(readings) * 6
 
 
 def test_wide_differences_and_restarts_find_states_at_contacts():

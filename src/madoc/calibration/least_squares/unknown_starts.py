@@ -46,6 +46,8 @@ FOLLOWED = (1.0, 0.3, 0.0)
 """Shares in [0, 1] of an initial state's step, of which every window takes the best: at contacts 1 may be too far."""
 LIKE_NOISE = 1.5
 """Cost of a window, in squared standard deviations; noise alone rarely exceeds it, as its mean is 0.8."""
+PLACINGS = 2
+"""Number of epochs of initial states alone where these include places and speeds of bases that no sensor shows."""
 SECOND_CHANCES = 2
 """Number of times that windows which a step of the parameters leaves unexplained begin anew."""
 WORSE = 2.0
@@ -135,7 +137,7 @@ class UnknownStarts:
     @staticmethod
     def settling_columns(problem: CalibrationProblem) -> int:
         """About how many systems are simulated in an epoch in which only initial states move."""
-        return 3 + problem.states.physical_size
+        return 4 + problem.states.physical_size
 
     def settle(
         self,
@@ -150,6 +152,8 @@ class UnknownStarts:
         None are once residuals of nearly all windows are noise. Until there are as many to go as restarts, differences
         become narrower; then windows whose residuals are more than noise begin anew.
         """
+        if self.readings.placed.any():
+            waiting = min(waiting, PLACINGS)
         width = WIDTHS[self.waiting - waiting] if waiting > RESTARTS else 0.0
         after = settle(self.simulator, self.readings, point, states, damping, width * errors, self.loss)
         if waiting <= RESTARTS:
@@ -203,7 +207,14 @@ class UnknownStarts:
         refining: bool,
     ) -> list[Plan]:
         """Differences around every search's point and initial states, in one batch each."""
-        slopes = slopes_at(self.simulator, self.readings, points, states, central=bool(self.touching.any()))
+        slopes = slopes_at(
+            self.simulator,
+            self.readings,
+            points,
+            states,
+            central=bool(self.touching.any()),
+            placed_alone=bool(self.readings.placed.any()) and not refining,
+        )
         searches = zip(slopes, points, damping.tolist(), state_damping, strict=True)
         return [
             self._plan(*each, contacts=self._contacts(each[1], state) if refining else None)
