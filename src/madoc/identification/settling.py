@@ -113,7 +113,7 @@ def settle(
         deviation=deviation,
         costs=costs.min(0),
         failures=int((~slopes.whole).sum()),
-        simulations=len(readings) * (1 + (readings.placed.sum() if placed_alone else len(width)) + len(TRIALS)),
+        simulations=len(readings) * (1 + (int(readings.placed.sum()) if placed_alone else len(width)) + len(TRIALS)),
     )
 
 
@@ -162,6 +162,28 @@ def restart(
         costs=new_costs,
         simulations=before.simulations + simulations + len(worse),
     )
+
+
+def with_bases_settled(
+    simulator: Simulator,
+    readings: Readings,
+    point: Float[np.ndarray, " d"],
+    guesses: Float[np.ndarray, "windows state"],
+) -> tuple[Float[np.ndarray, "windows state"], int]:
+    """Initial states from near which those of single contacts can be fitted, and the simulations that it took.
+
+    They are the guesses, but where sensors do not show where a base is: its place and speed settle there first.
+    """
+    if not readings.placed.any():
+        return guesses, 0
+    random, damping, none = (
+        np.random.default_rng(0),
+        np.full(len(guesses), FIRST_DAMPING),
+        np.zeros(len(readings.spread)),
+    )
+    first = settle(simulator, readings, point, guesses, damping, none, "cauchy")
+    after = restart(simulator, readings, point, guesses, first, "cauchy", random)
+    return after.states, after.simulations
 
 
 @cache

@@ -125,9 +125,11 @@ class UnknownStarts:
         return rows
 
     @staticmethod
-    def columns(problem: CalibrationProblem, *, smooth: bool) -> int:
+    def columns(problem: CalibrationProblem, *, smooth: bool, refining: bool) -> int:
         """Number of systems simulated for the derivatives of an epoch: differences by parameters and states."""
-        return 1 + (1 if smooth else 2) * len(problem.simulator.parameters) + problem.states.physical_size
+        placed = int(problem.states.placed.sum())
+        values = placed if placed and not refining else problem.states.physical_size
+        return 1 + (1 if smooth else 2) * len(problem.simulator.parameters) + values
 
     @staticmethod
     def trial_columns(*, smooth: bool) -> int:
@@ -177,14 +179,15 @@ class UnknownStarts:
         point = np.clip(plan.point + plan.steps[0], -1.0, 1.0)
         states = states + self.readings.in_state_units(plan.state_steps[0], states.shape[1])
         damping, simulations = np.full(len(states), FIRST_DAMPING), 0
-        for width in RESETTLING:
+        of_bases = bool(self.readings.placed.any())
+        for width in RESETTLING[of_bases:]:
             after = settle(self.simulator, self.readings, point, states, damping, width * errors, self.loss)
             states, damping, simulations = after.states, after.damping, simulations + after.simulations
         residuals = self.readings.residuals(self.simulator, point[None], states[None])[0, 0]
         costs = window_costs(residuals / np.tile(plan.deviation, self.readings.steps + 1), self.loss)
         simulations += len(states)
         after = replace(after, costs=costs, deviation=plan.deviation, errors=errors, simulations=simulations)
-        for again in range(SECOND_CHANCES):
+        for again in range(SECOND_CHANCES - of_bases):
             random = np.random.default_rng(RESTARTS + 1 + again)
             after = restart(self.simulator, self.readings, point, self.guesses, after, self.loss, random)
         if not plan.kept.any():
@@ -357,8 +360,9 @@ class UnknownStarts:
         contacts: Int[np.ndarray, "windows readings"],
         kept: Bool[np.ndarray, " windows"],
     ) -> float:
-        shape = (int(kept.sum()), *self.readings.observed.shape[1:])
-        return steady_cost(slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape), contacts[kept], self.loss)
+        shape, of_bases = (int(kept.sum()), *self.readings.observed.shape[1:]), bool(self.readings.placed.any())
+        residuals, left = slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape)
+        return steady_cost(residuals, left, contacts[kept], self.loss, steady_alone=of_bases)
 
     def _deviation(
         self, slopes: WindowSlopes, spare: Float[np.ndarray, "windows values"], kept: Bool[np.ndarray, " windows"]
