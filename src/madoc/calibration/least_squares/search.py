@@ -262,7 +262,8 @@ class Search:
             new["point"][0] = np.clip(plan.point + step, -1.0, 1.0)
             new["states"][0], new["state_damping"][0] = after.states, after.damping
         new["damping"][0] = np.clip(damping, *DAMPING_RANGE)
-        least = LEAST_STEP if windows.readings.placed.any() else 0.0
+        of_bases = bool(windows.readings.placed.any())
+        least = LEAST_STEP if of_bases else 0.0
         new["cost"][0], new["moved"][0] = cost, self._relative_step(plan, step, ROUGHLY_SETTLED, least)
         if not better and state.damping[0] <= self.starts.stuck:
             new["moved"][0] = max(new["moved"][0], 1.0)  # a damped step may be small far from the minimum too
@@ -280,7 +281,8 @@ class Search:
         )
         noise = float(np.median(plan.deviation))
         metrics = {"residual": float(np.sqrt(cost)) * noise, "moved": float(following.moved[0]), "noise": noise}
-        if following.moved[0] < 1.0 and self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0:
+        far = self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0
+        if following.moved[0] < 1.0 and far and not of_bases:  # with these every step looks anew
             moved = np.maximum(following.moved, 1.0)
             following = replace(following, waiting=settling.RESTARTS, moved=moved)
         columns = 2 + 2 * len(step) + len(plan.spread)  # the last for the contacts
