@@ -157,6 +157,50 @@ parameters:
 
 MODELS = {"arm.xml": ARM, "spring.xml": SPRING, "cart.xml": CART, "pendulum.xml": PENDULUM}
 
+SLED = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <default><geom type="sphere" size="0.02" mass="0.05" friction="0.5" priority="1"/></default>
+  <worldbody>
+    <geom name="ground" type="plane" size="5 5 1" pos="0 0 0.3" priority="0"/>
+    <body name="sled" pos="0 0 1"><freejoint name="base"/>
+      <site name="imu" pos="0.05 0 0.02"/>
+      <geom type="box" size="0.15 0.1 0.02" mass="1"/>
+      <geom name="a" pos="0.12 0.08 -0.05"/><geom name="b" pos="0.12 -0.08 -0.05"/>
+      <geom name="c" pos="-0.12 0.08 -0.05"/><geom name="d" pos="-0.12 -0.08 -0.05"/>
+      <body name="rider"><joint name="rail" type="slide" axis="1 0.3 0" damping="1"/>
+        <geom type="box" size="0.03 0.03 0.01" mass="0.6" contype="0" conaffinity="0"/></body>
+    </body>
+  </worldbody>
+  <actuator><position name="drive" joint="rail" kp="200"/></actuator>
+  <sensor><framequat name="attitude" objtype="site" objname="imu"/><gyro name="gyro" site="imu"/></sensor>
+</mujoco>
+"""
+"""A sled on four round feet, 0.07 m high, that a rider shakes; its IMU shows its attitude, nothing its place."""
+
+SLED_SPEC = """\
+madoc: 1
+name: sled
+model: sled.xml
+control_step: 0.02
+signals:
+  - {name: rider, reads: position(rail)}
+  - {name: rider_speed, reads: velocity(rail)}
+  - {name: w, reads: "sensor(attitude)[0]"}
+  - {name: x, reads: "sensor(attitude)[1]"}
+  - {name: y, reads: "sensor(attitude)[2]"}
+  - {name: z, reads: "sensor(attitude)[3]"}
+  - {name: roll, reads: "sensor(gyro)[0]"}
+  - {name: pitch, reads: "sensor(gyro)[1]"}
+  - {name: yaw, reads: "sensor(gyro)[2]"}
+actions:
+  - {name: target, actuator: drive, low: -0.1, high: 0.1}
+parameters:
+  - {field: geom_friction, elements: [a, b, c, d], name: friction, low: 0.1, high: 1}
+  - {field: body_mass, element: rider, low: 0.2, high: 1}
+"""
+SLED_TRUTH = {"friction": 0.4, "body_mass.rider": 0.7}
+
 
 def write_robot(folder, spec, file="robot.yaml", **models):
     """A spec file beside the models it may name; where it lies."""

@@ -124,7 +124,7 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     point = state.point.copy()
     state, epoch = search.step(problem, state)
     assert (state.waiting, state.rough) == (0, 0)
-    assert epoch.control_steps == 40 * 5 * (1 + 2 + 2)
+    assert epoch.control_steps == 40 * 5 * (1 + 2 + 3)
     np.testing.assert_array_equal(state.point, point)
     state, epoch = search.step(problem, state)
     derivatives, tried = 1 + len(truth) + 2, 1  # the first step helps, so no other is tried

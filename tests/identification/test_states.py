@@ -9,7 +9,7 @@ import pytest
 from madoc import robots, simulation
 from madoc.errors import MadocError
 from madoc.identification.states import probing_windows, states_observed_as, states_of
-from own_robots import CART_SPEC, write_robot
+from own_robots import CART_SPEC, SLED, SLED_SPEC, SLED_TRUTH, write_robot
 from robots import SPRING_TRUTH, recorded, spring
 
 SPRING = spring(max_episode_steps=100)
@@ -72,3 +72,14 @@ def test_windows_to_probe_begin_at_logged_states():
     simulator = simulation.make(SPRING, threads=1)
     windows = probing_windows(states_of(log, simulator), log, simulator, steps=8, count=3)
     np.testing.assert_array_equal(windows.states, log.transitions.observation[[0, 6, 12]])
+
+
+def test_a_base_that_no_sensor_shows_stands_on_the_floor_and_is_followed(tmp_path):
+    task = robots.load(write_robot(tmp_path, SLED_SPEC, sled=SLED)).task
+    log = recorded(task, SLED_TRUTH, 100, jax.random.key(0))
+    logged = states_of(log, simulation.make(task, threads=1))
+    assert (logged.kind, logged.measured) == ("approximate", 9)
+    np.testing.assert_array_equal(np.flatnonzero(logged.placed), [0, 1, 2, 8, 9, 10])
+    # Once it has fallen, it is 0.07 m above the ground, which is at 0.3 m; feet give way by less than a millimetre.
+    np.testing.assert_allclose(logged.states[40:, 2], 0.37, atol=2e-3)
+    np.testing.assert_allclose(logged.states[40:, 10], 0.0, atol=0.05)

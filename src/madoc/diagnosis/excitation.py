@@ -7,6 +7,8 @@ from jaxtyping import Float, PRNGKeyArray
 
 from madoc.data import Dataset, stride, typical_change
 from madoc.data.findings import Finding
+from madoc.identification.excitation import expected_half_widths
+from madoc.identification.fitted_windows import fit_windows, noise_of, windows_of
 from madoc.identification.gauss_newton import descend
 from madoc.identification.information import (
     Uncertainty,
@@ -28,6 +30,8 @@ from madoc.simulation.response import mass_like
 WINDOWS = {3: 300, 20: 60}
 """Largest number of windows, by their length in strides (`data.timescale`). Long ones narrow the intervals where
 sensors are noisy, short ones where the robot is chaotic."""
+FEWEST = 5
+"""Windows beyond the number of parameters that are fitted where states are approximate."""
 ROUNDS = 3
 """Number of linearisations, at least 1: from the best draw two steps reach the residuals that no parameters explain."""
 INSIDE = 0.98
@@ -50,7 +54,7 @@ class Excitation:
 
     Attributes:
         effect: Change of an observation by half of the parameter's range, over the residual that no parameters
-            explain; NaN where states are not exact, so that this residual cannot be computed.
+            explain; NaN where states are unknown, so that this residual cannot be computed.
         half_width: Half of the expected 95 % interval, in physical units; NaN likewise.
         pairs: Parameters whose estimates would be correlated: two names and the correlation.
         sentences: Which parameters, alone or together, cannot be determined.
@@ -127,7 +131,11 @@ def _excited(
 
 
 def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates) -> Excitation:
-    """Which estimates would correlate, where the log's states are not exact; no intervals can be expected then."""
+    """Which estimates would correlate, where the log's states are not exact, and intervals where they are approximate.
+
+    Those are the narrowest that the log allows where parameters and initial states fit some of its windows best, with
+    what is left there for noise; NaN where states are unknown.
+    """
     space = simulator.parameters
     strides, count = max(WINDOWS.items())
     windows = probing_windows(logged, dataset, simulator, steps=strides * stride(dataset), count=count)
@@ -137,14 +145,26 @@ def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates)
     around = linearise(points, window_residuals(simulator, windows, points, scale))
     certainty = sandwich(bread(around, 1.0, "linear"), np.zeros((len(space), len(space))))
     certainty, only_ratios = _without_scale(certainty, around, middle, space)
-    unknown = np.full(len(space), np.nan)
+    effect = half = np.full(len(space), np.nan)
+    spent = len(points) * len(windows) * windows.steps
+    if logged.kind == "approximate":
+        fitted = windows_of(dataset, logged, scale, fewest=FEWEST + len(space), most=FEWEST + len(space))
+        fit = fit_windows(simulator, fitted.readings, fitted.states, middle)
+        if fit.counted.any():
+            noise = noise_of(fit, fitted.readings)
+            left = scale[: len(noise)] * noise
+            half, steps = expected_half_widths(logged, dataset, simulator, fit.point, left, exact=False)
+            half, spent = half * (space.high - space.low) / 2.0, spent + steps
+            seen = fit.slopes.over(np.tile(noise, fitted.readings.steps + 1)).by_parameters[fit.counted]
+            effect = np.sqrt((seen**2).mean((0, 1)))
+        spent += fit.control_steps
     return Excitation(
-        effect=unknown,
-        half_width=unknown,
+        effect=effect,
+        half_width=half,
         pairs=tuple(correlated_pairs(certainty.correlation, space.names)),
         sentences=identifiability(certainty, space.names),
         only_ratios=only_ratios,
-        control_steps=len(points) * len(windows) * windows.steps,
+        control_steps=spent,
     )
 
 

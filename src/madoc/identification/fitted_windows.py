@@ -14,6 +14,7 @@ from madoc.identification.losses import TUNING, loss_slope, loss_value, scale_of
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.score_tests import Products
+from madoc.identification.settling import with_bases_settled
 from madoc.identification.states import LoggedStates
 from madoc.identification.windows import disjoint_windows, evenly, longest_fit
 from madoc.simulation.base import Simulator
@@ -151,7 +152,9 @@ def fit_windows(
     more at the parameters found, so that outlying readings count little.
     """
     unknown = np.zeros((len(readings), readings.observed[0].size, len(point)))
-    fit = _settled(simulator, readings, _sloped(simulator, readings, states, point, 0, by_parameters=unknown))
+    states, simulations = with_bases_settled(simulator, readings, point, states)
+    spent = simulations * readings.steps
+    fit = _settled(simulator, readings, _sloped(simulator, readings, states, point, spent, by_parameters=unknown))
     fit = _sloped_by_parameters(simulator, readings, fit)
     for _ in range(LINEARISATIONS):
         moved = _descended(simulator, readings, fit)
@@ -297,6 +300,11 @@ def negligible(slopes: WindowSlopes) -> bool:
     """Whether there are residuals, and none of them is worth an explanation."""
     finite = slopes.finite
     return bool(finite.any()) and float(np.abs(slopes.residuals[finite]).max()) < NEGLIGIBLE
+
+
+def noise_of(fit: Fit, readings: Readings) -> Float[np.ndarray, " channels"]:
+    """Standard deviation of each channel's noise in its typical changes, by what a fit leaves of its windows."""
+    return _noise(fit.slopes, readings)[: len(readings.scale)]
 
 
 def _noise(slopes: WindowSlopes, readings: Readings) -> Float[np.ndarray, " values"]:

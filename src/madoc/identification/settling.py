@@ -23,6 +23,8 @@ WIDTHS = (0.0, 3.0, 3.0, 1.5, 0.7, 0.3, 0.1, 0.0, 0.0)
 """Widths of the differences from step to step, in standard errors of the initial states; 0 is `DIFFERENCE`."""
 RESETTLING = (1.0, 0.3, 0.0)
 """The same after a step of the parameters, by which initial states have moved little."""
+PLACED_ALONE = 3
+"""Number of steps of places and speeds that no sensor shows, before all values of an initial state move."""
 RESTARTS = 5
 """Number of times that windows whose residuals are more than noise begin anew, near the guess of their state."""
 FARTHEST = 30.0
@@ -31,8 +33,8 @@ BEYOND = 3.0
 """Standard deviations of a window's cost under noise alone, above its mean; a higher cost is more than noise."""
 FEW = 0.01
 """Share in [0, 1] of the windows whose residuals are more than noise, up to which no further steps are tried."""
-FOLLOWED = (1.0, 0.3)
-"""Shares in (0, 1] of a step that are tried: at contacts the whole one may be too far."""
+TRIALS = (1e-2, 1.0, 1e2)
+"""Factors of the last damping that helped, tried at once; where none helps, it is multiplied by the last."""
 FIRST_DAMPING = 1e-2
 """Damping of the first step, relative to the squared lengths of the columns."""
 DAMPING_RANGE = (1e-9, 1e6)
@@ -82,24 +84,27 @@ def settle(
     damping: Float[np.ndarray, " windows"],
     width: Float[np.ndarray, " physical"],
     loss: Loss,
+    *,
+    placed_alone: bool = False,
 ) -> Settled:
-    """One damped Gauss-Newton step of every window's initial state, of which a window takes the share that fits best.
+    """One damped Gauss-Newton step of every window's initial state, of the damping of `TRIALS` that fits it best.
 
     `width` is that of the differences, in standard deviations of each value over the log, at least `DIFFERENCE`. It
-    takes 1 + n + 2 simulations of every window, for states of n values.
+    takes 1 + n + 3 simulations of every window, for states of n values, or of n that are placed where these alone move.
     """
-    (slopes,) = slopes_at(simulator, readings, point[None], states[None], parameters=False, width=width)
+    (slopes,) = slopes_at(
+        simulator, readings, point[None], states[None], parameters=False, width=width, placed_alone=placed_alone
+    )
     deviation, errors = _noise_and_errors(slopes, readings)
     scaled = slopes.over(np.tile(deviation, readings.steps + 1))
     weights = loss_slope((scaled.residuals / TUNING[loss]) ** 2, loss) * scaled.whole[:, None]
-    step = eliminate(scaled, weights, damping).states_step(np.zeros(0))
-    shares = np.array(FOLLOWED)[:, None, None]
-    moved = states + shares * readings.in_state_units(step, states.shape[1])
+    steps = [eliminate(scaled, weights, damping * factor).states_step(np.zeros(0)) for factor in TRIALS]
+    moved = states + readings.in_state_units(np.stack(steps), states.shape[1])
     after = readings.residuals(simulator, point[None], moved.reshape(1, -1, states.shape[1]))[0]
     whole = np.where(slopes.whole[:, None], slopes.residuals, np.nan)
     costs = window_costs(np.concatenate([after, whole[None]]) / np.tile(deviation, readings.steps + 1), loss)
     best = costs.argmin(0)
-    factor = np.array([0.1, 1.0, 10.0])[best]
+    factor = np.array([*TRIALS, TRIALS[-1]])[best]
     most = WIDE_DAMPING if (width > DIFFERENCE).any() else DAMPING_RANGE[1]
     return Settled(
         states=np.concatenate([moved, states[None]])[best, np.arange(len(states))],
@@ -108,7 +113,7 @@ def settle(
         deviation=deviation,
         costs=costs.min(0),
         failures=int((~slopes.whole).sum()),
-        simulations=len(readings) * (1 + len(readings.spread) + len(FOLLOWED)),
+        simulations=len(readings) * (1 + (int(readings.placed.sum()) if placed_alone else len(width)) + len(TRIALS)),
     )
 
 
@@ -124,7 +129,9 @@ def restart(
     """Settle anew the windows whose residuals are more than noise, and keep what fits each of them better.
 
     They begin at their guess and a normal error of the size of the states' standard errors or of up to `FARTHEST` times
-    that: where velocities jump, guesses may be far off.
+    that: where velocities jump, guesses may be far off. Where sensors show all but the place and speed of a base, they
+    begin at the guess with that place and speed as they have settled: these are better known by then, and what is
+    measured has gone astray to make up for what they were.
     """
     worse = np.flatnonzero(before.unexplained(readings.observed[0].size, loss))
     if not len(worse):
@@ -132,10 +139,15 @@ def restart(
     part = readings.of(worse)
     size = FARTHEST ** random.random((len(worse), 1)) * before.errors
     error = np.minimum(size, 1.0) * random.standard_normal((len(worse), len(before.errors)))
-    states = guesses[worse] + readings.in_state_units(error, guesses.shape[1])
+    states, widths = guesses[worse] + readings.in_state_units(error, guesses.shape[1]), WIDTHS[1:]
+    if readings.placed.any():
+        columns = np.flatnonzero(readings.placed)
+        states, widths = guesses[worse], (*np.zeros(PLACED_ALONE), *RESETTLING)
+        states[:, columns] = before.states[np.ix_(worse, columns)]
     damping, simulations = np.full(len(worse), FIRST_DAMPING), 0
-    for width in WIDTHS[1:]:
-        after = settle(simulator, part, point, states, damping, width * before.errors, loss)
+    for step, width in enumerate(widths):
+        alone = readings.placed.any() and step < PLACED_ALONE
+        after = settle(simulator, part, point, states, damping, width * before.errors, loss, placed_alone=bool(alone))
         states, damping, simulations = after.states, after.damping, simulations + after.simulations
     residuals = part.residuals(simulator, point[None], states[None])[0, 0]
     costs = window_costs(residuals / np.tile(before.deviation, readings.steps + 1), loss)
@@ -150,6 +162,28 @@ def restart(
         costs=new_costs,
         simulations=before.simulations + simulations + len(worse),
     )
+
+
+def with_bases_settled(
+    simulator: Simulator,
+    readings: Readings,
+    point: Float[np.ndarray, " d"],
+    guesses: Float[np.ndarray, "windows state"],
+) -> tuple[Float[np.ndarray, "windows state"], int]:
+    """Initial states from near which those of single contacts can be fitted, and the simulations that it took.
+
+    They are the guesses, but where sensors do not show where a base is: its place and speed settle there first.
+    """
+    if not readings.placed.any():
+        return guesses, 0
+    random, damping, none = (
+        np.random.default_rng(0),
+        np.full(len(guesses), FIRST_DAMPING),
+        np.zeros(len(readings.spread)),
+    )
+    first = settle(simulator, readings, point, guesses, damping, none, "cauchy")
+    after = restart(simulator, readings, point, guesses, first, "cauchy", random)
+    return after.states, after.simulations
 
 
 @cache

@@ -5,20 +5,25 @@ from typing import Literal
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from madoc.data.dataset import Dataset
 from madoc.data.velocities import moving_states
 from madoc.errors import MadocError
-from madoc.identification.windows import Windows, evenly, longest_fit, rows_that_fit, windows_at
+from madoc.identification.windows import Windows, consecutive_rows, evenly, longest_fit, rows_that_fit, windows_at
 from madoc.simulation.base import Simulator
+from madoc.simulation.floating_base import Placed, on_the_floor
 from madoc.simulation.rollout import reset_states
-from madoc.simulation.velocities import unseen_positions
+from madoc.simulation.velocities import unseen_values
 from madoc.tasks import Task
 
 _PROBED = 64
 """Number of logged actions simulated from a reset where states are unknown; after so many the robot moves, so that
 damping, friction and the like have an effect."""
+
+Kind = Literal["exact", "approximate", "unknown"]
+SINKING = 0.01
+"""Depth in m below the floor that a base is followed to; contacts of robots give way by less."""
 
 
 @dataclass(frozen=True)
@@ -36,14 +41,16 @@ class LoggedStates:
         physical_size: Number of values of (qpos, qvel), which come first in a state; pending actions follow.
         measured: Number of values of an observation, the first ones, that sensors measured; the others were derived
             from them by finite differences.
+        placed: Which values of (qpos, qvel) are places and speeds of bases that no sensor shows, found from contacts.
     """
 
-    kind: Literal["exact", "approximate", "unknown"]
+    kind: Kind
     states: Float[np.ndarray, "states state"]
     rows: Int[np.ndarray, " states"]
     reason: str
     physical_size: int
     measured: int
+    placed: Bool[np.ndarray, " physical"]
 
     @property
     def starts_known(self) -> bool:
@@ -78,7 +85,13 @@ def states_of(dataset: Dataset, simulator: Simulator) -> LoggedStates:
     physical = size - task.pending * simulator.action_size
     derived = task.velocities * (dataset.disturbance.velocities == "differences")
     rebuilt = LoggedStates(
-        "unknown", np.zeros((0, size)), np.zeros(0, np.int64), "", physical, task.observation_size - derived
+        kind="unknown",
+        states=np.zeros((0, size)),
+        rows=np.zeros(0, np.int64),
+        reason="",
+        physical_size=physical,
+        measured=task.observation_size - derived,
+        placed=np.zeros(physical, bool),
     )
     try:
         states, rows = logged_states(dataset, task)
@@ -87,13 +100,42 @@ def states_of(dataset: Dataset, simulator: Simulator) -> LoggedStates:
         rebuilt = replace(rebuilt, reason=str(error))
     if task.state_from_observation is not None or task.posture is None:
         return rebuilt
-    guess = moving_states(dataset, task)[0]
-    guess = np.where(np.isnan(guess), simulator.initial_state[:physical], guess)
+    placed = on_the_floor(task, moving_states(dataset, task)[0])
+    guess = np.where(np.isnan(placed.states), simulator.initial_state[:physical], placed.states)
     try:
         states, rows = with_pending(dataset, task, guess, np.arange(len(dataset)))
     except MadocError as error:
         return replace(rebuilt, reason=str(error))
-    return replace(rebuilt, kind="unknown" if unseen_positions(task) else "approximate", states=states, rows=rows)
+    if placed.found.any():
+        states = _followed(dataset, simulator, states, rows, placed)
+    unseen = (unseen_values(task) & ~placed.found[: task.model.nq]).any()
+    kind: Kind = "unknown" if unseen else "approximate"
+    return replace(rebuilt, kind=kind, states=states, rows=rows, placed=placed.found)
+
+
+def _followed(
+    dataset: Dataset,
+    simulator: Simulator,
+    states: Float[np.ndarray, "rows state"],
+    rows: Int[np.ndarray, " rows"],
+    placed: Placed,
+) -> Float[np.ndarray, "rows state"]:
+    """The states with heights and speeds of bases as the simulator at mid-range leads to them from the row before.
+
+    All other values are the log's at every row, so that an error of these does not last: in a few steps contacts give
+    way as much as what they carry weighs (an observer of reduced order, Luenberger 1971). A step that fails, or leads
+    farther into the floor than contacts give way, begins anew on it.
+    """
+    system, model = simulator.bind(simulator.parameters.middle[None]), simulator.task.model
+    action = np.asarray(dataset.transitions.action, np.float64)
+    speeds = np.flatnonzero(placed.found[model.nq :]) + model.nq
+    columns, followed = np.concatenate([placed.heights, speeds]), states.copy()
+    for position in consecutive_rows(dataset, rows).tolist():
+        after = system.step(followed[None, position, None], action[None, rows[position], None])[0, 0]
+        sunk = states[position + 1, placed.heights] - after[placed.heights]
+        if np.isfinite(after).all() and (sunk <= SINKING).all():
+            followed[position + 1, columns] = after[columns]
+    return followed
 
 
 def logged_states(dataset: Dataset, task: Task) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:

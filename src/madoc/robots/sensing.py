@@ -1,6 +1,6 @@
 """Signals as functions: of a state, of the model's sensors, and back to a state where they determine it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from madoc.errors import MadocError, nearest_hint
 from madoc.robots.expressions import Expression, Read
+from madoc.simulation.linear_sensors import linear_sensors
 from madoc.simulation.write import element_names
 from madoc.tasks.base import Batch
 
@@ -23,6 +24,7 @@ class Layout:
     Attributes:
         physical: Number of values of (qpos, qvel).
         accelerating: Sensors that depend on the control as well.
+        weights: By its address in sensordata, the weights of (qpos, qvel) in each value that is a weighted sum of them.
     """
 
     position: dict[str, Span]
@@ -30,6 +32,7 @@ class Layout:
     sensor: dict[str, Span]
     physical: int
     accelerating: frozenset[str]
+    weights: Mapping[int, Float[np.ndarray, " physical"]]
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> "Layout":
@@ -42,7 +45,15 @@ class Layout:
             sensor={sensor.name: (int(sensor.adr[0]), int(sensor.dim[0])) for sensor in sensors},
             physical=int(model.nq + model.nv),
             accelerating=frozenset(one.name for one in sensors if one.needstage[0] == mujoco.mjtStage.mjSTAGE_ACC),
+            weights={
+                first + step: row for first, rows in linear_sensors(model).items() for step, row in enumerate(rows)
+            },
         )
+
+    def of_state(self, read: Read) -> Float[np.ndarray, " physical"] | None:
+        """The weights of (qpos, qvel) in a value; None for a sensor that is no weighted sum of them."""
+        address = self.address(read)
+        return self.weights.get(address) if read.kind == "sensor" else np.eye(self.physical)[address]
 
     def address(self, read: Read) -> int:
         """Address of a value in the state or in sensordata; what the model does not have is refused."""
@@ -86,8 +97,7 @@ class Signals:
 
     def undetermined(self) -> tuple[str, ...]:
         """A sentence for each joint position and velocity that is in no signal that is a weighted sum."""
-        sums = [affine[0] for expression in self.expressions if (affine := expression.affine()) is not None]
-        covered = {self.layout.address(read) for reads in sums for read in reads if read.kind != "sensor"}
+        covered = set(np.flatnonzero(self._weights()[0].any(0)).tolist())
         return tuple(
             f"no signal is the {kind} of {joint}"
             for kind in ("position", "velocity")
@@ -123,16 +133,16 @@ class Signals:
         return lambda observation: (observation - constant) @ backward + blank
 
     def _weights(self) -> tuple[Float[np.ndarray, "signals state"], Float[np.ndarray, " signals"]]:
-        """Coefficients of (qpos, qvel) and constant of each signal that is a weighted sum of them; 0 for others."""
+        """Weights of (qpos, qvel) and constant of each signal that is a weighted sum of them; 0 for others."""
         count = len(self.expressions)
         forward, constant = np.zeros((count, self.layout.physical)), np.zeros(count)
         for row, expression in enumerate(self.expressions):
             affine = expression.affine()
-            if affine is None or any(read.kind == "sensor" for read in affine[0]):
+            parts = [] if affine is None else [(self.layout.of_state(read), by) for read, by in affine[0].items()]
+            if affine is None or any(weights is None for weights, _ in parts):
                 continue
             constant[row] = affine[1]
-            for read, weight in affine[0].items():
-                forward[row, self.layout.address(read)] += weight
+            forward[row] = sum(weights * by for weights, by in parts if weights is not None)
         return forward, constant
 
 

@@ -18,6 +18,7 @@ _NOT_SI = re.compile(
 """Units of length, angle and speed that are not m, rad, m/s or rad/s."""
 _FIRST_OF_QUATERNION = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
 """Index of the quaternion's first component among the positions of a joint of this type."""
+_QUATERNION_SENSORS = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
 
 
 def read_signals(draft: Draft, model: mujoco.MjModel) -> Signals:
@@ -64,11 +65,13 @@ def turn_of(model: mujoco.MjModel, expression: Expression) -> float:
 
 
 def quaternion_of(model: mujoco.MjModel, expression: Expression) -> str:
-    """The free or ball joint of whose quaternion an expression is one component, as it is; empty where it is none."""
+    """The free or ball joint, or the sensor, of whose quaternion an expression is one component; empty for others."""
     affine = expression.affine()
     if affine is None or affine[1] or list(affine[0].values()) != [1.0]:
         return ""
     (read,) = affine[0]
+    if read.kind == "sensor":
+        return f"sensor({read.name})" if int(model.sensor(read.name).type[0]) in _QUATERNION_SENSORS else ""
     if read.kind != "position" or read.index is None:
         return ""
     first = _FIRST_OF_QUATERNION.get(int(model.joint(read.name).type[0]), read.index + 1)

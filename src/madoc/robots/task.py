@@ -37,7 +37,7 @@ class Signal:
     """One value of an observation: its name, its unit, and the expression it is.
 
     `turn` is the change of its value in a turn of the hinge whose position it is; 0 where it is none. `quaternion` is
-    the free or ball joint of whose quaternion it is a component; empty where it is none.
+    the free or ball joint, or the sensor, of whose quaternion it is a component; empty where it is none.
     """
 
     name: str

@@ -2,7 +2,7 @@
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from madoc.errors import MadocError
 from madoc.tasks.base import Task
@@ -35,12 +35,27 @@ def with_velocities(
     return np.where(np.isnan(states), padded, states)
 
 
+def hidden_values(task: Task) -> Bool[np.ndarray, " state"]:
+    """Which values of (qpos, qvel) an observation does not determine, for a task with a `posture`."""
+    assert task.posture is not None
+    return np.isnan(np.asarray(task.posture(np.zeros(task.observation_size))))
+
+
 def missing_velocities(task: Task) -> Int[np.ndarray, " velocities"]:
     """Indices in a state of the velocities that an observation does not determine, for a task with a `posture`."""
-    assert task.posture is not None
-    unknown = np.isnan(np.asarray(task.posture(np.zeros(task.observation_size))))
     positions = task.model.nq
-    return positions + np.flatnonzero(unknown[positions:])
+    return positions + np.flatnonzero(hidden_values(task)[positions:])
+
+
+def unseen_values(task: Task) -> Bool[np.ndarray, " positions"]:
+    """Which values of qpos an observation does not show, for a task with a `posture`."""
+    model = task.model
+    blind = hidden_values(task)[: model.nq]
+    if task.sense is None:
+        state = np.concatenate([model.qpos0, np.zeros(model.nv)])
+        moved = state + 1e-3 * np.eye(len(state))[: model.nq]
+        blind |= (np.asarray(task.observe(moved)) == np.asarray(task.observe(state))).all(-1)
+    return blind
 
 
 def unseen_positions(task: Task) -> tuple[str, ...]:
@@ -48,12 +63,7 @@ def unseen_positions(task: Task) -> tuple[str, ...]:
     if task.posture is None:
         return ()
     model = task.model
-    blind = np.isnan(np.asarray(task.posture(np.zeros((1, task.observation_size)))))[0, : model.nq]
-    if task.sense is None:
-        state = np.concatenate([model.qpos0, np.zeros(model.nv)])
-        moved = state + 1e-3 * np.eye(len(state))[: model.nq]
-        blind |= (np.asarray(task.observe(moved)) == np.asarray(task.observe(state))).all(-1)
-    joints = np.add.reduceat(blind.astype(int), model.jnt_qposadr).nonzero()[0]
+    joints = np.add.reduceat(unseen_values(task).astype(int), model.jnt_qposadr).nonzero()[0]
     return tuple(model.joint(index).name or f"joint {index}" for index in joints.tolist())
 
 

@@ -31,7 +31,8 @@ from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.types import named_key
 from madoc.verdict.adequacy import NUMERICAL, actions_in_time, felt, in_full, is_certain, widening
-from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of
+from madoc.verdict.fitted_starts import MOST as MOST_FITTED
+from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of, replay_steps
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import NEGLIGIBLE, better_than_chance
 from madoc.verdict.two_sample import WindowView, behaviour, classify, rolled
@@ -48,6 +49,10 @@ COLUMNS, COLUMNS_OF_A_VALUE = 60, 20
 freedom."""
 EXCHANGED = "exchanged columns"
 """A part of judging without which nothing is tested."""
+FITTING = 0.4
+"""Share in (0, 1) of the time left that fitting the starts of windows of the hold-out may take."""
+FEWEST_FITTED = 10
+"""Smallest number of such windows, however little time is left."""
 TESTING = 0.7
 """Share in (0, 1) of the time left that testing what the model lacks may take."""
 _LONGEST_ROLLOUT = 1000
@@ -96,6 +101,16 @@ class Bench:
         """Time in s for what is still to be judged."""
         return np.inf if self.until is None else self.until - time.monotonic()
 
+    def windows_in_time(self, control_steps: int, share: float, most: int) -> int:
+        """How many windows of so many control steps each can be simulated in a share of the time left, or the most.
+
+        They are at least `FEWEST_FITTED`.
+        """
+        if self.until is None:
+            return most
+        affordable = int(share * self.rate * max(self.seconds_left, 0.0) / control_steps)
+        return min(most, max(FEWEST_FITTED, affordable))
+
     def begins(self, part: str, seconds: float = 0.0) -> bool:
         """Whether there is time for a part that takes so long: it is told of, or noted where there is none."""
         if self.seconds_left > seconds:
@@ -141,7 +156,9 @@ class Bench:
         """Windows of the hold-out whose initial states are to be fitted; None where they cannot be."""
         if self.states.kind == "unknown" or self.held_out.disturbance.shuffled != "none":
             return None
-        return fitted_replays_of(self.held_out, self.simulator, self.change, stride(self.problem.dataset))
+        moving, space = stride(self.problem.dataset), self.simulator.parameters
+        most = self.windows_in_time(replay_steps(self.states, moving, len(space)), FITTING, MOST_FITTED)
+        return fitted_replays_of(self.held_out, self.simulator, self.change, moving, most=most)
 
     @cached_property
     def clone(self) -> TanhGaussianPolicy:

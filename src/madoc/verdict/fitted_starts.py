@@ -13,7 +13,8 @@ from jaxtyping import Float, Int
 from madoc.data import Dataset
 from madoc.identification.gauss_newton import eliminate
 from madoc.identification.replay import Readings, slopes_at
-from madoc.identification.states import states_of
+from madoc.identification.settling import with_bases_settled
+from madoc.identification.states import LoggedStates, states_of
 from madoc.identification.windows import evenly, rows_that_fit
 from madoc.simulation.base import Simulator
 from madoc.verdict.prediction import FEWEST_WINDOWS
@@ -28,10 +29,14 @@ FIT_STEPS = 10
 """Largest number of damped Gauss-Newton steps of an initial state, which begins at finite differences."""
 GAIN = 1e-3
 """Share in (0, 1] of a window's squared residuals; after a step that saves less its initial state is fitted."""
+STEPS_OF_BASES = 2
+"""The same where the place of a base, which no sensor shows, has settled with the state before."""
 FEW = 0.01
 """Share in [0, 1] of the windows, up to which no further step is taken for those that are not fitted."""
 _SHARES = np.array([1.0, 0.3, 0.1])
 """Shares in (0, 1] of a step, of which every window takes the one that fits it best; none where none does."""
+_POINTS, _NEARBY_STEPS = 6, 6
+"""Number of points at which starts are fitted, and of Gauss-Newton steps of the parameters beside them."""
 _DAMPING = 1e-8
 """Damping of an initial state's step, relative to the squared lengths of the columns; 0 is none."""
 
@@ -81,9 +86,10 @@ class FittedReplays:
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
-        states = np.repeat(self.near[None], len(points), axis=0)
-        damping, spent = np.full(len(first), _DAMPING), 0
-        for _ in range(FIT_STEPS):
+        settled = [with_bases_settled(self.simulator, first, point, self.near) for point in points]
+        states = np.stack([each for each, _ in settled])
+        damping, spent = np.full(len(first), _DAMPING), first.steps * sum(simulations for _, simulations in settled)
+        for _ in range(STEPS_OF_BASES if first.placed.any() else FIT_STEPS):
             around = slopes_at(self.simulator, first, points, states, parameters=False)
             fits = [eliminate(slopes, np.ones_like(slopes.residuals), damping) for slopes in around]
             step = first.in_state_units(np.stack([fit.states_step(np.zeros(0)) for fit in fits]), states.shape[2])
@@ -97,6 +103,13 @@ class FittedReplays:
             if _unfitted(before, costs.min(1)) <= FEW:
                 break
         return states, spent
+
+
+def replay_steps(logged: LoggedStates, stride: int, parameters: int) -> int:
+    """About how many control steps a window takes until it is judged: at four points, with noise, and nearby."""
+    values, fitted, ahead = logged.physical_size, FITTED * stride, AHEAD[-1] * stride
+    starts = _POINTS * FIT_STEPS * (1 + values + len(_SHARES)) * fitted
+    return starts + _NEARBY_STEPS * (1 + 2 * parameters + values) * (fitted + ahead)
 
 
 def _squares(residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray, "*windows"]:

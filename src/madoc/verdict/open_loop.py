@@ -20,13 +20,15 @@ from madoc.parameters import Parameter, ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.simulation.write import nominal_values
 from madoc.verdict.bench import Bench
-from madoc.verdict.fitted_starts import FITTED, fitted_replays_of
+from madoc.verdict.fitted_starts import FITTED, fitted_replays_of, replay_steps
 from madoc.verdict.statistics import independent_groups, interval_of, resampled
 
 SECONDS = (0.1, 0.3, 1.0)
 """Times in s over which motion is predicted, besides whole runs."""
 MOST = 60
 """Largest number of windows of one length."""
+SHARE = 0.3
+"""Share in (0, 1) of the time left that the starts of those of one length may take to fit."""
 FAILED = 10.0
 """Least error, in typical changes of a stride, once a simulation has failed; it is the worst of any that has not."""
 
@@ -120,9 +122,10 @@ def _from_fitted(
 ) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
     """The same from starts that are fitted under each model to the strides before."""
     moving, of_models, rows = stride(bench.problem.dataset), [], np.empty(0, np.int64)
+    most = bench.windows_in_time(replay_steps(bench.states, moving, 0) // 2, SHARE, MOST)
     for simulator, points in _models(bench, given, point):
         replays = fitted_replays_of(
-            bench.held_out, simulator, bench.change, moving, ahead=(steps,), fewest=1, most=MOST
+            bench.held_out, simulator, bench.change, moving, ahead=(steps,), fewest=1, most=most
         )
         if replays is None:
             return None

@@ -15,6 +15,7 @@ from madoc.calibration.least_squares.lengthening import (
     FEWEST,
     LENGTHS,
     LONGER,
+    OF_BASES,
     READINGS,
     WIDER,
     continued,
@@ -28,7 +29,7 @@ from madoc.calibration.least_squares.lengthening import (
     widened,
 )
 from madoc.calibration.least_squares.search import Search, SearchState
-from madoc.calibration.least_squares.statistics import alternation, consecutive_residuals
+from madoc.calibration.least_squares.statistics import alternation, consecutive_residuals, noisy_rows
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import stride
 from madoc.identification.information import identifiability, quantile, sandwich
@@ -47,8 +48,6 @@ SEARCH_WINDOWS: dict[InitialStates, int] = {"logged": 64, "estimated": 24}
 """Largest number of windows while searching."""
 STARTING_STRIDES = 1
 """Length in strides of the rows of windows from logged states where these are noisy and only a start is wanted."""
-NOISY_STRIDE = 1e-3
-"""Noise of a channel in its typical changes in a stride; above it logged states are noisy where rows are close."""
 NOISY = 0.2
 """Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5, and random forces
 as large as it half of that."""
@@ -224,7 +223,7 @@ class LeastSquares:
         if problem.states.kind != "exact" and len(problem.states.rows):
             return "estimated"
         disturbance = problem.dataset.disturbance
-        noisy = disturbance.noise > 0 or disturbance.velocities == "differences" or _noisy_rows(problem)
+        noisy = disturbance.noise > 0 or disturbance.velocities == "differences" or noisy_rows(problem)
         return "starting" if noisy or self.initial_states == "estimated" else "undecided"
 
     def _known(self, problem: CalibrationProblem) -> Search:
@@ -234,10 +233,15 @@ class LeastSquares:
         return self._search(KnownStarts, "logged", horizon, self.searches)
 
     def _unknown(self, problem: CalibrationProblem, length: int = 0) -> Search:
-        """The search with unknown initial states; after one from logged states it needs to begin at one point only."""
-        searches = self.searches if self._first_stage(problem) == "estimated" else 1
+        """The search with unknown initial states; after one from logged states it needs to begin at one point only.
+
+        So does one in which nearly all of the states is measured, as where only the place of a base is not.
+        """
+        of_bases = bool(problem.states.placed.any())
+        searches = self.searches if self._first_stage(problem) == "estimated" and not of_bases else 1
         fewest = 2 * (FEWEST + len(problem.simulator.parameters))
-        horizon = self.horizon or LENGTHS[length] * horizon_of(problem.dataset, fewest)
+        scales = OF_BASES if of_bases else 1
+        horizon = self.horizon or LENGTHS[length] * horizon_of(problem.dataset, fewest, scales)
         return self._search(UnknownStarts, "estimated", horizon, searches)
 
     def _search(
@@ -249,12 +253,14 @@ class LeastSquares:
     def _all_lengths(self, problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[SearchState, ...]:
         """Searches on few and many of the shortest windows, and on every length that the episodes are long enough for.
 
-        If `horizon` is given, there is one length.
+        If `horizon` is given, there is one length, and where sensors do not show where a base is: longer windows hold
+        more contacts that begin and end, and would tell little more.
         """
         shortest = self._unknown(problem)
         first = shortest.init(problem, key)
         searches = [first, replace(shortest, windows=self.windows or MOST, searches=1).init(problem, key)]
-        for length in range(LONGER, len(LENGTHS) if self.horizon is None else LONGER):
+        one_length = self.horizon is not None or problem.states.placed.any()
+        for length in range(LONGER, LONGER if one_length else len(LENGTHS)):
             most = READINGS * len(first.rows) // LENGTHS[length]
             shorter = searches[-1] if length > LONGER else first
             longer = lengthened(problem, shorter, self._unknown(problem, length).horizon, most)
@@ -348,15 +354,6 @@ class LeastSquares:
         if longer is not None:
             return (*about, sentences.about_model_errors(self._unknown(problem, longer).horizon))
         return about
-
-
-def _noisy_rows(problem: CalibrationProblem) -> bool:
-    """Whether noise hides the motion from row to row, in a log whose rate is high for its robot.
-
-    There noise need not alternate: steps of an encoder and filters of a drive last for several rows.
-    """
-    loud = problem.noise_by_differences > NOISY_STRIDE * problem.typical_change
-    return stride(problem.dataset) > 1 and bool(loud.any())
 
 
 def _begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:

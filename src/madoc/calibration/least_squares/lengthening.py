@@ -26,6 +26,9 @@ SHORTEST = 3
 state."""
 READINGS = 2
 """Largest number of readings in all longer windows, relative to the first search; more only for `FEWEST` windows."""
+OF_BASES = 3
+"""Length of the first windows relative to the time scale where these also tell where a base is, which no sensor does:
+the readings of several steps of the legs bear it out, those of one do not."""
 FEWEST = 5
 """Smallest number of windows beyond that of parameters; with fewer, Student's t would widen the intervals much."""
 AS_WELL = 1.2
@@ -44,8 +47,8 @@ CHANCE = 3.0
 _SMALLEST = 1e-100
 
 
-def horizon_of(dataset: Dataset, fewest: int) -> int:
-    """Length in control steps of the first windows with unknown initial states: the robot's time scale.
+def horizon_of(dataset: Dataset, fewest: int, scales: int = 1) -> int:
+    """Length in control steps of the first windows with unknown initial states: as many of the robot's time scales.
 
     In shorter windows little moves; in longer ones small errors grow until simulated and logged motion are unrelated.
     The length is at least `SHORTEST`, no longer than the episode that the median row is in, and short enough for
@@ -53,7 +56,7 @@ def horizon_of(dataset: Dataset, fewest: int) -> int:
     """
     lengths = dataset.episode_ends - dataset.episode_starts
     longest = min(int(np.median(np.repeat(lengths, lengths))), len(dataset) // fewest - 1)
-    return max(min(SHORTEST, int(lengths.max())), min(dataset.time_scale, longest))
+    return max(min(SHORTEST, int(lengths.max())), min(scales * dataset.time_scale, longest))
 
 
 def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, most: int) -> SearchState | None:

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.data import stride
 from madoc.identification.losses import NORMAL_MAD, Loss
 from madoc.identification.noise import OUTLIER, channel_noise
 from madoc.identification.replay import window_residuals
@@ -12,6 +13,8 @@ from madoc.identification.windows import consecutive_rows, windows_at
 
 FEWEST_STEADY = 10
 """Smallest number of windows of a kind whose noise is estimated by itself."""
+NOISY_STRIDE = 1e-3
+"""Noise of a channel in its typical changes in a stride; above it logged states are noisy where rows are close."""
 _LARGEST = 3.0
 """Standard deviations of the noise at which residuals are clipped before they are correlated."""
 _SMALLEST = 1e-12
@@ -59,19 +62,25 @@ def steady_cost(
     spare: Float[np.ndarray, "windows readings channels"],
     contacts: Int[np.ndarray, "windows readings"],
     loss: Loss,
+    *,
+    steady_alone: bool = False,
 ) -> float:
     """Mean cost of the windows in which no contact begins or ends; 0 without windows.
 
     Where one does, residuals jump with the error of the initial state. Windows with the same number of `contacts` at
     every reading are of one kind, whose cost is in standard deviations of its own noise: a force that disturbs a flying
     body shows less where friction holds it. Kinds of fewer than `FEWEST_STEADY` windows say nothing; if all are, all
-    windows count as one kind. A contact between two readings is not seen. `spare` is 1 - leverage of each residual.
+    windows count as one kind, or none does where only steady ones may. A contact between two readings is not seen.
+    `spare` is 1 - leverage of each residual.
     """
     if not len(residuals):
         return 0.0
     steady = (contacts == contacts[:, :1]).all(1)
     kinds = [steady & (contacts[:, 0] == count) for count in np.unique(contacts[steady, 0])]
-    kinds = [kind for kind in kinds if kind.sum() >= FEWEST_STEADY] or [np.ones_like(steady)]
+    kinds = [kind for kind in kinds if kind.sum() >= FEWEST_STEADY]
+    if not kinds and steady_alone:
+        return 0.0
+    kinds = kinds or [np.ones_like(steady)]
     costs = [
         window_costs((residuals[kind] / channel_noise(residuals[kind], spare[kind])).reshape(kind.sum(), -1), loss)
         for kind in kinds
@@ -156,3 +165,12 @@ def consecutive_residuals(
     pairs = residuals.reshape(2, len(first), residuals.shape[-1])
     before, after = pairs[:, np.isfinite(pairs).all((0, 2))]
     return (before, after), len(both)
+
+
+def noisy_rows(problem: CalibrationProblem) -> bool:
+    """Whether noise hides the motion from row to row, in a log whose rate is high for its robot.
+
+    There noise need not alternate: steps of an encoder and filters of a drive last for several rows.
+    """
+    loud = problem.noise_by_differences > NOISY_STRIDE * problem.typical_change
+    return stride(problem.dataset) > 1 and bool(loud.any())

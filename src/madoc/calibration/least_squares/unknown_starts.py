@@ -46,6 +46,8 @@ FOLLOWED = (1.0, 0.3, 0.0)
 """Shares in [0, 1] of an initial state's step, of which every window takes the best: at contacts 1 may be too far."""
 LIKE_NOISE = 1.5
 """Cost of a window, in squared standard deviations; noise alone rarely exceeds it, as its mean is 0.8."""
+PLACINGS = 2
+"""Number of epochs of initial states alone where these include places and speeds of bases that no sensor shows."""
 SECOND_CHANCES = 2
 """Number of times that windows which a step of the parameters leaves unexplained begin anew."""
 WORSE = 2.0
@@ -123,9 +125,11 @@ class UnknownStarts:
         return rows
 
     @staticmethod
-    def columns(problem: CalibrationProblem, *, smooth: bool) -> int:
+    def columns(problem: CalibrationProblem, *, smooth: bool, refining: bool) -> int:
         """Number of systems simulated for the derivatives of an epoch: differences by parameters and states."""
-        return 1 + (1 if smooth else 2) * len(problem.simulator.parameters) + problem.states.physical_size
+        placed = int(problem.states.placed.sum())
+        values = placed if placed and not refining else problem.states.physical_size
+        return 1 + (1 if smooth else 2) * len(problem.simulator.parameters) + values
 
     @staticmethod
     def trial_columns(*, smooth: bool) -> int:
@@ -135,7 +139,7 @@ class UnknownStarts:
     @staticmethod
     def settling_columns(problem: CalibrationProblem) -> int:
         """About how many systems are simulated in an epoch in which only initial states move."""
-        return 3 + problem.states.physical_size
+        return 4 + problem.states.physical_size
 
     def settle(
         self,
@@ -150,6 +154,8 @@ class UnknownStarts:
         None are once residuals of nearly all windows are noise. Until there are as many to go as restarts, differences
         become narrower; then windows whose residuals are more than noise begin anew.
         """
+        if self.readings.placed.any():
+            waiting = min(waiting, PLACINGS)
         width = WIDTHS[self.waiting - waiting] if waiting > RESTARTS else 0.0
         after = settle(self.simulator, self.readings, point, states, damping, width * errors, self.loss)
         if waiting <= RESTARTS:
@@ -173,14 +179,15 @@ class UnknownStarts:
         point = np.clip(plan.point + plan.steps[0], -1.0, 1.0)
         states = states + self.readings.in_state_units(plan.state_steps[0], states.shape[1])
         damping, simulations = np.full(len(states), FIRST_DAMPING), 0
-        for width in RESETTLING:
+        of_bases = bool(self.readings.placed.any())
+        for width in RESETTLING[of_bases:]:
             after = settle(self.simulator, self.readings, point, states, damping, width * errors, self.loss)
             states, damping, simulations = after.states, after.damping, simulations + after.simulations
         residuals = self.readings.residuals(self.simulator, point[None], states[None])[0, 0]
         costs = window_costs(residuals / np.tile(plan.deviation, self.readings.steps + 1), self.loss)
         simulations += len(states)
         after = replace(after, costs=costs, deviation=plan.deviation, errors=errors, simulations=simulations)
-        for again in range(SECOND_CHANCES):
+        for again in range(SECOND_CHANCES - of_bases):
             random = np.random.default_rng(RESTARTS + 1 + again)
             after = restart(self.simulator, self.readings, point, self.guesses, after, self.loss, random)
         if not plan.kept.any():
@@ -203,7 +210,14 @@ class UnknownStarts:
         refining: bool,
     ) -> list[Plan]:
         """Differences around every search's point and initial states, in one batch each."""
-        slopes = slopes_at(self.simulator, self.readings, points, states, central=bool(self.touching.any()))
+        slopes = slopes_at(
+            self.simulator,
+            self.readings,
+            points,
+            states,
+            central=bool(self.touching.any()),
+            placed_alone=bool(self.readings.placed.any()) and not refining,
+        )
         searches = zip(slopes, points, damping.tolist(), state_damping, strict=True)
         return [
             self._plan(*each, contacts=self._contacts(each[1], state) if refining else None)
@@ -346,8 +360,9 @@ class UnknownStarts:
         contacts: Int[np.ndarray, "windows readings"],
         kept: Bool[np.ndarray, " windows"],
     ) -> float:
-        shape = (int(kept.sum()), *self.readings.observed.shape[1:])
-        return steady_cost(slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape), contacts[kept], self.loss)
+        shape, of_bases = (int(kept.sum()), *self.readings.observed.shape[1:]), bool(self.readings.placed.any())
+        residuals, left = slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape)
+        return steady_cost(residuals, left, contacts[kept], self.loss, steady_alone=of_bases)
 
     def _deviation(
         self, slopes: WindowSlopes, spare: Float[np.ndarray, "windows values"], kept: Bool[np.ndarray, " windows"]

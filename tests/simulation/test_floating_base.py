@@ -1,0 +1,47 @@
+"""Free bases placed by what touches the floor, against heights and speeds worked out by hand."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from madoc.simulation.floating_base import on_the_floor
+from robots import spring
+
+WHEEL = """<mujoco><worldbody>
+  <geom type="plane" size="5 5 0.1" pos="0 0 {floor}"/>
+  <body pos="0 0 3"><freejoint name="base"/><geom size="0.1" pos="0 0 -0.2" {geom}/></body>
+</worldbody></mujoco>"""
+HALF_TURN = (0.0, 1.0, 0.0, 0.0)  # about x: the ball is above the body's origin
+
+
+def placed(states, *, floor=0.0, geom=""):
+    """States of a body with a ball of 0.1 m that is 0.2 m below its origin; all but attitude and turning is hidden."""
+    hidden = np.array([np.nan] * 3 + [0.0] * 4 + [np.nan] * 3 + [0.0] * 3)
+    text = WHEEL.format(floor=floor, geom=geom)
+    task = replace(
+        spring(), spec=lambda: mujoco.MjSpec.from_string(text), observation_size=1, posture=lambda observation: hidden
+    )
+    return on_the_floor(task, np.array(states, np.float64) + hidden)
+
+
+def of(attitude, turning):
+    return [0.0] * 3 + list(attitude) + [0.0] * 3 + list(turning)
+
+
+def test_the_lowest_geom_stands_on_the_floor():
+    found = placed([of((1, 0, 0, 0), (0, 0, 0)), of(HALF_TURN, (0, 0, 0))], floor=0.5)
+    np.testing.assert_allclose(found.states[:, 2], [0.8, 0.4], atol=1e-9)
+    np.testing.assert_array_equal(np.flatnonzero(found.found), [0, 1, 2, 7, 8, 9])
+    np.testing.assert_array_equal(found.heights, [2])
+
+
+def test_what_stands_does_not_move():
+    found = placed([of((1, 0, 0, 0), (0, 2.0, 0)), of((1, 0, 0, 0), (0, 0, 2.0))])
+    # Turning about y by 2 rad/s with the lowest point 0.3 m below moves the origin by 0.6 m/s along x.
+    np.testing.assert_allclose(found.states[:, 7:10], [[0.6, 0.0, 0.0], [0.0, 0.0, 0.0]], atol=1e-9)
+
+
+def test_what_cannot_touch_the_floor_is_not_placed():
+    found = placed([of((1, 0, 0, 0), (0, 0, 0))], geom='contype="0" conaffinity="0"')
+    assert not found.found.any() and np.isnan(found.states[0, 2])
