@@ -69,6 +69,7 @@ def test_resuming_does_only_what_is_missing(whole, tmp_path, capsys):
     assert answer["calibration"]["seconds"] == earlier["calibration"]["seconds"]
 
 
+@pytest.mark.slow
 def test_a_log_without_truth_is_calibrated_and_learnt_from(recorded, tmp_path, capsys):
     import numpy as np
 

@@ -94,6 +94,7 @@ def covered(task, seed):
     return (spans[:, 0] <= truth) & (truth <= spans[:, 1])
 
 
+@pytest.mark.slow
 def test_noise_at_contacts_misleads_neither_estimates_nor_intervals(bouncer):
     assert np.sum([covered(bouncer, seed) for seed in range(2)]) >= 5
 

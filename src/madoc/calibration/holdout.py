@@ -151,6 +151,8 @@ class Judged:
         finer: Whether other terms than the error of the integration step were tested with steps of a quarter of the
             length, as that error explains much and would hide them.
         open_loop: Errors of open-loop predictions in the signals' units, the shortest first; none without states.
+        base_from_contacts: Whether no sensor shows where a free base is or how fast it moves, and both were taken from
+            contacts that stand still.
     """
 
     split: str
@@ -170,6 +172,7 @@ class Judged:
     coarseness: float = 0.0
     finer: bool = False
     open_loop: tuple[OpenLoop, ...] = ()
+    base_from_contacts: bool = False
 
     @property
     def clearest(self) -> AgainstChance:

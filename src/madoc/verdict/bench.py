@@ -320,6 +320,7 @@ def judged(
         coarseness=coarse,
         finer=finer,
         at_end=space.at_end(point),
+        base_from_contacts=bool(bench.states.placed.any()),
     )
 
 

@@ -81,6 +81,7 @@ def judge(
         or _no_improvement(holdout)
         or (None if settled else Verdict("NO_IMPROVEMENT", f"{_how_good(holdout)}, but {UNSETTLED}"))
         or _untested(holdout)
+        or _with_an_assumed_base(holdout)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and every parameter is known to within half of its range")
     )
 
@@ -312,6 +313,18 @@ def _untested(holdout: HoldOut) -> Verdict | None:
             "or the budget was too short; log more, or in longer runs, or give it more time"
         )
     return Verdict("NOT_IDENTIFIABLE", f"{_how_good(holdout)}, but {why}")
+
+
+def _with_an_assumed_base(holdout: HoldOut) -> Verdict | None:
+    """What would be `CALIBRATED`, if contacts that stand still were not all that tells where a base is."""
+    if not holdout.base_from_contacts:
+        return None
+    why = (
+        "no sensor shows where the base is and how fast it moves: both were taken from contacts that stand still, "
+        "which was not tested; log the base by motion capture, for a while at least, to be sure of the values"
+    )
+    found = _usable(holdout, Verdict("MODEL_MISMATCH", why))
+    return found or Verdict("NOT_IDENTIFIABLE", f"{_how_good(holdout)}, but {why}")
 
 
 def _no_improvement(holdout: HoldOut) -> Verdict | None:
