@@ -1,0 +1,181 @@
+"""What a model lacks, as the hold-out and the tests at the estimate show it: each way is a verdict of its own."""
+
+from dataclasses import replace
+
+from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, ToldApart, Verdict
+from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
+from madoc.identification.term_tests import MissingTerm, named
+from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
+from madoc.verdict.remedies import WARM_UP, remedy, value_of
+from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
+from madoc.verdict.systematic import EXPLAINED
+from madoc.verdict.wording import change_of, in_steps, of_area
+
+WHITE = 0.2
+"""Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
+PERSISTENT = 0.1
+"""Correlation in [-1, 1] of residuals with those a few rows later, above which a force is missing that lasts."""
+BEYOND_RANDOM = 1.3
+"""Lower end of the 95 % interval of a signal's error over that of noise and random forces; above it something adds up
+that is not random."""
+_MOST_NAMED = 3
+"""Largest number of terms that a sentence names beside the likeliest."""
+SEPARABLE = 0.65
+"""Area under the curve in [0.5, 1]; above it simulated rows differ from logged ones. Rollouts of a cloned policy in the
+true simulator have about 0.55."""
+
+
+def lacking(holdout: HoldOut, *, long_tails: bool) -> Verdict | None:
+    """The first of the ways in which a model lacks something; None where there is none.
+
+    `long_tails` tells that residuals have longer tails than noise has.
+    """
+    found = _missing(holdout) or _mismatch(holdout) or _outside(holdout)
+    return found or (_unlike_noise(holdout) if long_tails else None)
+
+
+def _missing(holdout: HoldOut) -> Verdict | None:
+    """A term that the model lacks and that moves the estimate, with the line that adds it to the spec."""
+    term = missing_term(holdout)
+    if term is None:
+        return None
+    value = value_of(term)
+    if term.cause in DRIFTS:
+        within = term.cause == WITHIN_RUNS
+        change = value_of(replace(term, value=2.0 * term.value, standard_error=2.0 * term.standard_error))
+        where = f"by {change} from the begin of a run to its end" if within else f"by {value} between its parts"
+        return Verdict(
+            "MODEL_MISMATCH",
+            f"{term.parameter} drifts: it changes {'within each run' if within else 'over the log'} {where} "
+            f"(t = {abs(term.t):.0f}), which is {(1 + within) * abs(term.shifts[term.parameter]):.2g} half-widths of "
+            f"its interval; {WARM_UP if within else 'calibrate to each run by itself'}{about_timestep(holdout)}",
+            (term.parameter,),
+        )
+    moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
+    effect = " and ".join(f"{name} by {abs(term.shifts[name]):.2g}" for name in moved)
+    return Verdict(
+        "MODEL_MISMATCH",
+        f"the model lacks {named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
+        f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
+        f"{_others(holdout, term)}{about_timestep(holdout, term)}; {remedy(term)}{_at_end(holdout)}"
+        f"{_disagreeing(holdout)}",
+        tuple(moved),
+    )
+
+
+def _others(holdout: HoldOut, term: MissingTerm) -> str:
+    """Which other terms are as likely as the one named."""
+    others = list(dict.fromkeys(map(named, as_likely(holdout, term))))[:_MOST_NAMED]
+    return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
+
+
+def _at_end(holdout: HoldOut) -> str:
+    """Which estimates are at an end of their range, where other terms may make up for what lies beyond it."""
+    names = ", ".join(holdout.at_end)
+    return f"; {names} at the end of the range: the true value may lie beyond it, so widen it first" if names else ""
+
+
+def _disagreeing(holdout: HoldOut) -> str:
+    """Which parameters the parts of the log disagree on."""
+    names = dict.fromkeys(name for each in holdout.alternatives if each.parts for name in each.shifts)
+    return f"; parts of the log disagree on {', '.join(names)}" if names else ""
+
+
+def contradicted(holdout: HoldOut) -> Verdict | None:
+    """A log that the check before the calibration found to contradict the spec."""
+    if not holdout.contradictions:
+        return None
+    return Verdict(
+        "MODEL_MISMATCH", f"the log contradicts the spec: {holdout.contradictions[0]}{about_timestep(holdout)}"
+    )
+
+
+def _outside(holdout: HoldOut) -> Verdict | None:
+    """An estimate at the end of its range, beyond which the true value may lie."""
+    if not holdout.at_end:
+        return None
+    return Verdict(
+        "MODEL_MISMATCH",
+        f"{', '.join(holdout.at_end)} at the end of the range: the true value may lie beyond it, and then the other "
+        f"parameters make up for it; widen the range{about_timestep(holdout)}",
+        holdout.at_end,
+    )
+
+
+def _unlike_noise(holdout: HoldOut) -> Verdict | None:
+    """Residuals with long tails, where the error of the integration step does not explain them."""
+    if numerical(holdout) is not None:
+        return None
+    return Verdict(
+        "MODEL_MISMATCH",
+        "residuals have longer tails than noise has: the model does not explain some stretches of the log, and "
+        "intervals do not count that; look there for a force that acts at times only, at contacts or in fast motion, "
+        f"for wrong or missing readings and for values that differ between runs{about_timestep(holdout)}",
+    )
+
+
+def _mismatch(holdout: HoldOut) -> Verdict | None:
+    if numerical(holdout) is not None:
+        return None
+    at_end = [f"{', '.join(holdout.at_end)} at the end of the range"] if holdout.at_end else []
+    if isinstance(holdout, ToldApart):
+        sentence = _separable(holdout.area_at_mid_range, holdout.area_at_estimate, at_end)
+    else:
+        sentence = _systematic(holdout, at_end)
+    if not sentence:
+        return None
+    term = likeliest([each for each in holdout.missing_terms if is_certain(each) and each.cause not in DRIFTS])
+    if term is not None:
+        sentence += (
+            f"; of single terms {named(term)} is the likeliest: {value_of(term)} explains {100 * term.explained:.2g} % "
+            f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}){_others(holdout, term)}; "
+            f"{remedy(term)}"
+        )
+    return Verdict("MODEL_MISMATCH", f"{sentence}{about_timestep(holdout)}", holdout.at_end)
+
+
+def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
+    """How the errors of the best parameters nearby differ from noise, in size and for a reason; else empty."""
+    errors, direct, reasons = holdout.errors, isinstance(holdout, Predicted), list[str]()
+    if holdout.explained > EXPLAINED:
+        inputs = "state and action" if direct else "readings and actions"
+        reasons.append(f"{inputs} explain {100 * holdout.explained:.0f} % of it")
+    if isinstance(holdout, Predicted) and holdout.autocorrelation > WHITE:
+        reasons.append(f"it is correlated from step to step ({holdout.autocorrelation:.2f})")
+    if isinstance(holdout, Predicted) and holdout.persistence > PERSISTENT:
+        lasts = f"it lasts over several rows (correlation {holdout.persistence:.2f})"
+        reasons.append(f"{lasts}, as an external force does or a base that moves")
+    reasons += at_end
+    beyond = beyond_noise(errors.nearby_best, errors.noise)
+    if not beyond or not reasons:
+        return _adding_up(holdout) if isinstance(holdout, Predicted) else ""
+    left, noise = max(beyond, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
+    return (
+        f"the best parameters nearby leave {left.mean:.2g} of the typical change in {in_steps(errors.stride)} after "
+        f"{in_steps(left.steps)}{'' if direct else ' behind a fitted start'} on the hold-out, where noise leaves "
+        f"{noise.mean:.2g}, and "
+        f"{', '.join(reasons)}: the model cannot explain the data ({change_of(errors)} at the estimate)"
+    )
+
+
+def _adding_up(holdout: Predicted) -> str:
+    """Which signal's error over the longest horizon is larger than noise and random forces make it; else empty."""
+    signal, factor = max(holdout.beside_random.items(), key=lambda pair: pair[1], default=("", 0.0))
+    if factor <= BEYOND_RANDOM:
+        return ""
+    return (
+        f"after {in_steps(holdout.errors.nearby_best[-1].steps)} the best parameters nearby leave {factor:.2g} times "
+        f"or more of the error in {signal} that sensor noise and random forces make: the model cannot explain the data "
+        f"({change_of(holdout.errors)} at the estimate)"
+    )
+
+
+def _separable(before: Area, after: Area, at_end: list[str]) -> str:
+    """How well a classifier separates simulated from logged rows, if better than `SEPARABLE`; else empty."""
+    if after.interval[0] <= SEPARABLE or after.area >= before.area:
+        return ""
+    return (
+        f"a classifier still tells rows of the simulator from those held out, {of_area(after)} after {of_area(before)} "
+        f"at mid-range (0.5 is chance){', and '.join(['', *at_end])}: the model cannot move as the data does, or the "
+        "search is not at its end"
+    )
