@@ -145,6 +145,7 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     assert (np.diag(state.meat) > np.diag(patient.meat)).all()
 
 
+@pytest.mark.slow
 def test_at_contacts_states_settle_anew_after_each_step_of_the_parameters(monkeypatch):
     task = tasks.make("halfcheetah", "legacy")
     truth = dict(zip(task.parameters.names, task.parameters.middle.tolist(), strict=True))

@@ -29,6 +29,7 @@ def test_tables_to_read(arm, capsys):
         assert words in told
 
 
+@pytest.mark.slow
 def test_json_and_a_forecast(arm, capsys):
     files = [str(arm / "logs" / f"{seed}.csv") for seed in (0, 1)]
     assert main(["check", str(arm / "arm.yaml"), "--json", "--data", *files]) == 0

@@ -21,6 +21,7 @@ def read(path):
     return json.loads(path.read_text())
 
 
+@pytest.mark.slow
 def test_calibrate_prints_what_it_leaves(recorded, whole, tmp_path, capsys):
     out = tmp_path / "calibration"
     words = ["calibrate", "hopper", "--data", recorded, "--out", out, *CALIBRATION, "--holdout", "0.2"]

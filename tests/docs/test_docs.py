@@ -25,6 +25,7 @@ PENDULUM = Path(os.environ.get("MADOC_PENDULUM", ROOT.parent / "shared" / "data"
 SERVO = Path(os.environ.get("MADOC_XL330", ROOT.parent / "shared" / "data" / "xl330"))
 ARM = Path(os.environ.get("MADOC_SO101", ROOT.parent / "shared" / "data" / "so101"))
 SLOW = {
+    "tutorial.md",
     "real-arm.md",
     "real-pendulum.md",
     "real-servo.md",

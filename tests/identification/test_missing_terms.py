@@ -114,6 +114,7 @@ def test_the_missing_term_is_named_with_its_value(tmp_path, lacks, parameter, va
     assert best.value == pytest.approx(value, rel=0.3)
 
 
+@pytest.mark.slow
 def test_rows_without_an_order_tell_a_missing_friction_as_well(tmp_path):
     dataset, simulator = plant(tmp_path, friction=0.01)
     loose = disturb(dataset, Disturbance(shuffled="rows"), simulator.task, jax.random.key(0))

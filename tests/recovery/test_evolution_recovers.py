@@ -81,6 +81,7 @@ def test_a_clone_that_acts_says_less_but_needs_no_states():
     assert (error < ACTED).all(), error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [CmaEs("distribution", **CLONED), Oted(**CLONED)])
 def test_windows_of_a_clones_positions_tell_where_velocities_are_hidden(method):
     error, result = off(method, "spring", rows=5000, hidden_velocities=True)
