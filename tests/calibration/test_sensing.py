@@ -74,7 +74,8 @@ def test_noise_that_simulated_readings_are_given_is_told():
     assert collection_of(problem).warnings == ()
 
 
-@pytest.mark.parametrize(("rows", "share", "short"), [(1, 0.1, 0.2), pytest.param(3, 0.1, 0.5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("rows", "share", "short"), [(1, 0.1, 0.2), (3, 0.1, 0.5)])
 def test_noise_is_estimated_from_a_log_that_declares_none(rows, share, short):
     # Of windows the estimate is a lower bound.
     exact = recorded(WHOLE, ARM_TRUTH, 3000, KEY)

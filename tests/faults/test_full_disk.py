@@ -29,6 +29,7 @@ def full(*arguments):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.mark.slow
 def test_what_was_not_written_for_want_of_room_is_done_again(tmp_path, monkeypatch):
     """The disk is full at 20 moments, in each of which a file was to be forced to it."""
     go_on(str(tmp_path / "whole"), BUDGET)

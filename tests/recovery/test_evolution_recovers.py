@@ -55,6 +55,7 @@ def test_errors_of_replayed_rows_lead_to_the_truth_and_the_search_ends_there(rob
     assert not result.warnings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("weight", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_a_likely_distribution_stands_about_the_truth(robot, weight):
