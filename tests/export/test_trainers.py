@@ -3,6 +3,8 @@
 import ast
 from dataclasses import replace
 
+import mujoco
+import numpy as np
 import pytest
 
 from madoc.calibration.result import ParameterEstimate
@@ -67,6 +69,7 @@ def test_mjlab_gets_servos_of_equal_numbers_together_and_other_actuators_as_they
     (motor,) = calls(path, "XmlActuatorCfg")
     assert motor["target_names_expr"] == ("hip",)
     text = path.read_text()
+    assert "draws do not reach opt.gravity" in text
     assert "CHANGED = ('dof_armature',)" in text and "MADE_BY_MJLAB = ('fl', 'fr')" in text
     assert "a delay of 4 physics steps is 0.5 ms more than estimated" in text and "density" in text
 
@@ -82,6 +85,42 @@ def test_isaac_lab_gets_what_its_joints_have_and_is_told_the_rest(tmp_path):
     text = path.read_text()
     assert "DRAWN = [('armature', ['fl_knee', 'fr_knee'], 0), ('stiffness', ['fl_knee'], 1)]" in text
     assert "body_mass.trunk = 5 kg has to go into the robot's USD file" in text
+
+
+def test_rows_of_the_model_are_found_again_in_a_scene_with_other_bodies_and_a_floor(tmp_path):
+    path = tmp_path / "mjlab_robot.py"
+    save_mjlab(path, ROBOT, PARAMETERS)
+    tree = ast.parse(path.read_text())
+    (function,) = (node for node in tree.body if getattr(node, "name", "") == "rows_in_scene")
+    names = {"np": np, "MADE_BY_MJLAB": ("servo",)}
+    exec(compile(ast.Module([function], []), str(path), "exec"), names)
+    legs = """<mujoco><worldbody><geom name="own floor" type="plane" size="1 1 1"/><body><freejoint/><geom size="0.1"/>
+    <body name="leg"><joint name="hip"/><geom size="0.1"/></body></body></worldbody>
+    <actuator><motor name="push" joint="hip"/><position name="servo" joint="hip"/></actuator></mujoco>"""
+    alone = mujoco.MjModel.from_xml_string(legs)
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><body><joint type='slide'/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    robot = mujoco.MjSpec.from_string(legs)
+    robot.actuators[1].name = "hip"  # as mjlab names the servo that it adds again
+    spec.attach(robot, prefix="robot/", frame=spec.worldbody.add_frame())
+    scene = spec.compile()
+    found = {
+        field: names["rows_in_scene"](field, alone, scene, "robot").tolist()
+        for field in (
+            "body_mass",
+            "dof_armature",
+            "jnt_stiffness",
+            "qpos0",
+            "qpos_spring",
+            "geom_friction",
+            "actuator_gear",
+        )
+    }
+    assert found["body_mass"] == [-1, 2, 3] and found["dof_armature"] == [*range(1, 8)]
+    assert found["jnt_stiffness"] == [1, 2] and found["qpos0"] == found["qpos_spring"] == [*range(1, 9)]
+    assert found["geom_friction"][0] == -1 and [scene.geom_bodyid[row] for row in found["geom_friction"][1:]] == [2, 3]
+    assert [scene.actuator(row).name for row in found["actuator_gear"]] == ["robot/push", "robot/hip"]
 
 
 @pytest.mark.parametrize("save", [save_mjlab, save_isaac_lab])

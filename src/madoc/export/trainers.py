@@ -64,6 +64,9 @@ def save_mjlab(path: Path, robot: Robot, exported: Sequence[Exported]) -> None:
         (kind, {"target_names_expr": _tuple(map(re.escape, joints)), **dict(arguments), **delay})
         for ((_, kind), *arguments), joints in groups.items()
     ]
+    placed = [field for field in robot.fields if field.partition("_")[0] in _PLACED]
+    left = [field for field in robot.fields if field not in placed]
+    unsaid += [f"draws do not reach {field}, which stays that of model.xml" for field in left]
     lost = [*robot.lost, *unsaid, *_biases(exported, "dr.encoder_bias adds it to what is observed")]
     if any(each.servo for each in robot.actuators):
         lost.append("commands beyond their range in the spec are not cut off by BuiltinPositionActuatorCfg")
@@ -79,7 +82,7 @@ def save_mjlab(path: Path, robot: Robot, exported: Sequence[Exported]) -> None:
         start=_table(robot.start),
         physics=robot.physics,
         decimation=robot.decimation,
-        fields=_tuple(field for field in robot.fields if not field.startswith("opt.")),
+        fields=_tuple(placed),
     )
 
 
@@ -120,6 +123,8 @@ def save_isaac_lab(path: Path, robot: Robot, exported: Sequence[Exported]) -> No
     )
 
 
+_PLACED = ("actuator", "body", "dof", "geom", "jnt", "qpos", "qpos0")
+"""First words of the arrays of a model whose rows `mjlab_robot.py` finds again in a scene."""
 _JOINT_WRITERS = {
     "dof_armature": "armature",
     "dof_frictionloss": "friction",
