@@ -6,6 +6,7 @@ that was run again has another row below, and the last one counts. Rows with a k
 longer there: they stay, and no table shows them.
 """
 
+import argparse
 import hashlib
 import importlib.metadata
 import importlib.util
@@ -14,9 +15,9 @@ import os
 import platform
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,27 @@ POLICIES = Study(RESULTS / "policies.jsonl", ("robot", "method", "at", "calibrat
 """Policies that were learnt and evaluated, by `policies.py`."""
 SYSID = Study(RESULTS / "sysid.jsonl", ("robot", "situation", "seed"))
 """Both tools on the same logs, by `against_sysid.py`."""
+
+
+def run_seeds(
+    study: Study,
+    solve: Callable[[int], dict[str, Any]],
+    table: Callable[[list[dict[str, Any]]], str],
+    *,
+    description: str | None,
+) -> None:
+    """The command line of a study whose cells are seeds: run those that have no row, and print the table of all."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--results", type=Path, default=study.file)
+    parser.add_argument("--table", action="store_true", help="print the summary of what is there, and run nothing")
+    arguments = parser.parse_args()
+    study = replace(study, file=arguments.results)
+    for seed in arguments.seeds if not arguments.table else ():
+        with study.claimed({"seed": seed}) as ours:
+            if ours:
+                study.add(solve(seed))
+    print(table(study.rows()))
 
 
 def commits(rows: Iterable[Mapping[str, Any]]) -> str:

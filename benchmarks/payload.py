@@ -9,10 +9,8 @@ step of 1 ms; 200 rows a second have positions, speeds and torques with the nois
 radius of gyration of the load, seven frictions and the delay are calibrated, with all defaults.
 """
 
-import argparse
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -20,7 +18,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from adversary import compared, madoc
-from kept import RESULTS, Study, commit, commits
+from kept import RESULTS, Study, commit, commits, run_seeds
 
 STUDY = Study(RESULTS / "payload.jsonl", ("seed",))
 LINKS = ((0.15, 4.0), (0.2, 4.0), (0.15, 3.0), (0.2, 3.0), (0.12, 2.5), (0.1, 1.5), (0.08, 0.8))
@@ -57,20 +55,6 @@ parameters:
   - {{field: dof_frictionloss, each: "j*", low: 0, high: 1}}
   - {{field: action_delay, low: 0, high: 0.02}}
 """
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--results", type=Path, default=STUDY.file)
-    parser.add_argument("--table", action="store_true", help="print the summary of what is there, and run nothing")
-    arguments = parser.parse_args()
-    study = replace(STUDY, file=arguments.results)
-    for seed in arguments.seeds if not arguments.table else ():
-        with study.claimed({"seed": seed}) as ours:
-            if ours:
-                study.add(solve(seed))
-    print(table(study.rows()))
 
 
 def solve(seed: int) -> dict[str, Any]:
@@ -186,4 +170,4 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_seeds(STUDY, solve, table, description=__doc__)

@@ -9,7 +9,6 @@ speeds are differences of them at 500 Hz, and torque is known from noisy current
 runs, over windows of 0.5 s, as are mid-range and values 5 % off the truth, as a maker's data sheet may be.
 """
 
-import argparse
 import tempfile
 import time
 from dataclasses import replace
@@ -25,7 +24,7 @@ from adversary_cases.case import ENCODER, Case, Log, Spec
 from adversary_cases.plant import Run, record_run, truth_of
 from adversary_cases.robots import ARM
 from adversary_cases.write import limits, write
-from kept import RESULTS, Study, commit, commits
+from kept import RESULTS, Study, commit, commits, run_seeds
 
 STUDY = Study(RESULTS / "rates.jsonl", ("seed",))
 RATES = (500, 100, 50)
@@ -43,20 +42,6 @@ SHEET = 0.05
 """Error of a maker's data sheet, as a share of each value; its sign is drawn."""
 LIMIT = 300.0
 """s, of one calibration."""
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--results", type=Path, default=STUDY.file)
-    parser.add_argument("--table", action="store_true", help="print the summary of what is there, and run nothing")
-    arguments = parser.parse_args()
-    study = replace(STUDY, file=arguments.results)
-    for seed in arguments.seeds if not arguments.table else ():
-        with study.claimed({"seed": seed}) as ours:
-            if ours:
-                study.add(solve(seed))
-    print(table(study.rows()))
 
 
 def solve(seed: int) -> dict[str, Any]:
@@ -162,4 +147,4 @@ def half_width(parameter: dict[str, Any]) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run_seeds(STUDY, solve, table, description=__doc__)
