@@ -99,7 +99,7 @@ def written(folder: Path, friction: str, values: Mapping[str, float] | None = No
     document["friction"] = [{"joint": "shaft", "model": friction, "up_to": document["friction"][0]["up_to"]}]
     if values is not None:
         drive = document["actions"][0]["drive"]
-        drive |= {name: values[name] for name in ("kt", "resistance")}
+        drive |= {name: values[name] for name in ("kt", "resistance")} | {"saturation": 0.0}
         document["friction"][0] |= {name: values[name] for name in TERMS if name in values}
         ends = {name: (0.999 * values[name], 1.001 * values[name]) for name in ("armature", "zero")}
         document["parameters"] = [

@@ -72,6 +72,7 @@ PARAMETER = "  - {field: drive_strength, element: goal, low: 0.5, high: 1.5}"
         ("gain_from: p", "gain_from: q", "expected the name of a condition, got 'q'; there are: p"),
         ("supply_from: volts", 'supply_from: "on"', "the column 'on' is used for something else already"),
         ("supply_from: volts", "supply_from: angle", "the name 'angle' is taken"),
+        ("gain: 0.2", "gain: 0.2, saturation: -1", "expected greater than or equal to 0 in actions.drive.saturation"),
         ("values: [2, 5]", "values: [2, 2]", "values: of p has one twice"),
         ("values: [2, 5]", "values: [2, 5], file_name: p", "expected one \\* in file_name:, got 'p'"),
         (PARAMETER, PARAMETER.replace("goal", "volts"), "drive_strength: actuator 'volts' is no such drive"),

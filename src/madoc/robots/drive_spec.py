@@ -48,6 +48,7 @@ class DriveSpec(Part):
     duty_limit: Share = Field(1.0, description="Largest duty, of 1.")
     current_limit: Positive | None = Field(None, description="Largest current, A. Default: none.")
     strength: Positive = Field(1.0, description="Factor on the torque: of gears, magnets and temperature.")
+    saturation: NotNegative = Field(0.0, description="Of torque by current, 1/A: at 1/saturation half of it is left.")
     enable: Name | None = Field(None, description="Column of the log: below 0.5 the drive is off, the joint is free.")
     supply_from: Name | None = Field(None, description="Column of the log with the measured supply, V.")
     gain_from: Name | None = Field(None, description="Condition whose value is the gain set in the firmware.")

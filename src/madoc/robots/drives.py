@@ -36,6 +36,7 @@ def drive_numbers(drive: DriveSpec, means: str) -> tuple[float, ...]:
         drive.duty_limit,
         UNLIMITED if drive.current_limit is None else drive.current_limit,
         drive.strength,
+        drive.saturation,
         -1.0,
         -1.0,
         -1.0,
