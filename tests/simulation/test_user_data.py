@@ -59,7 +59,10 @@ def test_a_number_that_is_not_there_is_refused(spring_task, field, element, sent
     ("field", "sentence"),
     [
         ("drive_current_limit", "the current of 'goal' is not limited; give it a current_limit:"),
-        ("drive_saturation", "the torque of 'goal' is in proportion to its current; give it a saturation: of more than"),
+        (
+            "drive_saturation",
+            "the torque of 'goal' is in proportion to its current; give it a saturation: of more than",
+        ),
     ],
 )
 def test_a_number_that_a_drive_does_without_is_refused(tmp_path, field, sentence):
