@@ -68,6 +68,12 @@ def missing_term(holdout: HoldOut) -> MissingTerm | None:
     return likeliest(moving)
 
 
+def suspect(holdout: HoldOut) -> MissingTerm | None:
+    """The term that a verdict names: one that moves the estimate, or else one that is certainly missing."""
+    certain = [each for each in holdout.missing_terms if is_certain(each) and each.cause not in DRIFTS]
+    return missing_term(holdout) or likeliest(certain)
+
+
 def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     """Of significant terms the one that explains most, or nearly as much if that is unusual; None of none.
 
