@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 
 from madoc import robots, simulation
-from madoc.data import Disturbance, disturb, typical_change
+from madoc.data import Disturbance, disturb, logs, typical_change
 from madoc.identification import missing_terms as terms
-from madoc.identification.candidate_terms import EARLY, LATE_DRIVE, LATE_SENSOR, Candidate, _cut_off, is_late
+from madoc.identification.candidate_effects import _cut_off
+from madoc.identification.candidate_terms import EARLY, LATE_DRIVE, LATE_SENSOR, Candidate, is_late
 from madoc.identification.drifts import DRIFT, WITHIN_RUNS, _between_runs, _drifts, _of_fitted_runs, _Part
 from madoc.identification.joint_forces import LOADED
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
 from madoc.identification.term_tests import TermTests
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
-from planted_pendulum import SPEC, plant
+from planted_pendulum import NOISE, SPEC, plant
 
 
 def scores(dataset, simulator, half_width: float = 0.01):
@@ -253,3 +254,39 @@ def test_a_drive_saturates_at_both_ends_of_what_it_is_asked_for(tmp_path):
     # 0, 5 and 10 N·m are -1, 0 and 1; what is above 7 N·m is cut off, nothing below 0.
     asked = np.array([-1.0, 0.0, 1.0])[None, :, None]
     np.testing.assert_allclose(_cut_off(asked, simulator)[0, :, 0], [-1.0, 0.0, 0.4])
+
+
+def test_a_longer_link_is_named_with_its_length(tmp_path):
+    arm = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
+      <body name="upper"><joint name="shoulder" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/>
+      <body name="fore" pos="0 0 -{length}"><joint name="elbow" axis="0 1 0" damping="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5"/></body></body></worldbody>
+      <actuator><motor name="shoulder" joint="shoulder"/><motor name="elbow" joint="elbow"/></actuator></mujoco>"""
+    spec = (
+        SPEC[: SPEC.index("signals:")]
+        + """
+signals: [{name: q1, reads: position(shoulder)}, {name: q2, reads: position(elbow)},
+          {name: v1, reads: velocity(shoulder)}, {name: v2, reads: velocity(elbow)}]
+actions: [{name: u1, actuator: shoulder, low: -3, high: 3}, {name: u2, actuator: elbow, low: -1, high: 1}]
+parameters: [{field: dof_damping, element: elbow, low: 0, high: 0.2}]
+"""
+    )
+    (tmp_path / "model.xml").write_text(arm.format(length=0.3))
+    (tmp_path / "arm.yaml").write_text(spec)
+    robot, random = robots.load(tmp_path / "arm.yaml"), np.random.default_rng(0)
+    (tmp_path / "model.xml").write_text(arm.format(length=0.315))
+    real = simulation.make(robots.load(tmp_path / "arm.yaml").task)
+    torque = np.repeat(random.uniform(-1, 1, (400, 2)), 5, axis=0)
+    start, system = real.initial_state[None, None], real.bind(np.array([[0.05]]))
+    states = np.concatenate([start[0], system.roll_out(start, torque[None, None])[0, 0]])[:-1]
+    seen = system.observe(states[None])[0] + NOISE * random.standard_normal((len(states), 4))
+    columns = np.column_stack([0.02 * np.arange(len(torque)), seen, torque * [3.0, 1.0]])
+    np.savetxt(tmp_path / "log.csv", columns, "%.9g", ",", header="time,q1,q2,v1,v2,u1,u2", comments="")
+    dataset, simulator = logs.read([tmp_path / "log.csv"], robot), simulation.make(robot.task)
+    point, change = simulator.parameters.to_unit(np.array([0.05])), typical_change(dataset)
+    found = terms.suspicions(dataset, states_of(dataset, simulator), simulator, point, np.array([0.01]), change).terms
+    length = next(term for term in found if term.parameter == "body_distance.fore")
+    assert length.explained == max(term.explained for term in found)
+    assert length.value == pytest.approx(0.315, abs=0.003)
+    assert length.nominal == 0.3

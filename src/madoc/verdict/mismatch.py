@@ -10,7 +10,7 @@ from madoc.verdict.adequacy import about_timestep, as_likely, missing_term, nume
 from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
-from madoc.verdict.wording import change_of, in_steps, of_area
+from madoc.verdict.wording import change_of, in_rows, of_area
 
 WHITE = 0.2
 """Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
@@ -164,20 +164,20 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
         inputs = "state and action" if direct else "readings and actions"
         reasons.append(f"{inputs} explain {100 * holdout.explained:.0f} % of it")
     if isinstance(holdout, Predicted) and holdout.autocorrelation > WHITE:
-        reasons.append(f"it is correlated from step to step ({holdout.autocorrelation:.2f})")
+        reasons.append(f"it is alike from row to row (correlation {holdout.autocorrelation:.2f})")
     if isinstance(holdout, Predicted) and holdout.persistence > PERSISTENT:
-        lasts = f"it lasts over several rows (correlation {holdout.persistence:.2f})"
-        reasons.append(f"{lasts}, as an external force does or a base that moves")
+        reasons.append(f"it lasts over several rows (correlation {holdout.persistence:.2f}), as of a lasting force")
     reasons += at_end
     beyond = beyond_noise(errors.nearby_best, errors.noise)
     if not beyond or not reasons:
         return _adding_up(holdout) if isinstance(holdout, Predicted) else ""
     left, noise = max(beyond, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
+    noisy = noise.mean > NEGLIGIBLE
+    much = f"{left.mean / noise.mean:.2g} times as much as noise does" if noisy else "none of which is noise"
     return (
-        f"the best parameters nearby leave {left.mean:.2g} of the typical change in {in_steps(errors.stride)} after "
-        f"{in_steps(left.steps)}{'' if direct else ' behind a fitted start'} on the hold-out, where noise leaves "
-        f"{noise.mean:.2g}, and "
-        f"{', '.join(reasons)}: the model cannot explain the data ({change_of(errors)} at the estimate)"
+        f"even the parameters nearby that fit the hold-out best err by {left.mean:.2g} of what a signal changes in "
+        f"{in_rows(errors.stride)}, after {in_rows(left.steps)}{'' if direct else ' from a fitted start'}, {much}, and "
+        f"{', '.join(reasons)}: the model cannot explain the data ({change_of(errors)})"
     )
 
 
@@ -187,9 +187,9 @@ def _adding_up(holdout: Predicted) -> str:
     if factor <= BEYOND_RANDOM:
         return ""
     return (
-        f"after {in_steps(holdout.errors.nearby_best[-1].steps)} the best parameters nearby leave {factor:.2g} times "
+        f"after {in_rows(holdout.errors.nearby_best[-1].steps)} the best parameters nearby leave {factor:.2g} times "
         f"or more of the error in {signal} that sensor noise and random forces make: the model cannot explain the data "
-        f"({change_of(holdout.errors)} at the estimate)"
+        f"({change_of(holdout.errors)})"
     )
 
 
