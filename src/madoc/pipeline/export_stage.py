@@ -12,7 +12,9 @@ from madoc.errors import MadocError
 from madoc.export import (
     Exported,
     Robot,
+    bam_files,
     is_patch,
+    save_bam,
     save_draws,
     save_isaac_lab,
     save_mjlab,
@@ -30,7 +32,7 @@ from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.report.reading import read_arrays
 from madoc.simulation import Simulator
-from madoc.simulation.configuration import joint_actuators, physics_options, start_position
+from madoc.simulation.configuration import JointDrive, joint_actuators, joint_drives, physics_options, start_position
 from madoc.simulation.drawn import numbers_of_draws
 from madoc.simulation.mjcf import DRIVES, save_mjcf
 from madoc.simulation.user_data import needs_callbacks
@@ -93,6 +95,9 @@ def export_run(
     else:
         files["robot for mjlab"] = folder / "mjlab_robot.py"
         files["robot for Isaac Lab"] = folder / "isaac_lab_robot.py"
+    drives = _drives(simulator, result.mean)
+    of_drives = bam_files(folder, drives)
+    files |= {f"drive {drive.name} for BAM": file for drive, file in zip(drives, of_drives, strict=True)}
     evidence = _evidence(calibrated) if rerun else {}
     targets = {name: folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx") for name in policies}
     if out is not None:
@@ -108,6 +113,8 @@ def export_run(
         robot = _robot(simulator, result.mean, fields)
         save_mjlab(files["robot for mjlab"], robot, exported)
         save_isaac_lab(files["robot for Isaac Lab"], robot, exported)
+    for drive, file in zip(drives, of_drives, strict=True):
+        save_bam(file, drive, _delay(simulator, result.mean))
     for name, file in policies.items():
         save_onnx(NumpyPolicy.load(file), targets[name])
         files[f"policy {name}"] = targets[name]
@@ -148,7 +155,6 @@ def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], field
     task, model = simulator.task, simulator.model(values)
     named = [channel.actuator for channel in task.actions] or element_names(model, "actuator")
     physics, lost = physics_options(model)
-    rows = zip(simulator.parameters.parameters, values.tolist(), strict=True)
     return Robot(
         name=task.name,
         actuators=joint_actuators(model, list(dict.fromkeys(named))),
@@ -156,10 +162,25 @@ def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], field
         physics=physics,
         decimation=task.frame_skip,
         timestep=simulator.control_step / task.frame_skip,
-        delay=sum(value for row, value in rows if row.field == "action_delay"),
+        delay=_delay(simulator, values),
         fields=fields,
         lost=lost,
     )
+
+
+def _drives(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> list[JointDrive]:
+    """The d.c. drives at the estimate; what differs between runs is what it is in a log's first condition."""
+    at_rest = {
+        channel.actuator: channel.scale * (channel.low + 0.5 * (channel.rest + 1.0) * (channel.high - channel.low))
+        for channel in simulator.task.actions
+    }
+    return joint_drives(simulator.model(values), at_rest)
+
+
+def _delay(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> float:
+    """From a command to its effect, s."""
+    rows = zip(simulator.parameters.parameters, values.tolist(), strict=True)
+    return sum((value for row, value in rows if row.field == "action_delay"), 0.0)
 
 
 def _require_ours(folder: Path, files: Iterable[Path]) -> None:
