@@ -96,7 +96,7 @@ def save_isaac_lab(path: Path, robot: Robot, exported: Sequence[Exported]) -> No
     groups: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for each in robot.actuators:
         if each.joint:
-            groups.setdefault(tuple(_of_isaac(each).items()), []).append(each.joint)
+            groups.setdefault(tuple(_of_isaac(each, explicit=lag > 0).items()), []).append(each.joint)
     delay = {"min_delay": str(lag), "max_delay": str(lag)} if lag else {}
     actuators = [
         {"joint_names_expr": repr([re.escape(joint) for joint in joints]), **dict(arguments), **delay}
@@ -151,8 +151,10 @@ def _of_mjlab(actuator: JointActuator) -> dict[str, str]:
     }
 
 
-def _of_isaac(actuator: JointActuator) -> dict[str, str]:
-    limit = {} if actuator.effort_limit is None else {"effort_limit_sim": repr(actuator.effort_limit)}
+def _of_isaac(actuator: JointActuator, *, explicit: bool) -> dict[str, str]:
+    """The arguments of an actuator's configuration; an explicit one cuts its force off itself, PhysX that of others."""
+    name = "effort_limit" if explicit else "effort_limit_sim"
+    limit = {} if actuator.effort_limit is None else {name: repr(actuator.effort_limit)}
     return {
         "stiffness": repr(actuator.stiffness),
         "damping": repr(actuator.damping),
