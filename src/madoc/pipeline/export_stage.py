@@ -28,6 +28,7 @@ from madoc.export import (
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
+from madoc.pipeline.export_losses import losses
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.report.reading import read_arrays
@@ -77,10 +78,14 @@ def export_run(
             )
     provenance = provenance_of(calibrated)
     model = calibrated.task.compile()
-    covariance = calibrated.distribution().covariance
+    covariance, draws = calibrated.distribution().covariance, _draws(calibrated)
+    own = [nominal_values(model, parameter) for parameter in simulator.parameters.parameters]
+    lost = losses(_evidence(calibrated), simulator, result.mean, own, draws)
     exported = [
-        Exported(parameter, replace(result.parameters[parameter.name], std=std), nominal_values(model, parameter))
-        for parameter, std in zip(simulator.parameters.parameters, np.sqrt(np.diag(covariance)).tolist(), strict=True)
+        Exported(parameter, replace(result.parameters[parameter.name], std=std), values, left_out)
+        for parameter, std, values, left_out in zip(
+            simulator.parameters.parameters, np.sqrt(np.diag(covariance)).tolist(), own, lost.left_out, strict=True
+        )
     ]
     files = {
         "model": folder / "model.xml",
@@ -104,13 +109,12 @@ def export_run(
         _require_ours(folder, [*files.values(), *targets.values()])
     changes = save_mjcf(simulator, result.mean, files["model"])
     save_patch(files["patch"], exported, provenance, changes=changes, stepping=_stepping(simulator))
-    save_randomization(
-        files["randomization ranges"], exported, provenance, None if result.covariance is None else covariance.tolist()
-    )
+    together = None if result.covariance is None else covariance.tolist()
+    save_randomization(files["randomization ranges"], exported, provenance, together, independent=lost.independent)
     save_sysid_parameters(files["mujoco.sysid parameters"], exported)
-    fields = _leave_draws(folder, simulator, calibrated)
+    fields = _leave_draws(folder, simulator, draws)
     if "robot for mjlab" in files:
-        robot = _robot(simulator, result.mean, fields)
+        robot = replace(_robot(simulator, result.mean, fields), rounded=lost.rounded)
         save_mjlab(files["robot for mjlab"], robot, exported)
         save_isaac_lab(files["robot for Isaac Lab"], robot, exported)
     for drive, file in zip(drives, of_drives, strict=True):
@@ -140,10 +144,14 @@ def _evidence(calibrated: Calibrated) -> dict[str, np.ndarray]:
     return read_arrays(calibrated.folder / "evidence.npz", "signals", "names", "time", "measured") or {}
 
 
-def _leave_draws(folder: Path, simulator: Simulator, calibrated: Calibrated) -> list[str]:
-    """Leave models drawn from the joint distribution of the estimate, and tell the arrays in which they differ."""
+def _draws(calibrated: Calibrated) -> Float[np.ndarray, "draws parameters"]:
+    """Values of the parameters out of the joint distribution of the estimate."""
     key = stage_key(calibrated.result.seed, "export")
-    values = np.asarray(calibrated.distribution().draw(key, DRAWS), np.float64)
+    return np.asarray(calibrated.distribution().draw(key, DRAWS), np.float64)
+
+
+def _leave_draws(folder: Path, simulator: Simulator, values: Float[np.ndarray, "draws parameters"]) -> list[str]:
+    """Leave models of such values, and tell the arrays in which they differ."""
     around = [row.name for row in simulator.parameters.parameters if not row.kind.in_model]
     numbers = numbers_of_draws(simulator, values)
     save_draws(folder, simulator.parameters.names, around, values, numbers)
