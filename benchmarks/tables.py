@@ -12,6 +12,7 @@ from typing import Any
 import adversary
 import adversary_table
 import interval_coverage
+import legged
 import method_page
 import numpy as np
 import payload
@@ -133,7 +134,7 @@ def planted_truths() -> str:
 
 
 def verdicts() -> str:
-    """What `adversary.py`, `interval_coverage.py`, `rates.py` and `payload.py` found."""
+    """What `adversary.py`, `interval_coverage.py`, `rates.py`, `payload.py` and `legged.py` found."""
     cases = adversary.STUDY.rows()
     return (
         "## Verdicts and intervals\n\n"
@@ -147,7 +148,10 @@ def verdicts() -> str:
         f"{rates.table(rates.STUDY.rows())}\n\n"
         "`python benchmarks/payload.py`: an arm of seven joints, driven by torques that arrive 8 ms late, with an "
         "unknown load of 0.5 kg off its axis and unknown dry friction, all defaults.\n\n"
-        f"{payload.table(payload.STUDY.rows())}\n"
+        f"{payload.table(payload.STUDY.rows())}\n\n"
+        "`python benchmarks/legged.py`: a quadruped of three position servos a leg that trots for 15 s and logs its "
+        "joint encoders and an IMU alone, all defaults and 300 s, judging included.\n\n"
+        f"{legged.table(legged.STUDY.rows())}\n"
     )
 
 
