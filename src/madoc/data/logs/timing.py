@@ -223,9 +223,8 @@ def averaged(
 ) -> Float[np.ndarray, " rows"]:
     """Each value as the mean of those at most half a width before or after it; what is not finite stays as it is."""
     known = np.isfinite(values)
-    first, last = (
-        np.searchsorted(time, time + half, side) for half, side in ((-width / 2, "left"), (width / 2, "right"))
-    )
+    first = np.searchsorted(time, time - width / 2, side="left")
+    last = np.searchsorted(time, time + width / 2, side="right")
     sums, counts = (np.append(0.0, np.cumsum(each)) for each in (np.where(known, values, 0.0), known))
     means = (sums[last] - sums[first]) / np.maximum(counts[last] - counts[first], 1.0)
     return np.where(known, means, values)
