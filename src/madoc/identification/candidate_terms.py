@@ -17,6 +17,7 @@ from madoc.identification.score_tests import Score
 from madoc.identification.states import LoggedStates
 from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.base import Simulator
+from madoc.simulation.gears import deflections
 from madoc.simulation.inertials import off_centre
 from madoc.simulation.user_data import is_drive
 from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, nominal_values
@@ -106,7 +107,7 @@ def candidates(
     calibrated = {(each.field, element) for each in simulator.parameters.parameters for element in each.elements}
     fields = {each.field for each in simulator.parameters.parameters}
     wanted: list[tuple[str, str, float]] = []
-    for name in (model.joint(joint).name for joint in range(model.njnt)):
+    for name in (model.joint(joint).name for joint in np.setdiff1d(np.arange(model.njnt), deflections(model)).tolist()):
         if name:
             references = references_of(logged, simulator, model.joint(name))
             wanted += [(field, name, reference) for field, reference in references.items()]
