@@ -129,6 +129,9 @@ class GearSpec(Part):
     )
     damping: NotNegative = Field(description="N·m·s/rad (of a slide, N·s/m).")
     backlash: NotNegative = Field(0.0, description="Whole width of the play, rad (of a slide, m).")
+    armature: Positive | None = Field(
+        None, description="Inertia of the motor behind its reduction, kg·m² (of a slide, kg). Default: the model's."
+    )
     encoder: Literal["motor", "link"] = Field(
         description="Where position and velocity of the joint are measured, for signals and for the loop of its drive."
     )

@@ -17,9 +17,9 @@ def check_gears(draft: Draft) -> None:
         name = f"{gear.joint}{SUFFIX}"
         if name in taken:
             raise draft.document.error(place, f"the name {name!r} of what a gear inserts is taken; say a gear once")
-        if joint.armature <= 0.0:
+        if gear.armature is None and joint.armature <= 0.0:
             raise draft.document.error(
-                place, f"expected an armature of {gear.joint!r} in the model, the inertia of the motor before the gear"
+                place, f"expected armature:, the inertia of the motor, as the model says none of {gear.joint!r}"
             )
         if joint.parent.joints[-1].name != gear.joint:
             raise draft.document.error(
@@ -47,7 +47,7 @@ def check_timestep(draft: Draft, model: mujoco.MjModel, space: ParameterSpace) -
             raise draft.document.error(
                 ("gears", index),
                 f"the gear of {gear.joint!r} is too stiff or too damped for a timestep of {model.opt.timestep:g} s; "
-                f"give timestep: of at most {longest:.1g} s, or less of them",
+                f"give timestep: of at most {0.95 * longest:.2g} s, or a smaller stiffness or damping",
             )
 
 

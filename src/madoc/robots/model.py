@@ -137,6 +137,7 @@ def make_model(
 def _insert_gear(spec: mujoco.MjSpec, gear: GearSpec) -> None:
     """Insert the joint and the tendon of a gear; keyframes, which would be too short then, are taken out."""
     joint, name, off = spec.joint(gear.joint), f"{gear.joint}{SUFFIX}", mujoco.mjtLimited.mjLIMITED_FALSE
+    joint.armature = joint.armature if gear.armature is None else gear.armature
     half, nothing = gear.backlash / 2.0, np.zeros(3)
     plain = {"armature": 0.0, "frictionloss": 0.0, "damping": nothing, "stiffness": nothing, "ref": 0.0}
     joint.parent.add_joint(
