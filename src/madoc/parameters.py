@@ -112,7 +112,7 @@ numbers of the gear behind a joint (`simulation/gears.py`); its backlash is the 
 
 
 _KINDS = {
-    **{kind: kind for kind in ("body", "geom", "site", "tendon", "actuator", "sensor")},
+    **{kind: kind for kind in ("body", "geom", "site", "pair", "tendon", "actuator", "sensor")},
     **dict.fromkeys(("dof", "jnt", "qpos", "qpos0"), "joint"),
     "eq": "equality",
     "opt": None,

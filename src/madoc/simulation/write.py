@@ -39,6 +39,7 @@ _KINDS = {
     "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
     "sensor": (mujoco.mjtObj.mjOBJ_SENSOR, "nsensor"),
     "site": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
+    "pair": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
     "tendon": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
     "equality": (mujoco.mjtObj.mjOBJ_EQUALITY, "neq"),
 }
