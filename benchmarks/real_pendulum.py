@@ -29,7 +29,6 @@ STUDY = Study(RESULTS / "real_pendulum.jsonl", ())
 PENDULUM = ROOT.parent / "examples" / "pendulum"
 CALIBRATED_TO, HELD_OUT = "ilqr", ("ddp", "energy_shaping", "sac")
 HORIZON = 20
-SETTINGS = ("horizon=10", "windows=400")
 
 
 def main() -> None:
@@ -75,8 +74,6 @@ def calibrated(data: Path, folder: Path) -> dict:
     order = pipeline.CalibrationOrder(
         task=str(PENDULUM / "pendulum.yaml"),
         source=pipeline.Source((str(runs),)),
-        search=pipeline.Search(method="least-squares", set=(SETTINGS,)),
-        holdout=0.25,
     )
     result = pipeline.calibrate_in(folder / "run", order).to_json()
     return {name: result[name] for name in ("parameters", "verdict", "control_steps", "seconds")}

@@ -46,13 +46,14 @@ PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z", "payload_gyrat
 INERTIA = tuple(f"inertia_{part}" for part in ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3"))
 """Fields of a body's ten inertial numbers, as deviations from the model's (Rucker and Wensing 2022); all 0 is that."""
 _DRAG = "drag that grows with the square of the speed"
-_ARMATURE = "inertia that goes with the acceleration of a joint"
+_ARMATURE = "inertia at the joint, as of a geared rotor"
 FIELDS: dict[str, Field] = {
     "gravity": Field(None, "m/s²", missing="another gravity", maximum=1e4),
     "body_mass": Field("body", "kg", 0.0, words="mass", missing="another mass, as of a payload"),
     "body_mass_and_inertia": Field("body", "kg", 0.0, words="mass, inertia"),
     "body_inertia": Field("body", "kg·m²", 0.0),
     "body_com": Field("body", "m", 0.0, missing="another centre of mass, as with a payload"),
+    "body_distance": Field("body", "m", 0.0, words="distance", missing="another length of the link before a body"),
     "payload_mass": Field("body", "kg", 0.0, words="payload"),
     **{f"payload_{axis}": Field("body", "m", words=f"payload's {axis}") for axis in "xyz"},
     "payload_gyration": Field("body", "m", 0.0, words="payload's radius of gyration"),
@@ -63,10 +64,10 @@ FIELDS: dict[str, Field] = {
     "dof_armature": Field("joint", "kg·m²", 0.0, "kg", "armature", _ARMATURE),
     "jnt_stiffness": Field("joint", "N·m/rad", 0.0, "N/m", "stiffness", "a spring"),
     "jnt_ref": Field("joint", "rad", slide_unit="m", words="zero"),
-    "geom_friction": Field("geom", "1", 0.0, words="friction"),
+    "geom_friction": Field("geom", "1", 0.0, words="friction", missing="another friction at contacts"),
     "geom_friction_torsional": Field("geom", "m", 0.0, words="torsional friction"),
     "geom_friction_rolling": Field("geom", "m", 0.0, words="rolling friction"),
-    "contact_time": Field("geom", "s", 0.0, words="time constant of contacts"),
+    "contact_time": Field("geom", "s", 0.0, words="time constant of contacts", missing="softer or harder contacts"),
     "contact_damping": Field("geom", "1", 0.0, words="damping ratio of contacts"),
     "actuator_gain": Field("actuator", "1", words="gain", missing="another gain of the actuator"),
     "actuator_kv": Field("actuator", "N·m·s/rad", 0.0, "N·s/m", "servo damping"),
@@ -98,7 +99,8 @@ FIELDS: dict[str, Field] = {
 
 `body_mass` leaves the inertia as it is (the paper's meaning), `body_mass_and_inertia` scales the inertia with the mass.
 `body_inertia` is the largest moment of inertia about the centre of mass, the others keep their ratio to it; `body_com`
-is how far the centre of mass is from the body's origin, in the direction it has. `actuator_gain` of a position or
+is how far the centre of mass is from the body's origin, in the direction it has; `body_distance` how far that origin is
+from the parent's, in the direction it has: the length of the link between them. `actuator_gain` of a position or
 velocity servo is its kp or kv, and moves the servo's bias with it; `actuator_kv` is the damping of a position servo.
 `jnt_ref` is what a hinge or slide reads, and is commanded to, where the model as drawn has its zero. `action_delay` is
 the time from an action to its effect, `signal_bias` what a sensor reads too much. `dof_drag` is damping that grows with

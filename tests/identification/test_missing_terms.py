@@ -1,7 +1,6 @@
 """The score test of one added term: by hand, and on a pendulum whose friction, drag or timing the model lacks."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,76 +9,15 @@ import pytest
 from madoc import robots, simulation
 from madoc.data import Disturbance, disturb, logs, typical_change
 from madoc.identification import missing_terms as terms
-from madoc.identification.candidate_terms import EARLY, LATE_DRIVE, LATE_SENSOR, Candidate, _cut_off, is_late
+from madoc.identification.candidate_effects import _cut_off
+from madoc.identification.candidate_terms import EARLY, LATE_DRIVE, LATE_SENSOR, Candidate, is_late
 from madoc.identification.drifts import DRIFT, WITHIN_RUNS, _between_runs, _drifts, _of_fitted_runs, _Part
 from madoc.identification.joint_forces import LOADED
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
 from madoc.identification.term_tests import TermTests
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
-
-MODEL = """
-<mujoco>
-  <option timestep="0.005" integrator="implicitfast"/>
-  <worldbody>
-    <body name="rod">
-      <joint name="hinge" type="hinge" axis="0 1 0" damping="{damping}{drag}" frictionloss="{friction}"/>
-      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="hinge" joint="hinge"/></actuator>
-</mujoco>
-"""
-SPEC = """
-madoc: 1
-name: pendulum
-model: model.xml
-control_step: 0.02
-signals:
-  - {name: angle, reads: position(hinge)}
-  - {name: speed, reads: velocity(hinge)}
-actions:
-  - {name: torque, actuator: hinge, low: -1, high: 1}
-parameters:
-  - {field: dof_damping, element: hinge, low: 0, high: 0.5}
-"""
-NOISE = 0.002
-
-
-def plant(
-    folder: Path,
-    *,
-    friction: float = 0.0,
-    drag: float = 0.0,
-    late: int = 0,
-    damping: float = 0.1,
-    filtered: float = 0.0,
-):
-    """A log of the pendulum with a term that the model of its spec lacks, and what the tests need of it.
-
-    Its damping is 0.1 N·m·s/rad in the first half of the log, and `damping` in the second. Its speed is logged behind a
-    filter that mixes this share of the row before with each row.
-    """
-    folder.mkdir(exist_ok=True)
-    (folder / "real.xml").write_text(MODEL.format(damping=0.1, friction=friction, drag=f" {drag} 0" if drag else ""))
-    (folder / "real.yaml").write_text(SPEC.replace("model.xml", "real.xml"))
-    (folder / "model.xml").write_text(MODEL.format(damping=0.1, friction=0, drag=""))
-    (folder / "pendulum.yaml").write_text(SPEC)
-    real = simulation.make(robots.load(folder / "real.yaml").task)
-    systems, random = [real.bind(np.array([[value]])) for value in (0.1, damping)], np.random.default_rng(0)
-    torque = np.repeat(random.uniform(-1, 1, 320), 5)
-    state, angles = real.initial_state[None, None], []
-    for row in range(len(torque)):
-        system = systems[2 * row // len(torque)]
-        angles.append(np.asarray(system.observe(state))[0, 0])
-        state = system.step(state, torque[None, None, min(max(0, row - late), len(torque) - 1)][..., None])
-    motion = np.array(angles)
-    motion[1:, 1] += filtered * (motion[:-1, 1] - motion[1:, 1])
-    seen = motion + NOISE * random.standard_normal((len(torque), 2))
-    columns = np.column_stack([0.02 * np.arange(len(torque)), seen, torque])
-    np.savetxt(folder / "log.csv", columns, "%.9g", ",", header="time,angle,speed,torque", comments="")
-    robot = robots.load(folder / "pendulum.yaml")
-    return logs.read([folder / "log.csv"], robot), simulation.make(robot.task)
+from planted_pendulum import NOISE, SPEC, plant
 
 
 def scores(dataset, simulator, half_width: float = 0.01):
@@ -316,3 +254,39 @@ def test_a_drive_saturates_at_both_ends_of_what_it_is_asked_for(tmp_path):
     # 0, 5 and 10 N·m are -1, 0 and 1; what is above 7 N·m is cut off, nothing below 0.
     asked = np.array([-1.0, 0.0, 1.0])[None, :, None]
     np.testing.assert_allclose(_cut_off(asked, simulator)[0, :, 0], [-1.0, 0.0, 0.4])
+
+
+def test_a_longer_link_is_named_with_its_length(tmp_path):
+    arm = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
+      <body name="upper"><joint name="shoulder" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/>
+      <body name="fore" pos="0 0 -{length}"><joint name="elbow" axis="0 1 0" damping="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5"/></body></body></worldbody>
+      <actuator><motor name="shoulder" joint="shoulder"/><motor name="elbow" joint="elbow"/></actuator></mujoco>"""
+    spec = (
+        SPEC[: SPEC.index("signals:")]
+        + """
+signals: [{name: q1, reads: position(shoulder)}, {name: q2, reads: position(elbow)},
+          {name: v1, reads: velocity(shoulder)}, {name: v2, reads: velocity(elbow)}]
+actions: [{name: u1, actuator: shoulder, low: -3, high: 3}, {name: u2, actuator: elbow, low: -1, high: 1}]
+parameters: [{field: dof_damping, element: elbow, low: 0, high: 0.2}]
+"""
+    )
+    (tmp_path / "model.xml").write_text(arm.format(length=0.3))
+    (tmp_path / "arm.yaml").write_text(spec)
+    robot, random = robots.load(tmp_path / "arm.yaml"), np.random.default_rng(0)
+    (tmp_path / "model.xml").write_text(arm.format(length=0.315))
+    real = simulation.make(robots.load(tmp_path / "arm.yaml").task)
+    torque = np.repeat(random.uniform(-1, 1, (400, 2)), 5, axis=0)
+    start, system = real.initial_state[None, None], real.bind(np.array([[0.05]]))
+    states = np.concatenate([start[0], system.roll_out(start, torque[None, None])[0, 0]])[:-1]
+    seen = system.observe(states[None])[0] + NOISE * random.standard_normal((len(states), 4))
+    columns = np.column_stack([0.02 * np.arange(len(torque)), seen, torque * [3.0, 1.0]])
+    np.savetxt(tmp_path / "log.csv", columns, "%.9g", ",", header="time,q1,q2,v1,v2,u1,u2", comments="")
+    dataset, simulator = logs.read([tmp_path / "log.csv"], robot), simulation.make(robot.task)
+    point, change = simulator.parameters.to_unit(np.array([0.05])), typical_change(dataset)
+    found = terms.suspicions(dataset, states_of(dataset, simulator), simulator, point, np.array([0.01]), change).terms
+    length = next(term for term in found if term.parameter == "body_distance.fore")
+    assert length.explained == max(term.explained for term in found)
+    assert length.value == pytest.approx(0.315, abs=0.003)
+    assert length.nominal == 0.3

@@ -125,7 +125,10 @@ def load_geared(folder, spec, model=GEARED):
         (GEAR.replace("joint: shaft", "joint: shft"), "expected the name of a joint, got 'shft'; nearest: shaft"),
         (f"{GEAR}\n  - {GEAR}", "the name 'shaft_gear' of what a gear inserts is taken; say a gear once"),
         (GEAR.replace("stiffness: 100", "stiffness: 1e5"), "too stiff or too damped for a timestep of 0.001 s; give"),
-        (GEAR.replace("damping: 0.5", "damping: 50"), "timestep: of at most 0.00013 s, or a smaller stiffness or damping"),
+        (
+            GEAR.replace("damping: 0.5", "damping: 50"),
+            "timestep: of at most 0.00013 s, or a smaller stiffness or damping",
+        ),
     ],
 )
 def test_a_mistake_in_a_gear_is_one_sentence_with_its_line(tmp_path, new, sentence):

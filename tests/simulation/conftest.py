@@ -33,6 +33,7 @@ def everything():
         Parameter("body_mass_and_inertia", "thigh", 3.0, 5.0),
         Parameter("body_inertia", "foot", 0.01, 0.1),
         Parameter("body_com", "foot", 0.05, 0.2),
+        Parameter("body_distance", "leg", 0.4, 0.6),
         Parameter("dof_damping", "leg_joint", 0.0, 3.0),
         Parameter("dof_armature", "leg_joint", 0.5, 2.0),
         Parameter("dof_drag", "leg_joint", 0.1, 1.0),

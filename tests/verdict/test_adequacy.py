@@ -121,7 +121,7 @@ def test_forces_that_are_not_listed_are_named_where_nothing_listed_explains_half
     assert as_likely(held(family, elsewhere, weaker), family) == [elsewhere]
     sentence = judge(held(family, elsewhere)).sentence
     assert f"the model lacks {family.cause}: a value of 1 ± 0.08 N·m explains 50 %" in sentence
-    assert f"({elsewhere.cause} would explain nearly as much); look there for what the model leaves out" in sentence
+    assert f"{elsewhere.cause} would explain nearly as much; look there for what the model leaves out" in sentence
     assert "add to the spec" not in sentence
 
 

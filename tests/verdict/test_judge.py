@@ -13,6 +13,7 @@ from madoc.calibration.holdout import (
     Predicted,
     PredictionError,
     PredictionErrors,
+    RicherModel,
     ToldApart,
 )
 from madoc.commands.answer import EXIT_CODES
@@ -65,7 +66,8 @@ def changed(good, error_changes=None, **changes):
 def test_a_good_estimate_is_calibrated_and_the_sentence_has_its_numbers(good):
     verdict = judge(good)
     assert verdict.word == "CALIBRATED"
-    assert "10 % of mid-range's (95 % interval 8 % to 12 %; 4 → 0.4 after 20 steps" in verdict.sentence
+    told = "10 % of mid-range's (95 % interval 8 % to 12 %; mid-range errs by 4 and the estimate by 0.4 of what"
+    assert told in verdict.sentence
     assert explains_all(good)
 
 
@@ -79,7 +81,7 @@ def test_a_good_estimate_is_calibrated_and_the_sentence_has_its_numbers(good):
             "MODEL_MISMATCH",
             LEFT_OVER,
             {"explained": 0.6},
-            "the best parameters nearby leave 0.8 of the typical change in 1 step",
+            "that fit the hold-out best err by 0.8 of what a signal changes in 1 row",
         ),
         ("MODEL_MISMATCH", LEFT_OVER, {"explained": 0.6}, "actions? explain 60 % of it"),
         ("MODEL_MISMATCH", LEFT_OVER, {"at_end": ("mass",)}, "mass at the end of the range"),
@@ -102,7 +104,8 @@ def test_one_thing_wrong_changes_the_word(good, word, of_errors, change, told):
 
 def test_a_mismatch_names_the_likeliest_term_though_it_hardly_moves_the_estimate():
     offset = MissingTerm("an offset of the sensor", "signal_bias.hip", 0.1, 0.01, "1", 0.8, 10.0, {"mass": 0.1})
-    verdict = judge(changed(PREDICTED, LEFT_OVER, explained=0.6, missing_terms=(offset,)))
+    richer = RicherModel("signal_bias.hip", ())
+    verdict = judge(changed(PREDICTED, LEFT_OVER, explained=0.6, missing_terms=(offset,), richer=richer))
     assert "of single terms an offset of the sensor (signal_bias.hip) is the likeliest: 0.1 ± 0.01" in verdict.sentence
     assert verdict.sentence.endswith("{field: signal_bias, element: hip, low: 0, high: 0.2}")
 
@@ -131,7 +134,7 @@ def test_what_predicts_much_better_than_the_model_as_given_is_usable_though_the_
     assert verdict.word == "USABLE"
     told = "over 1 s held-out motion is predicted with 40 % of the error of the model as given (95 % interval 30 % to "
     assert verdict.sentence.startswith(told)
-    assert "not the machine's own values, as the best parameters nearby leave 0.8" in verdict.sentence
+    assert "need not be the machine's own values, as even the parameters nearby" in verdict.sentence
 
 
 @EITHER
@@ -176,7 +179,7 @@ def test_a_search_that_has_not_settled_is_never_usable():
 def test_correlated_residuals_of_single_steps_are_a_mismatch():
     verdict = judge(changed(PREDICTED, LEFT_OVER, autocorrelation=0.5))
     assert verdict.word == "MODEL_MISMATCH"
-    assert "correlated from step to step (0.50)" in verdict.sentence
+    assert "alike from row to row (correlation 0.50)" in verdict.sentence
 
 
 @EITHER
@@ -191,13 +194,13 @@ def test_a_log_that_contradicts_the_spec_is_a_mismatch_however_well_it_is_predic
 def test_residuals_that_last_are_a_mismatch():
     verdict = judge(changed(PREDICTED, LEFT_OVER, persistence=0.5))
     assert verdict.word == "MODEL_MISMATCH"
-    assert "it lasts over several rows (correlation 0.50), as an external force" in verdict.sentence
+    assert "it lasts over several rows (correlation 0.50), as of a lasting force" in verdict.sentence
     assert judge(changed(PREDICTED, persistence=0.5)).word == "CALIBRATED"  # no larger than noise
 
 
 def test_errors_behind_a_fitted_start_are_said_to_be():
-    assert "after 20 steps behind a fitted start on" in judge(changed(FITTED, LEFT_OVER, explained=0.6)).sentence
-    assert "after 20 steps on" in judge(changed(PREDICTED, LEFT_OVER, explained=0.6)).sentence
+    assert "after 20 rows from a fitted start, " in judge(changed(FITTED, LEFT_OVER, explained=0.6)).sentence
+    assert "after 20 rows, " in judge(changed(PREDICTED, LEFT_OVER, explained=0.6)).sentence
 
 
 @EITHER

@@ -127,6 +127,20 @@ class AgainstChance:
     p_value: float
 
 
+@dataclass(frozen=True)
+class RicherModel:
+    """The model with the parameter that it seems to lack, fitted to the same windows and put to the same tests.
+
+    Attributes:
+        parameter: The parameter that was added, as `dof_frictionloss.hinge`.
+        left: Terms that this model seems to lack in turn, in words, the most significant first; none where it explains
+            the log.
+    """
+
+    parameter: str
+    left: tuple[str, ...]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Judged:
     """The fields that all three records have in common.
@@ -143,6 +157,7 @@ class Judged:
         missing_terms: Terms that the model may lack, the most significant first.
         alternatives: Other estimates that the log does not exclude, which the intervals cover.
         imitated: Terms that the model has none of and parameters imitate, which the intervals do not cover.
+        richer: The model with the likeliest term, where a parameter of a spec adds it and there was time to test it.
         tested: False where the log cannot tell whether the model lacks a term: it is too short, or tells no states.
         at_end: Parameters estimated at an end of their range that is no physical bound.
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
@@ -166,6 +181,7 @@ class Judged:
     missing_terms: tuple[MissingTerm, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
     imitated: tuple[ImitatedTerm, ...] = ()
+    richer: RicherModel | None = None
     tested: bool = True
     at_end: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()

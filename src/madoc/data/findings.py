@@ -18,7 +18,7 @@ class Finding:
         where: A file, a row, a signal or a parameter; empty where it concerns the whole log.
         do: What to do about it; empty where nothing is to be done.
         contradicts: Whether the log contradicts the spec, so that no estimate from the two is to be trusted.
-        late: Whether it contradicts it as actions seem to take effect late, which tests at an estimate may exclude.
+        late: How late actions seem to take effect, s, where that is the finding; tests at an estimate may exclude it.
     """
 
     level: Level
@@ -26,7 +26,7 @@ class Finding:
     where: str = ""
     do: str = ""
     contradicts: bool = False
-    late: bool = False
+    late: float = 0.0
 
     @property
     def sentence(self) -> str:

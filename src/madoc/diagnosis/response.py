@@ -138,8 +138,9 @@ def _lag_findings(response: Response, action: str, simulator: Simulator) -> list
     low, high = max(0.0, lag - 2.0 * step), lag + 2.0 * step
     remedy = f"{{field: action_delay, low: {0.0 if low < step else low:.2g}, high: {high:.2g}}}"
     verb = "widen the range of the delay to" if delays else "add the parameter"
-    do = f"{verb} {remedy}; a lag of the motor, a filter on the logged speed and an elastic transmission look alike"
-    return [Finding("warning", what, action, do, contradicts=lag >= CONTRADICTING * step, late=True)]
+    alike = "a limit of speed, a lag of the motor, a filter on the log or an elastic transmission"
+    do = f"if it is a delay, {verb} {remedy}; {alike} would look alike"
+    return [Finding("warning", what, action, do, contradicts=lag >= CONTRADICTING * step, late=lag)]
 
 
 def _gain_findings(response: Response, action: str, modelled: Float[np.ndarray, " points"]) -> list[Finding]:

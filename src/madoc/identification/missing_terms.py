@@ -13,13 +13,13 @@ from jaxtyping import Float
 
 from madoc import simulation
 from madoc.data.dataset import Dataset
+from madoc.identification.candidate_effects import effects
 from madoc.identification.candidate_terms import (
     BELOW_MINIMUM,
     EARLY,
     INTEGRATION,
     Candidate,
     candidates,
-    effects,
     is_late,
 )
 from madoc.identification.drifts import drifts_of

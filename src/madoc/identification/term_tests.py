@@ -39,6 +39,7 @@ class MissingTerm:
             probability.
         shifts: By how much each calibrated parameter would move if the term were included, in half-widths of its
             95 % interval.
+        nominal: Its value in the model as it is.
     """
 
     cause: str
@@ -49,6 +50,7 @@ class MissingTerm:
     explained: float
     t: float
     shifts: dict[str, float]
+    nominal: float = 0.0
 
 
 def named(term: MissingTerm | Candidate) -> str:
@@ -154,6 +156,7 @@ def term_of(candidate: Candidate, found: Score, shifts: dict[str, float]) -> Mis
         explained=found.explained,
         t=found.t,
         shifts=shifts,
+        nominal=candidate.nominal,
     )
 
 

@@ -148,9 +148,10 @@ class CpuSimulator:
     ) -> Int[np.ndarray, " rows"]:
         """Number of pairs of geoms in contact in each state, at physical values, which are mid-range unless given.
 
-        No parameter changes the shape of a body; `jnt_ref` and numbers of the model may change where it is placed.
+        No parameter changes the shape of a body; `jnt_ref`, `body_distance` and numbers of the model may move it.
         """
-        placed = any(row.field == "jnt_ref" or row.field not in FIELDS for row in self.parameters.parameters)
+        moving = ("jnt_ref", "body_distance")
+        placed = any(row.field in moving or row.field not in FIELDS for row in self.parameters.parameters)
         model = self.model(self.parameters.middle if values is None else values) if placed else self._model
         data, contacts = self._data[0], np.zeros(len(state), dtype=np.int64)
         for row, position in enumerate(state[:, : model.nq]):

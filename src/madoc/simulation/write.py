@@ -188,6 +188,14 @@ def heavy_bodies(model: mujoco.MjModel) -> Iterator[str]:
             yield name
 
 
+def linked_bodies(model: mujoco.MjModel) -> Iterator[tuple[str, float]]:
+    """Names of bodies that hang on others that move, away from their origin, and how far from it they are, m."""
+    for body in range(1, model.nbody):
+        distance = float(np.linalg.norm(model.body_pos[body]))
+        if model.body(body).name and distance > 0.0 and model.body_weldid[model.body_parentid[body]] != 0:
+            yield model.body(body).name, distance
+
+
 def _dofs(model: mujoco.MjModel, joint: int) -> slice:
     """The degrees of freedom of a joint: 6 of a free one, 3 of a ball, 1 of any other."""
     return slice(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + len(model.joint(joint).damping))
@@ -250,6 +258,17 @@ def _write_ref(model: mujoco.MjModel, joint: int, value: float) -> None:
             model.tendon_range[tendon] += longer
 
 
+def _write_distance(model: mujoco.MjModel, body: int, value: float) -> None:
+    """A body stays in the direction in which it is from its parent's origin; one that is there has none."""
+    distance = np.linalg.norm(model.body_pos[body])
+    if distance == 0.0:
+        raise MadocError(
+            f"body_distance: body {model.body(body).name!r} is at the origin of its parent, so it has no direction to "
+            "move in; place it in the model"
+        )
+    model.body_pos[body] *= value / distance
+
+
 def _write_contact(place: int) -> Callable[[mujoco.MjModel, int, float], None]:
     """A writer of the time constant (place 0) or the damping ratio (1) of a geom's contacts; both are above 0."""
 
@@ -282,6 +301,7 @@ _PLACES: dict[str, tuple[Numbers, Write | None]] = {
     "body_mass_and_inertia": (lambda model, body: model.body_mass[body : body + 1], write_mass_and_inertia),
     "body_inertia": (lambda model, body: model.body_inertia[body].max(keepdims=True), write_inertia),
     "body_com": (lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]), write_centre_of_mass),
+    "body_distance": (lambda model, body: np.array([np.linalg.norm(model.body_pos[body])]), _write_distance),
     **dict.fromkeys((*PAYLOAD, *INERTIA), (lambda model, body: np.zeros(1), None)),
     "dof_frictionloss": (lambda model, joint: model.dof_frictionloss[_dofs(model, joint)], _write_friction_loss),
     "dof_drag": (lambda model, joint: model.dof_dampingpoly[_dofs(model, joint), :1], None),

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from madoc.calibration.holdout import HoldOut
+from madoc.calibration.holdout import HoldOut, Judged
 from madoc.calibration.result import CalibrationResult
 from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, UNLISTED, is_late
 from madoc.identification.coarseness import COARSE
@@ -50,7 +50,7 @@ NAMED = 3
 """Number of causes named for which intervals are widened, and of terms that the log cannot tell."""
 
 
-def missing_term(holdout: HoldOut) -> MissingTerm | None:
+def missing_term(holdout: Judged) -> MissingTerm | None:
     """The likeliest term that the model certainly lacks, if such terms move the estimate by themselves or together.
 
     None where the error of the integration step explains much of the residuals and lesser ones were not tested without.
@@ -66,6 +66,12 @@ def missing_term(holdout: HoldOut) -> MissingTerm | None:
             term for term in others if is_certain(term) or not (is_joint_force(term.cause) or is_late(term.cause))
         ]
     return likeliest(moving)
+
+
+def suspect(holdout: Judged) -> MissingTerm | None:
+    """The term that a verdict names: one that moves the estimate, or else one that is certainly missing."""
+    certain = [each for each in holdout.missing_terms if is_certain(each) and each.cause not in DRIFTS]
+    return missing_term(holdout) or likeliest(certain)
 
 
 def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
@@ -140,7 +146,7 @@ def moves_certainly(term: MissingTerm) -> bool:
     return is_certain(term) and max(map(abs, term.shifts.values())) >= MOVES
 
 
-def _moved_together(holdout: HoldOut) -> bool:
+def _moved_together(holdout: Judged) -> bool:
     """Whether terms that cannot be excluded together move a parameter by more than the error of that."""
     return any(
         abs(shift) >= max(MOVES, each.errors[name])
@@ -150,7 +156,7 @@ def _moved_together(holdout: HoldOut) -> bool:
     )
 
 
-def numerical(holdout: HoldOut) -> MissingTerm | None:
+def numerical(holdout: Judged) -> MissingTerm | None:
     """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
     step = integration(holdout.missing_terms)
     # What terms explain with a finer step is a share of what the error of the model's own leaves.

@@ -13,11 +13,12 @@ from madoc.data import Dataset
 from madoc.errors import MadocError
 from madoc.simulation.base import Simulator
 from madoc.verdict.adequacy import about_imitated, with_widened_intervals
-from madoc.verdict.bench import Bench, judged
+from madoc.verdict.bench import Bench
 from madoc.verdict.fitted import fitted
 from madoc.verdict.judge import beats_mid_range, explains_all, judge
 from madoc.verdict.open_loop import open_loop
 from madoc.verdict.predicted import noise_hides_gain, predicted
+from madoc.verdict.records import judged
 
 NO_BETTER = "the estimate predicts the rows held out no better than mid-range does, so it is not settled"
 

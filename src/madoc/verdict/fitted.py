@@ -15,9 +15,10 @@ from madoc.identification.losses import curvature_share, loss_slope, scale_of
 from madoc.identification.noise import residual_noise
 from madoc.identification.replay import slopes_at
 from madoc.simulation.attitudes import moved
-from madoc.verdict.bench import Bench, judged
+from madoc.verdict.bench import Bench
 from madoc.verdict.fitted_starts import FittedReplays
 from madoc.verdict.prediction import magnitudes
+from madoc.verdict.records import judged
 from madoc.verdict.statistics import best_of, better_than_chance, independent_groups, prediction_errors
 from madoc.verdict.systematic import explained_at_end
 

@@ -13,7 +13,7 @@ from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.verdict.adequacy import numerical
 from madoc.verdict.mismatch import SEPARABLE, contradicted, lacking
 from madoc.verdict.statistics import FEWEST_GROUPS, WORTH_GAINING, beyond_noise
-from madoc.verdict.wording import change_of, in_percent, in_steps, of_area
+from madoc.verdict.wording import change_of, in_percent, of_area
 
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
 
@@ -72,8 +72,8 @@ def _usable(holdout: HoldOut, lacks: Verdict) -> Verdict | None:
     found = max(better, key=lambda each: (not each.whole, each.seconds))  # whole runs are often few
     return Verdict(
         "USABLE",
-        f"{_beside_given(found)}, so the estimates are of use in this simulator; they are not the machine's own "
-        f"values, as {lacks.sentence}",
+        f"{_beside_given(found)}, so the estimates are of use in this simulator; they need not be the machine's "
+        f"own values, as {lacks.sentence}",
         lacks.parameters,
     )
 
@@ -180,7 +180,7 @@ def _no_better_errors(holdout: Predicted | Fitted) -> str:
     if errors.nearby_relative > 1.0 - WORTH_GAINING and not only_noise:
         return (
             f"mid-range is as good: parameters nearby leave {100 * errors.nearby_relative:.0f} % of its error on the "
-            f"hold-out ({change_of(errors)} at the estimate)"
+            f"hold-out ({change_of(errors)})"
         )
     gained = (1.0 - errors.relative) / (1.0 - errors.nearby_relative)
     if errors.relative_interval[1] < 1.0 and gained >= GAINED:
@@ -222,5 +222,5 @@ def _how_small(errors: PredictionErrors) -> str:
     low, high = map(in_percent, errors.relative_interval)
     return (
         f"the prediction error on the hold-out is {in_percent(errors.relative)} of mid-range's (95 % interval {low} to "
-        f"{high}; {change_of(errors)}, in typical changes of {in_steps(errors.stride)})"
+        f"{high}; {change_of(errors)})"
     )

@@ -3,13 +3,14 @@
 from dataclasses import replace
 
 from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, ToldApart, Verdict
+from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
 from madoc.identification.term_tests import MissingTerm, named
-from madoc.verdict.adequacy import about_timestep, as_likely, is_certain, likeliest, missing_term, numerical
-from madoc.verdict.remedies import WARM_UP, remedy, value_of
+from madoc.verdict.adequacy import about_timestep, as_likely, missing_term, numerical, suspect
+from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
-from madoc.verdict.wording import change_of, in_steps, of_area
+from madoc.verdict.wording import change_of, in_rows, of_area
 
 WHITE = 0.2
 """Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
@@ -53,20 +54,43 @@ def _missing(holdout: HoldOut) -> Verdict | None:
         )
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
     effect = " and ".join(f"{name} by {abs(term.shifts[name]):.2g}" for name in moved)
+    sure = _proved(holdout, term) or term.cause.startswith(UNLISTED)
+    lacks = "the model lacks" if sure else "what the model lacks acts like"
     return Verdict(
         "MODEL_MISMATCH",
-        f"the model lacks {named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared "
-        f"residuals (t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
-        f"{_others(holdout, term)}{about_timestep(holdout, term)}; {remedy(term)}{_at_end(holdout)}"
-        f"{_disagreeing(holdout)}",
+        f"{lacks} {named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared residuals "
+        f"(t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
+        f"{about_timestep(holdout, term)}; {_advice(holdout, term)}{_at_end(holdout)}{_disagreeing(holdout)}",
         tuple(moved),
     )
 
 
-def _others(holdout: HoldOut, term: MissingTerm) -> str:
-    """Which other terms are as likely as the one named."""
+def _proved(holdout: HoldOut, term: MissingTerm) -> bool:
+    """Whether the model with a term explains the log, and no other term explains nearly as much."""
+    richer = holdout.richer
+    explains = richer is not None and richer.parameter == term.parameter and not richer.left
+    return explains and not as_likely(holdout, term)
+
+
+def _advice(holdout: HoldOut, term: MissingTerm) -> str:
+    """What to do about a term: the line that adds it only where the model with it explains the log, and no other does.
+
+    Terms that explain nearly as much are told with it.
+    """
     others = list(dict.fromkeys(map(named, as_likely(holdout, term))))[:_MOST_NAMED]
-    return f" ({' or '.join(others)} would explain nearly as much)" if others else ""
+    alike = f"{' or '.join(others)} would explain nearly as much" if others else ""
+    if not is_of_spec(term):
+        return "; ".join(part for part in (alike, remedy(term)) if part)
+    if _proved(holdout, term):
+        return f"a model with it explains the log: {remedy(term)}"
+    richer = holdout.richer
+    if richer is None or richer.parameter != term.parameter:
+        whole = "whether that is all that it lacks was not tested, so look for the cause before you add it to the spec"
+    elif richer.left:
+        whole = f"a model with it still lacks {richer.left[0]}, so look for the cause before you add it to the spec"
+    else:
+        whole = "find out on the machine which of them it is, and add that one to the spec's parameters"
+    return "; ".join(part for part in (alike, whole) if part)
 
 
 def _at_end(holdout: HoldOut) -> str:
@@ -124,12 +148,11 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
         sentence = _systematic(holdout, at_end)
     if not sentence:
         return None
-    term = likeliest([each for each in holdout.missing_terms if is_certain(each) and each.cause not in DRIFTS])
+    term = suspect(holdout)
     if term is not None:
         sentence += (
             f"; of single terms {named(term)} is the likeliest: {value_of(term)} explains {100 * term.explained:.2g} % "
-            f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}){_others(holdout, term)}; "
-            f"{remedy(term)}"
+            f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}); {_advice(holdout, term)}"
         )
     return Verdict("MODEL_MISMATCH", f"{sentence}{about_timestep(holdout)}", holdout.at_end)
 
@@ -141,20 +164,20 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
         inputs = "state and action" if direct else "readings and actions"
         reasons.append(f"{inputs} explain {100 * holdout.explained:.0f} % of it")
     if isinstance(holdout, Predicted) and holdout.autocorrelation > WHITE:
-        reasons.append(f"it is correlated from step to step ({holdout.autocorrelation:.2f})")
+        reasons.append(f"it is alike from row to row (correlation {holdout.autocorrelation:.2f})")
     if isinstance(holdout, Predicted) and holdout.persistence > PERSISTENT:
-        lasts = f"it lasts over several rows (correlation {holdout.persistence:.2f})"
-        reasons.append(f"{lasts}, as an external force does or a base that moves")
+        reasons.append(f"it lasts over several rows (correlation {holdout.persistence:.2f}), as of a lasting force")
     reasons += at_end
     beyond = beyond_noise(errors.nearby_best, errors.noise)
     if not beyond or not reasons:
         return _adding_up(holdout) if isinstance(holdout, Predicted) else ""
     left, noise = max(beyond, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
+    noisy = noise.mean > NEGLIGIBLE
+    much = f"{left.mean / noise.mean:.2g} times as much as noise does" if noisy else "none of which is noise"
     return (
-        f"the best parameters nearby leave {left.mean:.2g} of the typical change in {in_steps(errors.stride)} after "
-        f"{in_steps(left.steps)}{'' if direct else ' behind a fitted start'} on the hold-out, where noise leaves "
-        f"{noise.mean:.2g}, and "
-        f"{', '.join(reasons)}: the model cannot explain the data ({change_of(errors)} at the estimate)"
+        f"even the parameters nearby that fit the hold-out best err by {left.mean:.2g} of what a signal changes in "
+        f"{in_rows(errors.stride)}, after {in_rows(left.steps)}{'' if direct else ' from a fitted start'}, {much}, and "
+        f"{', '.join(reasons)}: the model cannot explain the data ({change_of(errors)})"
     )
 
 
@@ -164,9 +187,9 @@ def _adding_up(holdout: Predicted) -> str:
     if factor <= BEYOND_RANDOM:
         return ""
     return (
-        f"after {in_steps(holdout.errors.nearby_best[-1].steps)} the best parameters nearby leave {factor:.2g} times "
+        f"after {in_rows(holdout.errors.nearby_best[-1].steps)} the best parameters nearby leave {factor:.2g} times "
         f"or more of the error in {signal} that sensor noise and random forces make: the model cannot explain the data "
-        f"({change_of(holdout.errors)} at the estimate)"
+        f"({change_of(holdout.errors)})"
     )
 
 

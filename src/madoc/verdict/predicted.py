@@ -14,8 +14,9 @@ from madoc.identification.gauss_newton import descend
 from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly
 from madoc.simulation.attitudes import differences
-from madoc.verdict.bench import Bench, judged
+from madoc.verdict.bench import Bench
 from madoc.verdict.prediction import nearby_best
+from madoc.verdict.records import judged
 from madoc.verdict.statistics import (
     NEGLIGIBLE,
     beside_random,

@@ -10,9 +10,10 @@ from madoc.identification.candidate_terms import (
     UNLISTED,
     is_late,
 )
-from madoc.identification.joint_forces import LOADED, SLOW, WEAKENING, is_joint_force
+from madoc.identification.drifts import DRIFTS
+from madoc.identification.joint_forces import LOADED, SLOW, WEAKENING
 from madoc.identification.term_tests import MissingTerm
-from madoc.parameters import FIELDS
+from madoc.parameters import FIELDS, Parameter
 
 REMEDIES = {
     EARLY: "log each action with what was seen just before it",
@@ -25,7 +26,7 @@ REMEDIES = {
 """What to do about terms that no further parameter of a spec adds."""
 WARM_UP = "let the machine warm up before it is logged, or leave the begin of each run out"
 """The same for a parameter that changes within each run."""
-CHANGE_MACHINE = "no parameter of a spec adds it: take it out of the machine, or log motions in which it is small"
+CHANGE_MACHINE = "no parameter of a spec adds it: write it into the model, or calibrate to motions in which it is small"
 """The same for a force at a joint."""
 LOOK = "look there for what the model leaves out; a parameter that acts like it would be wrong in its place"
 """The same for a force that no listed term describes."""
@@ -41,26 +42,40 @@ CHANGE_DRIVE = "no parameter of a spec adds the lag of one drive (action_delay i
 
 
 def value_of(term: MissingTerm) -> str:
-    """The value of a missing term with its standard error and unit."""
+    """The value of a missing term with its standard error and unit, and what the model has where that is not 0."""
     unit = "" if term.unit == "1" else term.unit
-    return f"{term.value:.3g} ± {term.standard_error:.1g} {unit}".rstrip()
+    own = f" (the model has {term.nominal:.3g})" if term.nominal else ""
+    return f"{term.value:.3g} ± {term.standard_error:.1g} {unit}".rstrip() + own
+
+
+def is_of_spec(term: MissingTerm) -> bool:
+    """Whether a parameter of a spec adds a term; a parameter that changes is one already."""
+    return bool(term.parameter) and term.cause not in (*REMEDIES, *DRIFTS) and not term.cause.startswith(UNLISTED)
+
+
+def line_of(term: MissingTerm) -> Parameter:
+    """The parameter that adds a term, in a range twice as wide as its value or eight of its standard errors."""
+    field, _, element = term.parameter.partition(".")
+    high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
+    low = 0.0 if term.value >= 0.0 else max(-high, FIELDS[field].minimum)
+    high = 0.0 if field == "gravity" and term.value < 0.0 else high  # it points downwards
+    elements = tuple(element.split("+")) if "+" in element else element
+    return Parameter(field, elements, low, high, measured_in=term.unit)
 
 
 def remedy(term: MissingTerm) -> str:
     """What to do about a missing term: the line of the spec that adds it, where there is one."""
-    field, _, element = term.parameter.partition(".")
+    if is_of_spec(term):
+        line = line_of(term)
+        named = f", element: {line.element}" if isinstance(line.element, str) and line.element else ""
+        named = named or (f", elements: [{', '.join(line.elements)}]" if line.elements else "")
+        return (
+            f"add to the spec's parameters: {{field: {line.field}{named}, low: {line.low:.2g}, high: {line.high:.2g}}}"
+        )
     if term.cause in REMEDIES:
         return REMEDIES[term.cause]
     if is_late(term.cause):
         return CHANGE_LOG if term.cause.startswith(LATE_SENSOR) else CHANGE_DRIVE
     if term.cause.startswith(UNLISTED):
         return LOOK
-    if is_joint_force(term.cause):
-        return next((told for cause, told in OF_JOINTS.items() if term.cause.startswith(cause)), CHANGE_MACHINE)
-    high = 2.0 * max(abs(term.value), 4.0 * term.standard_error)
-    low = 0.0 if term.value >= 0.0 else max(-high, FIELDS[field].minimum)
-    high = 0.0 if field == "gravity" and term.value < 0.0 else high  # it points downwards
-    joints = element.split("+")
-    named = f", element: {element}" if element else ""
-    named = named if len(joints) == 1 else f", elements: [{', '.join(joints)}]"
-    return f"add to the spec's parameters: {{field: {field}{named}, low: {low:.2g}, high: {high:.2g}}}"
+    return next((told for cause, told in OF_JOINTS.items() if term.cause.startswith(cause)), CHANGE_MACHINE)

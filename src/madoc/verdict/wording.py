@@ -6,9 +6,11 @@ from madoc.calibration.holdout import Area, PredictionErrors
 
 
 def change_of(errors: PredictionErrors) -> str:
-    """Errors after the most steps: at mid-range, then at the estimate."""
+    """Errors after the most rows: at mid-range, then at the estimate."""
     before, after = errors.mid_range[-1], errors.estimate[-1]
-    return f"{before.mean:.2g} → {after.mean:.2g} after {in_steps(after.steps)}"
+    change = f"of what a signal changes in {in_rows(errors.stride)}"
+    both = f"mid-range errs by {before.mean:.2g} and the estimate by {after.mean:.2g}"
+    return f"{both} {change}, after {in_rows(after.steps)}"
 
 
 def of_area(area: Area) -> str:
@@ -17,9 +19,9 @@ def of_area(area: Area) -> str:
     return f"{area.area:.2f} [{low:.2f}, {high:.2f}]"
 
 
-def in_steps(count: int) -> str:
-    """A number of steps."""
-    return "1 step" if count == 1 else f"{count} steps"
+def in_rows(count: int) -> str:
+    """A number of rows of a log, which are control steps of its robot."""
+    return "1 row" if count == 1 else f"{count} rows"
 
 
 def in_percent(share: float) -> str:

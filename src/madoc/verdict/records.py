@@ -1,0 +1,249 @@
+"""The fields of a record that all measures have: what the model lacks, what contradicts the spec, what is open."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from madoc import simulation
+from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
+from madoc.data import stride
+from madoc.data.findings import Finding
+from madoc.diagnosis.channels import signal_names
+from madoc.diagnosis.exchanged_columns import exchanged_columns
+from madoc.identification.candidate_terms import DELAY, INTEGRATION
+from madoc.identification.coarseness import FINER, coarseness
+from madoc.identification.excitation import expected_half_widths
+from madoc.identification.fitted_windows import STRIDES, WINDOWS
+from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
+from madoc.identification.term_tests import FEWEST, MissingTerm
+from madoc.identification.windows import horizons
+from madoc.parameters import ParameterSpace
+from madoc.verdict.adequacy import NUMERICAL, actions_in_time, felt, in_full, is_certain, suspect, widening
+from madoc.verdict.bench import Bench
+from madoc.verdict.remedies import is_of_spec
+from madoc.verdict.richer import richer_model
+from madoc.verdict.statistics import NEGLIGIBLE
+
+_MOST_TERMS = 5
+"""Number of missing terms that a report keeps, the most significant ones; besides them the integration step's and all
+that are certain are kept, as a verdict rests on them."""
+COLUMNS, COLUMNS_OF_A_VALUE = 60, 20
+"""Simulations of a window that testing a model takes about, and how many more for each parameter and each degree of
+freedom."""
+EXCHANGED = "exchanged columns"
+"""A part of judging without which nothing is tested."""
+NO_DELAY = (
+    "no delay was found to explain the log, so add none for its own sake: look for a limit of speed, a lag or a filter "
+    "of the drives or of the log"
+)
+"""What to do where actions take effect late, and a constant delay leaves something over or was not tested."""
+TESTING = 0.7
+"""Share in (0, 1) of the time left that testing what the model lacks may take."""
+
+Measure = TypeVar("Measure", bound=Judged)
+
+
+def _doubts(
+    bench: Bench, point: Float[np.ndarray, " d"], half_widths: Float[np.ndarray, " d"]
+) -> tuple[Suspicions, bool]:
+    """What the log says against the model, and whether that was tested with a finer integration step.
+
+    Where the error of the integration step explains much, it hides other terms or looks like them. These are then
+    tested with steps of a quarter of the length, unless their error explains much there too. A log that tells neither
+    states nor what is needed to fit them cannot be tested, nor can one without pairs of consecutive observations. Under
+    a limit of time windows are as many as that allows.
+    """
+    problem, task = bench.problem, bench.problem.simulator.task
+    ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
+    told = bench.states_known or (bench.states.kind == "approximate" and ordered)
+    if not told or problem.dataset.disturbance.shuffled == "next_observations":
+        return Suspicions(tested=False), False
+    given, most = (problem.dataset, bench.states), _windows_in_time(bench)
+    enough = most is None or most >= 2 * (FEWEST + len(point))
+    if not bench.begins("tests of what the model lacks", 0.0 if enough else np.inf):
+        return Suspicions(tested=False), False
+    if most is not None and most < WINDOWS:
+        bench.left_out.append("tests on as many windows as usual")
+    doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most)
+    doubts = replace(doubts, alternatives=in_full(doubts.alternatives, doubts.terms))
+    step = felt(doubts.terms)
+    if step is None or task.source is None:
+        return doubts, False
+    if not bench.begins("the same tests with a finer timestep", FINER * doubts.control_steps / bench.rate):
+        return doubts, False
+    finer = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
+    fine = suspicions(*given, finer, point, half_widths, bench.change, of_other_model=True, most=most)
+    spent = doubts.control_steps + FINER * fine.control_steps
+    left = felt(fine.terms)
+    if not fine.tested or (left is not None and left.explained >= NUMERICAL):
+        return replace(doubts, control_steps=spent), False
+    others = [replace(each, terms=False) for each in doubts.alternatives]
+    others += [
+        replace(each, causes=(INTEGRATION,)) if each.causes == (OTHER_WINDOWS,) else each for each in fine.alternatives
+    ]
+    terms = step, *(term for term in fine.terms if term.cause != INTEGRATION)
+    return replace(fine, terms=terms, alternatives=tuple(others), control_steps=spent), True
+
+
+def _windows_in_time(bench: Bench) -> int | None:
+    """How many windows the model can be tested on in the time left; None where that is not limited."""
+    if bench.until is None:
+        return None
+    values = len(bench.simulator.parameters) + bench.simulator.task.model.nv
+    window = STRIDES * stride(bench.problem.dataset) * (COLUMNS + COLUMNS_OF_A_VALUE * values)
+    return int(TESTING * bench.rate * bench.seconds_left / window)
+
+
+def judged(
+    record: Callable[..., Measure],
+    bench: Bench,
+    point: Float[np.ndarray, " d"],
+    interval: Float[np.ndarray, "d 2"] | None,
+    *,
+    at: Float[np.ndarray, " d"],
+    residual: Float[np.ndarray, " channels"],
+    by_model: tuple[AgainstChance, ...],
+    noise: Float[np.ndarray, " channels"],
+    control_steps: int,
+    exact: bool = False,
+) -> Measure:
+    """Complete a measure's record by the fields that all measures have.
+
+    The best possible intervals are computed for parameters `at`, as if `residual` were the standard deviation of noise:
+    of a single step from a logged state where states are `exact`, else of a reading. That and the sensors' `noise` are
+    in typical changes of a stride.
+    """
+    space, problem = bench.simulator.parameters, bench.problem
+    best, of_widths = _best_half_widths(bench, at, residual, noise if exact and noise.any() else None, exact=exact)
+    own = best
+    if interval is not None:  # to the farther end, as the other may be cut off at an end of the range
+        own = np.maximum(np.abs(space.to_unit(interval.T) - point).max(0), 1e-9)
+    doubts, finer = _doubts(bench, point, own)
+    contradicting, of_columns = _contradictions(bench, point, at, doubts)
+    coarse, of_steps = 0.0, 0
+    if bench.simulator.task.source is not None and bench.begins("the length of the timestep"):
+        coarse, of_steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
+    ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
+    shares = _shares(space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own, doubts)
+    signals = signal_names(bench.simulator.task)[: len(noise)]
+    found = record(
+        split=bench.split,
+        rows=len(bench.held_out),
+        episodes=len(bench.held_out.episode_starts),
+        estimate=dict(zip(space.names, point.tolist(), strict=True)),
+        interval_shares=dict(zip(space.names, shares.tolist(), strict=True)),
+        against_chance=(*by_model, *bench.model_free),
+        noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
+        control_steps=control_steps + of_widths + of_columns + of_steps + doubts.control_steps,
+        missing_terms=tuple(
+            term
+            for place, term in enumerate(doubts.terms)
+            if place < _MOST_TERMS or term.cause == INTEGRATION or is_certain(term)
+        ),
+        alternatives=doubts.alternatives,
+        imitated=doubts.imitated,
+        tested=doubts.tested and EXCHANGED not in bench.left_out,
+        coarseness=coarse,
+        finer=finer,
+        at_end=space.at_end(point),
+        base_from_contacts=bool(bench.states.placed.any()),
+    )
+    late = next((each for each in contradicting if each.late), None)
+    term = suspect(found) if late is None else _delay(doubts, late)
+    richer, of_richer = _richer(bench, point, own, term, doubts, finer=finer)
+    told = tuple(_contradiction(each, richer) for each in contradicting)
+    return replace(found, richer=richer, contradictions=told, control_steps=found.control_steps + of_richer)
+
+
+def _delay(doubts: Suspicions, late: Finding) -> MissingTerm | None:
+    """The delay of actions, with the value that the check of the log has found where it is the larger one."""
+    for term in doubts.terms:
+        if term.cause == DELAY:
+            return replace(term, value=max(term.value, late.late))
+    return None
+
+
+def _richer(
+    bench: Bench,
+    point: Float[np.ndarray, " d"],
+    half_widths: Float[np.ndarray, " d"],
+    term: MissingTerm | None,
+    doubts: Suspicions,
+    *,
+    finer: bool,
+) -> tuple[RicherModel | None, int]:
+    """The model with a term, if a parameter of a spec adds it and there is time; also the control steps simulated."""
+    if term is None or not is_of_spec(term) or not doubts.tested:
+        return None, 0
+    if not bench.begins(f"the model with {term.parameter}", doubts.control_steps / bench.rate):
+        return None, 0
+    given = bench.problem.dataset, bench.simulator, point, half_widths, bench.change, term
+    return richer_model(*given, finer=finer, most=_windows_in_time(bench))
+
+
+def _contradiction(finding: Finding, richer: RicherModel | None) -> str:
+    """A finding that contradicts the spec, with what to do, unless that is a delay that does not explain the log."""
+    if not finding.late or (richer is not None and not richer.left):
+        return finding.sentence
+    return f"{replace(finding, do='').sentence}; {NO_DELAY}"
+
+
+def _best_half_widths(
+    bench: Bench,
+    at: Float[np.ndarray, " d"],
+    residual: Float[np.ndarray, " channels"],
+    sensors: Float[np.ndarray, " channels"] | None,
+    *,
+    exact: bool,
+) -> tuple[Float[np.ndarray, " d"], int]:
+    """Half of the narrowest 95 % intervals that the log allows, in [-1, 1], and the control steps simulated.
+
+    Where states are exact but for the noise of `sensors`, windows with fitted initial states may tell more than single
+    noisy steps do.
+    """
+    given = bench.problem.states, bench.problem.dataset, bench.problem.simulator, at
+    residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
+    half, spent = expected_half_widths(*given, residual, exact=exact)
+    if sensors is None:
+        return half, spent
+    fitted, more = expected_half_widths(*given, np.maximum(sensors, NEGLIGIBLE) * bench.change, exact=False)
+    return np.minimum(half, fitted), spent + more
+
+
+def _contradictions(
+    bench: Bench, point: Float[np.ndarray, " d"], at: Float[np.ndarray, " d"], doubts: Suspicions
+) -> tuple[tuple[Finding, ...], int]:
+    """Findings of the log that contradict the spec, and the control steps simulated.
+
+    Actions that seem late are none where tests at the estimate exclude it.
+    """
+    simulator, dataset = bench.simulator, bench.problem.dataset
+    found, spent = dataset.findings, 0
+    possible = simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none"
+    if possible and bench.begins(EXCHANGED):
+        points = np.stack([np.zeros(len(point)), point, at])
+        exchanged, spent = exchanged_columns(
+            bench.held_out, simulator, points, horizons(dataset)[1], bench.change, contradicts=True
+        )
+        found = (*exchanged, *found)
+    in_time = actions_in_time(doubts.terms, simulator.control_step)
+    return tuple(each for each in found if each.contradicts and not (each.late and in_time)), spent
+
+
+def _shares(
+    space: ParameterSpace,
+    best: Float[np.ndarray, "d 2"],
+    ends: Float[np.ndarray, "d 2"],
+    half_widths: Float[np.ndarray, " d"],
+    doubts: Suspicions,
+) -> Float[np.ndarray, " d"]:
+    """Shares in [0, 1] of each range that intervals cover: the best possible, or the given ones widened, if wider.
+
+    Another estimate of other windows says that the search is not at its end, not that a parameter is open.
+    """
+    open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
+    ends = ends + half_widths[:, None] * widening(open_by, space.names) * (-1.0, 1.0)
+    return np.maximum(*(np.ptp(np.clip(each, -1.0, 1.0), axis=1) / 2.0 for each in (best, ends)))

@@ -1,0 +1,70 @@
+"""The model with the parameter that it seems to lack: whether that is what it lacks is tested before anybody adds it.
+
+A term may explain much of the residuals because it acts somewhat like what is missing. The model with it is therefore
+fitted to the same windows and put to the same tests: only where these find nothing more is it the cause, as far as
+the log tells.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from madoc import simulation
+from madoc.calibration.holdout import RicherModel
+from madoc.data import Dataset
+from madoc.identification.candidate_terms import INTEGRATION
+from madoc.identification.coarseness import FINER
+from madoc.identification.missing_terms import suspicions
+from madoc.identification.states import states_of
+from madoc.identification.term_tests import LIKELY_FORCE, MissingTerm, named
+from madoc.parameters import ParameterSpace
+from madoc.simulation.base import Simulator
+from madoc.verdict.remedies import line_of
+
+
+def richer_model(
+    dataset: Dataset,
+    simulator: Simulator,
+    point: Float[np.ndarray, " d"],
+    half_widths: Float[np.ndarray, " d"],
+    scale: Float[np.ndarray, " observation"],
+    term: MissingTerm,
+    *,
+    finer: bool,
+    most: int | None,
+) -> tuple[RicherModel, int]:
+    """The model with the parameter of a term, and the control steps simulated.
+
+    Args:
+        dataset: The log that was calibrated to.
+        simulator: The model with its calibrated parameters.
+        point: Their estimate in [-1, 1].
+        half_widths: Half of each one's 95 % interval in [-1, 1].
+        scale: Typical change of each signal in a stride.
+        term: The term, which a parameter of a spec adds.
+        finer: Whether to integrate in steps of a quarter of the length, as the tests that found the term did.
+        most: Largest number of windows; None for the usual one.
+    """
+    added, task = line_of(term), simulator.task
+    space = ParameterSpace((*simulator.parameters.parameters, added))
+    late = int(np.ceil(added.high / simulator.control_step)) if added.field == "action_delay" else 0
+    task = replace(task, parameters=space, pending=max(task.pending, late))
+    wide = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER) if finer else task)
+    shift = np.array([term.shifts.get(name, 0.0) for name in simulator.parameters.names]) * half_widths
+    start = np.append(point + shift, space.to_unit(np.append(simulator.parameters.middle, term.value))[-1])
+    widths = np.append(half_widths, 4.0 * term.standard_error / (added.high - added.low))
+    found = suspicions(
+        dataset,
+        states_of(dataset, wide),
+        wide,
+        np.clip(start, -1.0, 1.0),
+        widths,
+        scale,
+        of_other_model=True,
+        most=most,
+    )
+    left = [each for each in found.terms if each.cause != INTEGRATION and abs(each.t) >= LIKELY_FORCE]
+    untested = () if found.tested else ("what cannot be tested",)
+    steps = found.control_steps * (FINER if finer else 1)
+    return RicherModel(term.parameter, (*map(named, left), *untested)), steps
