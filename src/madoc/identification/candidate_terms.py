@@ -24,7 +24,7 @@ from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bo
 
 DELAY = "actions that take effect later, by a delay or a lag of the actuator"
 EARLY = "actions that take effect before they are logged"
-BELOW_MINIMUM = "something that a value below its least possible one would imitate"
+BELOW_MINIMUM = "a value below what is physically possible"
 SATURATION = "a drive that saturates below the limit of its actions"
 SPACING = "another time between rows than the spec says, by another rate or a clock that drifts"
 TILTS = ("a base or a floor that is tilted towards x", "a base or a floor that is tilted towards y")

@@ -40,6 +40,8 @@ NO_DELAY = (
     "of the drives or of the log"
 )
 """What to do where actions take effect late, and a constant delay leaves something over or was not tested."""
+BEFORE_OTHERS = 2.0
+"""Time left over that of a test, from which it comes before what is to follow, as predictions over longer times."""
 TESTING = 0.7
 """Share in (0, 1) of the time left that testing what the model lacks may take."""
 
@@ -178,7 +180,8 @@ def _richer(
     """The model with a term, if a parameter of a spec adds it and there is time; also the control steps simulated."""
     if term is None or not is_of_spec(term) or not doubts.tested:
         return None, 0
-    if not bench.begins(f"the model with {term.parameter}", doubts.control_steps / bench.rate):
+    seconds = doubts.control_steps / bench.rate
+    if not bench.begins(f"the model with {term.parameter}", BEFORE_OTHERS * seconds):
         return None, 0
     given = bench.problem.dataset, bench.simulator, point, half_widths, bench.change, term
     return richer_model(*given, finer=finer, most=_windows_in_time(bench))

@@ -33,8 +33,8 @@ def richer_model(
     *,
     finer: bool,
     most: int | None,
-) -> tuple[RicherModel, int]:
-    """The model with the parameter of a term, and the control steps simulated.
+) -> tuple[RicherModel | None, int]:
+    """The model with the parameter of a term, or None if it cannot be tested; also the control steps simulated.
 
     Args:
         dataset: The log that was calibrated to.
@@ -65,6 +65,5 @@ def richer_model(
         most=most,
     )
     left = [each for each in found.terms if each.cause != INTEGRATION and abs(each.t) >= LIKELY_FORCE]
-    untested = () if found.tested else ("what cannot be tested",)
     steps = found.control_steps * (FINER if finer else 1)
-    return RicherModel(term.parameter, (*map(named, left), *untested)), steps
+    return RicherModel(term.parameter, tuple(map(named, left))) if found.tested else None, steps
