@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 from scipy.constants import g as standard_gravity
@@ -135,7 +134,7 @@ def candidates(
 
 
 def _at_contacts(
-    model: mujoco.MjModel, logged: LoggedStates, calibrated: AbstractSet[tuple[str, str]]
+    model: Any, logged: LoggedStates, calibrated: AbstractSet[tuple[str, str]]
 ) -> Iterator[tuple[str, tuple[str, ...], float]]:
     """Friction and stiffness of the geoms that touch others in the log, of one value for all of a kind."""
     touching = touching_geoms(model, logged.states[evenly(np.arange(len(logged.states)), _SEEN)])
@@ -147,7 +146,7 @@ def _at_contacts(
             yield field, alike, float(values[0])
 
 
-def _plausible(model: mujoco.MjModel, parameter: Parameter, reference: float) -> tuple[float, float]:
+def _plausible(model: Any, parameter: Parameter, reference: float) -> tuple[float, float]:
     """Smallest and largest value that a machine can have."""
     if parameter.field == "gravity":
         return ON_THE_GROUND
