@@ -16,6 +16,7 @@ import method_page
 import numpy as np
 import payload
 import planted
+import planted_servo
 import rates
 from disturbances import disturbed, settled_wrongly
 from kept import CALIBRATIONS, POLICIES, RESULTS, SYSID, Study, commits, is_time
@@ -133,7 +134,7 @@ def planted_truths() -> str:
 
 
 def verdicts() -> str:
-    """What `adversary.py`, `interval_coverage.py`, `rates.py` and `payload.py` found."""
+    """What `adversary.py`, `interval_coverage.py`, `rates.py`, `payload.py` and `planted_servo.py` found."""
     cases = adversary.STUDY.rows()
     return (
         "## Verdicts and intervals\n\n"
@@ -147,7 +148,10 @@ def verdicts() -> str:
         f"{rates.table(rates.STUDY.rows())}\n\n"
         "`python benchmarks/payload.py`: an arm of seven joints, driven by torques that arrive 8 ms late, with an "
         "unknown load of 0.5 kg off its axis and unknown dry friction, all defaults.\n\n"
-        f"{payload.table(payload.STUDY.rows())}\n"
+        f"{payload.table(payload.STUDY.rows())}\n\n"
+        "`python benchmarks/planted_servo.py`: a hobby servo with supply limit, back-EMF, friction by speed and load, "
+        "and backlash, all unknown, at two gains of its firmware; its encoder alone is logged. All defaults.\n\n"
+        f"{planted_servo.table(planted_servo.STUDY.rows())}\n"
     )
 
 
