@@ -41,6 +41,8 @@ RANGES: dict[str, tuple[float, float, float]] = {
 """Middle of the truths, and the range, by parameter."""
 SPREAD = 0.25
 """Standard deviation of the logarithm of a truth."""
+EDGE = 0.03
+"""Share of a range at either end in which no truth lies."""
 NOISE, ROW, LIMIT = 5e-4, 0.01, 1500.0
 """rad, s, s."""
 GAINS, RUNS, SECONDS = (16, 32), 4, 5.0
@@ -86,10 +88,7 @@ parameters:
 def solve(seed: int) -> dict[str, Any]:
     """Record, calibrate and compare."""
     random, started = np.random.default_rng(seed), time.monotonic()
-    truth = {
-        name: float(np.clip(middle * np.exp(SPREAD * random.standard_normal()), low, high))
-        for name, (middle, low, high) in RANGES.items()
-    }
+    truth = drawn(random)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         recorded(folder, truth, random)
@@ -106,6 +105,17 @@ def solve(seed: int) -> dict[str, Any]:
             name: compared(result.get("parameters", {}).get(name, {}), (value, value)) for name, value in truth.items()
         },
     }
+
+
+def drawn(random: np.random.Generator) -> dict[str, float]:
+    """A truth, each value of which is drawn anew until it is off the ends of its range."""
+    truth = {}
+    for name, (middle, low, high) in RANGES.items():
+        off = EDGE * (high - low)
+        while not low + off <= (value := middle * np.exp(SPREAD * random.standard_normal())) <= high - off:
+            pass
+        truth[name] = float(value)
+    return truth
 
 
 def recorded(folder: Path, truth: dict[str, float], random: np.random.Generator) -> None:
