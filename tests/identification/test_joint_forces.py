@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_missing_terms import MODEL, NOISE, SPEC, scores
+from test_missing_terms import scores
 
 from madoc import robots, simulation
 from madoc.data import logs
@@ -22,6 +22,7 @@ from madoc.identification.joint_forces import (
     joint_forces,
 )
 from madoc.verdict.adequacy import NEARLY, is_certain, likeliest
+from planted_pendulum import MODEL, NOISE, SPEC
 
 
 def test_forces_along_a_motion():
