@@ -12,6 +12,7 @@ from typing import Any
 import adversary
 import adversary_table
 import interval_coverage
+import legged
 import method_page
 import numpy as np
 import payload
@@ -134,7 +135,7 @@ def planted_truths() -> str:
 
 
 def verdicts() -> str:
-    """What `adversary.py`, `interval_coverage.py`, `rates.py`, `payload.py` and `planted_servo.py` found."""
+    """What `adversary.py`, `interval_coverage.py`, `rates.py`, `payload.py` and others found."""
     cases = adversary.STUDY.rows()
     return (
         "## Verdicts and intervals\n\n"
@@ -151,7 +152,10 @@ def verdicts() -> str:
         f"{payload.table(payload.STUDY.rows())}\n\n"
         "`python benchmarks/planted_servo.py`: a hobby servo with supply limit, back-EMF, friction by speed and load, "
         "and backlash, all unknown, at two gains of its firmware; its encoder alone is logged. All defaults.\n\n"
-        f"{planted_servo.table(planted_servo.STUDY.rows())}\n"
+        f"{planted_servo.table(planted_servo.STUDY.rows())}\n\n"
+        "`python benchmarks/legged.py`: a quadruped of three position servos a leg that trots for 15 s and logs its "
+        "joint encoders and an IMU alone, all defaults and 300 s, judging included.\n\n"
+        f"{legged.table(legged.STUDY.rows())}\n"
     )
 
 

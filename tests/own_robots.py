@@ -1,5 +1,6 @@
 """Robots as a user would describe them: spec files of the two small robots, and of a cart that floats freely."""
 
+import madoc.robots
 from robots import ARM, PENDULUM, SPRING
 
 ARM_SPEC = """\
@@ -233,3 +234,41 @@ def write_robot(folder, spec, file="robot.yaml", **models):
     path = folder / file
     path.write_text(spec)
     return path
+
+
+URDF = """
+<robot name="pendulum">
+  <link name="base"/>
+  <link name="rod">
+    <inertial><origin xyz="0 0 -0.5"/><mass value="2"/>
+      <inertia ixx="0.2" iyy="0.2" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="hinge" type="revolute">
+    <parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>
+    <limit lower="-3" upper="3" effort="5" velocity="9"/><dynamics damping="0.1" friction="0"/>
+  </joint>
+</robot>
+"""
+
+
+URDF_SPEC = """\
+madoc: 1
+name: pendulum
+model: pendulum.xml
+control_step: 0.02
+signals:
+  - {name: angle, reads: position(hinge) * 180 / pi, unit: deg}
+  - {name: rate, reads: velocity(hinge)}
+actions:
+  - {name: torque, joint: hinge, means: torque, low: -5, high: 5}
+parameters:
+  - {field: body_mass, element: rod, low: 1, high: 3}
+  - {field: body_com, element: rod, low: 0.2, high: 1}
+  - {field: body_inertia, element: rod, low: 0.1, high: 0.4}
+  - {field: dof_damping, element: hinge, low: 0, high: 0.5}
+"""
+
+
+def task_of(folder, spec, **models):
+    """The task of a spec file beside the models it may name."""
+    return madoc.robots.load(write_robot(folder, spec, **models)).task

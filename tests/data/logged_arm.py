@@ -67,3 +67,28 @@ def write_csv(path: Path, columns: dict[str, np.ndarray], separator: str = ",") 
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def matrix(columns, names):
+    return np.stack([columns[name] for name in names], axis=-1)
+
+
+def assert_same(dataset, columns, *, atol=0.0):
+    """One episode that holds exactly the columns, actions brought to [-1, 1] by hand."""
+    seen = matrix(columns, SIGNALS)
+    unit = np.stack([columns["shoulder_torque"] / 0.5, columns["elbow_torque"] / 0.2 - 1.0], axis=-1)
+    logged = dataset.transitions
+    np.testing.assert_allclose(logged.observation, seen[:-1], rtol=0, atol=atol)
+    np.testing.assert_allclose(logged.next_observation, seen[1:], rtol=0, atol=atol)
+    np.testing.assert_allclose(logged.action, unit[:-1], rtol=0, atol=1e-12 + atol)
+    assert dataset.episode_starts.tolist() == [0]
+    assert logged.truncated.tolist() == [False] * (len(seen) - 2) + [True]
+    assert not logged.terminated.any()
+    assert not logged.reward.any()
+
+
+def named(signal, action, time="time"):
+    """The `log:` section where signals and actions are elements of arrays."""
+    pairs = [f"{name}: '{signal}[{index}]'" for index, name in enumerate(SIGNALS)]
+    pairs += [f"{name}: '{action}[{index}]'" for index, name in enumerate(ACTIONS)]
+    return f"{{time: {time}, columns: {{{', '.join(pairs)}}}}}"

@@ -13,11 +13,6 @@ from robots import ARM
 
 
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory):
-    return arm_of(tmp_path_factory.mktemp("arm"))
-
-
-@pytest.fixture(scope="module")
 def resampled(tmp_path_factory):
     return arm_of(tmp_path_factory.mktemp("resampled"), log="{resample: linear}")
 

@@ -7,20 +7,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from logged_arm import ACTIONS, SIGNALS, arm_of, columns_of, write_csv
+from logged_arm import ACTIONS, SIGNALS, arm_of, write_csv
 
 from madoc.data import logs
 from madoc.errors import MadocError
-
-
-@pytest.fixture(scope="module")
-def robot(tmp_path_factory):
-    return arm_of(tmp_path_factory.mktemp("arm"))
-
-
-@pytest.fixture(scope="module")
-def columns(robot):
-    return columns_of(robot)
 
 
 def changed(**columns):

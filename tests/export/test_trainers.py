@@ -30,6 +30,22 @@ ROBOT = Robot(
 )
 
 
+ACTUATOR_FIELDS = {"joint_names_expr", "stiffness", "damping", "armature", "friction", "dynamic_friction"}
+ACTUATOR_FIELDS |= {"viscous_friction", "effort_limit", "effort_limit_sim"}
+WHERE = {"joint_ids", "env_ids"}
+ISAAC_LAB = {
+    "ImplicitActuatorCfg": ACTUATOR_FIELDS,
+    "DelayedPDActuatorCfg": ACTUATOR_FIELDS | {"min_delay", "max_delay"},
+    "write_joint_armature_to_sim_index": {"armature"} | WHERE,
+    "write_joint_friction_coefficient_to_sim_index": {"joint_friction_coeff", "joint_dynamic_friction_coeff"} | WHERE,
+    "write_joint_viscous_friction_coefficient_to_sim_index": {"joint_viscous_friction_coeff"} | WHERE,
+    "write_joint_stiffness_to_sim_index": {"stiffness"} | WHERE,
+    "write_joint_damping_to_sim_index": {"damping"} | WHERE,
+}
+"""Names and keywords in isaac-sim/IsaacLab: isaaclab/actuators/actuator_base_cfg.py and actuator_pd_cfg.py (e579469),
+isaaclab_physx/assets/articulation/articulation.py (b4e94b5)."""
+
+
 def exported(field, element, estimate):
     parameter = Parameter(field, element, 0.0, 10.0)
     row = ParameterEstimate(estimate=estimate, std=0.1, low=0.0, high=10.0, unit=parameter.unit)
@@ -85,6 +101,31 @@ def test_isaac_lab_gets_what_its_joints_have_and_is_told_the_rest(tmp_path):
     text = path.read_text()
     assert "DRAWN = [('armature', ['fl_knee', 'fr_knee'], 0), ('stiffness', ['fl_knee'], 1)]" in text
     assert "body_mass.trunk = 5 kg has to go into the robot's USD file" in text
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.0075])
+def test_isaac_lab_is_asked_for_by_its_published_names_alone(tmp_path, delay):
+    path = tmp_path / "isaac_lab_robot.py"
+    fields = ("dof_armature", "dof_frictionloss", "dof_damping")
+    rows = [exported(field, "fl_knee", 0.01) for field in fields]
+    rows += [exported(field, "fl", 40.0) for field in ("actuator_gain", "actuator_kv")]
+    save_isaac_lab(path, replace(ROBOT, delay=delay), rows)
+    tree = ast.parse(path.read_text())
+    imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for name in node.names}
+    kind = "DelayedPDActuatorCfg" if delay else "ImplicitActuatorCfg"
+    assert imported == {"Path", kind, "ManagerTermBase"}
+    (servos, _) = calls(path, kind)
+    assert servos.keys() <= ISAAC_LAB[kind] and ("effort_limit" in servos) == bool(delay)
+    asked = {
+        node.func.attr: {word.arg for word in node.keywords if word.arg} | WHERE  # by **where
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "").startswith("write_")
+    }
+    assert len(asked) == 3 and all(words == ISAAC_LAB[name] for name, words in asked.items())
+    assert ("write_joint_{what}_to_sim_index" in path.read_text()) == (delay == 0.0)
+    (drawn,) = (node.value for node in tree.body if getattr(getattr(node, "targets", [None])[0], "id", "") == "DRAWN")
+    quantities = [what for what, _, _ in ast.literal_eval(drawn)]
+    assert quantities == ["armature", "friction", "viscous_friction", "stiffness", "damping"]
 
 
 def test_rows_of_the_model_are_found_again_in_a_scene_with_other_bodies_and_a_floor(tmp_path):

@@ -7,7 +7,11 @@ from madoc.errors import MadocError
 from own_robots import ARM_SPEC, CART, CART_SPEC, write_robot
 
 ACTION = "  - {name: shoulder_motor, actuator: shoulder, low: -1, high: 1}"
+
+
 DAMPING = "  - {field: dof_damping, element: elbow, low: 0, high: 0.5}"
+
+
 SIGNAL = "  - {name: elbow_angle, reads: position(elbow)}"
 
 
@@ -289,79 +293,6 @@ def test_a_name_is_taken_across_signals_and_actions(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        (b"", "robot.yaml is empty; write one with: madoc init MODEL"),
-        (b"# nothing\n", "robot.yaml is empty"),
-        (b"just words", "line 1: expected keys and values"),
-        (b"[1, 2]", "line 1: expected keys and values"),
-        (b"a: 1\n\tb: 2", "line 2: this is not YAML"),
-        (b"a: [1, 2", "line 1: this is not YAML"),
-        (b"a: &x 1\nb: *x", "line 1: anchors and aliases"),
-        (b"a: !!python/object:os.system {}", "line 1: expected a plain value, got the tag"),
-        (b"a: !mine 1", "line 1: expected a plain value, got the tag !mine"),
-        (b"a: 1\n---\nb: 2", "line 2: this is not YAML"),
-        (b"? [a]\n: 1", "line 1: expected a word before the colon"),
-        (b"name: caf\xe9\n", "line 1: expected text in UTF-8, got byte 0xe9"),
-        (b"\n\na: \x00", "this is not YAML"),
-        (b"[" * 5000, "line 1: nested more than 20 deep"),
-        (b"a: " + b"[" * 30 + b"]" * 30, "line 1: nested more than 20 deep"),
-        (b"#" * 200_001, "has 200,001 bytes, a robot's spec at most 200,000"),
-    ],
-)
-def test_what_is_no_yaml_of_ours(tmp_path, content, sentence):
-    path = tmp_path / "robot.yaml"
-    path.write_bytes(content)
-    with pytest.raises(MadocError, match=sentence) as refusal:
-        robots.load(path)
-    assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize(
-    ("model", "sentence"),
-    [
-        (None, r"line 3: there is no model file .*cart.xml: it is missing; check the path"),
-        ("", "line 3: model cart.xml cannot be read"),
-        ("hello", "line 3: model cart.xml cannot be read: it is not XML"),
-        ("<mujoco><wordbody/></mujoco>", "line 3: model cart.xml cannot be read: .*wordbody"),
-        (
-            '<mujoco><worldbody><body name="cart"><joint name="rail"/></body></worldbody></mujoco>',
-            "line 3: model cart.xml does not compile: .*mass and inertia",
-        ),
-        (CART.replace("</mujoco>", '<include file="rest.xml"/></mujoco>'), "line 3: .*rest.xml"),
-        (
-            CART.replace(
-                "</mujoco>", '<actuator><intvelocity name="a" joint="rail" kp="1" actrange="-1 1"/></actuator></mujoco>'
-            ),
-            "line 9: the joint 'rail' has an actuator 'a' in the model",
-        ),
-    ],
-)
-def test_what_is_no_model(tmp_path, model, sentence):
-    path = write_robot(tmp_path, CART_SPEC)
-    (tmp_path / "cart.xml").unlink()
-    if model is not None:
-        (tmp_path / "cart.xml").write_text(model)
-    with pytest.raises(MadocError, match=sentence) as refusal:
-        robots.load(path)
-    assert "\n" not in str(refusal.value)
-
-
-def test_models_that_cannot_be_stepped_yet_are_refused(tmp_path):
-    actuator = '<actuator><intvelocity name="a" joint="rail" kp="1" actrange="-1 1"/></actuator></mujoco>'
-    path = write_robot(
-        tmp_path,
-        CART_SPEC.replace("joint: rail, means: force", "actuator: a"),
-        cart=CART.replace("</mujoco>", actuator),
-    )
-    with pytest.raises(
-        MadocError,
-        match=r"line 3: cart: of the actuators a with an activation .* the state is not simulated",
-    ):
-        robots.load(path)
-
-
-@pytest.mark.parametrize(
     ("before", "after", "sentence"),
     [
         ("means: force", "means: torque", "line 9: expected means: force of the slide 'rail'"),
@@ -392,19 +323,6 @@ def test_a_value_in_two_units_is_not_shared(tmp_path):
         MadocError, match=r"line 12: one value cannot be in N·m·s/rad and in N·s/m; make it two parameters"
     ):
         robots.load(write_robot(tmp_path, CART_SPEC + shared, cart=model))
-
-
-def test_several_mistakes_are_counted(tmp_path):
-    spec = ARM_SPEC.replace("low: 0,", "low: no,").replace("groups: 2", "groups: x")
-    with pytest.raises(MadocError, match=r"line 17: expected a number in parameters.low, got 'no' \(and 2 more\)"):
-        robots.load(write_robot(tmp_path, spec))
-
-
-def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path):
-    spec = CART_SPEC.replace("low: 0.5, high: 2", "low: 5e-1, high: 2E+0").replace("name: place", "name: on")
-    task = robots.load(write_robot(tmp_path, spec)).task
-    assert task.signals == ("on", "speed")
-    assert (task.parameters.low, task.parameters.high) == (0.5, 2.0)
 
 
 def test_a_unit_that_nobody_knows(tmp_path):

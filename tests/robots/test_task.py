@@ -14,48 +14,13 @@ import madoc.simulation
 import madoc.tasks
 from madoc import robots
 from madoc.data import Dataset
-from madoc.errors import MadocError, NotAllowed
+from madoc.errors import MadocError
 from madoc.identification.states import logged_states
 from madoc.simulation.cpu import CpuSimulator
 from madoc.simulation.sensitivity import insensitive
 from madoc.types import Transitions
-from own_robots import ARM_SPEC, BOUNCER, BOUNCER_SPEC, CART_SPEC, SPRING_SPEC, write_robot
+from own_robots import ARM_SPEC, CART_SPEC, SPRING_SPEC, URDF, URDF_SPEC, task_of, write_robot
 from robots import spring, two_link_arm
-
-URDF = """
-<robot name="pendulum">
-  <link name="base"/>
-  <link name="rod">
-    <inertial><origin xyz="0 0 -0.5"/><mass value="2"/>
-      <inertia ixx="0.2" iyy="0.2" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
-  </link>
-  <joint name="hinge" type="revolute">
-    <parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>
-    <limit lower="-3" upper="3" effort="5" velocity="9"/><dynamics damping="0.1" friction="0"/>
-  </joint>
-</robot>
-"""
-
-URDF_SPEC = """\
-madoc: 1
-name: pendulum
-model: pendulum.xml
-control_step: 0.02
-signals:
-  - {name: angle, reads: position(hinge) * 180 / pi, unit: deg}
-  - {name: rate, reads: velocity(hinge)}
-actions:
-  - {name: torque, joint: hinge, means: torque, low: -5, high: 5}
-parameters:
-  - {field: body_mass, element: rod, low: 1, high: 3}
-  - {field: body_com, element: rod, low: 0.2, high: 1}
-  - {field: body_inertia, element: rod, low: 0.1, high: 0.4}
-  - {field: dof_damping, element: hinge, low: 0, high: 0.5}
-"""
-
-
-def task_of(folder, spec, **models):
-    return robots.load(write_robot(folder, spec, **models)).task
 
 
 def same_steps(mine, written, values=None):
@@ -106,48 +71,6 @@ def test_units_follow_the_joint(tmp_path):
     assert [signal.unit for signal in robot.signals] == ["m", "m/s"]
 
 
-def test_a_servo_pulls_to_its_target(tmp_path):
-    # kp (u - x) - kd v = 100 (0.1 - 0.04) - 2 * 0.5 = 5 N on 2 kg for one step of 0.01 s, twice.
-    spec = CART_SPEC.replace(
-        "means: force, low: -10, high: 10", "means: position, kp: 100, kd: 2, low: -200, high: 200, unit: mm"
-    )
-    spec = (
-        spec.replace("control_step: 0.02", "control_step: 0.01")
-        + "  - {field: actuator_gain, element: push, low: 50, high: 200}\n"
-    )
-    task = task_of(tmp_path, spec)
-    simulator = CpuSimulator(task, threads=1)
-    system = simulator.bind(np.array([[2.0, 100.0], [2.0, 50.0]]))
-    end = system.step(np.full((2, 1, 2), [0.04, 0.5]), np.full((2, 1, 1), 0.5))
-    # Half the gain, in its bias as well: 50 (0.1 - 0.04) - 1 = 2 N.
-    np.testing.assert_allclose(end[:, 0, 1], [0.5 + 0.01 * 5 / 2, 0.5 + 0.01 * 2 / 2], rtol=1e-12)
-    assert task.parameters.parameters[1].unit == "N/m"
-    assert (task.actions[0].unit, task.actions[0].scale) == ("mm", 1e-3)
-    model = simulator.model(np.array([2.0, 100.0]))
-    assert model.actuator_ctrllimited.all()
-    np.testing.assert_allclose(model.actuator_ctrlrange, [[-0.2, 0.2]])
-
-
-def test_a_velocity_servo_and_its_limit(tmp_path):
-    spec = CART_SPEC.replace("means: force, low: -10, high: 10", "means: velocity, kd: 4, limit: 3, low: -1, high: 1")
-    spec = spec.replace("control_step: 0.02", "control_step: 0.01")
-    system = CpuSimulator(task_of(tmp_path, spec), threads=1).bind(np.array([[1.0]]))
-    # kd (u - v): 4 (0.5 - 0) = 2 N; 4 (1 - 0) = 4 N, of which 3 N are had.
-    end = system.step(np.zeros((1, 2, 2)), np.array([[[0.5], [1.0]]]))
-    np.testing.assert_allclose(end[0, :, 1], [0.02, 0.03], rtol=1e-12)
-
-
-def test_actions_are_an_affine_map_and_rest_at_nothing(tmp_path):
-    spec = CART_SPEC.replace("low: -10, high: 10", "low: 0, high: 4").replace(
-        "control_step: 0.02", "control_step: 0.01"
-    )
-    task = task_of(tmp_path, spec + "  - {field: action_delay, low: 0, high: 0.01}\n")
-    simulator = CpuSimulator(task, threads=1)
-    assert simulator.initial_state.tolist() == [0.0, 0.0, -1.0]
-    end = simulator.bind(np.array([[1.0, 0.0]])).step(np.zeros((1, 3, 3)), np.array([[[-1.0], [0.0], [1.0]]]))
-    np.testing.assert_allclose(end[0, :, 1], [0.0, 0.02, 0.04], atol=1e-15)
-
-
 def test_a_shared_value_is_written_into_each_element(tmp_path):
     shared = "  - {field: dof_damping, elements: [shoulder, elbow], name: damping, low: 0, high: 1}\n"
     apart = ARM_SPEC[: ARM_SPEC.index("  - {field: dof_damping")]
@@ -158,18 +81,6 @@ def test_a_shared_value_is_written_into_each_element(tmp_path):
     both = CpuSimulator(task_of(tmp_path, ARM_SPEC), threads=1).bind(np.array([[*values, 0.3, 0.3]]))
     state, action = np.full((1, 2, 4), 0.4), np.full((1, 2, 2), 0.2)
     np.testing.assert_array_equal(one.step(state, action), both.step(state, action))
-
-
-def test_a_bias_is_seen_and_taken_off_the_start(tmp_path):
-    bias = "  - {field: signal_bias, element: place, low: -0.1, high: 0.1}\n"
-    task = task_of(tmp_path, CART_SPEC.replace("position(rail)", "2 * position(rail) + 1") + bias)
-    assert task.parameters.parameters[1].unit == "1"
-    system = CpuSimulator(task, threads=1).bind(np.array([[1.0, 0.0], [1.0, 0.06]]))
-    state = np.full((2, 1, 2), [0.5, 3.0])
-    np.testing.assert_allclose(system.observe(state)[:, 0], [[2.0, 3.0], [2.06, 3.0]])
-    # An observation of 2.06 by a sensor that reads 0.06 too much is a place of 0.5.
-    rebuilt = task.state_from_observation(np.full((2, 1, 2), [2.06, 3.0]))
-    np.testing.assert_allclose(system.unbiased(rebuilt)[:, 0], [[0.53, 3.0], [0.5, 3.0]])
 
 
 def test_delay_and_bias_are_felt_and_an_idle_one_is_found(tmp_path):
@@ -185,54 +96,6 @@ def test_delay_and_bias_are_felt_and_an_idle_one_is_found(tmp_path):
     still = np.concatenate([np.zeros((20, 2)), np.zeros((20, 2))], -1)
     found, _ = insensitive(simulator, still, np.zeros((20, 1)), key=jax.random.key(0))
     assert found == ["body_mass.cart", "action_delay", "jnt_stiffness.rail"]
-
-
-SENSED = """
-<mujoco>
-  <option timestep="0.01" gravity="0 0 0"/>
-  <worldbody>
-    <body name="cart"><joint name="rail" type="slide" axis="1 0 0"/><geom type="box" size=".1 .1 .1" mass="2"/>
-      <site name="front" pos="0.3 0 0"/></body>
-  </worldbody>
-  <sensor><framepos name="front" objtype="site" objname="front"/><accelerometer name="shake" site="front"/></sensor>
-</mujoco>
-"""
-
-
-def test_sensors_are_read_in_a_forward_pass_of_each_system(tmp_path):
-    spec = CART_SPEC.replace("place, reads: position(rail)", 'place, reads: "sensor(front)[0] * 1000", unit: mm')
-    task = task_of(tmp_path, spec, cart=SENSED)
-    assert task.pending == 0
-    assert task.state_from_observation is None
-    system = CpuSimulator(task, threads=1).bind(np.array([[1.0], [2.0]]))
-    state = np.tile([0.2, -1.0], (2, 12, 1))
-    state[1, 3] = np.nan
-    seen = system.observe(state)
-    np.testing.assert_allclose(seen[0], np.tile([500.0, -1.0], (12, 1)), rtol=1e-12)
-    assert np.isnan(seen[1, 3]).all()
-    assert np.isfinite(seen[1, 4:]).all()
-    with pytest.raises(MadocError, match="only a bound system can make it"):
-        task.observe(state)
-
-
-def test_a_sensor_of_acceleration_feels_the_last_action(tmp_path):
-    spec = CART_SPEC.replace("velocity(rail)", '"sensor(shake)[0]"')
-    task = task_of(tmp_path, spec, cart=SENSED)
-    assert task.pending == 1
-    system = CpuSimulator(task, threads=1).bind(np.array([[0.5], [2.0]]))
-    seen = system.observe(np.full((2, 1, 3), [0.0, 0.0, 0.4]))  # 4 N
-    np.testing.assert_allclose(seen[:, 0, 1], [8.0, 2.0], rtol=1e-12)
-
-
-def test_a_sensor_feels_the_action_that_has_taken_effect(tmp_path):
-    spec = CART_SPEC.replace("velocity(rail)", '"sensor(shake)[0]"') + "  - {field: action_delay, low: 0, high: 0.04}\n"
-    simulator = CpuSimulator(task_of(tmp_path, spec, cart=SENSED), threads=1)
-    assert simulator.task.pending == 3  # 0.04 s, and the physics step of 0.01 s in which that action still holds
-    delays = (0.01, 0.03, 0.015, 0.035)
-    system = simulator.bind(np.array([[1.0, delay] for delay in delays]))
-    seen = system.observe(np.full((4, 1, 5), [0.0, 0.0, 0.4, -0.2, 0.6]))
-    # Where actions change within the last physics step, it has half of each: (4 - 2) / 2 and (-2 + 6) / 2.
-    np.testing.assert_allclose(seen[:, 0, 1], [4.0, -2.0, 1.0, 2.0], rtol=1e-12)
 
 
 def test_a_urdf(tmp_path):
@@ -258,43 +121,6 @@ def test_length_and_inertia_of_a_pendulum(tmp_path):
     system = CpuSimulator(single, threads=1).bind(np.array([[2.0, 0.25, 0.4, 0.0]]))
     after = system.step(np.array([[[math.pi / 2, 0.0]]]), np.zeros((1, 1, 1)))[0, 0]
     np.testing.assert_allclose(after[1], -timestep * 2.0 * 9.81 * 0.25 / (0.4 + 2.0 * 0.25**2), rtol=1e-9)
-
-
-def test_a_state_needs_every_position_and_velocity(tmp_path):
-    hidden = ARM_SPEC.replace("  - {name: elbow_speed, reads: velocity(elbow)}\n", "")
-    robot = robots.load(write_robot(tmp_path, hidden))
-    assert robot.task.state_from_observation is None
-    assert robot.undetermined == ("no signal is the velocity of elbow",)
-    bent = ARM_SPEC.replace("position(elbow)", "sin(position(elbow))")
-    assert task_of(tmp_path, bent).state_from_observation is None
-
-
-def test_sums_of_joints_are_taken_apart(tmp_path):
-    # Encoders that see the forearm's angle in the world, and one that sees the shoulder twice.
-    spec = ARM_SPEC.replace("reads: position(elbow)", "reads: position(shoulder) + position(elbow)")
-    spec = spec.replace("reads: position(shoulder), unit: rad", "reads: 3 - 2 * position(shoulder)")
-    task = task_of(tmp_path, spec)
-    state = np.random.default_rng(0).normal(size=(5, 4))
-    np.testing.assert_allclose(task.state_from_observation(task.observe(state)), state, atol=1e-12)
-    np.testing.assert_allclose(jax.jit(task.observe)(jnp.asarray(state)), task.observe(state), rtol=1e-5)
-
-
-def test_a_free_body_has_thirteen_values(tmp_path):
-    model = """<mujoco><worldbody><body name="box" pos="0 0 1"><freejoint name="root"/>
-      <geom type="box" size=".1 .1 .1" mass="1"/><body name="arm"><joint name="j"/><geom size=".05" mass=".1"/></body>
-      </body></worldbody></mujoco>"""
-    reads = [f"position(root)[{i}]" for i in range(7)] + ["position(j)"]
-    reads += [f"velocity(root)[{i}]" for i in range(6)] + ["velocity(j)"]
-    signals = "".join(f'  - {{name: s{i}, reads: "{text}"}}\n' for i, text in enumerate(reads))
-    spec = (
-        "madoc: 1\nname: box\nmodel: box.xml\ncontrol_step: 0.02\nsignals:\n" + signals + "actions:\n"
-        "  - {name: t, joint: j, means: torque, low: -1, high: 1}\n"
-        "parameters:\n  - {field: body_mass, element: box, low: 0.5, high: 2}\n"
-    )
-    task = task_of(tmp_path, spec, box=model)
-    state = CpuSimulator(task, threads=1).initial_state
-    np.testing.assert_array_equal(task.observe(state), state)
-    np.testing.assert_array_equal(task.state_from_observation(state), state)
 
 
 def logged(task, observation, action, starts):
@@ -330,47 +156,6 @@ def test_a_reward_of_signals_and_actions(tmp_path):
     np.testing.assert_array_equal(plain.terminated(next_state), np.zeros(3, dtype=bool))
 
 
-def test_meshes_and_includes_are_kept(tmp_path):
-    corner = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-    (tmp_path / "meshes").mkdir()
-    (tmp_path / "meshes" / "corner.obj").write_text(corner)
-    (tmp_path / "part.xml").write_text(
-        '<mujoco><worldbody><body name="b"><joint name="j"/>'
-        '<geom type="mesh" mesh="corner"/></body></worldbody></mujoco>'
-    )
-    model = (
-        '<mujoco><compiler meshdir="meshes"/><asset><mesh name="corner" file="corner.obj"/></asset>'
-        '<include file="part.xml"/></mujoco>'
-    )
-    spec = CART_SPEC.replace("rail", "j").replace("element: cart", "element: b").replace("force", "torque")
-    task = task_of(tmp_path, spec, cart=model)
-    (tmp_path / "part.xml").unlink()
-    (tmp_path / "meshes" / "corner.obj").unlink()
-    again = robots.restore(json.loads(json.dumps(task.source))).task
-    assert again.compile().nmesh == task.compile().nmesh == 1
-    np.testing.assert_array_equal(again.compile().body_inertia, task.compile().body_inertia)
-
-
-def test_a_urdf_finds_meshes_in_its_package(tmp_path):
-    package = tmp_path / "arm_description"
-    (package / "urdf").mkdir(parents=True)
-    (package / "meshes").mkdir()
-    (package / "meshes" / "rod.obj").write_text(
-        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-    )
-    mesh = '<collision><geometry><mesh filename="package://arm_description/meshes/rod.obj"/></geometry></collision>'
-    text = URDF.replace("</inertial>", f"</inertial>{mesh}")
-    path = write_robot(package / "urdf", URDF_SPEC, pendulum=text)
-    with pytest.raises(NotAllowed, match=r"robot.yaml, line 3: .*package://arm_description/meshes/rod.obj, outside"):
-        robots.load(path)
-    assert robots.load(path, allow_outside=True).task.compile().nmesh == 1
-    (package / "meshes" / "rod.obj").unlink()
-    with pytest.raises(
-        MadocError, match=r"robot.yaml, line 3: pendulum.xml refers to package://arm_description/meshes/rod"
-    ):
-        robots.load(path)
-
-
 def test_moving_a_centre_of_mass_leaves_shapes_where_they_are(tmp_path):
     task = task_of(
         tmp_path,
@@ -403,20 +188,6 @@ def test_names_and_paths_resolve(tmp_path, monkeypatch):
         robots.resolve(tmp_path / "nothing.yaml")
 
 
-def test_what_signals_tell_of_a_state(tmp_path):
-    # The elbow's encoder sees the sum of both angles; only the elbow's speed is measured, as twice itself plus 1.
-    spec = ARM_SPEC.replace("reads: position(elbow)", "reads: position(shoulder) + position(elbow)")
-    spec = spec.replace("  - {name: shoulder_speed, reads: velocity(shoulder)}\n", "")
-    spec = spec.replace("reads: velocity(elbow)", "reads: 1 + 2 * velocity(elbow)")
-    task = task_of(tmp_path, spec)
-    assert task.state_from_observation is None
-    state = np.random.default_rng(0).normal(size=(5, 4))
-    expected = state.copy()
-    expected[:, 2] = np.nan
-    np.testing.assert_allclose(task.posture(task.observe(state)), expected, atol=1e-12)
-    assert task_of(tmp_path, ARM_SPEC.replace("position(", "velocity(")).posture is None
-
-
 def test_a_spec_is_parsed_and_its_model_compiled_once(tmp_path, monkeypatch):
     compiled, compile_spec = [], mujoco.MjSpec.compile
     monkeypatch.setattr(mujoco.MjSpec, "compile", lambda spec: compiled.append(spec) or compile_spec(spec))
@@ -437,13 +208,6 @@ def test_a_compiled_model_is_the_callers_own():
     task.compile().opt.gravity[2] = 0.0
     assert task.model is task.with_parameters(["gravity"]).model
     assert task.model.opt.gravity[2] == task.compile().opt.gravity[2] == -9.81
-
-
-def test_limits_that_the_model_gives_are_in_the_unit_of_the_action(tmp_path):
-    model = BOUNCER.replace('joint="knee" gear="60"', 'joint="knee" ctrlrange="-0.02 0.03"')
-    spec = BOUNCER_SPEC.replace("low: -1, high: 1}", "unit: mm}")
-    (action,) = robots.load(write_robot(tmp_path, spec, bouncer=model)).task.actions
-    assert (action.low, action.high, action.scale) == (pytest.approx(-20.0), pytest.approx(30.0), 1e-3)
 
 
 def test_a_drone_takes_a_payload_off_its_centre(tmp_path):

@@ -28,6 +28,8 @@ ARM = """
 """
 LOAD = '<body pos="0.05 -0.02 -0.15"><inertial pos="0 0 0" mass="0.4" diaginertia="3.6e-4 3.6e-4 3.6e-4"/></body>'
 """0.4 kg with a radius of gyration of 3 cm: 0.4 · 0.03² = 3.6e-4 kg·m²."""
+AXES = 1e-7
+"""What MuJoCo 3.8 leaves of a torque by stopping its search for principal axes at 1e-12 kg·m²; 3.17 leaves 1e-12."""
 
 
 def arm(load=""):
@@ -61,7 +63,7 @@ def test_writing_what_was_read_changes_nothing():
     model = arm()
     before = torques(model)
     write_pseudo_inertia(model, 2, pseudo_inertia(model, 2))
-    np.testing.assert_allclose(torques(model), before, rtol=1e-12)
+    np.testing.assert_allclose(torques(model), before, rtol=AXES)
     assert model.body_mass[2] == 0.5
     np.testing.assert_allclose(np.sort(model.body_inertia[2]), np.sort(arm().body_inertia[2]), rtol=1e-12)
 
@@ -69,7 +71,7 @@ def test_writing_what_was_read_changes_nothing():
 def test_a_payload_is_what_a_body_welded_to_the_hand_is():
     values = dict(zip(PAYLOAD, (0.4, 0.05, -0.02, -0.15, 0.03), strict=True))
     loaded = written(arm(), values)
-    np.testing.assert_allclose(torques(loaded), torques(arm(LOAD)), rtol=1e-12)
+    np.testing.assert_allclose(torques(loaded), torques(arm(LOAD)), rtol=AXES)
     assert loaded.body_subtreemass[1] == pytest.approx(1.9)
     assert [nominal_values(arm(), Parameter(field, "hand", 0.0, 1.0)) for field in PAYLOAD] == 5 * [(0.0,)]
 

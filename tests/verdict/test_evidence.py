@@ -6,7 +6,7 @@ import pytest
 from planted_logs import ROBOTS, bench, log_of
 
 from madoc.data import Disturbance, disturb, hide_velocities
-from madoc.verdict.evidence import evidence, save_evidence
+from madoc.verdict.evidence import evidence, replay_errors, save_evidence
 
 STEP = 0.02
 
@@ -71,3 +71,19 @@ def test_runs_start_at_fitted_states_where_velocities_are_hidden():
     assert arrays["measured"].shape[2] == 2
     near, far = (np.nanmax(np.abs(arrays[when] - arrays["measured"])) for when in ("after", "before"))
     assert near < 0.01 * far
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_replay_at_the_estimate_has_the_errors_of_the_runs_that_were_kept(hidden):
+    if hidden:
+        log, task, values = hidden_arm(1000)
+    else:
+        (task, truth), log = ROBOTS["spring"], log_of("spring")
+        values = task.parameters.vector(truth)
+    judged, middle = bench(log, task), task.parameters.middle
+    arrays = evidence(judged, middle, control_step=STEP)
+    exact, kept = replay_errors(arrays, judged.simulator, np.stack([values, middle]))
+    apart = (arrays["after"].astype(float) - arrays["measured"]) / arrays["scale"]
+    assert kept == pytest.approx(np.sqrt(np.nanmean(apart**2)), rel=1e-4)
+    assert exact < (0.5 if hidden else 1e-4) * kept  # hidden, runs start where the middle of the ranges fits best
+    assert replay_errors({"measured": arrays["measured"]}, judged.simulator, middle[None]) is None

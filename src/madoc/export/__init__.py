@@ -1,5 +1,6 @@
 """A calibration out of Madoc: the model, what changed in it, ranges to randomize in, a policy for other runtimes."""
 
+from madoc.export.bam import bam_files, save_bam
 from madoc.export.draws import save_draws
 from madoc.export.onnx_policy import save_onnx
 from madoc.export.parameter_files import Exported, is_patch, save_patch, save_randomization, save_sysid_parameters
@@ -9,7 +10,9 @@ from madoc.export.trainers import Robot, save_isaac_lab, save_mjlab
 __all__ = [
     "Exported",
     "Robot",
+    "bam_files",
     "is_patch",
+    "save_bam",
     "save_draws",
     "save_isaac_lab",
     "save_mjlab",

@@ -23,11 +23,13 @@ class Exported:
         parameter: Its field, elements and range.
         row: Its estimate.
         own: The values in the robot's own model, one for each element.
+        left_out: A clause with what leaving it as it is there costs over held-out runs; empty where that is not known.
     """
 
     parameter: Parameter
     row: ParameterEstimate
     own: tuple[float, ...]
+    left_out: str = ""
 
 
 def save_patch(
@@ -63,17 +65,25 @@ def is_patch(path: Path) -> bool:
 
 
 def save_randomization(
-    path: Path, exported: Sequence[Exported], provenance: Mapping[str, object], covariance: list[list[float]] | None
+    path: Path,
+    exported: Sequence[Exported],
+    provenance: Mapping[str, object],
+    covariance: list[list[float]] | None,
+    *,
+    independent: str = "",
 ) -> None:
     """Write, for each parameter, a range and a truncated normal distribution to draw it from in training.
 
     The range is the 95 % interval where the method gave one, else 1.96 standard deviations to either side, within the
-    range that was searched. The covariance, where the method gave one, is for drawing parameters together.
+    range that was searched. The covariance, where the method gave one, is for drawing parameters together;
+    `independent` says what drawing each by itself costs.
     """
     content: dict[str, object] = {
         "provenance": _without_empty(provenance),
         "parameters": {each.parameter.name: _distribution(each) for each in exported},
     }
+    if independent:
+        content["drawn_independently"] = independent
     if covariance is not None:
         content["covariance"] = {"order": [each.parameter.name for each in exported], "rows": covariance}
     _write(path, "Ranges to randomize in; each is a normal distribution cut off at low and high.", content)
@@ -109,7 +119,7 @@ def _patched(exported: Exported) -> dict[str, object]:
         "std": row.std,
         "interval_95": row.interval,
         "searched": [row.low, row.high],
-        "applied": None if in_model else "around the model, which has no place for it",
+        "applied": None if in_model else f"around the model, which has no place for it{exported.left_out}",
     }
     return _without_empty(fields)
 

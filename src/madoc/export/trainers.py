@@ -36,6 +36,7 @@ class Robot:
         delay: From a command to its effect, s.
         fields: Arrays of the model in which draws differ.
         lost: What MuJoCo's options say and mjlab's do not, a clause each.
+        rounded: A clause with what it costs over held-out runs that the delay is a whole number of physics steps.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Robot:
     delay: float
     fields: Sequence[str]
     lost: Sequence[str]
+    rounded: str = ""
 
 
 def save_mjlab(path: Path, robot: Robot, exported: Sequence[Exported]) -> None:
@@ -96,7 +98,7 @@ def save_isaac_lab(path: Path, robot: Robot, exported: Sequence[Exported]) -> No
     groups: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for each in robot.actuators:
         if each.joint:
-            groups.setdefault(tuple(_of_isaac(each).items()), []).append(each.joint)
+            groups.setdefault(tuple(_of_isaac(each, explicit=lag > 0).items()), []).append(each.joint)
     delay = {"min_delay": str(lag), "max_delay": str(lag)} if lag else {}
     actuators = [
         {"joint_names_expr": repr([re.escape(joint) for joint in joints]), **dict(arguments), **delay}
@@ -104,7 +106,8 @@ def save_isaac_lab(path: Path, robot: Robot, exported: Sequence[Exported]) -> No
     ]
     lost = [*unsaid, *(f"{each.name} drives no single joint" for each in robot.actuators if not each.joint)]
     lost += [
-        f"{row.parameter.name} = {row.row.estimate:.6g} {row.row.unit} has to go into the robot's USD file"
+        f"{row.parameter.name} = {row.row.estimate:.6g} {row.row.unit} has to go into the robot's USD "
+        f"file{row.left_out}"
         for row in exported
         if row.parameter.kind.in_model and not _drawn(row, robot)
     ]
@@ -151,8 +154,10 @@ def _of_mjlab(actuator: JointActuator) -> dict[str, str]:
     }
 
 
-def _of_isaac(actuator: JointActuator) -> dict[str, str]:
-    limit = {} if actuator.effort_limit is None else {"effort_limit_sim": repr(actuator.effort_limit)}
+def _of_isaac(actuator: JointActuator, *, explicit: bool) -> dict[str, str]:
+    """The arguments of an actuator's configuration; an explicit one cuts its force off itself, PhysX that of others."""
+    name = "effort_limit" if explicit else "effort_limit_sim"
+    limit = {} if actuator.effort_limit is None else {name: repr(actuator.effort_limit)}
     return {
         "stiffness": repr(actuator.stiffness),
         "damping": repr(actuator.damping),
@@ -182,12 +187,13 @@ def _lag(robot: Robot) -> tuple[int, list[str]]:
         return lag, []
     return lag, [
         f"a delay of {lag} physics steps is {abs(less):.3g} ms {'less' if less > 0 else 'more'} than estimated"
+        f"{robot.rounded}"
     ]
 
 
 def _biases(exported: Sequence[Exported], how: str) -> list[str]:
     return [
-        f"{row.parameter.name} = {row.row.estimate:.6g} {row.row.unit} is not of the model: {how}"
+        f"{row.parameter.name} = {row.row.estimate:.6g} {row.row.unit} is not of the model: {how}{row.left_out}"
         for row in exported
         if row.parameter.field == "signal_bias"
     ]

@@ -12,7 +12,9 @@ from madoc.errors import MadocError
 from madoc.export import (
     Exported,
     Robot,
+    bam_files,
     is_patch,
+    save_bam,
     save_draws,
     save_isaac_lab,
     save_mjlab,
@@ -26,11 +28,12 @@ from madoc.export import (
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
+from madoc.pipeline.export_losses import losses
 from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.report.reading import read_arrays
 from madoc.simulation import Simulator
-from madoc.simulation.configuration import joint_actuators, physics_options, start_position
+from madoc.simulation.configuration import JointDrive, joint_actuators, joint_drives, physics_options, start_position
 from madoc.simulation.drawn import numbers_of_draws
 from madoc.simulation.mjcf import DRIVES, save_mjcf
 from madoc.simulation.user_data import needs_callbacks
@@ -75,10 +78,14 @@ def export_run(
             )
     provenance = provenance_of(calibrated)
     model = calibrated.task.compile()
-    covariance = calibrated.distribution().covariance
+    covariance, draws = calibrated.distribution().covariance, _draws(calibrated)
+    own = [nominal_values(model, parameter) for parameter in simulator.parameters.parameters]
+    lost = losses(_evidence(calibrated), simulator, result.mean, own, draws)
     exported = [
-        Exported(parameter, replace(result.parameters[parameter.name], std=std), nominal_values(model, parameter))
-        for parameter, std in zip(simulator.parameters.parameters, np.sqrt(np.diag(covariance)).tolist(), strict=True)
+        Exported(parameter, replace(result.parameters[parameter.name], std=std), values, left_out)
+        for parameter, std, values, left_out in zip(
+            simulator.parameters.parameters, np.sqrt(np.diag(covariance)).tolist(), own, lost.left_out, strict=True
+        )
     ]
     files = {
         "model": folder / "model.xml",
@@ -93,21 +100,25 @@ def export_run(
     else:
         files["robot for mjlab"] = folder / "mjlab_robot.py"
         files["robot for Isaac Lab"] = folder / "isaac_lab_robot.py"
+    drives = _drives(simulator, result.mean)
+    of_drives = bam_files(folder, drives)
+    files |= {f"drive {drive.name} for BAM": file for drive, file in zip(drives, of_drives, strict=True)}
     evidence = _evidence(calibrated) if rerun else {}
     targets = {name: folder / (f"policy-{name}.onnx" if len(policies) > 1 else "policy.onnx") for name in policies}
     if out is not None:
         _require_ours(folder, [*files.values(), *targets.values()])
     changes = save_mjcf(simulator, result.mean, files["model"])
     save_patch(files["patch"], exported, provenance, changes=changes, stepping=_stepping(simulator))
-    save_randomization(
-        files["randomization ranges"], exported, provenance, None if result.covariance is None else covariance.tolist()
-    )
+    together = None if result.covariance is None else covariance.tolist()
+    save_randomization(files["randomization ranges"], exported, provenance, together, independent=lost.independent)
     save_sysid_parameters(files["mujoco.sysid parameters"], exported)
-    fields = _leave_draws(folder, simulator, calibrated)
+    fields = _leave_draws(folder, simulator, draws)
     if "robot for mjlab" in files:
-        robot = _robot(simulator, result.mean, fields)
+        robot = replace(_robot(simulator, result.mean, fields), rounded=lost.rounded)
         save_mjlab(files["robot for mjlab"], robot, exported)
         save_isaac_lab(files["robot for Isaac Lab"], robot, exported)
+    for drive, file in zip(drives, of_drives, strict=True):
+        save_bam(file, drive, _delay(simulator, result.mean))
     for name, file in policies.items():
         save_onnx(NumpyPolicy.load(file), targets[name])
         files[f"policy {name}"] = targets[name]
@@ -133,10 +144,14 @@ def _evidence(calibrated: Calibrated) -> dict[str, np.ndarray]:
     return read_arrays(calibrated.folder / "evidence.npz", "signals", "names", "time", "measured") or {}
 
 
-def _leave_draws(folder: Path, simulator: Simulator, calibrated: Calibrated) -> list[str]:
-    """Leave models drawn from the joint distribution of the estimate, and tell the arrays in which they differ."""
+def _draws(calibrated: Calibrated) -> Float[np.ndarray, "draws parameters"]:
+    """Values of the parameters out of the joint distribution of the estimate."""
     key = stage_key(calibrated.result.seed, "export")
-    values = np.asarray(calibrated.distribution().draw(key, DRAWS), np.float64)
+    return np.asarray(calibrated.distribution().draw(key, DRAWS), np.float64)
+
+
+def _leave_draws(folder: Path, simulator: Simulator, values: Float[np.ndarray, "draws parameters"]) -> list[str]:
+    """Leave models of such values, and tell the arrays in which they differ."""
     around = [row.name for row in simulator.parameters.parameters if not row.kind.in_model]
     numbers = numbers_of_draws(simulator, values)
     save_draws(folder, simulator.parameters.names, around, values, numbers)
@@ -148,7 +163,6 @@ def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], field
     task, model = simulator.task, simulator.model(values)
     named = [channel.actuator for channel in task.actions] or element_names(model, "actuator")
     physics, lost = physics_options(model)
-    rows = zip(simulator.parameters.parameters, values.tolist(), strict=True)
     return Robot(
         name=task.name,
         actuators=joint_actuators(model, list(dict.fromkeys(named))),
@@ -156,10 +170,25 @@ def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], field
         physics=physics,
         decimation=task.frame_skip,
         timestep=simulator.control_step / task.frame_skip,
-        delay=sum(value for row, value in rows if row.field == "action_delay"),
+        delay=_delay(simulator, values),
         fields=fields,
         lost=lost,
     )
+
+
+def _drives(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> list[JointDrive]:
+    """The d.c. drives at the estimate; what differs between runs is what it is in a log's first condition."""
+    at_rest = {
+        channel.actuator: channel.scale * (channel.low + 0.5 * (channel.rest + 1.0) * (channel.high - channel.low))
+        for channel in simulator.task.actions
+    }
+    return joint_drives(simulator.model(values), at_rest)
+
+
+def _delay(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> float:
+    """From a command to its effect, s."""
+    rows = zip(simulator.parameters.parameters, values.tolist(), strict=True)
+    return sum((value for row, value in rows if row.field == "action_delay"), 0.0)
 
 
 def _require_ours(folder: Path, files: Iterable[Path]) -> None:

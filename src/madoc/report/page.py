@@ -98,7 +98,7 @@ def _facts(run: Run) -> list[tuple[str, str, str]]:
         facts.append(("control steps", count(run.result.control_steps), "simulated"))
         facts.append(("time", duration(run.result.seconds), "wall clock"))
     if run.spec.data is not None:
-        facts.append(("log", count(run.spec.data.rows), f"rows · {run.spec.data.fingerprint}"))
+        facts.append(("log", count(run.spec.data.rows), f"rows, checksum {run.spec.data.fingerprint}"))
     return facts
 
 
@@ -109,7 +109,7 @@ def _on_holdout(held: HoldOut) -> tuple[str, str, str]:
         note = f"area of a classifier, {low} to {high}; 0.5 is chance"
         return "classifier, simulated or logged", number(held.area_at_estimate.area, 2), note
     value, low, high = map(percent, (held.score, *held.score_interval))
-    return "error on the hold-out", value, f"of mid-range's; {low} to {high}"
+    return "error on the hold-out", value, f"of that at mid-range, the middle of every range; {low} to {high}"
 
 
 def _ended(run: Run) -> str:

@@ -1,11 +1,13 @@
 """What a model is in the terms of those who configure robots for training: actuators, options, the start."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
+from madoc.simulation.callbacks import DRIVE, FRICTION, MEANS, UNLIMITED
+from madoc.simulation.user_data import has_speed_or_load_friction, is_drive
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF, has_gain
 
 
@@ -35,6 +37,68 @@ class JointActuator:
     armature: float
     friction: float
     viscous: float
+
+
+@dataclass(frozen=True)
+class JointDrive:
+    """A d.c. drive, and the joint behind it.
+
+    Attributes:
+        name: Of its actuator.
+        means: What its command is: position, velocity or duty.
+        numbers: Its numbers by the names of `callbacks.DRIVE`, supply to strength.
+        current_limit: In A; None where it has none.
+        setting: What its gain is multiplied by, as set in a firmware; 1 where it is not.
+        supply_from: Name of what brings in the measured supply; empty where the supply is constant.
+        friction: Numbers of the joint by the names of `callbacks.FRICTION`; empty where its friction depends on
+            neither speed nor load.
+        coulomb: Coulomb friction of the joint, N·m.
+        viscous: Viscous damping of the joint, N·m·s/rad.
+        drag: Damping of the joint by the square of its speed, N·m·s²/rad².
+        armature: Of the joint, kg·m².
+        zero: What the joint reads where the model as drawn has its zero, rad.
+    """
+
+    name: str
+    means: str
+    numbers: Mapping[str, float]
+    current_limit: float | None
+    setting: float
+    supply_from: str
+    friction: Mapping[str, float]
+    coulomb: float
+    viscous: float
+    drag: float
+    armature: float
+    zero: float
+
+
+def joint_drives(model: mujoco.MjModel, controls: Mapping[str, float]) -> list[JointDrive]:
+    """The d.c. drives of a model; `controls` are values of what brings in numbers of them, by actuator."""
+    return [_joint_drive(model, each, controls) for each in range(model.nu) if is_drive(model, each)]
+
+
+def _joint_drive(model: mujoco.MjModel, index: int, controls: Mapping[str, float]) -> JointDrive:
+    own = dict(zip(DRIVE, model.actuator_user[index].tolist(), strict=True))
+    joint = int(model.actuator_trnid[index, 0])
+    dof, loaded = int(model.jnt_dofadr[joint]), has_speed_or_load_friction(model, joint)
+    supply, gain = (
+        "" if own[key] < 0.0 else model.actuator(int(own[key])).name for key in ("supply_from", "gain_from")
+    )
+    return JointDrive(
+        name=model.actuator(index).name,
+        means=MEANS[int(own["means"])],
+        numbers={name: own[name] for name in DRIVE[DRIVE.index("supply") : DRIVE.index("enable")]},
+        current_limit=own["current_limit"] if own["current_limit"] < UNLIMITED else None,
+        setting=controls[gain] if gain else 1.0,
+        supply_from=supply,
+        friction=dict(zip(FRICTION[1:], model.jnt_user[joint, 1:].tolist(), strict=True)) if loaded else {},
+        coulomb=float(model.dof_frictionloss[dof]),
+        viscous=float(model.dof_damping[dof]),
+        drag=float(model.dof_dampingpoly[dof, 0]),
+        armature=float(model.dof_armature[dof]),
+        zero=float(model.qpos0[model.jnt_qposadr[joint]]),
+    )
 
 
 def joint_actuators(model: mujoco.MjModel, names: Sequence[str]) -> list[JointActuator]:

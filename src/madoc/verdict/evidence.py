@@ -1,5 +1,6 @@
 """What the hold-out looks like before and after calibration, as arrays for plots and films: `evidence.npz`."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,8 @@ SECONDS = 2.0
 """Time in s that simulating the runs may take, by what simulating took in the search."""
 ROWS = (2_000, 20_000)
 """Least and largest number of rows that are simulated, whatever time they take; a longer run is cut."""
+REPLAYED = 2_000
+"""Number of rows over which the errors of other parameters are measured."""
 
 Runs = tuple[Float[np.ndarray, "told state"], Int[np.ndarray, " runs"], Int[np.ndarray, " runs"]]
 """The state of each run at its first row, if the log tells states; that row, and the number of control steps."""
@@ -34,10 +37,11 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     the start of a run, `names` of the runs, `row` (where each begins in the hold-out) and `measured` (runs, times,
     signals). Where the log tells positions there are also `before` and `after`, the same runs simulated in the user's
     model as it was given and at the estimate under the logged actions, without another look at the log (NaN once a
-    simulation has failed), and `posture_measured`, `posture_before` and `posture_after` (runs, times, qpos). Runs start
-    at the first logged state, or where velocities are hidden or noisy at one fitted to the first `fitted` rows. Where
-    states are known there are `residual_before` and `residual_after` (windows, signals), simulated minus measured
-    observations after the shortest horizon.
+    simulation has failed), `posture_measured`, `posture_before` and `posture_after` (runs, times, qpos); for replays
+    with other parameters `start` (runs, state), at the estimate, and `actions` (runs, steps, action). Runs start at the
+    first logged state, or where velocities are hidden or noisy at one fitted to the first `fitted` rows. Where states
+    are known there are `residual_before` and `residual_after` (windows, signals), simulated minus measured observations
+    after the shortest horizon.
     `mean` is the estimate in physical units, `control_step` the time between two rows in s.
     """
     held, simulator = bench.held_out, bench.simulator
@@ -65,14 +69,15 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     point = np.clip(simulator.parameters.to_unit(mean), -1.0, 1.0)
     for when, model, at in (("before", given, -np.ones(len(given.parameters))), ("after", simulator, point)):
         starts = states if not fitted else _fitted(bench, model, at, states, first, fitted)
-        visited, seen = _simulated(model, at, starts, actions, exact=not fitted)
+        values = model.parameters.to_physical(at)[None]
+        visited, seen = (found[0] for found in _simulated(model, values, starts, actions, exact=not fitted))
         seen = moved(simulator.task.attitudes, measured, differences(simulator.task.attitudes, seen, measured))
         arrays |= {when: _until(over, seen), f"posture_{when}": _until(over, visited[..., : simulator.task.model.nq])}
         if bench.states_known:
             replays = replace(bench.replays, simulator=model)
             residuals = replays.residuals(at[None], replays.single_steps())
             arrays[f"residual_{when}"] = residuals[0, :, 0] * bench.change
-    arrays["fitted"] = np.array(fitted)
+    arrays |= {"fitted": np.array(fitted), "start": starts, "actions": actions}
     arrays["posture_measured"] = _until(over, _posture(simulator, measured, visited))
     return arrays
 
@@ -115,20 +120,43 @@ def _fitted(
     return FittedReplays(model, readings, states, first, held.episode_of(first), moving, ()).starts(point[None])[0][0]
 
 
+def replay_errors(
+    arrays: Mapping[str, np.ndarray], simulator: Simulator, values: Float[np.ndarray, "systems d"]
+) -> Float[np.ndarray, " systems"] | None:
+    """How far held-out runs are from their simulation at other parameters, in physical units, from the same starts.
+
+    It is the root mean square over all signals of whole runs, `REPLAYED` rows in all, in the unit of each signal's
+    `scale`; infinite where a simulation fails. None where `evidence` has left no starts.
+    """
+    if "start" not in arrays:
+        return None
+    steps = min(arrays["actions"].shape[1], REPLAYED)
+    runs = max(1, REPLAYED // steps)
+    measured = np.asarray(arrays["measured"][:runs, : steps + 1], dtype=np.float64)
+    given = arrays["start"][:runs], arrays["actions"][:runs, :steps]
+    _, seen = _simulated(simulator, values, *given, exact=not arrays["fitted"])
+    known = np.isfinite(measured)
+    apart = differences(simulator.task.attitudes, seen, np.where(known, measured, 0.0)) / arrays["scale"]
+    square = np.where(known, np.where(np.isfinite(apart), apart, np.inf) ** 2, 0.0)
+    return np.sqrt(square.sum((1, 2, 3)) / max(1, known.sum()))
+
+
 def _simulated(
     model: Simulator,
-    point: Float[np.ndarray, " d"],
+    values: Float[np.ndarray, "systems d"],
     states: Float[np.ndarray, "runs state"],
     actions: Float[np.ndarray, "runs steps action"],
     *,
     exact: bool,
-) -> tuple[Float[np.ndarray, "runs times state"], Float[np.ndarray, "runs times signals"]]:
-    """The states that a model goes through and what its sensors show; exact states are those that sensors told."""
-    system = model.bind(model.parameters.to_physical(point)[None])
-    start = np.ascontiguousarray(states[None])
+) -> tuple[Float[np.ndarray, "systems runs times state"], Float[np.ndarray, "systems runs times signals"]]:
+    """The states that models go through and what their sensors show; exact states are those that sensors told."""
+    system, count = model.bind(values), len(values)
+    start = np.repeat(states[None], count, 0)
     start = system.unbiased(start) if exact else start
-    visited = np.concatenate([start[0, :, None], system.roll_out(start, actions[None])[0]], axis=1)
-    return visited, system.observe(visited.reshape(1, -1, visited.shape[-1])).reshape(*visited.shape[:2], -1)
+    after = system.roll_out(start, np.repeat(actions[None], count, 0))
+    visited = np.concatenate([start[:, :, None], after], axis=2)
+    seen = system.observe(visited.reshape(count, -1, visited.shape[-1]))
+    return visited, seen.reshape(*visited.shape[:3], -1)
 
 
 def _posture(

@@ -80,7 +80,7 @@ def about_model_errors(horizon: int) -> str:
     """A sentence that longer windows show model errors."""
     return (
         f"over {horizon} control steps the simulator leaves more than noise: something the model lacks, "
-        "which intervals do not count"
+        "which intervals do not count and the verdict weighs"
     )
 
 
