@@ -17,6 +17,7 @@ import method_page
 import numpy as np
 import payload
 import planted
+import planted_servo
 import rates
 from disturbances import disturbed, settled_wrongly
 from kept import CALIBRATIONS, POLICIES, RESULTS, SYSID, Study, commits, is_time
@@ -134,7 +135,7 @@ def planted_truths() -> str:
 
 
 def verdicts() -> str:
-    """What `adversary.py`, `interval_coverage.py`, `rates.py`, `payload.py` and `legged.py` found."""
+    """What `adversary.py`, `interval_coverage.py`, `rates.py`, `payload.py` and others found."""
     cases = adversary.STUDY.rows()
     return (
         "## Verdicts and intervals\n\n"
@@ -149,6 +150,9 @@ def verdicts() -> str:
         "`python benchmarks/payload.py`: an arm of seven joints, driven by torques that arrive 8 ms late, with an "
         "unknown load of 0.5 kg off its axis and unknown dry friction, all defaults.\n\n"
         f"{payload.table(payload.STUDY.rows())}\n\n"
+        "`python benchmarks/planted_servo.py`: a hobby servo with supply limit, back-EMF, friction by speed and load, "
+        "and backlash, all unknown, at two gains of its firmware; its encoder alone is logged. All defaults.\n\n"
+        f"{planted_servo.table(planted_servo.STUDY.rows())}\n\n"
         "`python benchmarks/legged.py`: a quadruped of three position servos a leg that trots for 15 s and logs its "
         "joint encoders and an IMU alone, all defaults and 300 s, judging included.\n\n"
         f"{legged.table(legged.STUDY.rows())}\n"

@@ -155,6 +155,30 @@ conditions:
 parameters:
   - {field: drive_strength, element: goal, low: 0.5, high: 1.5}
 """
+GEARED = SERVO.replace('axis="0 1 0"', 'axis="0 1 0" armature="0.02"').replace('pos="0 0 -1"', 'pos="0 0 -0.1"')
+GEARED_SPEC = """\
+madoc: 1
+name: geared
+model: geared.xml
+control_step: 0.01
+signals:
+  - {name: angle, reads: position(shaft)}
+actions:
+  - name: goal
+    joint: shaft
+    means: position
+    low: -1
+    high: 1
+    drive: {kind: dc, supply: 12, kt: 0.5, resistance: 2, gain: 5}
+gears:
+  - {joint: shaft, stiffness: 100, damping: 0.5, backlash: 0.02, encoder: motor}
+parameters:
+  - {field: gear_backlash, element: shaft, low: 0, high: 0.04}
+  - {field: gear_stiffness, element: shaft, low: 50, high: 200}
+  - {field: gear_damping, element: shaft, low: 0, high: 1}
+"""
+"""A motor of 0.02 kg·m² before a gear with play, and behind it 1 kg on a rod of 0.1 m, which hangs."""
+
 
 MODELS = {"arm.xml": ARM, "spring.xml": SPRING, "cart.xml": CART, "pendulum.xml": PENDULUM}
 

@@ -90,6 +90,9 @@ FIELDS: dict[str, Field] = {
     },
     "friction_quadratic_motor": Field("joint", "1/(N·m)", 0.0, "1/N", "quadratic friction, motor"),
     "friction_quadratic_external": Field("joint", "1/(N·m)", 0.0, "1/N", "quadratic friction, external"),
+    "gear_backlash": Field("joint", "rad", 0.0, "m", "backlash"),
+    "gear_stiffness": Field("joint", "N·m/rad", 0.0, "N/m", "stiffness of the gear"),
+    "gear_damping": Field("joint", "N·m·s/rad", 0.0, "N·s/m", "damping of the gear"),
     "action_delay": Field(None, "s", 0.0, words="delay", maximum=10.0, in_model=False),
     "signal_bias": Field("signal", "1", words="bias", missing="an offset of the sensor", in_model=False),
 }
@@ -106,12 +109,13 @@ the square of the speed. `contact_time` and `contact_damping` are MuJoCo's `solr
 shapes apart, and 1 where it does so without a bounce. A payload adds to the body's own mass and inertia; its moment of
 inertia about each axis is its mass times the square of its radius of gyration. `drive_*` are the numbers of a d.c.
 drive, `friction_*` those of friction that depends on speed and load (`simulation/callbacks.py` has the equations);
-`friction_load` and `friction_stribeck_load` are one value for the motor's and the external torque.
+`friction_load` and `friction_stribeck_load` are one value for the motor's and the external torque. `gear_*` are the
+numbers of the gear behind a joint (`simulation/gears.py`); its backlash is the whole width of the play.
 """
 
 
 _KINDS = {
-    **{kind: kind for kind in ("body", "geom", "site", "tendon", "actuator", "sensor")},
+    **{kind: kind for kind in ("body", "geom", "site", "pair", "tendon", "actuator", "sensor")},
     **dict.fromkeys(("dof", "jnt", "qpos", "qpos0"), "joint"),
     "eq": "equality",
     "opt": None,

@@ -144,6 +144,7 @@ def drive(**changed):
     [
         ({}, []),
         ({"means": "duty"}, ["the command is a duty and BAM's is a position, so error_gain is 0"]),
+        ({"gives": True}, ["backlash and elasticity of the gear are left out"]),
         ({"drag": 0.01}, ["drag is left out, 5.76 N·m at the no-load speed of 24 rad/s"]),
         (
             {"numbers": drive().numbers | {"damping_gain": 0.1}},

@@ -9,7 +9,7 @@ import pytest
 from madoc import robots, simulation
 from madoc.errors import MadocError
 from madoc.identification.states import probing_windows, states_observed_as, states_of
-from own_robots import CART_SPEC, SLED, SLED_SPEC, SLED_TRUTH, write_robot
+from own_robots import CART_SPEC, GEARED, GEARED_SPEC, SLED, SLED_SPEC, SLED_TRUTH, write_robot
 from robots import SPRING_TRUTH, recorded, spring
 
 SPRING = spring(max_episode_steps=100)
@@ -83,3 +83,17 @@ def test_a_base_that_no_sensor_shows_stands_on_the_floor_and_is_followed(tmp_pat
     # Once it has fallen, it is 0.07 m above the ground, which is at 0.3 m; feet give way by less than a millimetre.
     np.testing.assert_allclose(logged.states[40:, 2], 0.37, atol=2e-3)
     np.testing.assert_allclose(logged.states[40:, 10], 0.0, atol=0.05)
+
+
+@pytest.mark.parametrize("encoder", ["motor", "link"])
+def test_a_gear_that_no_log_shows_begins_where_its_load_presses_it(tmp_path, encoder):
+    spec = GEARED_SPEC.replace("encoder: motor", f"encoder: {encoder}")
+    task = robots.load(write_robot(tmp_path, spec, geared=GEARED)).task
+    truth = {"gear_backlash.shaft": 0.02, "gear_stiffness.shaft": 125.0, "gear_damping.shaft": 0.5}
+    log = recorded(task, truth, 100, jax.random.key(0))
+    logged = states_of(log, simulation.make(task, threads=1))
+    assert (logged.kind, logged.measured) == ("approximate", 1)
+    angle = np.asarray(log.transitions.observation)[:, 0]
+    shown = logged.states[:, 0] + (logged.states[:, 1] if encoder == "link" else 0.0)
+    np.testing.assert_allclose(shown, angle, atol=1e-12)
+    assert (np.abs(logged.states[:, 1]) >= 0.01).all()

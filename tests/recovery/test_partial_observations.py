@@ -11,7 +11,7 @@ from test_madoc_recovers import quick
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
 from madoc.data import Disturbance, disturb
-from own_robots import ARM_SPEC, BOUNCER, BOUNCER_SPEC, PENDULUM_SPEC, write_robot
+from own_robots import ARM_SPEC, BOUNCER, BOUNCER_SPEC, GEARED, GEARED_SPEC, PENDULUM_SPEC, write_robot
 from robots import ARM_TRUTH, recorded
 
 ARM = {"body_mass.fore": 0.4, "dof_damping.shoulder": 0.3, "dof_damping.elbow": 0.35}
@@ -141,3 +141,23 @@ def test_intervals_cover_planted_truths(pendulum):
         inside.append((low <= truth) & (truth <= high))
     # 95 % of 30, less and more two deviations of a binomial: 26.1 to 30.
     assert (np.sum(inside, axis=0) >= 26).all(), np.mean(inside, axis=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("encoder", ["motor", "link"])
+def test_least_squares_finds_a_gear_whose_deflection_no_log_shows(tmp_path, encoder):
+    """Its intervals hold the backlash, the stiffness and the damping, at 1 % of noise."""
+    spec = GEARED_SPEC.replace("encoder: motor", f"encoder: {encoder}")
+    task = robots.load(write_robot(tmp_path, spec, geared=GEARED)).task
+    truth = {"gear_backlash.shaft": 0.015, "gear_stiffness.shaft": 140.0, "gear_damping.shaft": 0.3}
+    result = calibrate(
+        LeastSquares(windows=40, search_windows=12),
+        problem_of(task, truth, rows=2000, noise=0.01),
+        key=KEY,
+        budget=600_000,
+    )
+    assert result.status == "converged"
+    assert result.interval is not None
+    for (low, high), value in zip(result.interval, task.parameters.vector(truth), strict=True):
+        assert low <= value <= high
+    assert (off(result, task, truth) < 3.0).all(), off(result, task, truth)

@@ -1,4 +1,4 @@
-"""Drives, friction and conditions of a spec: what they make of the model, what they calibrate, what is refused."""
+"""Drives, friction, gears and conditions of a spec: what they make of the model, and what is refused."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from madoc.data import logs
 from madoc.errors import MadocError
 from madoc.simulation.callbacks import FRICTION
 from madoc.simulation.cpu import CpuSimulator
-from own_robots import CART_SPEC, SERVO, SERVO_SPEC, write_robot
+from own_robots import CART_SPEC, GEARED, GEARED_SPEC, SERVO, SERVO_SPEC, write_robot
 
 FRICTION_LINE = "friction:\n  - {joint: shaft, model: M1, up_to: 0.2}\nparameters:"
 M1 = SERVO_SPEC.replace("parameters:", FRICTION_LINE)
@@ -107,6 +107,80 @@ def test_a_mistake_in_friction_is_one_sentence_with_its_line(tmp_path, new, sent
     with pytest.raises(MadocError, match=sentence) as refusal:
         load(tmp_path, spec)
     assert str(refusal.value).startswith(f"robot.yaml, line {line_of(new, spec)}: ")
+
+
+GEAR = "{joint: shaft, stiffness: 100, damping: 0.5, backlash: 0.02, encoder: motor}"
+
+
+def load_geared(folder, spec, model=GEARED):
+    return robots.load(write_robot(folder, spec, geared=model))
+
+
+@pytest.mark.parametrize(
+    ("new", "sentence"),
+    [
+        ("{joint: shaft, stiffness: 100, damping: 0.5}", "expected encoder: in this part of gears"),
+        (GEAR.replace("motor", "wheel"), "expected 'motor' or 'link' in gears.encoder, got 'wheel'"),
+        (GEAR.replace("stiffness: 100", "stiffness: 0"), "expected greater than 0 in gears.stiffness, got 0"),
+        (GEAR.replace("backlash: 0.02", "armature: 0"), "expected greater than 0 in gears.armature, got 0"),
+        (GEAR.replace("backlash", "play"), "unknown key 'play'"),
+        (GEAR.replace("joint: shaft", "joint: shft"), "expected the name of a joint, got 'shft'; nearest: shaft"),
+        (f"{GEAR}\n  - {GEAR}", "the name 'shaft_gear' of what a gear inserts is taken; say a gear once"),
+        (GEAR.replace("stiffness: 100", "stiffness: 1e5"), "too stiff or too damped for a timestep of 0.001 s; give"),
+        (
+            GEAR.replace("damping: 0.5", "damping: 50"),
+            "timestep: of at most 0.00013 s, or a smaller stiffness or damping",
+        ),
+    ],
+)
+def test_a_mistake_in_a_gear_is_one_sentence_with_its_line(tmp_path, new, sentence):
+    spec = GEARED_SPEC.replace(GEAR, new)
+    assert spec != GEARED_SPEC
+    with pytest.raises(MadocError, match=sentence) as refusal:
+        load_geared(tmp_path, spec)
+    line = line_of("joint: sh", spec[spec.index("gears:") :]) + spec[: spec.index("gears:")].count("\n")
+    assert str(refusal.value).startswith(f"robot.yaml, line {line + (new.count('joint') - 1)}: ")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            'armature="0.02"',
+            "",
+            "expected armature:, the inertia of the motor, as the model says none of 'shaft'",
+        ),
+        ("<inertial", '<joint name="b" axis="1 0 0"/><inertial', "expected the last joint of its body, got 'shaft'"),
+    ],
+)
+def test_a_joint_that_cannot_have_a_gear_is_refused(tmp_path, old, new, sentence):
+    with pytest.raises(MadocError, match=sentence):
+        load_geared(tmp_path, GEARED_SPEC, GEARED.replace(old, new))
+
+
+def test_a_gear_may_say_the_inertia_of_its_motor(tmp_path):
+    spec = GEARED_SPEC.replace("stiffness: 100", "armature: 0.05, stiffness: 100")
+    assert load_geared(tmp_path, spec).task.model.dof_armature.tolist() == [0.05, 0.0]
+
+
+def test_a_servo_of_mujoco_cannot_read_an_encoder_behind_a_gear(tmp_path):
+    servo = "kp: 5, low: -1, high: 1}"
+    start, end = GEARED_SPEC.index("  - name: goal"), GEARED_SPEC.index("gears:")
+    spec = f"{GEARED_SPEC[:start]}  - {{name: goal, joint: shaft, means: position, {servo}\n{GEARED_SPEC[end:]}"
+    load_geared(tmp_path, spec)
+    with pytest.raises(MadocError, match="give the action of 'shaft' a drive:, which reads the encoder, or say"):
+        load_geared(tmp_path, spec.replace("encoder: motor", "encoder: link"))
+
+
+def test_what_a_gear_inserts_has_nothing_of_the_models_defaults_nor_of_its_keyframes(tmp_path):
+    defaults = '<default><joint armature="0.3" damping="1" frictionloss="0.1" stiffness="2"/></default>'
+    model = GEARED.replace("<worldbody>", f"{defaults}<worldbody>")
+    model = model.replace("</worldbody>", '</worldbody><keyframe><key qpos="0.3"/></keyframe>')
+    made = load_geared(tmp_path, GEARED_SPEC, model).task.model
+    assert made.dof_damping[0] == 1.0
+    for numbers in (made.dof_armature, made.dof_damping, made.dof_frictionloss, made.jnt_stiffness):
+        assert numbers[1] == 0.0
+    assert made.nkey == 0
 
 
 def test_a_policy_cannot_choose_its_supply(tmp_path):

@@ -30,6 +30,7 @@ LEG = """
     </body>
   </worldbody>
   <tendon><fixed name="cord" stiffness="10"><joint joint="knee" coef="1"/></fixed></tendon>
+  <contact><pair name="step" geom1="foot" geom2="floor"/></contact>
   <equality><joint name="lock" joint1="knee" active="false"/></equality>
   <actuator><position name="servo" joint="knee" kp="10" forcerange="-5 5" ctrlrange="-1 1"/></actuator>
   <sensor><accelerometer name="acceleration" site="imu"/></sensor>
@@ -45,6 +46,8 @@ NUMBERS = {
     "jnt_range[1]": ("knee", lambda model: model.joint("knee").range[1]),
     "dof_solref[0]": ("knee", lambda model: model.dof_solref[6, 0]),
     "site_pos[0]": ("imu", lambda model: model.site("imu").pos[0]),
+    "pair_friction[0]": ("step", lambda model: model.pair_friction[0, 0]),
+    "pair_solref[0]": ("step", lambda model: model.pair_solref[0, 0]),
     "tendon_stiffness": ("cord", lambda model: model.tendon_stiffness[0]),
     "eq_data[0]": ("lock", lambda model: model.eq_data[0, 0]),
     "actuator_forcerange[1]": ("servo", lambda model: model.actuator("servo").forcerange[1]),

@@ -40,7 +40,7 @@ NONE = dict.fromkeys(FRICTION[1:], 0.0) | {"stribeck_speed": 2.0, "stribeck_expo
     ],
 )
 def test_the_torque_of_a_dc_drive(change, error, speed, torque):
-    assert dc_torque(error, speed, **(DC | change)) == pytest.approx(torque, rel=1e-14)
+    assert dc_torque(error, speed, speed, **(DC | change)) == pytest.approx(torque, rel=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -164,9 +164,7 @@ def test_bits_depend_on_neither_threads_nor_what_ran_before(tmp_path):
 
 def test_an_exported_file_needs_no_madoc_and_is_refused_without_its_drives(tmp_path):
     shutil.copy(callbacks.__file__, tmp_path / "drives.py")
-    own = " ".join(
-        str(float(({"mark": MARK, "enable": -1, "supply_from": -1, "gain_from": -1} | DC).get(n, 0))) for n in DRIVE
-    )
+    own = " ".join(str(float((dict.fromkeys(DRIVE[-4:], -1) | {"mark": MARK} | DC).get(n, 0))) for n in DRIVE)
     (tmp_path / "model.xml").write_text(
         f"""<mujoco>
 {callbacks.GUARD}<worldbody><body>

@@ -95,7 +95,7 @@ def test_a_drive_of_fixed_numbers_is_made_of_mujocos_own_elements(tmp_path, mean
         data.qpos[:], data.qvel[:], data.ctrl[:] = angle, rate, command
         mujoco.mj_forward(model, data)
         error = command - {"position": angle, "velocity": rate, "duty": 0.0}[means]
-        torque = dc_torque(error, rate, **numbers)
+        torque = dc_torque(error, rate, rate, **numbers)
         assert data.qfrc_actuator[0] + data.qfrc_passive[0] == pytest.approx(torque, rel=1e-12)
 
 

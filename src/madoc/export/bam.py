@@ -90,6 +90,7 @@ def _lost(drive: JointDrive, delay: float) -> Sequence[str]:
         "standstill": drive.supply_from,
         f"drag is left out, {drive.drag * no_load**2:.3g} N·m at the no-load speed of {no_load:.3g} rad/s": drive.drag,
         f"versions of BAM without command_delay leave {1e3 * delay:.3g} ms of delay out": delay,
+        "backlash and elasticity of the gear are left out": drive.gives,
         "friction by load counts contacts as load, and leaves springs out": any(
             value for name, value in drive.friction.items() if "load" in name or "quadratic" in name
         ),

@@ -15,6 +15,7 @@ from madoc.identification.states import LoggedStates
 from madoc.identification.windows import evenly
 from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.base import Simulator
+from madoc.simulation.gears import deflections
 from madoc.simulation.inertials import off_centre
 from madoc.simulation.touching import touching_geoms
 from madoc.simulation.user_data import is_drive
@@ -103,7 +104,7 @@ def candidates(
     calibrated = {(each.field, element) for each in simulator.parameters.parameters for element in each.elements}
     fields = {each.field for each in simulator.parameters.parameters}
     wanted: list[tuple[str, str | tuple[str, ...], float]] = []
-    for name in (model.joint(joint).name for joint in range(model.njnt)):
+    for name in (model.joint(joint).name for joint in np.setdiff1d(np.arange(model.njnt), deflections(model)).tolist()):
         if name:
             references = references_of(logged, simulator, model.joint(name))
             wanted += [(field, name, reference) for field, reference in references.items()]

@@ -13,6 +13,7 @@ from madoc.errors import MadocError
 from madoc.identification.windows import Windows, consecutive_rows, evenly, longest_fit, rows_that_fit, windows_at
 from madoc.simulation.base import Simulator
 from madoc.simulation.floating_base import Placed, on_the_floor
+from madoc.simulation.gears import deflection_values, deflections, loaded_deflections
 from madoc.simulation.rollout import reset_states
 from madoc.simulation.velocities import unseen_values
 from madoc.tasks import Task
@@ -100,17 +101,50 @@ def states_of(dataset: Dataset, simulator: Simulator) -> LoggedStates:
         rebuilt = replace(rebuilt, reason=str(error))
     if task.state_from_observation is not None or task.posture is None:
         return rebuilt
-    placed = on_the_floor(task, moving_states(dataset, task)[0])
+    here, there = moving_states(dataset, task)
+    placed = on_the_floor(task, here)
     guess = np.where(np.isnan(placed.states), simulator.initial_state[:physical], placed.states)
+    gears = deflection_values(task.model)[0]
+    gears = gears[np.isnan(here[:, gears]).all(0)]
+    if len(gears):
+        guess = _with_loaded_gears(simulator, guess, (there - here)[:, task.model.nq :] / simulator.control_step, gears)
     try:
         states, rows = with_pending(dataset, task, guess, np.arange(len(dataset)))
     except MadocError as error:
         return replace(rebuilt, reason=str(error))
     if placed.found.any():
         states = _followed(dataset, simulator, states, rows, placed)
-    unseen = (unseen_values(task) & ~placed.found[: task.model.nq]).any()
+    guessed = placed.found[: task.model.nq].copy()
+    guessed[gears] = True  # a gear gives little
+    unseen = (unseen_values(task) & ~guessed).any()
     kind: Kind = "unknown" if unseen else "approximate"
     return replace(rebuilt, kind=kind, states=states, rows=rows, placed=placed.found)
+
+
+def _with_loaded_gears(
+    simulator: Simulator,
+    states: Float[np.ndarray, "rows physical"],
+    acceleration: Float[np.ndarray, "rows velocity"],
+    gears: Int[np.ndarray, " gears"],
+) -> Float[np.ndarray, "rows physical"]:
+    """States with the deflections, at these places, that the gears' loads at mid-range make of the observed motion.
+
+    Where an encoder shows the sum, the motor's shaft is turned back by them, so that the observations stay the same.
+    """
+    values, model, step = simulator.parameters.middle, simulator.task.model, 1e-3
+    chosen = np.isin(deflection_values(model)[0], gears)
+    motors = model.jnt_qposadr[deflections(model)[chosen] - 1]  # a gear's joint follows that which it is behind
+    probe = np.tile(simulator.initial_state, (1 + 2 * len(gears), 1))
+    probe[1 : 1 + len(gears), gears] += step * np.eye(len(gears))
+    probe[1 + len(gears) :, gears] += step * np.eye(len(gears))
+    probe[1 + len(gears) :, motors] -= step * np.eye(len(gears))
+    seen = simulator.bind(values[None]).observe(probe[None])[0]
+    alone, both = np.abs(seen[1:] - seen[0]).max(-1).reshape(2, -1)
+    deflected = loaded_deflections(simulator.model(values), states, acceleration)[:, chosen]
+    loaded = states.copy()
+    loaded[:, gears] = deflected
+    loaded[:, motors] -= np.where(both < alone / 2.0, deflected, 0.0)
+    return loaded
 
 
 def _followed(

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 
 from madoc.robots.drives import drive_numbers
+from madoc.robots.gears import encoder_tendon
 from madoc.robots.model import AddedActuator, Draft, is_slide
 from madoc.robots.spec import SCALES, ActionSpec
 from madoc.simulation.write import OF_A_JOINT
@@ -45,9 +46,8 @@ def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
     assert action.low is not None and action.high is not None  # the spec requires both beside joint:
     ends = action.low * scale, action.high * scale
     if action.drive is not None:
-        return AddedActuator(
-            action.name, action.joint, *ends, 0.0, numbers=drive_numbers(action.drive, str(action.means))
-        )
+        numbers = drive_numbers(action.drive, str(action.means), encoder_tendon(draft, action.joint))
+        return AddedActuator(action.name, action.joint, *ends, 0.0, numbers=numbers)
     stiffness, damping = action.kp or 0.0, action.kd or 0.0
     gain = {"position": stiffness, "velocity": damping}.get(str(action.means), 1.0)
     return AddedActuator(action.name, action.joint, *ends, gain, stiffness, damping, action.limit)

@@ -1,4 +1,4 @@
-"""The parts of a spec that say what a joint is driven by, what resists it, and what differs between runs."""
+"""The parts of a spec that say what drives a joint, what gives and resists there, and what differs between runs."""
 
 import re
 from typing import Annotated, Literal
@@ -124,6 +124,23 @@ class FrictionSpec(Part):
     def names(self) -> tuple[str, ...]:
         """The joints."""
         return tuple(self.joints or [str(self.joint)])
+
+
+class GearSpec(Part):
+    """What gives between the motor of a joint and its link: a spring with a dead band, and a damper beside it."""
+
+    joint: Name = Field(description="The joint; its armature, friction and actuators are before the gear.")
+    stiffness: Positive = Field(
+        description="N·m/rad (of a slide, N/m), of teeth, belts or cables outside the backlash."
+    )
+    damping: NotNegative = Field(description="N·m·s/rad (of a slide, N·s/m).")
+    backlash: NotNegative = Field(0.0, description="Whole width of the play, rad (of a slide, m).")
+    armature: Positive | None = Field(
+        None, description="Inertia of the motor behind its reduction, kg·m² (of a slide, kg). Default: the model's."
+    )
+    encoder: Literal["motor", "link"] = Field(
+        description="Where position and velocity of the joint are measured, for signals and for the loop of its drive."
+    )
 
 
 class ConditionSpec(Part):

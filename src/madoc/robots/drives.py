@@ -23,7 +23,7 @@ _LOAD = {"load": 0.5, "stribeck_load": 1.0, "quadratic": 0.1}
 times theirs."""
 
 
-def drive_numbers(drive: DriveSpec, means: str) -> tuple[float, ...]:
+def drive_numbers(drive: DriveSpec, means: str, encoder: float) -> tuple[float, ...]:
     """The numbers of a drive in the model, in the order of `DRIVE`; what it takes from the log comes in later."""
     return (
         MARK,
@@ -40,6 +40,7 @@ def drive_numbers(drive: DriveSpec, means: str) -> tuple[float, ...]:
         -1.0,
         -1.0,
         -1.0,
+        encoder,
     )
 
 
@@ -134,7 +135,11 @@ def joint_frictions(draft: Draft) -> tuple[JointFriction, ...]:
     found: dict[str, JointFriction] = {}
     for index, friction in enumerate(draft.spec.friction):
         for joint in friction.names:
-            _check_joint(draft, index, joint)
+            single_joint(draft, ("friction", index), joint)
+            if any(len(other.userdata) for other in draft.base.joints):
+                raise draft.document.error(
+                    ("friction", index), "the model keeps user data of its joints (user=), where friction is kept"
+                )
             if joint in found:
                 raise draft.document.error(
                     ("friction", index), f"the friction of {joint!r} is said already; say it once"
@@ -186,13 +191,12 @@ def _friction_numbers(friction: FrictionSpec) -> tuple[float, ...]:
     return (MARK, *(number(name) for name in FRICTION[1:]))
 
 
-def _check_joint(draft: Draft, index: int, name: str) -> None:
+def single_joint(draft: Draft, place: Place, name: str) -> mujoco.MjsJoint:
+    """The joint of the model file with a name; one that is no hinge and no slide is refused at a place of the spec."""
     joint = draft.base.joint(name)
-    place = ("friction", index)
     if joint is None:
         names = [joint.name for joint in draft.base.joints if joint.name]
         raise draft.document.unknown(place, "the name of a joint", name, names)
     if int(joint.type) not in ONE_DOF:
         raise draft.document.error(place, f"expected a hinge or a slide, got {name!r}, which is a ball or free")
-    if any(len(other.userdata) for other in draft.base.joints):
-        raise draft.document.error(place, "the model keeps user data of its joints (user=), where friction is kept")
+    return joint

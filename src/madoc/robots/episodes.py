@@ -267,7 +267,7 @@ class _Reader:
         """One value after a step."""
         of_signals, of_actions = self._of_signals, {channel.name: index for index, channel in enumerate(self.actions)}
         if read.kind != "name":
-            return state[..., self.signals.layout.address(read)]
+            return self.signals.layout.look_up(read, state)
         if read.name in of_signals:
             return self.signals.value(of_signals[read.name], state)
         if read.name in self.goals:

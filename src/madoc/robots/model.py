@@ -8,10 +8,12 @@ import numpy as np
 
 from madoc.errors import MadocError
 from madoc.robots.document import Document
+from madoc.robots.drive_spec import GearSpec
 from madoc.robots.functions import PythonFile
 from madoc.robots.model_files import ModelFiles
 from madoc.robots.spec import RobotSpec
 from madoc.simulation.callbacks import DRIVE
+from madoc.simulation.gears import SUFFIX
 from madoc.simulation.user_data import LEAST_FRICTION
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF
 from madoc.tasks.base import compiled_model
@@ -96,9 +98,12 @@ def make_model(
     added: tuple[AddedActuator, ...] = (),
     timestep: float | None = None,
     frictions: tuple[JointFriction, ...] = (),
+    gears: tuple[GearSpec, ...] = (),
 ) -> mujoco.MjSpec:
-    """A copy of a spec with added actuators and frictions, and with another timestep if one is given."""
+    """A copy of a spec with added actuators, frictions and gears, and with another timestep if one is given."""
     spec = base.copy()
+    for gear in gears:
+        _insert_gear(spec, gear)
     for friction in frictions:
         joint = spec.joint(friction.joint)
         if friction.viscous is not None:
@@ -127,6 +132,23 @@ def make_model(
             if actuator.limit is None and actuator.numbers[DRIVE.index("kt")]:
                 new.biastype = mujoco.mjtBias.mjBIAS_USER
     return spec
+
+
+def _insert_gear(spec: mujoco.MjSpec, gear: GearSpec) -> None:
+    """Insert the joint and the tendon of a gear; keyframes, which would be too short then, are taken out."""
+    joint, name, off = spec.joint(gear.joint), f"{gear.joint}{SUFFIX}", mujoco.mjtLimited.mjLIMITED_FALSE
+    joint.armature = joint.armature if gear.armature is None else gear.armature
+    half, nothing = gear.backlash / 2.0, np.zeros(3)
+    plain = {"armature": 0.0, "frictionloss": 0.0, "damping": nothing, "stiffness": nothing, "ref": 0.0}
+    joint.parent.add_joint(
+        name=name, type=joint.type, axis=joint.axis, pos=joint.pos, limited=off, actfrclimited=off, **plain
+    )
+    tendon = spec.add_tendon(name=name, limited=off, actfrclimited=off, armature=0.0, frictionloss=0.0)
+    tendon.springlength, tendon.stiffness, tendon.damping = (-half, half), nothing, nothing
+    tendon.stiffness[0], tendon.damping[0] = gear.stiffness, gear.damping
+    tendon.wrap_joint(name, 1.0)
+    for key in spec.keys:
+        spec.delete(key)
 
 
 def with_whole_inertia(spec: Callable[[], mujoco.MjSpec], bodies: tuple[str, ...]) -> mujoco.MjSpec:

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from madoc.errors import MadocError, nearest_hint
 from madoc.robots.expressions import Expression, Read
+from madoc.simulation.gears import SUFFIX, deflection_values
 from madoc.simulation.linear_sensors import linear_sensors
 from madoc.simulation.write import element_names
 from madoc.tasks.base import Batch
@@ -24,6 +25,8 @@ class Layout:
     Attributes:
         physical: Number of values of (qpos, qvel).
         accelerating: Sensors that depend on the control as well.
+        behind: Joints whose encoder sits behind a gear, so that it shows the gear's deflection as well.
+        deflections: Addresses of the deflections of gears and of their velocities.
         weights: By its address in sensordata, the weights of (qpos, qvel) in each value that is a weighted sum of them.
     """
 
@@ -32,11 +35,13 @@ class Layout:
     sensor: dict[str, Span]
     physical: int
     accelerating: frozenset[str]
+    behind: frozenset[str]
+    deflections: Int[np.ndarray, " values"]
     weights: Mapping[int, Float[np.ndarray, " physical"]]
 
     @classmethod
-    def of(cls, model: mujoco.MjModel) -> "Layout":
-        """The layout of a model."""
+    def of(cls, model: mujoco.MjModel, behind: frozenset[str] = frozenset()) -> "Layout":
+        """The layout of a model, and the joints whose encoder sits behind a gear."""
         joints = [model.joint(name) for name in element_names(model, "joint")]
         sensors = [model.sensor(name) for name in element_names(model, "sensor")]
         return cls(
@@ -45,6 +50,8 @@ class Layout:
             sensor={sensor.name: (int(sensor.adr[0]), int(sensor.dim[0])) for sensor in sensors},
             physical=int(model.nq + model.nv),
             accelerating=frozenset(one.name for one in sensors if one.needstage[0] == mujoco.mjtStage.mjSTAGE_ACC),
+            behind=behind,
+            deflections=np.concatenate(deflection_values(model)),
             weights={
                 first + step: row for first, rows in linear_sensors(model).items() for step, row in enumerate(rows)
             },
@@ -52,8 +59,19 @@ class Layout:
 
     def of_state(self, read: Read) -> Float[np.ndarray, " physical"] | None:
         """The weights of (qpos, qvel) in a value; None for a sensor that is no weighted sum of them."""
-        address = self.address(read)
-        return self.weights.get(address) if read.kind == "sensor" else np.eye(self.physical)[address]
+        if read.kind == "sensor":
+            return self.weights.get(self.address(read))
+        return np.eye(self.physical)[[*self.addresses(read)]].sum(0)
+
+    def addresses(self, read: Read) -> tuple[int, ...]:
+        """Addresses of the values whose sum is read: of a joint whose encoder is behind a gear, its deflection too."""
+        deflection = (getattr(self, read.kind)[f"{read.name}{SUFFIX}"][0],) if read.name in self.behind else ()
+        return (self.address(read), *deflection)
+
+    def look_up(self, read: Read, state: Batch) -> Batch:
+        """The value of a position or a velocity in a state."""
+        first, *others = (state[..., address] for address in self.addresses(read))
+        return sum(others, first)
 
     def address(self, read: Read) -> int:
         """Address of a value in the state or in sensordata; what the model does not have is refused."""
@@ -110,8 +128,9 @@ class Signals:
         namespace = state.__array_namespace__()
 
         def look_up(read: Read) -> Batch:
-            source: Batch = sensordata if read.kind == "sensor" else state
-            return source[..., self.layout.address(read)]
+            if read.kind == "sensor":
+                return sensordata[..., self.layout.address(read)]  # type: ignore[index]
+            return self.layout.look_up(read, state)
 
         with np.errstate(all="ignore"):
             return namespace.stack([expression.value(look_up, namespace) for expression in expressions], axis=-1)
@@ -123,8 +142,13 @@ class Signals:
         return None if backward is None else lambda observation: (observation - constant) @ backward
 
     def posture(self) -> Callable[[Batch], Batch] | None:
-        """Observation -> (qpos, qvel), NaN for values not determined; None where no position is determined."""
+        """Observation -> (qpos, qvel), NaN for values not determined; None where no position is determined.
+
+        Of a joint whose encoder alone shows the sum with the deflection of its gear it is the position without that.
+        """
         forward, constant = self._weights()
+        gears = self.layout.deflections
+        forward[:, gears[~_partial_inverse(forward)[1][gears]]] = 0.0
         backward, determined = _partial_inverse(forward)
         positions = [start + step for start, count in self.layout.position.values() for step in range(count)]
         if not determined[positions].any():

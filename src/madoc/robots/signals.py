@@ -24,7 +24,7 @@ _QUATERNION_SENSORS = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSen
 def read_signals(draft: Draft, model: mujoco.MjModel) -> Signals:
     """The signals of a spec, each with an expression that parses, has a value, and reads what the model has."""
     expressions = []
-    layout = Layout.of(model)
+    layout = Layout.of(model, frozenset(gear.joint for gear in draft.spec.gears if gear.encoder == "link"))
     for index, signal in enumerate(draft.spec.signals):
         with draft.document.at("signals", index, "reads"):
             expression = parse(signal.reads)

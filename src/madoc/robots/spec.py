@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, WithJsonSchema, field_validator, mo
 from madoc.errors import nearest_hint
 from madoc.parameters import FIELDS, INERTIA, Parameter
 from madoc.robots.document import Document, read_document
-from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec
+from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec, GearSpec
 from madoc.robots.validation import File, Finite, Name, Part, Positive, Unit, refuse, refused_with_line
 from madoc.tasks import TASKS
 
@@ -202,6 +202,7 @@ class RobotSpec(Part):
     signals: list[SignalSpec] = Field(min_length=1, description="The observation, in this order.")
     actions: list[ActionSpec] = Field(min_length=1, description="The action, in this order.")
     friction: list[FrictionSpec] = Field([], description="Friction of joints, whose terms are calibrated too.")
+    gears: list[GearSpec] = Field([], description="Backlash and elasticity between motors and links.")
     conditions: list[ConditionSpec] = Field([], description="What differs between runs and is known.")
     parameters: list[ParameterSpec] = Field(min_length=1, description="What can be calibrated.")
     groups: Annotated[int, Field(ge=1, le=1000)] | None = Field(
@@ -246,6 +247,7 @@ _PARTS: dict[str | int, type] = {
     "actions": ActionSpec,
     "drive": DriveSpec,
     "friction": FrictionSpec,
+    "gears": GearSpec,
     "conditions": ConditionSpec,
     "parameters": ParameterSpec,
     "log": LogSpec,

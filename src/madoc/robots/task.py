@@ -16,6 +16,7 @@ from madoc.robots.actions import action_channel, added_actuator, idle_actuators
 from madoc.robots.drives import joint_frictions, with_inputs
 from madoc.robots.episodes import Episode, no_reward, read_episode
 from madoc.robots.functions import PythonFile
+from madoc.robots.gears import check_gears, check_timestep
 from madoc.robots.model import Draft, compiled, make_model, read_model, with_whole_inertia
 from madoc.robots.model_files import ModelFiles
 from madoc.robots.signals import attitudes_of, quaternion_of, read_signals, signal_unit, turn_of
@@ -96,6 +97,7 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
     signals = read_signals(draft, model)
     actions = (*(action_channel(draft, model, index) for index in range(len(spec.actions))), *inputs)
     space, frame_skip = parameter_space(draft, model), _frame_skip(draft, model)
+    check_timestep(draft, model, space)
     single = tuple(dict.fromkeys(name for row in space.parameters for name in diagonal_bodies(model, row)))
     if single:
         factory = partial(with_whole_inertia, factory, single)
@@ -169,7 +171,10 @@ def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco
     """The function that builds the MuJoCo spec with the added actuators, its model, and what drives take from a log."""
     actuators = [added_actuator(draft, index) for index in range(len(draft.spec.actions))]
     added, inputs = with_inputs(draft, tuple(actuator for actuator in actuators if actuator is not None))
-    factory = partial(make_model, draft.base, added, draft.spec.timestep, joint_frictions(draft))
+    check_gears(draft)
+    factory = partial(
+        make_model, draft.base, added, draft.spec.timestep, joint_frictions(draft), tuple(draft.spec.gears)
+    )
     with draft.document.at("actions"):
         return factory, compiled(factory, file), inputs
 

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from madoc.simulation.callbacks import DRIVE, FRICTION, MEANS, UNLIMITED
+from madoc.simulation.gears import deflections
 from madoc.simulation.user_data import has_speed_or_load_friction, is_drive
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF, has_gain
 
@@ -57,6 +58,7 @@ class JointDrive:
         drag: Damping of the joint by the square of its speed, N·m·s²/rad².
         armature: Of the joint, kg·m².
         zero: What the joint reads where the model as drawn has its zero, rad.
+        gives: Whether a gear with backlash and elasticity is behind the joint.
     """
 
     name: str
@@ -71,6 +73,7 @@ class JointDrive:
     drag: float
     armature: float
     zero: float
+    gives: bool = False
 
 
 def joint_drives(model: mujoco.MjModel, controls: Mapping[str, float]) -> list[JointDrive]:
@@ -98,6 +101,7 @@ def _joint_drive(model: mujoco.MjModel, index: int, controls: Mapping[str, float
         drag=float(model.dof_dampingpoly[dof, 0]),
         armature=float(model.dof_armature[dof]),
         zero=float(model.qpos0[model.jnt_qposadr[joint]]),
+        gives=bool(joint + 1 in deflections(model)),  # a gear's joint follows that which it is behind
     )
 
 

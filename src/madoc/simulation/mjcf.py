@@ -278,7 +278,7 @@ def _body_name(model: mujoco.MjModel, index: int) -> str:
 
 
 _KINDS = {
-    **{kind: kind for kind in ("body", "geom", "site", "tendon", "actuator", "sensor")},
+    **{kind: kind for kind in ("body", "geom", "site", "pair", "tendon", "actuator", "sensor")},
     **dict.fromkeys(("dof", "jnt", "qpos0", "qpos"), "joint"),
     "eq": "equality",
 }

@@ -1,8 +1,8 @@
 """Numbers of drives and of friction that a model keeps as user data of its actuators and joints.
 
-A d.c. drive whose supply, gain and state never come from a log, and whose torque is in proportion to a current without
-limit, is said by MuJoCo's own elements: a servo whose largest force is that of its largest duty, and damping by
-back-EMF. Other drives, and friction that depends on speed or load, need `callbacks`.
+A d.c. drive whose supply, gain and state never come from a log, whose torque is in proportion to a current without
+limit, and whose encoder is on the motor, is said by MuJoCo's own elements: a servo whose largest force is that of its
+largest duty, and damping by back-EMF. Other drives, and friction that depends on speed or load, need `callbacks`.
 """
 
 from collections.abc import Sequence
@@ -51,8 +51,8 @@ def install_callbacks() -> None:
         callbacks.install()
     except ImportError as error:
         raise MadocError(
-            "a drive with inputs from the log, a current limit or saturation, and friction by speed or load, need "
-            "Numba; install it: pip install 'madoc-calibration[drives]'"
+            "a drive with inputs from the log, a current limit, saturation or an encoder behind a gear, and friction "
+            "by speed or load, need Numba; install it: pip install 'madoc-calibration[drives]'"
         ) from error
     except RuntimeError as error:
         raise MadocError(f"{error}; install another version of it") from error

@@ -11,6 +11,7 @@ import numpy as np
 from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.arrays import numbers_at, write_number
+from madoc.simulation.gears import backlash, deflections, gear_numbers, write_backlash
 from madoc.simulation.inertials import (
     DIAGONAL,
     write_centre_of_mass,
@@ -38,6 +39,7 @@ _KINDS = {
     "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
     "sensor": (mujoco.mjtObj.mjOBJ_SENSOR, "nsensor"),
     "site": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
+    "pair": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
     "tendon": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
     "equality": (mujoco.mjtObj.mjOBJ_EQUALITY, "neq"),
 }
@@ -122,7 +124,7 @@ def find_elements(model: mujoco.MjModel, parameter: Parameter) -> list[int]:
     """Indices of a parameter's elements in the model; one -1 for gravity. A body may be named by a joint of its own."""
     kind = parameter.kind.element
     found = [-1] if kind is None else [_find_element(model, parameter.name, kind, one) for one in parameter.elements]
-    if parameter.field.startswith(("drive_", "friction_")):
+    if parameter.field.startswith(("drive_", "friction_", "gear_")):
         for element in found:
             _place_of(parameter.field)[0](model, element)  # refuses what has no such number
     return found
@@ -147,8 +149,11 @@ def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
 
 
 def single_joints(model: mujoco.MjModel) -> list[tuple[Any, bool]]:
-    """Views of the joints that have a name and one degree of freedom, and whether each is a hinge."""
-    joints = (model.joint(index) for index in range(model.njnt))
+    """Views of the joints that have a name and one degree of freedom, and whether each is a hinge.
+
+    Deflections of gears, which no log shows, are none of them.
+    """
+    joints = (model.joint(index) for index in range(model.njnt) if index not in deflections(model))
     return [
         (joint, int(joint.type[0]) == int(mujoco.mjtJoint.mjJNT_HINGE))
         for joint in joints
@@ -317,6 +322,9 @@ _PLACES: dict[str, tuple[Numbers, Write | None]] = {
         for field in FIELDS
         if field[:9] == "friction_"
     },
+    "gear_backlash": (backlash, write_backlash),
+    "gear_stiffness": (partial(gear_numbers, name="stiffness"), None),
+    "gear_damping": (partial(gear_numbers, name="damping"), None),
 }
 """Where each field stands in a model: the numbers of an element, the first of which is its value, and what writes one.
 
