@@ -1,6 +1,6 @@
 """A Dynamixel XL330 of hardware: how well runs that were never shown are predicted, beside the published models.
 
-    python benchmarks/real_servo.py --data FOLDER [--held-out 400] [--friction M6] [--set horizon=200 loss=linear]
+    python benchmarks/real_servo.py --data FOLDER [--held-out 400] [--friction M5] [--set horizon=200 loss=linear]
 
 FOLDER holds the CSV files that docs/real-servo.md says where from. Calibrated to the runs of the other gains of the
 firmware; those of the gain held out are simulated from the measured state, over windows of one second and as a whole,
@@ -51,7 +51,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--held-out", type=int, choices=(200, 400, 800), default=400)
-    parser.add_argument("--friction", choices=("M1", "M2", "M3", "M4", "M5", "M6"), default="M6")
+    parser.add_argument("--friction", choices=("M1", "M2", "M3", "M4", "M5", "M6"), default="M5")
     parser.add_argument("--set", nargs="*", default=[], help="hyperparameters of least squares")
     arguments = parser.parse_args()
     found = compare(arguments.data, arguments.held_out, arguments.friction, tuple(arguments.set))
@@ -96,10 +96,12 @@ def compare(data: Path, held_out: int, friction: str, settings: tuple[str, ...] 
 def written(folder: Path, friction: str, values: Mapping[str, float] | None = None) -> Path:
     """The example's spec with a model of friction, beside its model; with values, all of its numbers are given."""
     document = YAML(typ="safe").load(SERVO / "xl330.yaml")
-    document["friction"] = [{"joint": "shaft", "model": friction, "up_to": document["friction"][0]["up_to"]}]
+    document["friction"][0]["model"] = friction
+    if friction in ("M1", "M3") or values is not None:
+        del document["friction"][0]["stribeck_exponent"]
     if values is not None:
         drive = document["actions"][0]["drive"]
-        drive |= {name: values[name] for name in ("kt", "resistance")}
+        drive |= {name: values[name] for name in ("kt", "resistance")} | {"saturation": 0.0}
         document["friction"][0] |= {name: values[name] for name in TERMS if name in values}
         ends = {name: (0.999 * values[name], 1.001 * values[name]) for name in ("armature", "zero")}
         document["parameters"] = [

@@ -79,6 +79,7 @@ FIELDS: dict[str, Field] = {
     "drive_duty_limit": Field("actuator", "1", 0.0, words="largest duty", maximum=1.0),
     "drive_current_limit": Field("actuator", "A", 0.0, words="largest current"),
     "drive_strength": Field("actuator", "1", 0.0, words="strength", missing="another strength of the drive"),
+    "drive_saturation": Field("actuator", "1/A", 0.0, words="saturation"),
     "friction_stribeck": Field("joint", "N·m", 0.0, "N", "Stribeck friction"),
     "friction_stribeck_speed": Field("joint", "rad/s", 1e-9, "m/s", "Stribeck speed"),
     "friction_stribeck_exponent": Field("joint", "1", 0.0, words="Stribeck exponent", maximum=100.0),

@@ -134,7 +134,7 @@ def test_bam_itself_reads_the_file(tmp_path, friction):
 
 def drive(**changed):
     numbers = {"supply": 12.0, "kt": 0.5, "resistance": 2.0, "gain": 0.2, "damping_gain": 0.0, "duty_limit": 1.0}
-    numbers |= {"strength": 1.0}
+    numbers |= {"strength": 1.0, "saturation": 0.0}
     plain = dict(name="a b", means="position", numbers=numbers, current_limit=None, setting=1.0, supply_from="")
     return JointDrive(**plain | dict(friction={}, coulomb=0.0, viscous=0.0, drag=0.0, armature=0.0, zero=0.0) | changed)
 
@@ -149,6 +149,10 @@ def drive(**changed):
         (
             {"numbers": drive().numbers | {"damping_gain": 0.1}},
             ["the firmware brakes by 0.3 N·m·s/rad, and BAM's loop does not"],
+        ),
+        (
+            {"numbers": drive().numbers | {"saturation": 0.1}},  # 6 A: 3 N·m over 1.6
+            ["saturation is left out, which at standstill and the largest current leaves 1.88 of 3 N·m"],
         ),
     ],
 )

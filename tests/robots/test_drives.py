@@ -72,6 +72,8 @@ PARAMETER = "  - {field: drive_strength, element: goal, low: 0.5, high: 1.5}"
         ("gain_from: p", "gain_from: q", "expected the name of a condition, got 'q'; there are: p"),
         ("supply_from: volts", 'supply_from: "on"', "the column 'on' is used for something else already"),
         ("supply_from: volts", "supply_from: angle", "the name 'angle' is taken"),
+        ("supply_from: volts", "supply_average: 0.5", "supply_average: means nothing without supply_from:"),
+        ("gain: 0.2", "gain: 0.2, saturation: -1", "expected greater than or equal to 0 in actions.drive.saturation"),
         ("values: [2, 5]", "values: [2, 2]", "values: of p has one twice"),
         ("values: [2, 5]", "values: [2, 5], file_name: p", "expected one \\* in file_name:, got 'p'"),
         (PARAMETER, PARAMETER.replace("goal", "volts"), "drive_strength: actuator 'volts' is no such drive"),
@@ -233,6 +235,22 @@ def test_a_condition_is_read_from_the_name_of_its_file(tmp_path):
     low, high = robot.actions[3].low, robot.actions[3].high
     given = low + (np.asarray(data.transitions.action)[:, 3] + 1.0) / 2.0 * (high - low)
     np.testing.assert_allclose(given, [2.0] * 4 + [5.0] * 4, rtol=1e-12)
+
+
+def test_the_supply_is_the_mean_of_its_readings_around_a_row(tmp_path):
+    """Half a width of 0.01 s holds the readings before and after; at the ends of a run there is one of them."""
+    path = written(tmp_path, "p2_a.csv")
+    rows = path.read_text().split("\n")
+    swinging = [
+        rows[0],
+        *(row.removesuffix("12") + volts for row, volts in zip(rows[1:6], ("10", "16", "10", "16", "10"), strict=True)),
+    ]
+    path.write_text("\n".join(swinging))
+    robot = load(tmp_path, NAMED.replace("supply_from: volts", "supply_from: volts, supply_average: 0.021"))
+    column = [channel.name for channel in robot.actions].index("volts")
+    low, high = robot.actions[column].low, robot.actions[column].high
+    given = low + (np.asarray(logs.read([path], robot).transitions.action)[:, column] + 1.0) / 2.0 * (high - low)
+    np.testing.assert_allclose(given, [13.0, 12.0, 14.0, 12.0], rtol=1e-12)
 
 
 @pytest.mark.parametrize(("name", "got"), [("p3_a.csv", "got 3;"), ("other.csv", "got no number there;")])

@@ -16,7 +16,7 @@ from madoc.simulation.cpu import CpuSimulator
 from own_robots import SERVO, SERVO_SPEC, write_robot
 
 DC = {"supply": 10.0, "kt": 0.5, "resistance": 2.0, "gain": 0.4, "damping_gain": 0.0, "duty_limit": 1.0}
-DC |= {"current_limit": UNLIMITED, "strength": 1.0}
+DC |= {"current_limit": UNLIMITED, "strength": 1.0, "saturation": 0.0}
 NONE = dict.fromkeys(FRICTION[1:], 0.0) | {"stribeck_speed": 2.0, "stribeck_exponent": 1.0}
 
 
@@ -33,6 +33,9 @@ NONE = dict.fromkeys(FRICTION[1:], 0.0) | {"stribeck_speed": 2.0, "stribeck_expo
         ({"duty_limit": 0.3}, 9.0, 0.0, 0.75),
         ({"current_limit": 2.0}, 9.0, 0.0, 1.0),
         ({"strength": 0.8}, 0.5, 0.0, 0.4),
+        ({"saturation": 0.2}, 9.0, 0.0, 1.25),  # 5 A are 1/saturation: half of 2.5
+        ({"saturation": 0.2}, 0.0, 4.0, -0.5 / 1.2),  # 1 A
+        ({"saturation": 0.2, "current_limit": 2.0}, 9.0, 0.0, 1.0 / 1.4),
         ({"supply": 5.0}, 0.5, 0.0, 0.25),
     ],
 )

@@ -55,9 +55,19 @@ def test_a_number_that_is_not_there_is_refused(spring_task, field, element, sent
         CpuSimulator(spring_task(Parameter(field, element, 0.1, 1.0)))
 
 
-def test_a_current_limit_that_is_none_is_refused(tmp_path):
-    with pytest.raises(MadocError, match="the current of 'goal' is not limited; give it a current_limit:"):
-        simulator_of(tmp_path, PLAIN.replace("drive_strength", "drive_current_limit"))
+@pytest.mark.parametrize(
+    ("field", "sentence"),
+    [
+        ("drive_current_limit", "the current of 'goal' is not limited; give it a current_limit:"),
+        (
+            "drive_saturation",
+            "the torque of 'goal' is in proportion to its current; give it a saturation: of more than",
+        ),
+    ],
+)
+def test_a_number_that_a_drive_does_without_is_refused(tmp_path, field, sentence):
+    with pytest.raises(MadocError, match=sentence):
+        simulator_of(tmp_path, PLAIN.replace("drive_strength", field))
 
 
 def test_without_numba_the_drive_is_refused_in_one_sentence(tmp_path, monkeypatch):
@@ -79,6 +89,7 @@ def test_a_drive_of_fixed_numbers_is_made_of_mujocos_own_elements(tmp_path, mean
     assert not has_gain(model, 0)
     data = mujoco.MjData(model)
     numbers = {"supply": 12.0, "kt": 0.8, "resistance": 2.0, "duty_limit": 0.6, "current_limit": 1e12, "strength": 1.0}
+    numbers["saturation"] = 0.0
     numbers |= {"gain": 1.0, "damping_gain": 0.0} if means == "duty" else {"gain": 0.2, "damping_gain": 0.05}
     for command, angle, rate in [(0.5, 0.1, 0.3), (1.0, -6.0, 2.0), (-0.2, 0.0, -4.0)]:
         data.qpos[:], data.qvel[:], data.ctrl[:] = angle, rate, command

@@ -7,6 +7,7 @@ current past its limit and Madoc does not.
 """
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -76,11 +77,15 @@ def _lost(drive: JointDrive, delay: float) -> Sequence[str]:
     """What the calibrated drive does and BAM's does not, a clause each, with the size of it."""
     of = drive.numbers
     per_volt = of["strength"] * of["kt"] / of["resistance"]
+    most = min(of["duty_limit"] * of["supply"] / of["resistance"], drive.current_limit or math.inf)
+    stall, saturated = of["strength"] * of["kt"] * most, 1.0 / (1.0 + of["saturation"] * most)
     no_load = of["duty_limit"] * of["supply"] / of["kt"]
     clauses = {
         f"the command is a {drive.means} and BAM's is a position, so error_gain is 0": drive.means != "position",
         f"the firmware brakes by {of['damping_gain'] * of['supply'] * per_volt:.3g} N·m·s/rad, and BAM's loop does "
         "not": of["damping_gain"],
+        f"saturation is left out, which at standstill and the largest current leaves {saturated * stall:.3g} of "
+        f"{stall:.3g} N·m": of["saturation"],
         f"vin is the supply of the spec, and the log's {drive.supply_from} varies; 1 V is {per_volt:.3g} N·m at "
         "standstill": drive.supply_from,
         f"drag is left out, {drive.drag * no_load**2:.3g} N·m at the no-load speed of {no_load:.3g} rad/s": drive.drag,

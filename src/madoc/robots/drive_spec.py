@@ -48,8 +48,12 @@ class DriveSpec(Part):
     duty_limit: Share = Field(1.0, description="Largest duty, of 1.")
     current_limit: Positive | None = Field(None, description="Largest current, A. Default: none.")
     strength: Positive = Field(1.0, description="Factor on the torque: of gears, magnets and temperature.")
+    saturation: NotNegative = Field(0.0, description="Of torque by current, 1/A: at 1/saturation half of it is left.")
     enable: Name | None = Field(None, description="Column of the log: below 0.5 the drive is off, the joint is free.")
     supply_from: Name | None = Field(None, description="Column of the log with the measured supply, V.")
+    supply_average: Positive | None = Field(
+        None, description="Time over which readings of supply_from around a row are averaged, s. Default: none are."
+    )
     gain_from: Name | None = Field(None, description="Condition whose value is the gain set in the firmware.")
 
     def check(self, means: str) -> None:
@@ -58,6 +62,8 @@ class DriveSpec(Part):
             means not in ("position", "velocity", "duty"), "expected means: position, velocity or duty beside drive:"
         )
         refuse(means != "duty" and self.gain is None, f"expected gain: of the drive, duty per error of {means}")
+        averaged = self.supply_average is not None and self.supply_from is None
+        refuse(averaged, "supply_average: means nothing without supply_from:")
         given = [key for key in ("gain", "gain_from") if getattr(self, key) is not None]
         refuse(means == "duty" and bool(given), f"{''.join(given[:1])}: means nothing beside means: duty")
 

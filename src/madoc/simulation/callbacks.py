@@ -33,14 +33,15 @@ DRIVE = (
     "duty_limit",
     "current_limit",
     "strength",
+    "saturation",
     "enable",
     "supply_from",
     "gain_from",
     "encoder",
 )
-"""User data of an actuator: V, N·m/A, Ω, duty per rad (or per rad/s), duty per rad/s, 1, A, 1; three numbers of other
-actuators, whose controls they are, or -1; and the number of the tendon that is as long as the deflection of the gear
-behind which the loop's encoder sits, or -1. One that only brings in a number has MARK and zeros."""
+"""User data of an actuator: V, N·m/A, Ω, duty per rad (or per rad/s), duty per rad/s, 1, A, 1, 1/A; three numbers of
+other actuators, whose controls they are, or -1; and the number of the tendon that is as long as the deflection of the
+gear behind which the loop's encoder sits, or -1. One that only brings in a number has MARK and zeros."""
 UNLIMITED = 1e12
 """Current limit in A of a drive that has none."""
 MEANS = ("position", "velocity", "duty")
@@ -77,16 +78,20 @@ def dc_torque(
     duty_limit: float,
     current_limit: float,
     strength: float,
+    saturation: float,
 ) -> float:
     """Torque of a d.c. motor behind a position or speed loop that sets its duty, N·m.
 
     duty = clip(gain · error - damping_gain · rate), current = clip((duty · supply - kt · ω) / R), torque = strength ·
-    kt · current: the voltage across the armature is what the supply leaves beside the back-EMF; inductance is
-    neglected. `rate` is the speed that the encoder shows, ω that of the motor.
+    kt · current / (1 + saturation · |current|): the voltage across the armature is what the supply leaves beside the
+    back-EMF; inductance is neglected. `rate` is the speed that the encoder shows, ω that of the motor. `saturation` in
+    1/A is the curvature of torque over current, as where iron saturates: at a current of 1/saturation half of the
+    torque is left (Froelich's equation of magnetisation).
     """
     duty = min(max(gain * error - damping_gain * rate, -duty_limit), duty_limit)
     current = (duty * supply - kt * speed) / resistance
-    return strength * kt * min(max(current, -current_limit), current_limit)
+    current = min(max(current, -current_limit), current_limit)
+    return strength * kt * current / (1.0 + saturation * abs(current))
 
 
 def friction_limit(
@@ -190,13 +195,13 @@ def _callbacks(at: "_Places") -> tuple[Any, Any]:
             return 0.0
         own = numbers(m, at.actuator_user, count * drive_size)[actuator * drive_size :][:drive_size]
         controls = numbers(d, at.ctrl, count)
-        if own[0] != marked or own[3] == 0.0 or (own[10] >= 0.0 and controls[int(own[10])] < 0.5):
+        if own[0] != marked or own[3] == 0.0 or (own[11] >= 0.0 and controls[int(own[11])] < 0.5):
             return 0.0
-        supply = own[2] if own[11] < 0.0 else controls[int(own[11])]
-        gain = own[5] if own[12] < 0.0 else own[5] * controls[int(own[12])]
+        supply = own[2] if own[12] < 0.0 else controls[int(own[12])]
+        gain = own[5] if own[13] < 0.0 else own[5] * controls[int(own[13])]
         low, high = numbers(m, at.actuator_ctrlrange, 2 * count)[2 * actuator :][:2]
         error, speed = min(max(controls[actuator], low), high), numbers(d, at.actuator_velocity, count)[actuator]
-        deflection, rate, tendon = 0.0, speed, int(own[13])
+        deflection, rate, tendon = 0.0, speed, int(own[14])
         if tendon >= 0:
             deflection = numbers(d, at.ten_length, tendon + 1)[tendon]
             rate += numbers(d, at.ten_velocity, tendon + 1)[tendon]
@@ -204,7 +209,7 @@ def _callbacks(at: "_Places") -> tuple[Any, Any]:
             error -= numbers(d, at.actuator_length, count)[actuator] + deflection
         elif own[1] == 1.0:
             error -= rate
-        return dc(error, rate, speed, supply, own[3], own[4], gain, own[6], own[7], own[8], own[9])
+        return dc(error, rate, speed, supply, own[3], own[4], gain, own[6], own[7], own[8], own[9], own[10])
 
     return friction, drive
 

@@ -1,8 +1,8 @@
 """Numbers of drives and of friction that a model keeps as user data of its actuators and joints.
 
-A d.c. drive whose supply, gain and state never come from a log, whose current is not limited, and whose encoder is on
-the motor, is said by MuJoCo's own elements: a servo whose largest force is that of its largest duty, and damping by
-back-EMF. Other drives, and friction that depends on speed or load, need `callbacks`.
+A d.c. drive whose supply, gain and state never come from a log, whose torque is in proportion to a current without
+limit, and whose encoder is on the motor, is said by MuJoCo's own elements: a servo whose largest force is that of its
+largest duty, and damping by back-EMF. Other drives, and friction that depends on speed or load, need `callbacks`.
 """
 
 from collections.abc import Sequence
@@ -51,8 +51,8 @@ def install_callbacks() -> None:
         callbacks.install()
     except ImportError as error:
         raise MadocError(
-            "a drive with inputs from the log, a current limit or an encoder behind a gear, and friction by speed or "
-            "load, need Numba; install it: pip install 'madoc-calibration[drives]'"
+            "a drive with inputs from the log, a current limit, saturation or an encoder behind a gear, and friction "
+            "by speed or load, need Numba; install it: pip install 'madoc-calibration[drives]'"
         ) from error
     except RuntimeError as error:
         raise MadocError(f"{error}; install another version of it") from error
@@ -68,6 +68,11 @@ def drive_number(model: mujoco.MjModel, actuator: int, name: str) -> np.ndarray:
     if name == "current_limit" and found[0] >= UNLIMITED:
         raise MadocError(
             f"drive_{name}: the current of {model.actuator(actuator).name!r} is not limited; give it a current_limit:"
+        )
+    if name == "saturation" and model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_USER:
+        raise MadocError(
+            f"drive_{name}: the torque of {model.actuator(actuator).name!r} is in proportion to its current; give it a "
+            "saturation: of more than 0"
         )
     return found
 
@@ -85,7 +90,9 @@ def friction_numbers(model: mujoco.MjModel, joint: int, name: str) -> np.ndarray
 
 def by_own_elements(numbers: Sequence[float]) -> bool:
     """Whether MuJoCo's own elements say a drive of these numbers (`DRIVE`), where its torque causes no friction."""
-    return max(numbers[DRIVE.index("enable") :]) < 0.0 and numbers[DRIVE.index("current_limit")] >= UNLIMITED
+    of = dict(zip(DRIVE, numbers, strict=True))
+    proportional = of["current_limit"] >= UNLIMITED and of["saturation"] == 0.0
+    return proportional and max(numbers[DRIVE.index("enable") :]) < 0.0
 
 
 def elements_of_drive(numbers: Sequence[float]) -> tuple[float, tuple[float, float], float, float]:
@@ -117,11 +124,11 @@ def write_elements(model: mujoco.MjModel) -> None:
 def scale_forces(model: mujoco.MjModel, factor: float) -> None:
     """Multiply the torques of d.c. drives, and those of friction that are not in proportion to others.
 
-    A current limit is multiplied as the resistance is divided.
+    A current limit is multiplied, and saturation divided, as the resistance is divided.
     """
     for actuator in range(model.nu):
         if is_drive(model, actuator):
-            model.actuator_user[actuator, DRIVE.index("resistance")] /= factor
+            model.actuator_user[actuator, [DRIVE.index("resistance"), DRIVE.index("saturation")]] /= factor
             if model.actuator_user[actuator, DRIVE.index("current_limit")] < UNLIMITED:
                 model.actuator_user[actuator, DRIVE.index("current_limit")] *= factor
     for joint in range(model.njnt):

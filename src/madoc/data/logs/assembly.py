@@ -13,6 +13,7 @@ from madoc.data.logs.tables import Run, Table, as_numbers
 from madoc.data.logs.timing import (
     Resample,
     Series,
+    averaged,
     check_ascending,
     common_grid,
     held_finding,
@@ -199,6 +200,12 @@ def _series(run: Run, table: Table, columns: Sequence[str], robot: Robot) -> tup
     values, wraps = unwrapped(series, columns, turns)
     series = replace(series, values=values)
     values, signs = of_one_sign(series, columns, {names[each.name]: each.quaternion for each in robot.signals})
+    for drive in (action.drive for action in robot.spec.actions if action.drive is not None):
+        column = names.get(drive.supply_from or "", "")
+        if drive.supply_average is not None and column in columns:
+            rows_a_second = 1.0 if run.timed else 1.0 / robot.spec.control_step
+            at = columns.index(column)
+            values[:, at] = averaged(series.time, values[:, at], drive.supply_average * rows_a_second)
     return replace(series, values=values), [*findings, *wraps, *signs]
 
 

@@ -218,6 +218,18 @@ def held_finding(actions: Series, end: float) -> list[Finding]:
     return [Finding("warning", what, actions.run, "nothing if actions are logged only where they change")]
 
 
+def averaged(
+    time: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], width: float
+) -> Float[np.ndarray, " rows"]:
+    """Each value as the mean of those at most half a width before or after it; what is not finite stays as it is."""
+    known = np.isfinite(values)
+    first = np.searchsorted(time, time - width / 2, side="left")
+    last = np.searchsorted(time, time + width / 2, side="right")
+    sums, counts = (np.append(0.0, np.cumsum(each)) for each in (np.where(known, values, 0.0), known))
+    means = (sums[last] - sums[first]) / np.maximum(counts[last] - counts[first], 1.0)
+    return np.where(known, means, values)
+
+
 def on_grid(
     series: Series, grid: Float[np.ndarray, " grid"], how: Resample
 ) -> tuple[Float[np.ndarray, "grid columns"], Bool[np.ndarray, " grid"]]:
