@@ -47,7 +47,7 @@ def test_one_channel_of_several_tells_of_noise_and_few_pairs_do_not():
     noise = np.random.default_rng(0).normal(size=(3, 20_000, 4))
     before, after = noise[1] - noise[0], noise[2] - noise[1]
     before[:, 1:], after[:, 1:] = noise[0, :, 1:], noise[1, :, 1:]  # which forget theirs in a row
-    assert alternation(before[:30], after[:30]) < 0.0
+    assert alternation(before[:30], after[:30]) < 0.2
     assert alternation(before, after) == pytest.approx(0.5, abs=0.03)
 
 
