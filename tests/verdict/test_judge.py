@@ -102,11 +102,12 @@ def test_one_thing_wrong_changes_the_word(good, word, of_errors, change, told):
     assert told.replace("actions?", "action" if good is PREDICTED else "actions") in verdict.sentence
 
 
-def test_a_mismatch_names_the_likeliest_term_though_it_hardly_moves_the_estimate():
+def test_a_certain_term_is_a_mismatch_though_it_hardly_moves_the_estimate():
     offset = MissingTerm("an offset of the sensor", "signal_bias.hip", 0.1, 0.01, "1", 0.8, 10.0, {"mass": 0.1})
     richer = RicherModel("signal_bias.hip", ())
-    verdict = judge(changed(PREDICTED, LEFT_OVER, explained=0.6, missing_terms=(offset,), richer=richer))
-    assert "of single terms an offset of the sensor (signal_bias.hip) is the likeliest: 0.1 ± 0.01" in verdict.sentence
+    verdict = judge(replace(PREDICTED, missing_terms=(offset,), richer=richer))
+    assert verdict.word == "MODEL_MISMATCH"
+    assert "the model lacks an offset of the sensor (signal_bias.hip): a value of 0.1 ± 0.01" in verdict.sentence
     assert verdict.sentence.endswith("{field: signal_bias, element: hip, low: 0, high: 0.2}")
 
 

@@ -24,7 +24,7 @@ windows, and many changes are looked for."""
 CERTAIN_STEP = 4.0
 """t of the error of the integration step, whose value is known beforehand; by chance one in 30 thousand is larger."""
 MOVES = 0.5
-"""Shift of a parameter in half-widths of its 95 % interval; a term that moves all by less may be left out."""
+"""Shift of a parameter in half-widths of its 95 % interval, from which a term is named before others."""
 WHOLE = 1.5
 """Largest value of the error of the integration step. The value is 1 / (1 - 4^-p) for an integrator of order p, at
 most 4 / 3, as the steps compared with are a quarter as long."""
@@ -51,27 +51,16 @@ NAMED = 3
 
 
 def missing_term(holdout: Judged) -> MissingTerm | None:
-    """The likeliest term that the model certainly lacks, if such terms move the estimate by themselves or together.
+    """The likeliest term that the model certainly lacks, of those that move the estimate if there are any.
 
+    One that moves nothing counts too: what it would move is known to first order, at an estimate that may be wrong.
     None where the error of the integration step explains much of the residuals and lesser ones were not tested without.
     """
     if numerical(holdout) is not None and not holdout.finer:
         return None
     certain = [term for term in holdout.missing_terms if is_certain(term)]
-    moving = [term for term in certain if moves_certainly(term)]
-    if certain and not moving and _moved_together(holdout):
-        uncertain = (*DRIFTS, INTEGRATION)  # by themselves, as are forces that no parameter adds
-        others = (term for term in holdout.missing_terms if term.cause not in uncertain)
-        moving = [
-            term for term in others if is_certain(term) or not (is_joint_force(term.cause) or is_late(term.cause))
-        ]
-    return likeliest(moving)
-
-
-def suspect(holdout: Judged) -> MissingTerm | None:
-    """The term that a verdict names: one that moves the estimate, or else one that is certainly missing."""
-    certain = [each for each in holdout.missing_terms if is_certain(each) and each.cause not in DRIFTS]
-    return missing_term(holdout) or likeliest(certain)
+    moving = [term for term in certain if max(map(abs, term.shifts.values())) >= MOVES]
+    return likeliest(moving or certain)
 
 
 def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
@@ -139,21 +128,6 @@ def about_timestep(holdout: HoldOut, named: MissingTerm | None = None) -> str:
 def is_certain(term: MissingTerm) -> bool:
     """Whether a term is so significant that it is missing, whatever it does to the estimate."""
     return term.cause != INTEGRATION and abs(term.t) >= (CERTAIN_DRIFT if term.cause in DRIFTS else CERTAIN)
-
-
-def moves_certainly(term: MissingTerm) -> bool:
-    """Whether a term is certainly missing and would move a parameter by itself."""
-    return is_certain(term) and max(map(abs, term.shifts.values())) >= MOVES
-
-
-def _moved_together(holdout: Judged) -> bool:
-    """Whether terms that cannot be excluded together move a parameter by more than the error of that."""
-    return any(
-        abs(shift) >= max(MOVES, each.errors[name])
-        for each in holdout.alternatives
-        if each.terms
-        for name, shift in each.shifts.items()
-    )
 
 
 def numerical(holdout: Judged) -> MissingTerm | None:

@@ -6,7 +6,7 @@ from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, ToldApar
 from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
 from madoc.identification.term_tests import MissingTerm, named
-from madoc.verdict.adequacy import about_timestep, as_likely, missing_term, numerical, suspect
+from madoc.verdict.adequacy import about_timestep, as_likely, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
@@ -148,12 +148,6 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
         sentence = _systematic(holdout, at_end)
     if not sentence:
         return None
-    term = suspect(holdout)
-    if term is not None:
-        sentence += (
-            f"; of single terms {named(term)} is the likeliest: {value_of(term)} explains {100 * term.explained:.2g} % "
-            f"of the squared residuals of windows with fitted starts (t = {abs(term.t):.0f}); {_advice(holdout, term)}"
-        )
     return Verdict("MODEL_MISMATCH", f"{sentence}{about_timestep(holdout)}", holdout.at_end)
 
 

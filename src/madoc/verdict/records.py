@@ -21,7 +21,7 @@ from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspic
 from madoc.identification.term_tests import FEWEST, MissingTerm
 from madoc.identification.windows import horizons
 from madoc.parameters import ParameterSpace
-from madoc.verdict.adequacy import NUMERICAL, actions_in_time, felt, in_full, is_certain, suspect, widening
+from madoc.verdict.adequacy import NUMERICAL, actions_in_time, felt, in_full, is_certain, missing_term, widening
 from madoc.verdict.bench import Bench
 from madoc.verdict.remedies import is_of_spec
 from madoc.verdict.richer import richer_model
@@ -154,7 +154,7 @@ def judged(
         base_from_contacts=bool(bench.states.placed.any()),
     )
     late = next((each for each in contradicting if each.late), None)
-    term = suspect(found) if late is None else _delay(doubts, late)
+    term = missing_term(found) if late is None else _delay(doubts, late)
     richer, of_richer = _richer(bench, point, own, term, doubts, finer=finer)
     told = tuple(_contradiction(each, richer) for each in contradicting)
     return replace(found, richer=richer, contradictions=told, control_steps=found.control_steps + of_richer)
