@@ -192,6 +192,15 @@ def test_a_log_that_contradicts_the_spec_is_a_mismatch_however_well_it_is_predic
     )
 
 
+@EITHER
+def test_an_end_of_a_range_says_nothing_while_the_search_has_not_settled(good):
+    at_end = replace(good, at_end=("mass",))
+    assert judge(at_end).word == "MODEL_MISMATCH"
+    unsettled = judge(at_end, settled=False)
+    assert unsettled.word == "NO_IMPROVEMENT"
+    assert "had not settled" in unsettled.sentence
+
+
 def test_residuals_that_last_are_a_mismatch():
     verdict = judge(changed(PREDICTED, LEFT_OVER, persistence=0.5))
     assert verdict.word == "MODEL_MISMATCH"

@@ -46,7 +46,7 @@ def judge(
     refused = _rejected(holdout) or contradicted(holdout)
     if refused:
         return refused
-    lacks = lacking(holdout, long_tails=long_tails)
+    lacks = lacking(holdout, settled=settled, long_tails=long_tails)
     if lacks:
         return (_usable(holdout, lacks) if settled else None) or lacks
     return (

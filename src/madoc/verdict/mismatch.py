@@ -26,12 +26,13 @@ SEPARABLE = 0.65
 true simulator have about 0.55."""
 
 
-def lacking(holdout: HoldOut, *, long_tails: bool) -> Verdict | None:
+def lacking(holdout: HoldOut, *, settled: bool, long_tails: bool) -> Verdict | None:
     """The first of the ways in which a model lacks something; None where there is none.
 
-    `long_tails` tells that residuals have longer tails than noise has.
+    An end of a range at which a search stands that has not settled says nothing. `long_tails` tells that residuals
+    have longer tails than noise has.
     """
-    found = _missing(holdout) or _mismatch(holdout) or _outside(holdout)
+    found = _missing(holdout) or _mismatch(holdout) or (_outside(holdout) if settled else None)
     return found or (_unlike_noise(holdout) if long_tails else None)
 
 
