@@ -161,7 +161,8 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
     if isinstance(holdout, Predicted) and holdout.autocorrelation > WHITE:
         reasons.append(f"it is alike from row to row (correlation {holdout.autocorrelation:.2f})")
     if isinstance(holdout, Predicted) and holdout.persistence > PERSISTENT:
-        reasons.append(f"it lasts over several rows (correlation {holdout.persistence:.2f}), as of a lasting force")
+        lasts = f"it lasts over several rows (correlation {holdout.persistence:.2f})"
+        reasons.append(f"{lasts}, as that of a force from outside would")
     reasons += at_end
     beyond = beyond_noise(errors.nearby_best, errors.noise)
     if not beyond or not reasons:
@@ -169,10 +170,11 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
     left, noise = max(beyond, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
     noisy = noise.mean > NEGLIGIBLE
     much = f"{left.mean / noise.mean:.2g} times as much as noise does" if noisy else "none of which is noise"
+    after = f"after {in_rows(left.steps)}{'' if direct else ' from a fitted start'}"
     return (
-        f"even the parameters nearby that fit the hold-out best err by {left.mean:.2g} of what a signal changes in "
-        f"{in_rows(errors.stride)}, after {in_rows(left.steps)}{'' if direct else ' from a fitted start'}, {much}, and "
-        f"{', '.join(reasons)}: the model cannot explain the data ({change_of(errors)})"
+        f"the model cannot explain the data: {after} even the parameters nearby that fit the hold-out best err by "
+        f"{left.mean:.2g} of what a signal changes in {in_rows(errors.stride)}, {much}; that is no chance, as "
+        f"{' and '.join(reasons)} ({change_of(errors)})"
     )
 
 
@@ -182,8 +184,8 @@ def _adding_up(holdout: Predicted) -> str:
     if factor <= BEYOND_RANDOM:
         return ""
     return (
-        f"after {in_rows(holdout.errors.nearby_best[-1].steps)} the best parameters nearby leave {factor:.2g} times "
-        f"or more of the error in {signal} that sensor noise and random forces make: the model cannot explain the data "
+        f"the model cannot explain the data: after {in_rows(holdout.errors.nearby_best[-1].steps)} the best parameters "
+        f"nearby leave at least {factor:.2g} times the error in {signal} that sensor noise and random forces make "
         f"({change_of(holdout.errors)})"
     )
 

@@ -35,10 +35,7 @@ COLUMNS, COLUMNS_OF_A_VALUE = 60, 20
 freedom."""
 EXCHANGED = "exchanged columns"
 """A part of judging without which nothing is tested."""
-NO_DELAY = (
-    "no delay was found to explain the log, so add none for its own sake: look for a limit of speed, a lag or a filter "
-    "of the drives or of the log"
-)
+NO_DELAY = "look for a limit of speed, a lag or a filter of the drives or of the log before you add a delay to the spec"
 """What to do where actions take effect late, and a constant delay leaves something over or was not tested."""
 BEFORE_OTHERS = 2.0
 """Time left over that of a test, from which it comes before what is to follow, as predictions over longer times."""
@@ -191,7 +188,8 @@ def _contradiction(finding: Finding, richer: RicherModel | None) -> str:
     """A finding that contradicts the spec, with what to do, unless that is a delay that does not explain the log."""
     if not finding.late or (richer is not None and not richer.left):
         return finding.sentence
-    return f"{replace(finding, do='').sentence}; {NO_DELAY}"
+    tried = "a constant delay does not explain it" if richer else "whether a constant delay explains it was not tested"
+    return f"{replace(finding, do='').sentence}; {tried}: {NO_DELAY}"
 
 
 def _best_half_widths(

@@ -26,7 +26,9 @@ REMEDIES = {
 """What to do about terms that no further parameter of a spec adds."""
 WARM_UP = "let the machine warm up before it is logged, or leave the begin of each run out"
 """The same for a parameter that changes within each run."""
-CHANGE_MACHINE = "no parameter of a spec adds it: write it into the model, or calibrate to motions in which it is small"
+CHANGE_MACHINE = (
+    "no parameter of a spec adds it: find out whether the machine has it, and calibrate to motions in which it is small"
+)
 """The same for a force at a joint."""
 LOOK = "look there for what the model leaves out; a parameter that acts like it would be wrong in its place"
 """The same for a force that no listed term describes."""
