@@ -116,9 +116,7 @@ def test_no_learner_is_forgotten():
     assert set(LEARNERS) <= set(METHODS), "add the new learner to METHODS"
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("morec", marks=pytest.mark.slow), *(name for name in LEARNERS if name != "morec")]
-)
+@pytest.mark.parametrize("name", LEARNERS)
 def test_a_learner_is_recognised_as_the_entry_it_was_made_from(name):
     assert entry_of(METHODS[name], LEARNERS).name == LEARNERS[name].name == name
     assert LEARNERS[name].summary
