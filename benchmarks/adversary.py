@@ -10,6 +10,7 @@ its own, with its defaults, and is the one that Python imports: PYTHONPATH of an
 
 import argparse
 import json
+import resource
 import subprocess
 import sys
 import tempfile
@@ -182,6 +183,24 @@ def compared(row: dict[str, Any], truth: tuple[float, float]) -> dict[str, Any]:
         low, high = interval
         miss = max(low - truth[0], truth[1] - high, 0.0) / (row["high"] - row["low"])
     return {"truth": truth, "estimate": row.get("estimate"), "interval": interval, "miss": miss}
+
+
+def solved(spec: Path, logs: Path, truth: dict[str, float], *words: str, limit: float) -> dict[str, Any]:
+    """What `madoc calibrate` makes of planted logs: verdict, seconds, and every estimate beside its truth."""
+    before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        given = ["calibrate", str(spec), "--data", str(logs), "--out", str(Path(folder) / "out"), "--json", "--quiet"]
+        _, result, complaint = madoc(*given, *words, limit=limit)
+    after, seconds = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic() - started
+    verdict, found = result.get("verdict") or {}, result.get("parameters", {})
+    return {
+        "commit": commit(),
+        "verdict": verdict.get("word", complaint),
+        "sentence": verdict.get("sentence"),
+        "seconds": round(seconds, 1),
+        "processor_seconds": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
+        "parameters": {name: compared(found.get(name, {}), (value, value)) for name, value in truth.items()},
+    }
 
 
 if __name__ == "__main__":

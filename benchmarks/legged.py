@@ -10,9 +10,7 @@ budget of time, judging included.
 """
 
 import argparse
-import resource
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -21,9 +19,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import yaml
-from adversary import compared, madoc
+from adversary import solved
 from jaxtyping import Float
-from kept import RESULTS, Study, commit, commits
+from kept import RESULTS, Study, commits
 
 from madoc import robots, simulation
 
@@ -87,21 +85,7 @@ def solve(seed: int, budget: str) -> dict[str, Any]:
     """Calibrate to a log of one quadruped, and compare."""
     with tempfile.TemporaryDirectory() as temporary:
         spec, logs, truth = write(seed, Path(temporary))
-        words = ["calibrate", str(spec), "--data", str(logs), "--budget", budget, "--json", "--quiet"]
-        before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-        _, result, complaint = madoc(*words, "--out", str(Path(temporary) / "out"), limit=3600.0)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        found = result.get("parameters", {})
-        return {
-            "seed": seed,
-            "budget": budget,
-            "commit": commit(),
-            "verdict": (result.get("verdict") or {}).get("word", complaint),
-            "sentence": (result.get("verdict") or {}).get("sentence"),
-            "seconds": round(time.monotonic() - started, 1),
-            "processor_seconds": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
-            "parameters": {name: compared(found.get(name, {}), (value, value)) for name, value in truth.items()},
-        }
+        return {"seed": seed, "budget": budget} | solved(spec, logs, truth, "--budget", budget, limit=3600.0)
 
 
 def write(seed: int, folder: Path) -> tuple[Path, Path, dict[str, float]]:

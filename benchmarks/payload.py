@@ -10,15 +10,14 @@ radius of gyration of the load, seven frictions and the delay are calibrated, wi
 """
 
 import tempfile
-import time
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import mujoco
 import numpy as np
-from adversary import compared, madoc
-from kept import RESULTS, Study, commit, commits, run_seeds
+from adversary import solved
+from kept import RESULTS, Study, commits, run_seeds
 
 STUDY = Study(RESULTS / "payload.jsonl", ("seed",))
 LINKS = ((0.15, 4.0), (0.2, 4.0), (0.15, 3.0), (0.2, 3.0), (0.12, 2.5), (0.1, 1.5), (0.08, 0.8))
@@ -65,7 +64,6 @@ def solve(seed: int) -> dict[str, Any]:
     truth = {"payload_mass.link7": MASS, "payload_gyration.link7": GYRATION, "action_delay": DELAY}
     truth |= {f"payload_{axis}.link7": float(place) for axis, place in zip("xyz", centre, strict=True)}
     truth |= {f"dof_frictionloss.{name}": float(value) for name, value in zip(NAMES, friction, strict=True)}
-    started = time.monotonic()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         (folder / "logs").mkdir()
@@ -80,19 +78,7 @@ def solve(seed: int) -> dict[str, Any]:
             np.savetxt(
                 folder / "logs" / f"{run}.csv", recorded(real, known, random), "%.9g", ",", header=header, comments=""
             )
-        words = ["calibrate", str(folder / "arm.yaml"), "--data", str(folder / "logs"), "--json", "--quiet"]
-        _, result, complaint = madoc(*words, "--out", str(folder / "out"), limit=LIMIT)
-    verdict = result.get("verdict") or {}
-    return {
-        "seed": seed,
-        "commit": commit(),
-        "verdict": verdict.get("word", complaint),
-        "sentence": verdict.get("sentence"),
-        "seconds": round(time.monotonic() - started, 1),
-        "parameters": {
-            name: compared(result.get("parameters", {}).get(name, {}), (value, value)) for name, value in truth.items()
-        },
-    }
+        return {"seed": seed} | solved(folder / "arm.yaml", folder / "logs", truth, limit=LIMIT)
 
 
 def mjcf(centre: np.ndarray | None = None, friction: np.ndarray | None = None) -> str:

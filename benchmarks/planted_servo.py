@@ -12,14 +12,13 @@ position alone, with noise. Everything drawn is calibrated, with all defaults, i
 
 import json
 import tempfile
-import time
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
-from adversary import compared, madoc
-from kept import RESULTS, Study, commit, commits, run_seeds
+from adversary import solved
+from kept import RESULTS, Study, commits, run_seeds
 
 from madoc import robots
 from madoc.simulation.cpu import CpuSimulator
@@ -87,24 +86,12 @@ parameters:
 
 def solve(seed: int) -> dict[str, Any]:
     """Record, calibrate and compare."""
-    random, started = np.random.default_rng(seed), time.monotonic()
+    random = np.random.default_rng(seed)
     truth = drawn(random)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         recorded(folder, truth, random)
-        words = ["calibrate", str(folder / "servo.yaml"), "--data", str(folder / "logs"), "--json", "--quiet"]
-        _, result, complaint = madoc(*words, "--out", str(folder / "out"), limit=LIMIT)
-    verdict = result.get("verdict") or {}
-    return {
-        "seed": seed,
-        "commit": commit(),
-        "verdict": verdict.get("word", complaint),
-        "sentence": verdict.get("sentence"),
-        "seconds": round(time.monotonic() - started, 1),
-        "parameters": {
-            name: compared(result.get("parameters", {}).get(name, {}), (value, value)) for name, value in truth.items()
-        },
-    }
+        return {"seed": seed} | solved(folder / "servo.yaml", folder / "logs", truth, limit=LIMIT)
 
 
 def drawn(random: np.random.Generator) -> dict[str, float]:
