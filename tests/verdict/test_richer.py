@@ -22,7 +22,7 @@ WIDTHS = np.array([0.01])
 def with_term(dataset, simulator, lacking):
     """The model with the parameter that adds a term, from near the estimate."""
     point = simulator.parameters.to_unit(np.array([0.1]))
-    given = dataset, simulator, point, WIDTHS, typical_change(dataset), lacking
+    given = dataset, states_of(dataset, simulator), simulator, point, WIDTHS, typical_change(dataset), lacking
     return richer_model(*given, finer=False, most=None)[0]
 
 

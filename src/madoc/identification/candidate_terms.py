@@ -1,4 +1,4 @@
-"""The terms that a model may lack: what each stands for, its value in the model, its effect on simulated windows."""
+"""The terms that a model may lack: what each stands for, its value in the model, the values it can have."""
 
 from collections.abc import Callable, Iterator
 from collections.abc import Set as AbstractSet
@@ -120,7 +120,7 @@ def candidates(
         distance = off_centre(model, at.id)
         wanted += [("body_mass", body, float(at.mass[0]))] * (body not in weighed | loaded)
         wanted += [("body_com", body, distance)] * (distance > 0.0 and body not in loaded)
-    wanted += [("body_distance", body, distance) for body, distance in linked_bodies(model) if body not in loaded]
+    wanted += [("body_distance", body, distance) for body, distance in linked_bodies(model)]
     if "gravity" not in fields:
         wanted.append(("gravity", "", float(abs(model.opt.gravity[2])) or standard_gravity))
     if task.source is not None:

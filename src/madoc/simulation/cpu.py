@@ -16,6 +16,7 @@ from madoc.runs.machine import usable_cores
 from madoc.simulation.arrays import check_field, check_written
 from madoc.simulation.delay import blend, delay_weights
 from madoc.simulation.drives import drive_forces
+from madoc.simulation.touching import collided
 from madoc.simulation.user_data import install_callbacks, needs_callbacks
 from madoc.simulation.write import conditions_of, find_elements, write_parameters
 from madoc.tasks.base import Task
@@ -153,11 +154,8 @@ class CpuSimulator:
         moving = ("jnt_ref", "body_distance")
         placed = any(row.field in moving or row.field not in FIELDS for row in self.parameters.parameters)
         model = self.model(self.parameters.middle if values is None else values) if placed else self._model
-        data, contacts = self._data[0], np.zeros(len(state), dtype=np.int64)
-        for row, position in enumerate(state[:, : model.nq]):
-            data.qpos[:] = position
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_collision(model, data)
+        contacts = np.zeros(len(state), dtype=np.int64)
+        for row, data in enumerate(collided(model, self._data[0], state)):
             contacts[row] = len(set(map(tuple, data.contact.geom.tolist()))) if data.ncon > 1 else data.ncon
         return contacts
 

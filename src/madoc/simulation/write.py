@@ -153,7 +153,7 @@ def single_joints(model: mujoco.MjModel) -> list[tuple[Any, bool]]:
 
     Deflections of gears, which no log shows, are none of them.
     """
-    joints = (model.joint(index) for index in range(model.njnt) if index not in deflections(model))
+    joints = (model.joint(index) for index in np.setdiff1d(np.arange(model.njnt), deflections(model)).tolist())
     return [
         (joint, int(joint.type[0]) == int(mujoco.mjtJoint.mjJNT_HINGE))
         for joint in joints

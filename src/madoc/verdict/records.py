@@ -158,10 +158,14 @@ def judged(
 
 
 def _delay(doubts: Suspicions, late: Finding) -> MissingTerm | None:
-    """The delay of actions, with the value that the check of the log has found where it is the larger one."""
+    """The delay of actions, with the value that the check of the log has found where it is the larger one.
+
+    Its range is twice that at most: a state carries an action for every control step of it.
+    """
     for term in doubts.terms:
         if term.cause == DELAY:
-            return replace(term, value=max(term.value, late.late))
+            value = max(term.value, late.late)
+            return replace(term, value=value, standard_error=min(term.standard_error, value / 4.0))
     return None
 
 
@@ -180,7 +184,7 @@ def _richer(
     seconds = doubts.control_steps / bench.rate
     if not bench.begins(f"the model with {term.parameter}", BEFORE_OTHERS * seconds):
         return None, 0
-    given = bench.problem.dataset, bench.simulator, point, half_widths, bench.change, term
+    given = bench.problem.dataset, bench.states, bench.simulator, point, half_widths, bench.change, term
     return richer_model(*given, finer=finer, most=_windows_in_time(bench))
 
 

@@ -16,7 +16,7 @@ from madoc.data import Dataset
 from madoc.identification.candidate_terms import INTEGRATION
 from madoc.identification.coarseness import FINER
 from madoc.identification.missing_terms import suspicions
-from madoc.identification.states import states_of
+from madoc.identification.states import LoggedStates, states_of
 from madoc.identification.term_tests import LIKELY_FORCE, MissingTerm, named
 from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
@@ -25,6 +25,7 @@ from madoc.verdict.remedies import line_of
 
 def richer_model(
     dataset: Dataset,
+    logged: LoggedStates,
     simulator: Simulator,
     point: Float[np.ndarray, " d"],
     half_widths: Float[np.ndarray, " d"],
@@ -38,6 +39,7 @@ def richer_model(
 
     Args:
         dataset: The log that was calibrated to.
+        logged: What it says of states.
         simulator: The model with its calibrated parameters.
         point: Their estimate in [-1, 1].
         half_widths: Half of each one's 95 % interval in [-1, 1].
@@ -54,16 +56,9 @@ def richer_model(
     shift = np.array([term.shifts.get(name, 0.0) for name in simulator.parameters.names]) * half_widths
     start = np.append(point + shift, space.to_unit(np.append(simulator.parameters.middle, term.value))[-1])
     widths = np.append(half_widths, 4.0 * term.standard_error / (added.high - added.low))
-    found = suspicions(
-        dataset,
-        states_of(dataset, wide),
-        wide,
-        np.clip(start, -1.0, 1.0),
-        widths,
-        scale,
-        of_other_model=True,
-        most=most,
-    )
+    logged = logged if wide.task.pending == simulator.task.pending else states_of(dataset, wide)
+    at = np.clip(start, -1.0, 1.0)
+    found = suspicions(dataset, logged, wide, at, widths, scale, of_other_model=True, most=most)
     left = [each for each in found.terms if each.cause != INTEGRATION and abs(each.t) >= LIKELY_FORCE]
     steps = found.control_steps * (FINER if finer else 1)
     return RicherModel(term.parameter, tuple(map(named, left))) if found.tested else None, steps
