@@ -85,3 +85,12 @@ def test_episodes_of_ten_rows_have_windows_behind_their_first_row():
     # Each begins at the second row of its episode, so that what came before is its first row, again and again.
     firsts = logged.states[dataset.episode_starts[windows.runs]]
     np.testing.assert_array_equal(windows.earlier, np.repeat(firsts[:, None], 9, axis=1))
+
+
+def test_shorter_windows_are_as_many_times_more():
+    task = spring(max_episode_steps=100)
+    dataset = recorded(task, SPRING_TRUTH, 20_000, jax.random.key(0))
+    given = dataset, states_of(dataset, simulation.make(task, threads=1)), typical_change(dataset)
+    usual, shorter = windows_of(*given, fewest=30), windows_of(*given, fewest=30, shorter=4)
+    assert shorter.readings.steps == usual.readings.steps // 4
+    assert len(shorter.readings) == 4 * len(usual.readings)

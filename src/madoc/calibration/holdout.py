@@ -9,6 +9,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
+from madoc.identification.concentration import Concentration
 from madoc.identification.term_tests import Alternative, ImitatedTerm, MissingTerm
 
 Word = Literal["CALIBRATED", "USABLE", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
@@ -168,6 +169,8 @@ class Judged:
         open_loop: Errors of open-loop predictions in the signals' units, the shortest first; none without states.
         base_from_contacts: Whether no sensor shows where a free base is or how fast it moves, and both were taken from
             contacts that stand still.
+        concentration: Where in the log that was calibrated to most of what the model leaves unexplained is; None where
+            that was not looked for or no place stands out.
     """
 
     split: str
@@ -189,6 +192,7 @@ class Judged:
     finer: bool = False
     open_loop: tuple[OpenLoop, ...] = ()
     base_from_contacts: bool = False
+    concentration: Concentration | None = None
 
     @property
     def clearest(self) -> AgainstChance:

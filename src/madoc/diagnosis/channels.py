@@ -56,11 +56,6 @@ class Channel:
         return self.high - self.low > _STILL * max(abs(self.low), abs(self.high), 1e-300)
 
 
-def signal_names(task: Task) -> tuple[str, ...]:
-    """Names of an observation's values."""
-    return task.signals or tuple(f"observation[{index}]" for index in range(task.observation_size))
-
-
 def action_names(task: Task) -> tuple[str, ...]:
     """Names of an action's values."""
     if task.actions:
@@ -76,7 +71,7 @@ def channels_of(dataset: Dataset, task: Task, robot: Robot | None = None) -> tup
     units = [signal.unit or "" for signal in robot.signals] if robot else []
     units += [""] * (task.observation_size - len(units))  # of velocities that were derived from positions too
     numbers = np.column_stack([both.min(0), both.max(0), (following - observation).std(0)]).tolist()
-    rows = zip(signal_names(task), units, numbers, observation.T, strict=True)
+    rows = zip(task.signal_names, units, numbers, observation.T, strict=True)
     signals = [
         Channel(name, "signal", unit, low, high, step, resolution=resolution_of(read))
         for name, unit, (low, high, step), read in rows

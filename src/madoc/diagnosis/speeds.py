@@ -9,7 +9,6 @@ from scipy.stats import median_abs_deviation
 
 from madoc.data import Dataset
 from madoc.data.findings import Finding
-from madoc.diagnosis.channels import signal_names
 from madoc.simulation.base import Simulator
 from madoc.tasks import Task
 
@@ -266,7 +265,7 @@ def _stretches(pair: _Pair, rows: int) -> Float[np.ndarray, "stretches 5"]:
 def _names_of_states(task: Task, size: int) -> list[str | None]:
     """The signal from which each value of (qpos, qvel) is rebuilt; None where there is not exactly one."""
     assert task.state_from_observation is not None
-    names, width = signal_names(task), task.observation_size
+    names, width = task.signal_names, task.observation_size
     base = np.asarray(task.state_from_observation(np.zeros((1, width))))[:, :size]
     moved = np.asarray(task.state_from_observation(np.eye(width)))[:, :size] - base
     sources = [np.flatnonzero(np.abs(moved[:, column]) > 1e-12) for column in range(size)]

@@ -22,6 +22,7 @@ from madoc.identification.candidate_terms import (
     candidates,
     is_late,
 )
+from madoc.identification.concentration import Concentration, concentration
 from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import Fit, LoggedWindows, fit_windows, negligible, products_of, windows_of
 from madoc.identification.information import NORMAL_95
@@ -72,6 +73,7 @@ class Suspicions:
         imitated: Terms that the model has none of and of which the log cannot tell whether they are missing.
         control_steps: Control steps that were simulated to find that out.
         tested: Whether there were states to begin at, and enough windows to find anything.
+        concentration: Where most of what the model leaves unexplained is; None where no place stands out.
     """
 
     terms: tuple[MissingTerm, ...] = ()
@@ -79,6 +81,7 @@ class Suspicions:
     imitated: tuple[ImitatedTerm, ...] = ()
     control_steps: int = 0
     tested: bool = True
+    concentration: Concentration | None = None
 
 
 def suspicions(
@@ -91,6 +94,7 @@ def suspicions(
     *,
     of_other_model: bool = False,
     most: int | None = None,
+    shorter: int = 1,
 ) -> Suspicions:
     """Terms that the model may lack, and what including them would do to the estimate.
 
@@ -105,8 +109,9 @@ def suspicions(
         of_other_model: Whether the estimate is another model's, so that other windows may move it for a reason:
             alternatives then move by that as well.
         most: Largest number of windows; None for the usual one.
+        shorter: How many times as short and as many windows are.
     """
-    windows = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)), most=most)
+    windows = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)), most=most, shorter=shorter)
     readings, runs = windows.readings, windows.runs
     if len(readings) < FEWEST + len(point):
         return Suspicions(tested=False)
@@ -135,7 +140,11 @@ def suspicions(
     others += [*with_chosen, *_of_friction(tests, chosen), *_of_forces(tests, chosen)]
     most_significant_first = sorted(terms, key=lambda term: -abs(term.t))
     imitated = tuple(imitated_terms(tests))
-    return Suspicions(tuple(most_significant_first), tuple(others), imitated, spent + of_parts + of_fit)
+    spent += of_parts + of_fit
+    where = concentration(
+        dataset, windows, fit, signals=simulator.task.signal_names, control_step=simulator.control_step
+    )
+    return Suspicions(tuple(most_significant_first), tuple(others), imitated, spent, concentration=where)
 
 
 def _effects(

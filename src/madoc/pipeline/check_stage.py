@@ -9,7 +9,6 @@ from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb, logs, observed_task
 from madoc.data.findings import Finding
 from madoc.diagnosis import Diagnosis, check
-from madoc.diagnosis.channels import signal_names
 from madoc.errors import MadocError
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.forecast import Forecast, forecast
@@ -91,7 +90,7 @@ def selftest_of(order: SelftestOrder, *, quiet: bool = False, permission: Permis
         prepared.dataset,
         prepared.simulator,
         noise=sensor_noise(prepared.bench),
-        signals=signal_names(prepared.simulator.task),
+        signals=prepared.simulator.task.signal_names,
         keys=[jax.random.fold_in(key, index) for index in range(order.truths)],
         budget=prepared.budget,
         quiet=quiet,

@@ -173,6 +173,11 @@ class Task:
         return copy.copy(self.model)
 
     @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Names of an observation's values."""
+        return self.signals or tuple(f"observation[{index}]" for index in range(self.observation_size))
+
+    @property
     def for_policies(self) -> "Task":
         """The task that policies learn and are evaluated in, with the same parameters."""
         return self if self.episodes is None else replace(self.episodes, parameters=self.parameters, ranges=self.ranges)

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.data import stride
-from madoc.diagnosis.channels import signal_names
 from madoc.identification.replay import Readings
 from madoc.identification.states import logged_states, states_of
 from madoc.identification.windows import evenly
@@ -56,7 +55,7 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     measured = np.concatenate([np.asarray(logged.observation)[first][:, None], following], axis=1)
     named = held.run_names or tuple(f"run {1 + index}" for index in range(len(held.episode_starts)))
     arrays = {
-        "signals": np.array(signal_names(simulator.task)),
+        "signals": np.array(simulator.task.signal_names),
         "scale": bench.change,
         "time": control_step * np.arange(steps + 1),
         "names": np.array([named[episode] for episode in held.episode_of(first)]),

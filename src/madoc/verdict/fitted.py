@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from madoc.calibration.holdout import AgainstChance, Fitted
 from madoc.data import stride
-from madoc.diagnosis.channels import signal_names
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.losses import curvature_share, loss_slope, scale_of
 from madoc.identification.noise import residual_noise
@@ -53,7 +52,7 @@ def fitted(
             best,
             groups=independent_groups(replays.episodes, replays.rows, replays.readings.steps),
             horizons=replays.ahead,
-            signals=signal_names(bench.simulator.task)[: len(noise)],
+            signals=bench.simulator.task.signal_names[: len(noise)],
             failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
             stride=stride(bench.problem.dataset),
         ),

@@ -134,8 +134,8 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
     return Verdict(
         "MODEL_MISMATCH",
         "residuals have longer tails than noise has: the model does not explain some stretches of the log, and "
-        "intervals do not count that; look there for a force that acts at times only, at contacts or in fast motion, "
-        f"for wrong or missing readings and for values that differ between runs{about_timestep(holdout)}",
+        f"intervals do not count that{_where(holdout)}; look for a force that acts at times only, at contacts or in "
+        f"fast motion, for wrong or missing readings and for values that differ between runs{about_timestep(holdout)}",
     )
 
 
@@ -174,7 +174,7 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
     return (
         f"the model cannot explain the data: {after} even the parameters nearby that fit the hold-out best err by "
         f"{left.mean:.2g} of what a signal changes in {in_rows(errors.stride)}, {much}; that is no chance, as "
-        f"{' and '.join(reasons)} ({change_of(errors)})"
+        f"{' and '.join(reasons)} ({change_of(errors)}){_where(holdout)}"
     )
 
 
@@ -186,8 +186,21 @@ def _adding_up(holdout: Predicted) -> str:
     return (
         f"the model cannot explain the data: after {in_rows(holdout.errors.nearby_best[-1].steps)} the best parameters "
         f"nearby leave at least {factor:.2g} times the error in {signal} that sensor noise and random forces make "
-        f"({change_of(holdout.errors)})"
+        f"({change_of(holdout.errors)}){_where(holdout)}"
     )
+
+
+def _where(holdout: HoldOut) -> str:
+    """A clause on the place in the log that was calibrated to where most of what the model leaves is, or none."""
+    found = holdout.concentration
+    if found is None:
+        return ""
+    places = [f"in {found.signal}"] if found.signal else []
+    if found.share:
+        time = "" if found.seconds is None else f" from {found.seconds[0]:.3g} to {found.seconds[1]:.3g} s"
+        run = f" of {found.run}" if found.run and time else found.run
+        places.append(f"in the rows{time}{run}" if time else f"in {run}")
+    return f"; most of what it leaves in the log that was calibrated to is {' and '.join(places)}"
 
 
 def _separable(before: Area, after: Area, at_end: list[str]) -> str:

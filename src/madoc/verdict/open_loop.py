@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from madoc import simulation
 from madoc.calibration.holdout import OpenLoop
 from madoc.data import stride
-from madoc.diagnosis.channels import signal_names
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, rows_that_fit, windows_at
@@ -84,7 +83,7 @@ def _over(
     before, _, after = of_windows.mean(1)
     draws = resampled(of_windows.T, groups)
     low, high = interval_of(draws[:, 2] / np.maximum(draws[:, 0], np.finfo(float).tiny))
-    named = [dict(zip(signal_names(bench.simulator.task), row, strict=False)) for row in of_signals.tolist()]
+    named = [dict(zip(bench.simulator.task.signal_names, row, strict=False)) for row in of_signals.tolist()]
     return OpenLoop(
         seconds=steps * bench.simulator.control_step,
         whole=whole,

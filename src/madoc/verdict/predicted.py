@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 
 from madoc.calibration.holdout import Predicted, PredictionErrors
 from madoc.data import stride
-from madoc.diagnosis.channels import signal_names
 from madoc.identification import noise as sensors
 from madoc.identification.gauss_newton import descend
 from madoc.identification.states import logged_states
@@ -55,7 +54,7 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         explained=max(single.explained, at_end),
         autocorrelation=single.autocorrelation,
         persistence=lasting,
-        beside_random=dict(zip(signal_names(bench.simulator.task), beside.tolist(), strict=True)),
+        beside_random=dict(zip(bench.simulator.task.signal_names, beside.tolist(), strict=True)),
         area_at_mid_range=area_at_mid_range,
         area_at_estimate=area_at_estimate,
     )
@@ -105,7 +104,7 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
     single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
     groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
-    signals = signal_names(bench.simulator.task)
+    signals = bench.simulator.task.signal_names
     errors = prediction_errors(
         sizes,
         replays.magnitudes(noisy)[:, 0],

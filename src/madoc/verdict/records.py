@@ -1,6 +1,7 @@
 """The fields of a record that all measures have: what the model lacks, what contradicts the spec, what is open."""
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -8,15 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc import simulation
-from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
+from madoc.calibration.holdout import AgainstChance, Judged, JudgedByErrors, RicherModel
 from madoc.data import stride
 from madoc.data.findings import Finding
-from madoc.diagnosis.channels import signal_names
 from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.identification.candidate_terms import DELAY, INTEGRATION
 from madoc.identification.coarseness import FINER, coarseness
 from madoc.identification.excitation import expected_half_widths
-from madoc.identification.fitted_windows import STRIDES, WINDOWS
+from madoc.identification.fitted_windows import SHORTER, STRIDES, WINDOWS
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
 from madoc.identification.term_tests import FEWEST, MissingTerm
 from madoc.identification.windows import horizons
@@ -25,7 +25,7 @@ from madoc.verdict.adequacy import NUMERICAL, actions_in_time, felt, in_full, is
 from madoc.verdict.bench import Bench
 from madoc.verdict.remedies import is_of_spec
 from madoc.verdict.richer import richer_model
-from madoc.verdict.statistics import NEGLIGIBLE
+from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
 
 _MOST_TERMS = 5
 """Number of missing terms that a report keeps, the most significant ones; besides them the integration step's and all
@@ -46,14 +46,14 @@ Measure = TypeVar("Measure", bound=Judged)
 
 
 def _doubts(
-    bench: Bench, point: Float[np.ndarray, " d"], half_widths: Float[np.ndarray, " d"]
+    bench: Bench, point: Float[np.ndarray, " d"], half_widths: Float[np.ndarray, " d"], shorter: int = 1
 ) -> tuple[Suspicions, bool]:
     """What the log says against the model, and whether that was tested with a finer integration step.
 
     Where the error of the integration step explains much, it hides other terms or looks like them. These are then
     tested with steps of a quarter of the length, unless their error explains much there too. A log that tells neither
     states nor what is needed to fit them cannot be tested, nor can one without pairs of consecutive observations. Under
-    a limit of time windows are as many as that allows.
+    a limit of time windows are as many as that allows. With `shorter` they are so many times as short and as many.
     """
     problem, task = bench.problem, bench.problem.simulator.task
     ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
@@ -62,11 +62,12 @@ def _doubts(
         return Suspicions(tested=False), False
     given, most = (problem.dataset, bench.states), _windows_in_time(bench)
     enough = most is None or most >= 2 * (FEWEST + len(point))
-    if not bench.begins("tests of what the model lacks", 0.0 if enough else np.inf):
+    part = "tests of what the model lacks" if shorter == 1 else "the same tests on shorter windows"
+    if not bench.begins(part, 0.0 if enough else np.inf):
         return Suspicions(tested=False), False
-    if most is not None and most < WINDOWS:
+    if shorter == 1 and most is not None and most < WINDOWS:
         bench.left_out.append("tests on as many windows as usual")
-    doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most)
+    doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most, shorter=shorter)
     doubts = replace(doubts, alternatives=in_full(doubts.alternatives, doubts.terms))
     step = felt(doubts.terms)
     if step is None or task.source is None:
@@ -74,7 +75,7 @@ def _doubts(
     if not bench.begins("the same tests with a finer timestep", FINER * doubts.control_steps / bench.rate):
         return doubts, False
     finer = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
-    fine = suspicions(*given, finer, point, half_widths, bench.change, of_other_model=True, most=most)
+    fine = suspicions(*given, finer, point, half_widths, bench.change, of_other_model=True, most=most, shorter=shorter)
     spent = doubts.control_steps + FINER * fine.control_steps
     left = felt(fine.terms)
     if not fine.tested or (left is not None and left.explained >= NUMERICAL):
@@ -127,7 +128,7 @@ def judged(
         coarse, of_steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
     ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
     shares = _shares(space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own, doubts)
-    signals = signal_names(bench.simulator.task)[: len(noise)]
+    signals = bench.simulator.task.signal_names[: len(noise)]
     found = record(
         split=bench.split,
         rows=len(bench.held_out),
@@ -137,11 +138,7 @@ def judged(
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
         control_steps=control_steps + of_widths + of_columns + of_steps + doubts.control_steps,
-        missing_terms=tuple(
-            term
-            for place, term in enumerate(doubts.terms)
-            if place < _MOST_TERMS or term.cause == INTEGRATION or is_certain(term)
-        ),
+        missing_terms=_worth_keeping(doubts.terms),
         alternatives=doubts.alternatives,
         imitated=doubts.imitated,
         tested=doubts.tested and EXCHANGED not in bench.left_out,
@@ -149,12 +146,40 @@ def judged(
         finer=finer,
         at_end=space.at_end(point),
         base_from_contacts=bool(bench.states.placed.any()),
+        concentration=doubts.concentration,
     )
+    shorter = SHORTER if _far_beyond_noise(found) and missing_term(found) is None else 1
+    if shorter > 1:
+        doubts, finer = _doubts(bench, point, own, shorter)
+        found = _told_apart(found, doubts, finer=finer)
     late = next((each for each in contradicting if each.late), None)
     term = missing_term(found) if late is None else _delay(doubts, late)
-    richer, of_richer = _richer(bench, point, own, term, doubts, finer=finer)
+    richer, of_richer = _richer(bench, point, own, term, doubts, finer=finer, shorter=shorter)
     told = tuple(_contradiction(each, richer) for each in contradicting)
     return replace(found, richer=richer, contradictions=told, control_steps=found.control_steps + of_richer)
+
+
+def _worth_keeping(terms: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:
+    """The most significant terms, those that are certain, and the error of the integration step."""
+    kept = (place < _MOST_TERMS or term.cause == INTEGRATION or is_certain(term) for place, term in enumerate(terms))
+    return tuple(itertools.compress(terms, kept))
+
+
+def _far_beyond_noise(found: Judged) -> bool:
+    """Whether even the parameters nearby that fit the hold-out best leave errors that noise does not explain."""
+    return isinstance(found, JudgedByErrors) and bool(beyond_noise(found.errors.nearby_best, found.errors.noise))
+
+
+def _told_apart(found: Measure, doubts: Suspicions, *, finer: bool) -> Measure:
+    """The record with the terms that tests on shorter windows find, beside the error of the integration step before.
+
+    That error is what tells whether anything is lacking at all, which windows of the usual length say.
+    """
+    step = [term for term in found.missing_terms if term.cause == INTEGRATION]
+    others = [term for term in _worth_keeping(doubts.terms) if term.cause != INTEGRATION]
+    terms = tuple(sorted((*step, *others), key=lambda term: -abs(term.t)))
+    spent = found.control_steps + doubts.control_steps
+    return replace(found, missing_terms=terms if doubts.tested else found.missing_terms, control_steps=spent)
 
 
 def _delay(doubts: Suspicions, late: Finding) -> MissingTerm | None:
@@ -177,6 +202,7 @@ def _richer(
     doubts: Suspicions,
     *,
     finer: bool,
+    shorter: int,
 ) -> tuple[RicherModel | None, int]:
     """The model with a term, if a parameter of a spec adds it and there is time; also the control steps simulated."""
     if term is None or not is_of_spec(term) or not doubts.tested:
@@ -185,7 +211,7 @@ def _richer(
     if not bench.begins(f"the model with {term.parameter}", BEFORE_OTHERS * seconds):
         return None, 0
     given = bench.problem.dataset, bench.states, bench.simulator, point, half_widths, bench.change, term
-    return richer_model(*given, finer=finer, most=_windows_in_time(bench))
+    return richer_model(*given, finer=finer, most=_windows_in_time(bench), shorter=shorter)
 
 
 def _contradiction(finding: Finding, richer: RicherModel | None) -> str:

@@ -34,6 +34,7 @@ def richer_model(
     *,
     finer: bool,
     most: int | None,
+    shorter: int,
 ) -> tuple[RicherModel | None, int]:
     """The model with the parameter of a term, or None if it cannot be tested; also the control steps simulated.
 
@@ -47,6 +48,7 @@ def richer_model(
         term: The term, which a parameter of a spec adds.
         finer: Whether to integrate in steps of a quarter of the length, as the tests that found the term did.
         most: Largest number of windows; None for the usual one.
+        shorter: How many times as short and as many they are, as in the tests that found the term.
     """
     added, task = line_of(term), simulator.task
     space = ParameterSpace((*simulator.parameters.parameters, added))
@@ -58,7 +60,7 @@ def richer_model(
     widths = np.append(half_widths, 4.0 * term.standard_error / (added.high - added.low))
     logged = logged if wide.task.pending == simulator.task.pending else states_of(dataset, wide)
     at = np.clip(start, -1.0, 1.0)
-    found = suspicions(dataset, logged, wide, at, widths, scale, of_other_model=True, most=most)
+    found = suspicions(dataset, logged, wide, at, widths, scale, of_other_model=True, most=most, shorter=shorter)
     left = [each for each in found.terms if each.cause != INTEGRATION and abs(each.t) >= LIKELY_FORCE]
     steps = found.control_steps * (FINER if finer else 1)
     return RicherModel(term.parameter, tuple(map(named, left))) if found.tested else None, steps

@@ -1,0 +1,90 @@
+"""Where in a log, and in which of its signals, most of what the model leaves unexplained is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from madoc.data.dataset import Dataset
+from madoc.identification.fitted_windows import Fit, LoggedWindows
+
+MOST = 0.5
+"""Share in (0, 1) of the squared residuals that a place must hold to be told."""
+SHORT = 0.1
+"""Largest share in (0, 1) of the windows that a stretch may have to be told; a run may have `MOST` of `MOST`."""
+
+
+@dataclass(frozen=True)
+class Concentration:
+    """A stretch of a run, or a whole run, and a signal that hold more than half of the squared residuals.
+
+    Attributes:
+        share: Share in [0, 1] of the squared residuals that the stretch holds; 0 where no place stands out.
+        run: The run that it is in; empty where runs have no name and there is one.
+        seconds: Where it begins and ends, in s from the begin of the run; None for the whole run.
+        signal: The signal, of three or more; empty where none has so much.
+    """
+
+    share: float
+    run: str
+    seconds: tuple[float, float] | None
+    signal: str
+
+
+def concentration(
+    dataset: Dataset, windows: LoggedWindows, fit: Fit, *, signals: Sequence[str], control_step: float
+) -> Concentration | None:
+    """Where most of what neither parameters nor initial states explain of the residuals is; None if it is all over.
+
+    Args:
+        dataset: The log.
+        windows: Its windows, in the order of its rows, of residuals in typical changes of a stride.
+        fit: What they were fitted by.
+        signals: Names of an observation's values, those that were measured first.
+        control_step: Time between two rows in s.
+    """
+    whole, shape = fit.slopes.whole, windows.readings.observed.shape[1:]
+    residuals = fit.slopes.residuals[whole][..., None]
+    explicable = fit.explicable[whole]
+    left = (residuals - explicable @ (np.swapaxes(explicable, 1, 2) @ residuals))[..., 0]
+    square = left.reshape(len(left), *shape) ** 2
+    total = float(square.sum())
+    if not total > 0.0:
+        return None
+    by_signal, by_window = square.sum((0, 1)) / total, square.sum((1, 2)) / total
+    leading = int(np.argmax(by_signal))
+    signal = signals[leading] if len(by_signal) > 2 and by_signal[leading] > MOST else ""
+    rows, runs = windows.rows[whole], windows.runs[whole]
+    first, last = _shortest(by_window, runs)
+    run = int(runs[first])
+    in_run, name = float(by_window[runs == run].sum()), _name(dataset, run)
+    pieces = (dataset.run_names or ()).count(name)  # times in a piece of a run are not those of the run
+    if last - first <= SHORT * len(by_window) and pieces <= 1:
+        begin = dataset.episode_starts[run]
+        ends = rows[first] - begin, rows[last - 1] + windows.readings.steps - begin
+        seconds = float(control_step * ends[0]), float(control_step * ends[1])
+        return Concentration(float(by_window[first:last].sum()), name, seconds, signal)
+    if in_run > MOST and (runs == run).mean() <= MOST * MOST:
+        return Concentration(in_run, name, None, signal)
+    return Concentration(0.0, "", None, signal) if signal else None
+
+
+def _shortest(share: Float[np.ndarray, " windows"], runs: Int[np.ndarray, " windows"]) -> tuple[int, int]:
+    """First and last (exclusive) of the fewest successive windows of one run that hold `MOST`; else of the best run."""
+    best, size = (0, len(share)), len(share) + 1
+    for run in np.unique(runs).tolist():
+        own = np.flatnonzero(runs == run)
+        sums = np.concatenate([[0.0], np.cumsum(share[own])])
+        ends = np.searchsorted(sums, sums[:-1] + MOST)
+        for begin, end in enumerate(ends.tolist()):
+            if end <= len(own) and end - begin < size:
+                best, size = (int(own[begin]), int(own[end - 1]) + 1), end - begin
+    return best
+
+
+def _name(dataset: Dataset, run: int) -> str:
+    """The name of a run where logs have one; else its place among several, and nothing for the only one."""
+    if dataset.run_names:
+        return dataset.run_names[run]
+    return f"run {1 + run}" if len(dataset.episode_starts) > 1 else ""
