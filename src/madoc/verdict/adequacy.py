@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from madoc.calibration.holdout import HoldOut, Judged
+from madoc.calibration.holdout import HoldOut, Judged, JudgedByErrors
 from madoc.calibration.result import CalibrationResult
 from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, UNLISTED, is_late
 from madoc.identification.coarseness import COARSE
@@ -15,6 +15,7 @@ from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
 from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import SUSPICIOUS, Alternative, MissingTerm
+from madoc.verdict.statistics import beyond_noise
 
 CERTAIN = 5.0
 """|t| from which a term is missing; by chance one in two million is larger where residuals are normal."""
@@ -44,6 +45,8 @@ NEARLY = 0.8
 """Share explained by a term over that of the one named; terms above it are as likely."""
 HALF = 0.5
 """Share explained by a listed term over that of forces that are not listed, from which these are not named."""
+WORTH_NAMING = 0.02
+"""Share in [0, 1] of the squared residuals far beyond noise that a term must explain to be named as what makes them."""
 SURER = 1.314
 """Half of a 99 % interval over half of a 95 % interval: an alternative is covered unless one in a hundred is worse."""
 NAMED = 3
@@ -61,6 +64,23 @@ def missing_term(holdout: Judged) -> MissingTerm | None:
     certain = [term for term in holdout.missing_terms if is_certain(term)]
     moving = [term for term in certain if max(map(abs, term.shifts.values())) >= MOVES]
     return likeliest(moving or certain)
+
+
+def main_term(holdout: Judged) -> MissingTerm | None:
+    """The likeliest term that the model certainly lacks, unless it explains next to nothing of errors far beyond noise.
+
+    What makes those is something else, and may pass for a small term.
+    """
+    term = missing_term(holdout)
+    small = term is not None and term.explained < WORTH_NAMING and far_beyond_noise(holdout)
+    return None if small else term
+
+
+def far_beyond_noise(holdout: Judged) -> bool:
+    """Whether even the parameters nearby that fit the hold-out best leave errors that noise does not explain."""
+    if not isinstance(holdout, JudgedByErrors):
+        return False
+    return bool(beyond_noise(holdout.errors.nearby_best, holdout.errors.noise))
 
 
 def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:

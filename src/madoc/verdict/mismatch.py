@@ -6,7 +6,7 @@ from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, ToldApar
 from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
 from madoc.identification.term_tests import MissingTerm, named
-from madoc.verdict.adequacy import about_timestep, as_likely, missing_term, numerical
+from madoc.verdict.adequacy import about_timestep, as_likely, main_term, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
@@ -32,13 +32,13 @@ def lacking(holdout: HoldOut, *, settled: bool, long_tails: bool) -> Verdict | N
     An end of a range at which a search stands that has not settled says nothing. `long_tails` tells that residuals
     have longer tails than noise has.
     """
-    found = _missing(holdout) or _mismatch(holdout) or (_outside(holdout) if settled else None)
+    found = _missing(holdout, main_term(holdout)) or _mismatch(holdout) or _missing(holdout, missing_term(holdout))
+    found = found or (_outside(holdout) if settled else None)
     return found or (_unlike_noise(holdout) if long_tails else None)
 
 
-def _missing(holdout: HoldOut) -> Verdict | None:
+def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
     """A term that the model lacks and that moves the estimate, with the line that adds it to the spec."""
-    term = missing_term(holdout)
     if term is None:
         return None
     value = value_of(term)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc import simulation
-from madoc.calibration.holdout import AgainstChance, Judged, JudgedByErrors, RicherModel
+from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
 from madoc.data import stride
 from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
@@ -21,11 +21,20 @@ from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspic
 from madoc.identification.term_tests import FEWEST, MissingTerm
 from madoc.identification.windows import horizons
 from madoc.parameters import ParameterSpace
-from madoc.verdict.adequacy import NUMERICAL, actions_in_time, felt, in_full, is_certain, missing_term, widening
+from madoc.verdict.adequacy import (
+    NUMERICAL,
+    actions_in_time,
+    far_beyond_noise,
+    felt,
+    in_full,
+    is_certain,
+    main_term,
+    widening,
+)
 from madoc.verdict.bench import Bench
 from madoc.verdict.remedies import is_of_spec
 from madoc.verdict.richer import richer_model
-from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
+from madoc.verdict.statistics import NEGLIGIBLE
 
 _MOST_TERMS = 5
 """Number of missing terms that a report keeps, the most significant ones; besides them the integration step's and all
@@ -148,12 +157,12 @@ def judged(
         base_from_contacts=bool(bench.states.placed.any()),
         concentration=doubts.concentration,
     )
-    shorter = SHORTER if _far_beyond_noise(found) and missing_term(found) is None else 1
+    shorter = SHORTER if far_beyond_noise(found) and main_term(found) is None else 1
     if shorter > 1:
         doubts, finer = _doubts(bench, point, own, shorter)
         found = _told_apart(found, doubts, finer=finer)
     late = next((each for each in contradicting if each.late), None)
-    term = missing_term(found) if late is None else _delay(doubts, late)
+    term = main_term(found) if late is None else _delay(doubts, late)
     richer, of_richer = _richer(bench, point, own, term, doubts, finer=finer, shorter=shorter)
     told = tuple(_contradiction(each, richer) for each in contradicting)
     return replace(found, richer=richer, contradictions=told, control_steps=found.control_steps + of_richer)
@@ -163,11 +172,6 @@ def _worth_keeping(terms: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:
     """The most significant terms, those that are certain, and the error of the integration step."""
     kept = (place < _MOST_TERMS or term.cause == INTEGRATION or is_certain(term) for place, term in enumerate(terms))
     return tuple(itertools.compress(terms, kept))
-
-
-def _far_beyond_noise(found: Judged) -> bool:
-    """Whether even the parameters nearby that fit the hold-out best leave errors that noise does not explain."""
-    return isinstance(found, JudgedByErrors) and bool(beyond_noise(found.errors.nearby_best, found.errors.noise))
 
 
 def _told_apart(found: Measure, doubts: Suspicions, *, finer: bool) -> Measure:
