@@ -14,8 +14,8 @@ from madoc.simulation.attitudes import rotated
 from madoc.simulation.base import Simulator
 from madoc.simulation.write import free_joints
 
-BENT_ALL = "drives whose forces are not in proportion to their commands"
-CUBIC_ALL = "drives whose forces bend with the cube of their commands"
+BENT_ALL = "drives that give less, at larger commands, than in proportion to them"
+CUBIC_ALL = "drives that give less at their largest commands, as when they saturate"
 DEAD_ALL = "drives that all give less at small commands, as with a dead zone"
 WEAKENING_ALL = "drives that all weaken with the speed at which they push"
 NEAR_GROUND = "drives that give more near the ground"

@@ -22,7 +22,7 @@ class Concentration:
     Attributes:
         share: Share in [0, 1] of the squared residuals that the stretch holds; 0 where no place stands out.
         run: The run that it is in; empty where runs have no name and there is one.
-        seconds: Where it begins and ends, in s from the begin of the run; None for the whole run.
+        seconds: Where it begins and ends, in s from the start of the run; None for the whole run.
         signal: The signal, of three or more; empty where none has so much.
     """
 

@@ -2,7 +2,7 @@
 
 Each is a function of the joint's position, its speed and what its drive exerts, or of another joint's motion. To first
 order the motion under a small force is that under its values along the motion without it. During a control step a force
-has its value at the begin of that.
+has its value at the start of that.
 """
 
 from collections.abc import Sequence

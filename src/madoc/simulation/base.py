@@ -50,7 +50,7 @@ class System(Protocol):
     def actuator_forces(
         self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
     ) -> Float[np.ndarray, "systems rows actuator dof"]:
-        """What each actuator exerts on every degree of freedom at the begin of a step, in N or N·m.
+        """What each actuator exerts on every degree of freedom at the start of a step, in N or N·m.
 
         Late actions count as late.
         """

@@ -12,7 +12,7 @@ def drive_forces(
     state: Float[np.ndarray, "rows state"],
     control: Float[np.ndarray, "rows actuator"],
 ) -> Float[np.ndarray, "rows actuator dof"]:
-    """Generalised forces of each actuator at the begin of a step, in N or N·m, whatever it acts on.
+    """Generalised forces of each actuator at the start of a step, in N or N·m, whatever it acts on.
 
     Each row has a model, all of one structure; states are (qpos, qvel, ...). Controls and forces are cut off where the
     model does so; at a joint whose actuators together are cut off, all are in proportion.

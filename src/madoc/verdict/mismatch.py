@@ -45,10 +45,10 @@ def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
     if term.cause in DRIFTS:
         within = term.cause == WITHIN_RUNS
         change = value_of(replace(term, value=2.0 * term.value, standard_error=2.0 * term.standard_error))
-        where = f"by {change} from the begin of a run to its end" if within else f"by {value} between its parts"
+        where = f"by {change} from the start of a run to its end" if within else f"by {value} between parts of the log"
         return Verdict(
             "MODEL_MISMATCH",
-            f"{term.parameter} drifts: it changes {'within each run' if within else 'over the log'} {where} "
+            f"{term.parameter} drifts: it changes {'within each run ' if within else ''}{where} "
             f"(t = {abs(term.t):.0f}), which is {(1 + within) * abs(term.shifts[term.parameter]):.2g} half-widths of "
             f"its interval; {WARM_UP if within else 'calibrate to each run by itself'}{about_timestep(holdout)}",
             (term.parameter,),

@@ -24,7 +24,7 @@ REMEDIES = {
     **dict.fromkeys(TILTS, "level it, or tilt the gravity of the model (its option gravity) as the base is"),
 }
 """What to do about terms that no further parameter of a spec adds."""
-WARM_UP = "let the machine warm up before it is logged, or leave the begin of each run out"
+WARM_UP = "let the machine warm up before it is logged, or leave out the start of each run"
 """The same for a parameter that changes within each run."""
 CHANGE_MACHINE = (
     "no parameter of a spec adds it: find out whether the machine has it, and calibrate to motions in which it is small"
