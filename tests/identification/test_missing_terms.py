@@ -11,7 +11,16 @@ from madoc.data import Disturbance, disturb, logs, typical_change
 from madoc.identification import missing_terms as terms
 from madoc.identification.candidate_effects import _cut_off
 from madoc.identification.candidate_terms import EARLY, LATE_DRIVE, LATE_SENSOR, Candidate, is_late
-from madoc.identification.drifts import DRIFT, WITHIN_RUNS, _between_runs, _drifts, _of_fitted_runs, _Part
+from madoc.identification.drifts import (
+    DRIFT,
+    ONE_RUN,
+    WITHIN_RUNS,
+    _between_runs,
+    _drifts,
+    _in_one_run,
+    _of_fitted_runs,
+    _Part,
+)
 from madoc.identification.joint_forces import LOADED
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
@@ -163,6 +172,21 @@ def test_a_parameter_that_changes_within_each_run_is_told():
         assert all(abs(term.t) < 3.0 for term in _drifts(tests) if term.cause == DRIFT)
     assert within.value == pytest.approx(0.3, rel=0.2)
     assert within.shifts["gravity"] == pytest.approx(within.value / 0.01)
+
+
+def test_a_run_that_has_another_value_than_all_others_is_named():
+    """As where a tool was left on; the value is by how much it differs from the others."""
+    random, names = np.random.default_rng(0), [f"{run}.csv" for run in range(6)]
+    runs, slope = np.repeat(np.arange(6), 20), random.standard_normal((120, 6))
+    space = ParameterSpace((Parameter("gravity", "", -11, -9),))
+    for apart in (0.0, 0.6):
+        residuals = -slope * apart * (runs == 4)[:, None] + 0.5 * random.standard_normal((120, 6))
+        products = Products.of(residuals, slope[..., None], np.zeros((120, 6, 0)))
+        (term,) = _in_one_run(TermTests(products, (), space, np.array([0.01]), runs), names)
+        assert (abs(term.t) > 4.0) == (apart > 0.0)
+    assert (term.cause, term.parameter) == (f"{ONE_RUN} (4.csv)", "gravity")
+    assert term.value == pytest.approx(0.6, rel=0.2)
+    assert not list(_in_one_run(TermTests(products, (), space, np.array([0.01]), runs % 2), names))
 
 
 def test_runs_that_repeat_one_motion_agree_and_are_no_sign_of_a_change():

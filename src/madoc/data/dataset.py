@@ -53,6 +53,11 @@ class Dataset:
         """The index of the episode that each of the given rows belongs to."""
         return np.searchsorted(self.episode_starts, rows, side="right") - 1
 
+    @property
+    def names_of_runs(self) -> tuple[str, ...]:
+        """The run that each episode is from, by its place where it has no name."""
+        return self.run_names or tuple(f"run {1 + episode}" for episode in range(len(self.episode_starts)))
+
     @cached_property
     def time_scale(self) -> int:
         """The time in rows in which the robot goes from one pose to another, at least 1; see `data.timescale`."""

@@ -21,7 +21,7 @@ class Concentration:
 
     Attributes:
         share: Share in [0, 1] of the squared residuals that the stretch holds; 0 where no place stands out.
-        run: The run that it is in; empty where runs have no name and there is one.
+        run: The run that it is in.
         seconds: Where it begins and ends, in s from the start of the run; None for the whole run.
         signal: The signal, of three or more; empty where none has so much.
     """
@@ -58,7 +58,7 @@ def concentration(
     rows, runs = windows.rows[whole], windows.runs[whole]
     first, last = _shortest(by_window, runs)
     run = int(runs[first])
-    in_run, name = float(by_window[runs == run].sum()), _name(dataset, run)
+    in_run, name = float(by_window[runs == run].sum()), dataset.names_of_runs[run]
     pieces = (dataset.run_names or ()).count(name)  # times in a piece of a run are not those of the run
     if last - first <= SHORT * len(by_window) and pieces <= 1:
         begin = dataset.episode_starts[run]
@@ -81,10 +81,3 @@ def _shortest(share: Float[np.ndarray, " windows"], runs: Int[np.ndarray, " wind
             if end <= len(own) and end - begin < size:
                 best, size = (int(own[begin]), int(own[end - 1]) + 1), end - begin
     return best
-
-
-def _name(dataset: Dataset, run: int) -> str:
-    """The name of a run where logs have one; else its place among several, and nothing for the only one."""
-    if dataset.run_names:
-        return dataset.run_names[run]
-    return f"run {1 + run}" if len(dataset.episode_starts) > 1 else ""

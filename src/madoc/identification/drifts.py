@@ -1,8 +1,8 @@
 """Whether parameters change over the log: by score tests, between runs, and from its first third to its last."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,7 +12,7 @@ from madoc.identification.fitted_windows import Fit, fit_windows, products_of
 from madoc.identification.information import NORMAL_95
 from madoc.identification.random_effects import common
 from madoc.identification.replay import Readings
-from madoc.identification.score_tests import deviate, parameter_shift, score, variances_by_group
+from madoc.identification.score_tests import deviate, parameter_shift, score, shared_deviate, variances_by_group
 from madoc.identification.term_tests import (
     DISAGREEING,
     FEWEST,
@@ -26,8 +26,10 @@ from madoc.simulation.base import Simulator
 
 DRIFT = "a value that changes over the log"
 WITHIN_RUNS = "a value that changes within each run"
-DRIFTS = (DRIFT, WITHIN_RUNS)
-"""Causes of a missing term that is a parameter itself, as it changes."""
+ONE_RUN = "another value in one run"
+"""What it stands for; the name of the run follows in brackets."""
+MOST_RUNS = 20
+"""Largest number of runs of which each is compared with all others; of more, they are compared all together alone."""
 FEWEST_OF_A_RUN = 3
 """Fewest windows of a run beyond the number of parameters, of which its values are estimated: their errors count only
 together with those of other runs."""
@@ -42,10 +44,11 @@ def drifts_of(
     runs: Int[np.ndarray, " windows"],
     fit: Fit,
     point: Float[np.ndarray, " d"],
+    names: Sequence[str],
 ) -> tuple[list[MissingTerm], list[Alternative], int]:
     """The most significant change of each parameter, and estimates of parts of the log that disagree.
 
-    A parameter may change over the log, within each run, as where a drive warms up, or from run to run.
+    A parameter may change over the log, within each run, as where a drive warms up, from run to run, or in one alone.
 
     Thirds of the log, and single runs, are fitted by themselves only where a test says that a parameter changes: score
     tests underestimate a change that leaves residuals far from noise, which count little.
@@ -57,6 +60,7 @@ def drifts_of(
         runs: The episode that each of them is from.
         fit: What they were fitted by.
         point: The estimate in [-1, 1], from which shifts count.
+        names: Names of the episodes.
 
     Returns:
         The changes, the other estimates, and the control steps that were simulated.
@@ -78,7 +82,36 @@ def drifts_of(
         fitted, of_runs = _fitted_parts(simulator, readings, fit, single, fewest=FEWEST_OF_A_RUN)
         others += _of_fitted_runs(tests, fitted, differing, point)
         spent += of_runs
-    return list(_most_certain([*drifts, *between])), others, spent
+    return list(_most_certain([*drifts, *between, *_in_one_run(tests, names)])), others, spent
+
+
+def is_change(cause: str) -> bool:
+    """Whether the cause of a missing term is that a parameter changes over the log, within runs or in one of them."""
+    return cause in (DRIFT, WITHIN_RUNS) or cause.startswith(ONE_RUN)
+
+
+def _in_one_run(tests: TermTests, names: Sequence[str]) -> Iterator[MissingTerm]:
+    """By how much each parameter is another one in one run than in all others, in the run where that is clearest."""
+    named = np.array(names)[tests.runs]
+    present = np.unique(named).tolist()
+    if not FEWEST_RUNS <= len(present) <= MOST_RUNS:
+        return
+    for index, row in enumerate(tests.space.parameters):
+        found = {run: score(tests.products, 1 + index, shape=_less_mean(named == run)) for run in present}
+        scores = {run: each for run, each in found.items() if each is not None}
+        if not scores:
+            continue
+        clearest = max(scores, key=lambda run: abs(scores[run].t))
+        own = scores[clearest]
+        candidate = Candidate(f"{ONE_RUN} ({clearest})", row.name, row.unit, 0.0, (row.high - row.low) / 2, -np.inf)
+        term = term_of(candidate, own, {row.name: own.change / float(tests.half_widths[index])})
+        t = shared_deviate(abs(own.t), len(present))
+        yield replace(term, t=float(np.copysign(t, own.change)))
+
+
+def _less_mean(chosen: Bool[np.ndarray, " windows"]) -> Float[np.ndarray, " windows"]:
+    """1 in the chosen windows and 0 in the others, less the mean."""
+    return chosen - float(np.mean(chosen))
 
 
 def _drifts(tests: TermTests) -> Iterator[MissingTerm]:

@@ -125,7 +125,7 @@ def suspicions(
     if products is None or len(products) < FEWEST + len(led):
         return Suspicions(control_steps=spent, tested=negligible(both))
     tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
-    drifts, others, of_parts = drifts_of(tests, simulator, readings, runs, fit, point)
+    drifts, others, of_parts = drifts_of(tests, simulator, readings, runs, fit, point, dataset.names_of_runs)
     terms = [*_terms(tests), *_below_minimum(tests, led), *drifts]
     unlisted, covering = unlisted_forces(tests, families(simulator, responses), readings, fit, by_terms, responses)
     terms, others = [*terms, *unlisted], [*others, *covering]

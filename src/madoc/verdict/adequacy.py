@@ -11,7 +11,7 @@ from madoc.calibration.result import CalibrationResult
 from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, UNLISTED, is_late
 from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
-from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
+from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import SUSPICIOUS, Alternative, MissingTerm
@@ -105,7 +105,8 @@ def _unlisted(term: MissingTerm) -> bool:
 
 
 def _unusual(term: MissingTerm) -> bool:
-    return term.cause in (EARLY, WITHIN_RUNS, *TILTS) or is_joint_force(term.cause) or is_late(term.cause)
+    changes = term.cause == WITHIN_RUNS or term.cause.startswith(ONE_RUN)
+    return changes or term.cause in (EARLY, *TILTS) or is_joint_force(term.cause) or is_late(term.cause)
 
 
 def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
@@ -115,7 +116,7 @@ def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
         for term in holdout.missing_terms
         if (term.cause, term.parameter) != (named.cause, named.parameter)
         and is_certain(term)
-        and term.cause not in DRIFTS
+        and not is_change(term.cause)
         and term.explained >= NEARLY * named.explained
         and (_unlisted(named) or not _unlisted(term))
     ]
@@ -147,7 +148,7 @@ def about_timestep(holdout: HoldOut, named: MissingTerm | None = None) -> str:
 
 def is_certain(term: MissingTerm) -> bool:
     """Whether a term is so significant that it is missing, whatever it does to the estimate."""
-    return term.cause != INTEGRATION and abs(term.t) >= (CERTAIN_DRIFT if term.cause in DRIFTS else CERTAIN)
+    return term.cause != INTEGRATION and abs(term.t) >= (CERTAIN_DRIFT if is_change(term.cause) else CERTAIN)
 
 
 def numerical(holdout: Judged) -> MissingTerm | None:
@@ -179,7 +180,7 @@ def _numerical(terms: Sequence[MissingTerm], left: float = 1.0) -> MissingTerm |
     step = integration(terms)
     if step is None or step.t < CERTAIN_STEP or step.explained < NUMERICAL:
         return None
-    others = (left * each.explained for each in terms if is_certain(each) and each.cause not in DRIFTS)
+    others = (left * each.explained for each in terms if is_certain(each) and not is_change(each.cause))
     return step if max(others, default=0.0) <= step.explained else None
 
 

@@ -53,7 +53,7 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     logged = held.transitions
     following = np.asarray(logged.next_observation)[first[:, None] + kept]
     measured = np.concatenate([np.asarray(logged.observation)[first][:, None], following], axis=1)
-    named = held.run_names or tuple(f"run {1 + index}" for index in range(len(held.episode_starts)))
+    named = held.names_of_runs
     arrays = {
         "signals": np.array(simulator.task.signal_names),
         "scale": bench.change,

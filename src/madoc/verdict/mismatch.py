@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, ToldApart, Verdict
 from madoc.identification.candidate_terms import UNLISTED
-from madoc.identification.drifts import DRIFTS, WITHIN_RUNS
+from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import about_timestep, as_likely, main_term, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
@@ -42,17 +42,8 @@ def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
     if term is None:
         return None
     value = value_of(term)
-    if term.cause in DRIFTS:
-        within = term.cause == WITHIN_RUNS
-        change = value_of(replace(term, value=2.0 * term.value, standard_error=2.0 * term.standard_error))
-        where = f"by {change} from the start of a run to its end" if within else f"by {value} between parts of the log"
-        return Verdict(
-            "MODEL_MISMATCH",
-            f"{term.parameter} drifts: it changes {'within each run ' if within else ''}{where} "
-            f"(t = {abs(term.t):.0f}), which is {(1 + within) * abs(term.shifts[term.parameter]):.2g} half-widths of "
-            f"its interval; {WARM_UP if within else 'calibrate to each run by itself'}{about_timestep(holdout)}",
-            (term.parameter,),
-        )
+    if is_change(term.cause):
+        return Verdict("MODEL_MISMATCH", f"{_changing(term)}{about_timestep(holdout)}", (term.parameter,))
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
     effect = " and ".join(f"{name} by {abs(term.shifts[name]):.2g}" for name in moved)
     sure = _proved(holdout, term) or term.cause.startswith(UNLISTED)
@@ -63,6 +54,30 @@ def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
         f"(t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
         f"{about_timestep(holdout, term)}; {_advice(holdout, term)}{_at_end(holdout)}{_disagreeing(holdout)}",
         tuple(moved),
+    )
+
+
+def _changing(term: MissingTerm) -> str:
+    """How a parameter changes over the log, by how much, and what to do."""
+    value, within = value_of(term), term.cause == WITHIN_RUNS
+    moved = (
+        f"(t = {abs(term.t):.0f}), which is {(1 + within) * abs(term.shifts[term.parameter]):.2g} half-widths of its"
+    )
+    if term.cause.startswith(ONE_RUN):
+        run = term.cause.removeprefix(ONE_RUN).strip(" ()")
+        return (
+            f"{term.parameter} is another one in {run}: it differs there by {value} from all other runs {moved} "
+            "interval; find out what was different in that run, or leave it out"
+        )
+    if within:
+        change = value_of(replace(term, value=2.0 * term.value, standard_error=2.0 * term.standard_error))
+        return (
+            f"{term.parameter} drifts: it changes within each run by {change} from the start of a run to its end "
+            f"{moved} interval; {WARM_UP}"
+        )
+    return (
+        f"{term.parameter} drifts: it changes by {value} between parts of the log {moved} interval; calibrate to each "
+        "run by itself"
     )
 
 

@@ -10,7 +10,7 @@ from madoc.identification.candidate_terms import (
     UNLISTED,
     is_late,
 )
-from madoc.identification.drifts import DRIFTS
+from madoc.identification.drifts import is_change
 from madoc.identification.joint_forces import LOADED, SLOW, WEAKENING
 from madoc.identification.term_tests import MissingTerm
 from madoc.parameters import FIELDS, Parameter
@@ -52,7 +52,8 @@ def value_of(term: MissingTerm) -> str:
 
 def is_of_spec(term: MissingTerm) -> bool:
     """Whether a parameter of a spec adds a term; a parameter that changes is one already."""
-    return bool(term.parameter) and term.cause not in (*REMEDIES, *DRIFTS) and not term.cause.startswith(UNLISTED)
+    other = term.cause in REMEDIES or is_change(term.cause) or term.cause.startswith(UNLISTED)
+    return bool(term.parameter) and not other
 
 
 def line_of(term: MissingTerm) -> Parameter:
