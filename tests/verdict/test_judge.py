@@ -156,6 +156,14 @@ def test_what_is_hardly_better_at_an_end_or_contradicted_stays_a_mismatch(good, 
     assert judge(replace(lacking, open_loop=())).word == "MODEL_MISMATCH"
 
 
+def test_an_estimate_under_contacts_that_chatter_is_never_calibrated():
+    over = (predicted_over(1.0, 0.4, (0.3, 0.6)),)
+    verdict = judge(replace(PREDICTED, open_loop=over), chattering=True)
+    assert verdict.word == "USABLE" and "contacts chatter" in verdict.sentence
+    assert judge(PREDICTED, chattering=True).word == "NOT_IDENTIFIABLE"
+    assert "not settled" in judge(PREDICTED, chattering=True, settled=False).sentence
+
+
 def test_a_base_that_only_contacts_show_is_never_calibrated():
     assert judge(PREDICTED).word == "CALIBRATED"
     over = (predicted_over(1.0, 0.4, (0.3, 0.6)),)

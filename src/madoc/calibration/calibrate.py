@@ -84,6 +84,7 @@ def calibrate(
         combinations=[] if told is None else list(combinations(space, estimate.mean, told, estimate.quantile)),
         settled=estimate.settled,
         long_tails=estimate.long_tails,
+        chattering=estimate.chattering,
         group_stability=estimate.group_stability,
         problem=problem,
     )

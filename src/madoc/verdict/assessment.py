@@ -78,7 +78,13 @@ def assess(
     if bench.begins("predictions over longer times"):
         holdout = replace(holdout, open_loop=open_loop(bench, point))
     widened = with_widened_intervals(result, holdout)
-    verdict = judge(holdout, settled=result.settled, long_tails=result.long_tails, combinations=widened.combinations)
+    verdict = judge(
+        holdout,
+        settled=result.settled,
+        long_tails=result.long_tails,
+        chattering=result.chattering,
+        combinations=widened.combinations,
+    )
     better = beats_mid_range(holdout) or explains_all(holdout)
     warnings = [*widened.warnings, *about_imitated(holdout), *([] if better else [NO_BETTER])]
     if bench.left_out:

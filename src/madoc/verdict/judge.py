@@ -16,7 +16,15 @@ from madoc.verdict.statistics import FEWEST_GROUPS, WORTH_GAINING, beyond_noise
 from madoc.verdict.wording import change_of, in_percent, of_area
 
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
-
+ASSUMED_BASE = (
+    "no sensor shows where the base is and how fast it moves: both were taken from contacts that stand still, "
+    "which was not tested; log the base by motion capture, for a while at least, to be sure of the values"
+)
+CHATTER = (
+    "contacts chatter when they are simulated from states as noisy as the log's, so that parameters are known less "
+    "well than their intervals say; soften the contacts of the model, or log with less noise what is near the ground"
+)
+"""What an estimate's intervals do not count."""
 CHANCE = 0.01
 """Significance level in [0, 1]: data is rejected where no prediction is better than chance at this level."""
 SKILL = 0.1
@@ -29,23 +37,31 @@ model lacks something."""
 
 
 def judge(
-    holdout: HoldOut, *, settled: bool = True, long_tails: bool = False, combinations: Sequence[Combination] = ()
+    holdout: HoldOut,
+    *,
+    settled: bool = True,
+    long_tails: bool = False,
+    chattering: bool = False,
+    combinations: Sequence[Combination] = (),
 ) -> Verdict:
     """The first verdict that applies: rejected data, a model that lacks something, open parameters, no improvement.
 
     What the model lacks makes an estimate `USABLE` where it predicts much better than the model as given, and else a
     mismatch. A log that is too short to tell whether the model lacks a term, or tells no states, leaves its parameters
-    open.
+    open. Where contacts chatter and errors are those of noise, tests of terms say nothing.
 
     Args:
         holdout: What the hold-out says of the estimate.
         settled: Whether the search that led to it came to its end.
         long_tails: Whether its residuals have longer tails than noise has.
+        chattering: Whether contacts chattered in its search, so that its intervals are too narrow.
         combinations: What the log tells of parameters that it leaves open.
     """
     refused = _rejected(holdout) or contradicted(holdout)
     if refused:
         return refused
+    if chattering and settled and explains_all(holdout):
+        return _not_certain(holdout, CHATTER)
     lacks = lacking(holdout, settled=settled, long_tails=long_tails)
     if lacks:
         return (_usable(holdout, lacks) if settled else None) or lacks
@@ -145,10 +161,11 @@ def _with_an_assumed_base(holdout: HoldOut) -> Verdict | None:
     """What would be `CALIBRATED`, if contacts that stand still were not all that tells where a base is."""
     if not holdout.base_from_contacts:
         return None
-    why = (
-        "no sensor shows where the base is and how fast it moves: both were taken from contacts that stand still, "
-        "which was not tested; log the base by motion capture, for a while at least, to be sure of the values"
-    )
+    return _not_certain(holdout, ASSUMED_BASE)
+
+
+def _not_certain(holdout: HoldOut, why: str) -> Verdict:
+    """An estimate that predicts, but whose intervals do not count something."""
     found = _usable(holdout, Verdict("MODEL_MISMATCH", why))
     return found or Verdict("NOT_IDENTIFIABLE", f"{_how_good(holdout)}, but {why}")
 

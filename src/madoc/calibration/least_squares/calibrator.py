@@ -201,6 +201,7 @@ class LeastSquares:
             quantile=errors,
             settled=settled,
             long_tails=settled and state.estimates_starts and sentences.have_long_tails(problem, best),
+            chattering=bool(state.estimates_starts and best.chattering),
         )
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:

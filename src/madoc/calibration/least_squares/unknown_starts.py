@@ -169,12 +169,17 @@ class UnknownStarts:
         return float(settled.unexplained(self.readings.observed[0].size, self.loss).mean())
 
     def profiled(
-        self, plan: Plan, states: Float[np.ndarray, "windows state"], errors: Float[np.ndarray, " physical"]
+        self,
+        plan: Plan,
+        states: Float[np.ndarray, "windows state"],
+        errors: Float[np.ndarray, " physical"],
+        second_chances: int,
     ) -> tuple[Settled, bool, float]:
         """Initial states settled after the least damped step of a plan, whether it helps, and the mean cost then kept.
 
         It does unless the windows' costs are significantly higher: at contacts initial states end here and there in
-        another minimum, and where they were before they had several chances.
+        another minimum, and where they were before they had several chances. Windows that it leaves unexplained begin
+        anew so many times.
         """
         point = np.clip(plan.point + plan.steps[0], -1.0, 1.0)
         states = states + self.readings.in_state_units(plan.state_steps[0], states.shape[1])
@@ -187,7 +192,7 @@ class UnknownStarts:
         costs = window_costs(residuals / np.tile(plan.deviation, self.readings.steps + 1), self.loss)
         simulations += len(states)
         after = replace(after, costs=costs, deviation=plan.deviation, errors=errors, simulations=simulations)
-        for again in range(SECOND_CHANCES - of_bases):
+        for again in range(second_chances - of_bases):
             random = np.random.default_rng(RESTARTS + 1 + again)
             after = restart(self.simulator, self.readings, point, self.guesses, after, self.loss, random)
         if not plan.kept.any():
@@ -217,6 +222,7 @@ class UnknownStarts:
             states,
             central=bool(self.touching.any()),
             placed_alone=bool(self.readings.placed.any()) and not refining,
+            chattering=bool(self.touching.any()),
         )
         searches = zip(slopes, points, damping.tolist(), state_damping, strict=True)
         return [
@@ -302,6 +308,7 @@ class UnknownStarts:
         """
         least = np.full(len(state_damping), LEAST_DAMPING)
         spare = eliminate(slopes, np.ones_like(slopes.residuals), least).spare
+        chattering, columns = slopes.chattering, slopes.more
         kept, deviation = self._weighted(slopes, spare, refining=contacts is not None)
         slopes = slopes.over(np.tile(deviation, self.readings.steps + 1))
         z = (slopes.residuals / TUNING[self.loss]) ** 2
@@ -333,6 +340,8 @@ class UnknownStarts:
             left_out=1.0 - float(kept.mean()),
             failures=int((~slopes.whole).sum()),
             steady_cost=0.0 if contacts is None else self._steady_cost(slopes, spare, contacts, kept),
+            chattering=chattering,
+            more=columns,
         )
 
     def _weighted(
