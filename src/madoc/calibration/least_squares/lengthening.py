@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import FIRST_DAMPING
-from madoc.calibration.least_squares.search import SearchState
+from madoc.calibration.least_squares.search import SearchState, epochs_of_states
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Dataset
 from madoc.identification.information import half_width, sandwich
@@ -93,7 +93,8 @@ def continued(longer: SearchState, shorter: SearchState) -> SearchState:
         state_errors=shorter.state_errors,
         damping=np.full_like(longer.damping, FIRST_DAMPING),
         state_damping=np.full_like(longer.state_damping, FIRST_DAMPING),
-        waiting=UnknownStarts.waiting,
+        chattering=shorter.chattering,
+        waiting=epochs_of_states(shorter.chattering),
         epochs=0,
     )
 
@@ -108,8 +109,9 @@ def widened(wider: SearchState, first: SearchState) -> SearchState:
         states=states,
         state_errors=first.state_errors,
         rough=first.rough,
+        chattering=first.chattering,
         refining=1,
-        waiting=UnknownStarts.waiting,
+        waiting=epochs_of_states(first.chattering),
     )
 
 

@@ -45,6 +45,8 @@ FAR = 3.0
 SHORTER = 1.0 / TRIALS[0]
 """Smallest damping after a step that did not help at contacts: with less, the next would hardly be shorter. It is that
 of the least damped step, by which it is multiplied, of 1."""
+HALF = 1.0
+"""The same where contacts chatter, so that the next step is half as long: costs are too rough to tell a minimum by."""
 _SMALLEST = 1e-100
 """Smallest tolerance, so that the ratio of a step to a tolerance of 0 is finite."""
 
@@ -267,7 +269,8 @@ class Search:
         (plan,) = windows.plans(state.point[:1], states, state.damping[:1], undamped, refining=True)
         chances = 0 if state.chattering else SECOND_CHANCES
         after, better, cost = windows.profiled(plan, states[0], state.state_errors, chances)
-        damping = TRIALS[0] * state.damping[0] if better else max(1e3 * state.damping[0], SHORTER)
+        refused = max(10.0 * state.damping[0], HALF) if state.chattering else max(1e3 * state.damping[0], SHORTER)
+        damping = TRIALS[0] * state.damping[0] if better else refused
         new, step = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}, plan.steps[0]
         if better:
             new["point"][0] = np.clip(plan.point + step, -1.0, 1.0)
@@ -293,7 +296,7 @@ class Search:
         noise = float(np.median(plan.deviation))
         metrics = {"residual": float(np.sqrt(cost)) * noise, "moved": float(following.moved[0]), "noise": noise}
         far = self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0
-        if following.moved[0] < 1.0 and far and not of_bases:  # with these every step looks anew
+        if following.moved[0] < 1.0 and far and not (of_bases or state.chattering):  # with these every step looks anew
             moved = np.maximum(following.moved, 1.0)
             following = replace(following, waiting=settling.RESTARTS, moved=moved)
         columns = 2 + 2 * len(step) + len(plan.spread) + plan.more  # one for the contacts
@@ -379,8 +382,13 @@ class Search:
         if self.starts.waiting:
             searches["damping"] = np.full(self.searches, FIRST_DAMPING)
             searches["state_damping"] = np.full_like(state.state_damping, FIRST_DAMPING)
-        waiting = settling.RESTARTS + WITHOUT_RESTARTS if state.chattering else self.starts.waiting
+        waiting = epochs_of_states(state.chattering) if self.starts.waiting else 0
         return replace(state, **searches, refining=1, waiting=waiting, epochs=0)
+
+
+def epochs_of_states(chattering: int) -> int:
+    """Number of epochs of initial states alone that begin a search on new windows: a few where contacts chatter."""
+    return settling.RESTARTS + WITHOUT_RESTARTS if chattering else UnknownStarts.waiting
 
 
 def _of_last_step(plan: Plan) -> Float[np.ndarray, "d d"]:
