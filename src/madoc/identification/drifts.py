@@ -105,7 +105,7 @@ def _in_one_run(tests: TermTests, names: Sequence[str]) -> Iterator[MissingTerm]
         own = scores[clearest]
         candidate = Candidate(f"{ONE_RUN} ({clearest})", row.name, row.unit, 0.0, (row.high - row.low) / 2, -np.inf)
         term = term_of(candidate, own, {row.name: own.change / float(tests.half_widths[index])})
-        t = shared_deviate(abs(own.t), len(present))
+        t = max(0.0, shared_deviate(abs(own.t), len(present)))
         yield replace(term, t=float(np.copysign(t, own.change)))
 
 

@@ -129,13 +129,10 @@ def deviate(ratio: float, freedom: float) -> float:
 
 
 def shared_deviate(t: float, tests: int) -> float:
-    """The normal deviate by whose probability one of so many tests exceeds t by chance, at most (Bonferroni 1936).
-
-    It is 0 where that is likelier than not.
-    """
+    """The normal deviate by whose probability one of so many tests exceeds t by chance, at most (Bonferroni 1936)."""
     from scipy.stats import norm  # slow to import, and only tests of terms need it
 
-    return float(norm.isf(min(0.5, tests * max(float(norm.sf(t)), np.finfo(float).tiny))))
+    return float(norm.isf(min(1.0, tests * max(float(norm.sf(t)), np.finfo(float).tiny))))
 
 
 def score(
