@@ -19,6 +19,7 @@ class Finding:
         do: What to do about it; empty where nothing is to be done.
         contradicts: Whether the log contradicts the spec, so that no estimate from the two is to be trusted.
         late: How late actions seem to take effect, s, where that is the finding; tests at an estimate may exclude it.
+        rough: Whether it is a size that the log alone tells roughly, so that an estimate may refute it.
     """
 
     level: Level
@@ -27,6 +28,7 @@ class Finding:
     do: str = ""
     contradicts: bool = False
     late: float = 0.0
+    rough: bool = False
 
     @property
     def sentence(self) -> str:

@@ -162,7 +162,8 @@ def _gain_findings(response: Response, action: str, modelled: Float[np.ndarray, 
     mistake = next((text for each, text in factors if least / 1.5 < told / each < 1.5 * most), "")
     what = f"it accelerates {joint} {told / bound:.2g} times as much as anywhere in the ranges of the parameters"
     what += f": {mistake}?" if mistake else ""
-    return [Finding("warning", what, action, "look at the units of the spec and of the log, and at the ranges", True)]
+    do = "look at the units of the spec and of the log, and at the ranges"
+    return [Finding("warning", what, action, do, contradicts=True, rough=True)]
 
 
 @dataclass(frozen=True)

@@ -161,6 +161,8 @@ def judged(
     if shorter > 1:
         doubts, finer = _doubts(bench, point, own, shorter)
         found = _told_apart(found, doubts, finer=finer)
+    unexplained = far_beyond_noise(found) and main_term(found) is None
+    contradicting = tuple(each for each in contradicting if unexplained or not each.rough)
     late = next((each for each in contradicting if each.late), None)
     term = main_term(found) if late is None else _delay(doubts, late)
     richer, of_richer = _richer(bench, point, own, term, doubts, finer=finer, shorter=shorter)
@@ -253,7 +255,8 @@ def _contradictions(
 ) -> tuple[tuple[Finding, ...], int]:
     """Findings of the log that contradict the spec, and the control steps simulated.
 
-    Actions that seem late are none where tests at the estimate exclude it.
+    Actions that seem late are none where tests at the estimate exclude it. Sizes that the log alone tells roughly are
+    findings only where errors are far beyond noise and nothing else explains them, which is seen later.
     """
     simulator, dataset = bench.simulator, bench.problem.dataset
     found, spent = dataset.findings, 0
