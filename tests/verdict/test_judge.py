@@ -162,6 +162,8 @@ def test_an_estimate_under_contacts_that_chatter_is_never_calibrated():
     assert verdict.word == "USABLE" and "contacts chatter" in verdict.sentence
     assert judge(PREDICTED, chattering=True).word == "NOT_IDENTIFIABLE"
     assert "not settled" in judge(PREDICTED, chattering=True, settled=False).sentence
+    beyond = changed(PREDICTED, LEFT_OVER)  # errors beyond those of noise, for no reason that is seen
+    assert "contacts chatter" in judge(beyond, chattering=True).sentence
 
 
 def test_a_base_that_only_contacts_show_is_never_calibrated():

@@ -45,10 +45,7 @@ def concentration(
         control_step: Time between two rows in s.
     """
     whole, shape = fit.slopes.whole, windows.readings.observed.shape[1:]
-    residuals = fit.slopes.residuals[whole][..., None]
-    explicable = fit.explicable[whole]
-    left = (residuals - explicable @ (np.swapaxes(explicable, 1, 2) @ residuals))[..., 0]
-    square = left.reshape(len(left), *shape) ** 2
+    square = fit.left[whole].reshape(-1, *shape) ** 2
     total = float(square.sum())
     if not total > 0.0:
         return None

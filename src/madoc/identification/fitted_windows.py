@@ -129,6 +129,12 @@ class Fit:
     control_steps: int
 
     @cached_property
+    def left(self) -> Float[np.ndarray, "windows values"]:
+        """What no initial state explains of the residuals, to first order."""
+        residuals = self.slopes.residuals[..., None]
+        return (residuals - self.explicable @ (np.swapaxes(self.explicable, 1, 2) @ residuals))[..., 0]
+
+    @cached_property
     def unexplained(self) -> float:
         """Median over the counted windows of the mean squared residual that no initial state explains.
 
@@ -136,9 +142,7 @@ class Fit:
         """
         if not self.counted.any():
             return np.inf
-        residuals = self.slopes.residuals[..., None]
-        left = (residuals - self.explicable @ (np.swapaxes(self.explicable, 1, 2) @ residuals))[..., 0]
-        return float(np.median(np.where(self.slopes.whole, (left**2).mean(-1), np.inf)[self.counted]))
+        return float(np.median(np.where(self.slopes.whole, (self.left**2).mean(-1), np.inf)[self.counted]))
 
     def gains_on(self, other: "Fit") -> bool:
         """Whether it leaves so much less unexplained than another fit that the search is to go on."""

@@ -71,6 +71,7 @@ def judge(
         or (None if settled else Verdict("NO_IMPROVEMENT", f"{_how_good(holdout)}, but {UNSETTLED}"))
         or _untested(holdout)
         or _with_an_assumed_base(holdout)
+        or (_not_certain(holdout, CHATTER) if chattering else None)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and every parameter is known to within half of its range")
     )
 

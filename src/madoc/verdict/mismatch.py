@@ -64,7 +64,7 @@ def _changing(term: MissingTerm) -> str:
         f"(t = {abs(term.t):.0f}), which is {(1 + within) * abs(term.shifts[term.parameter]):.2g} half-widths of its"
     )
     if term.cause.startswith(ONE_RUN):
-        run = term.cause.removeprefix(ONE_RUN).strip(" ()")
+        run = term.cause.removeprefix(f"{ONE_RUN} (").removesuffix(")")
         return (
             f"{term.parameter} is another one in {run}: it differs there by {value} from all other runs {moved} "
             "interval; find out what was different in that run, or leave it out"
