@@ -26,7 +26,7 @@ def found(errors, names=None):
     windows = LoggedWindows(readings, none, none, none[:, None], dataset.episode_of(rows), rows)
     slopes = WindowSlopes(errors.reshape(100, values), *(np.zeros((100, values, 0)),) * 2, np.ones(100, bool))
     fit = Fit(np.zeros(0), none, slopes, np.zeros((100, values, 0)), slopes.whole, 0)
-    return concentration(dataset, windows, fit, signals=SIGNALS, control_step=0.01)
+    return concentration(dataset, windows, fit, SIGNALS, 0.01)
 
 
 def alike():

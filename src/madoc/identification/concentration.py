@@ -33,7 +33,7 @@ class Concentration:
 
 
 def concentration(
-    dataset: Dataset, windows: LoggedWindows, fit: Fit, *, signals: Sequence[str], control_step: float
+    dataset: Dataset, windows: LoggedWindows, fit: Fit, signals: Sequence[str], control_step: float
 ) -> Concentration | None:
     """Where most of what neither parameters nor initial states explain of the residuals is; None if it is all over.
 

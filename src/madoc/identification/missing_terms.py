@@ -141,9 +141,7 @@ def suspicions(
     most_significant_first = sorted(terms, key=lambda term: -abs(term.t))
     imitated = tuple(imitated_terms(tests))
     spent += of_parts + of_fit
-    where = concentration(
-        dataset, windows, fit, signals=simulator.task.signal_names, control_step=simulator.control_step
-    )
+    where = concentration(dataset, windows, fit, simulator.task.signal_names, simulator.control_step)
     return Suspicions(tuple(most_significant_first), tuple(others), imitated, spent, concentration=where)
 
 

@@ -45,8 +45,6 @@ FAR = 3.0
 SHORTER = 1.0 / TRIALS[0]
 """Smallest damping after a step that did not help at contacts: with less, the next would hardly be shorter. It is that
 of the least damped step, by which it is multiplied, of 1."""
-HALF = 1.0
-"""The same where contacts chatter, so that the next step is half as long: costs are too rough to tell a minimum by."""
 _SMALLEST = 1e-100
 """Smallest tolerance, so that the ratio of a step to a tolerance of 0 is finite."""
 
@@ -269,8 +267,7 @@ class Search:
         (plan,) = windows.plans(state.point[:1], states, state.damping[:1], undamped, refining=True)
         chances = 0 if state.chattering else SECOND_CHANCES
         after, better, cost = windows.profiled(plan, states[0], state.state_errors, chances)
-        refused = max(10.0 * state.damping[0], HALF) if state.chattering else max(1e3 * state.damping[0], SHORTER)
-        damping = TRIALS[0] * state.damping[0] if better else refused
+        damping = TRIALS[0] * state.damping[0] if better else max(1e3 * state.damping[0], SHORTER)
         new, step = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}, plan.steps[0]
         if better:
             new["point"][0] = np.clip(plan.point + step, -1.0, 1.0)
@@ -290,6 +287,7 @@ class Search:
             explained=int(plan.kept.sum()),
             steady_cost=plan.steady_cost,
             autocorrelation=plan.autocorrelation,
+            chattering=max(state.chattering, int(plan.chattering > CHATTERING)),
             epochs=state.epochs + 1,
             failures=state.failures + plan.failures + after.failures,
         )
