@@ -23,6 +23,7 @@ from madoc.verdict.adequacy import (
     likeliest,
     missing_term,
     numerical,
+    of_small_terms,
     widening,
     with_widened_intervals,
 )
@@ -102,6 +103,22 @@ def test_the_term_that_explains_most_is_named_among_those_as_significant():
     friction, spring = term(explained=0.2), term("a spring", t=9.0, explained=0.05, parameter="jnt_stiffness.hip")
     assert missing_term(held(spring, friction)) is friction
     assert missing_term(held(term("a spring", t=30.0, explained=0.05), friction)).cause == "a spring"
+
+
+def test_small_terms_are_covered_by_intervals_and_not_named():
+    """A term of t = 8 that moves a mass by 4 half-widths is known to 1.96 · 4 / 8 = 0.98 of them."""
+    small = replace(term("a gain", t=8.0, explained=0.01), shifts={"mass": 4.0})
+    assert missing_term(held(small)) is None
+    assert missing_term(held(small), least=0.0) is small
+    (other,) = of_small_terms([small, term(explained=0.2), term("a clock", t=4.0, explained=0.01)])
+    assert (other.causes, other.shifts) == (("a gain (dof_frictionloss.hip)",), {"mass": 4.0})
+    assert other.errors["mass"] == pytest.approx(0.98, abs=1e-3)
+    change = term(DRIFT, t=9.0, explained=0.0)
+    assert missing_term(held(change)) is change
+    # Steps of a quarter leave up to a fifth of the 30 % that the error of the model's own explains.
+    step, friction = term(INTEGRATION, t=20.0, explained=0.3, parameter=""), term(explained=0.05)
+    assert missing_term(replace(held(step, friction), finer=True)) is None
+    assert missing_term(replace(held(replace(step, explained=0.2), friction), finer=True)) is friction
 
 
 def test_what_is_usual_is_named_before_a_tilted_base():

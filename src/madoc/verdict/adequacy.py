@@ -12,9 +12,10 @@ from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILT
 from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
+from madoc.identification.information import NORMAL_95
 from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
-from madoc.identification.term_tests import SUSPICIOUS, Alternative, MissingTerm
+from madoc.identification.term_tests import SUSPICIOUS, Alternative, MissingTerm, named
 from madoc.verdict.statistics import beyond_noise
 
 CERTAIN = 5.0
@@ -46,34 +47,59 @@ NEARLY = 0.8
 HALF = 0.5
 """Share explained by a listed term over that of forces that are not listed, from which these are not named."""
 WORTH_NAMING = 0.02
-"""Share in [0, 1] of the squared residuals far beyond noise that a term must explain to be named as what makes them."""
+"""Share in [0, 1] of the squared residuals that a term must explain to be named as what the model lacks."""
+NOT_REMOVED = 0.2
+"""Share in [0, 1] of what the integration step's error explains that a step of a quarter may still leave; it is more
+than a ninth where friction begins to hold a joint, or a contact begins."""
 SURER = 1.314
 """Half of a 99 % interval over half of a 95 % interval: an alternative is covered unless one in a hundred is worse."""
 NAMED = 3
 """Number of causes named for which intervals are widened, and of terms that the log cannot tell."""
 
 
-def missing_term(holdout: Judged) -> MissingTerm | None:
+def missing_term(holdout: Judged, least: float | None = None) -> MissingTerm | None:
     """The likeliest term that the model certainly lacks, of those that move the estimate if there are any.
 
     One that moves nothing counts too: what it would move is known to first order, at an estimate that may be wrong.
-    None where the error of the integration step explains much of the residuals and lesser ones were not tested without.
+    A force or a value that explains less than a share `least` of the squared residuals does not, `worth_naming` by
+    default: where errors are those of noise, intervals cover the estimate with it, and where they are far beyond noise
+    something else makes them. None where the error of the integration step explains much of the residuals and lesser
+    ones were not tested without.
     """
+    if least is None:
+        least = worth_naming(integration(holdout.missing_terms) if holdout.finer else None)
     if numerical(holdout) is not None and not holdout.finer:
         return None
-    certain = [term for term in holdout.missing_terms if is_certain(term)]
+    certain = [term for term in holdout.missing_terms if is_certain(term) and not _is_small(term, least)]
     moving = [term for term in certain if max(map(abs, term.shifts.values())) >= MOVES]
     return likeliest(moving or certain)
 
 
-def main_term(holdout: Judged) -> MissingTerm | None:
-    """The likeliest term that the model certainly lacks, unless it explains next to nothing of errors far beyond noise.
+def worth_naming(removed: MissingTerm | None = None) -> float:
+    """Share in [0, 1] of the squared residuals from which a term is named.
 
-    What makes those is something else, and may pass for a small term.
+    It is larger where the error of the integration step was `removed` by one of a quarter of the length: an integrator
+    of first order still has a quarter of its error then, a third of what was removed, whose square is a ninth.
     """
-    term = missing_term(holdout)
-    small = term is not None and term.explained < WORTH_NAMING and far_beyond_noise(holdout)
-    return None if small else term
+    return WORTH_NAMING if removed is None else max(WORTH_NAMING, NOT_REMOVED * removed.explained)
+
+
+def of_small_terms(terms: Sequence[MissingTerm], least: float = WORTH_NAMING) -> tuple[Alternative, ...]:
+    """The estimate with each term that is certain and explains less than a share `least`, for intervals to cover."""
+    small = [term for term in terms if is_certain(term) and _is_small(term, least)]
+    return tuple(
+        Alternative(
+            (named(term),),
+            terms=False,
+            shifts=dict(term.shifts),
+            errors={name: NORMAL_95 * abs(shift / term.t) for name, shift in term.shifts.items()},
+        )
+        for term in small
+    )
+
+
+def _is_small(term: MissingTerm, least: float) -> bool:
+    return term.explained < least and not is_change(term.cause)
 
 
 def far_beyond_noise(holdout: Judged) -> bool:
@@ -122,10 +148,10 @@ def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
     ]
 
 
-def coarse_step(holdout: HoldOut, named: MissingTerm) -> MissingTerm | None:
+def coarse_step(holdout: HoldOut, term: MissingTerm) -> MissingTerm | None:
     """The error of the integration step, where it is certain and explains more than the term named."""
     step = integration(holdout.missing_terms)
-    coarse = step is not None and step.t >= CERTAIN and step.explained > named.explained
+    coarse = step is not None and step.t >= CERTAIN and step.explained > term.explained
     return step if coarse else None
 
 

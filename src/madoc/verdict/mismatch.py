@@ -6,7 +6,7 @@ from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, ToldApar
 from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.term_tests import MissingTerm, named
-from madoc.verdict.adequacy import about_timestep, as_likely, main_term, missing_term, numerical
+from madoc.verdict.adequacy import about_timestep, as_likely, far_beyond_noise, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
@@ -32,7 +32,9 @@ def lacking(holdout: HoldOut, *, settled: bool, long_tails: bool) -> Verdict | N
     An end of a range at which a search stands that has not settled says nothing. `long_tails` tells that residuals
     have longer tails than noise has.
     """
-    found = _missing(holdout, main_term(holdout)) or _mismatch(holdout) or _missing(holdout, missing_term(holdout))
+    found = _missing(holdout, missing_term(holdout)) or _mismatch(holdout)
+    if far_beyond_noise(holdout):
+        found = found or _missing(holdout, missing_term(holdout, least=0.0))
     found = found or (_outside(holdout) if settled else None)
     return found or (_unlike_noise(holdout) if long_tails else None)
 

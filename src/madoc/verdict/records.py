@@ -28,8 +28,10 @@ from madoc.verdict.adequacy import (
     felt,
     in_full,
     is_certain,
-    main_term,
+    missing_term,
+    of_small_terms,
     widening,
+    worth_naming,
 )
 from madoc.verdict.bench import Bench
 from madoc.verdict.remedies import is_of_spec
@@ -77,7 +79,8 @@ def _doubts(
     if shorter == 1 and most is not None and most < WINDOWS:
         bench.left_out.append("tests on as many windows as usual")
     doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most, shorter=shorter)
-    doubts = replace(doubts, alternatives=in_full(doubts.alternatives, doubts.terms))
+    alternatives = in_full((*doubts.alternatives, *of_small_terms(doubts.terms)), doubts.terms)
+    doubts = replace(doubts, alternatives=alternatives)
     step = felt(doubts.terms)
     if step is None or task.source is None:
         return doubts, False
@@ -93,6 +96,7 @@ def _doubts(
     others += [
         replace(each, causes=(INTEGRATION,)) if each.causes == (OTHER_WINDOWS,) else each for each in fine.alternatives
     ]
+    others += of_small_terms(fine.terms, worth_naming(step))
     terms = step, *(term for term in fine.terms if term.cause != INTEGRATION)
     return replace(fine, terms=terms, alternatives=tuple(others), control_steps=spent), True
 
@@ -157,14 +161,14 @@ def judged(
         base_from_contacts=bool(bench.states.placed.any()),
         concentration=doubts.concentration,
     )
-    shorter = SHORTER if far_beyond_noise(found) and main_term(found) is None else 1
+    shorter = SHORTER if far_beyond_noise(found) and missing_term(found) is None else 1
     if shorter > 1:
         doubts, finer = _doubts(bench, point, own, shorter)
         found = _told_apart(found, doubts, finer=finer)
-    unexplained = far_beyond_noise(found) and main_term(found) is None
+    unexplained = far_beyond_noise(found) and missing_term(found) is None
     contradicting = tuple(each for each in contradicting if unexplained or not each.rough)
     late = next((each for each in contradicting if each.late), None)
-    term = main_term(found) if late is None else _delay(doubts, late)
+    term = missing_term(found) if late is None else _delay(doubts, late)
     richer, of_richer = _richer(bench, point, own, term, doubts, finer=finer, shorter=shorter)
     told = tuple(_contradiction(each, richer) for each in contradicting)
     return replace(found, richer=richer, contradictions=told, control_steps=found.control_steps + of_richer)

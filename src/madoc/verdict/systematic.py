@@ -1,6 +1,7 @@
 """Whether residuals are noise, or a function of the robot's state and action."""
 
 from collections.abc import Callable
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import KFold, cross_val_predict
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
+from threadpoolctl import threadpool_limits
 
 from madoc.identification.noise import clipped
 
@@ -25,8 +27,8 @@ EXPLAINED = 0.1
 systematic. Noise alone gives at most a few percent of many independent rows."""
 REDRAWN = 39
 """Number of draws of signs with which a share explained is compared."""
-SIGNIFICANT = 0.05
-"""Significance level in [0, 1] of a share explained."""
+BY_CHANCE = 1
+"""Number of these draws that may have as large a share explained: (1 + 1) / (39 + 1) is a significance level of 5 %."""
 
 LAGS = range(4, 9)
 """Distances in rows at which residuals are compared: long enough that sensor noise, filters and differences of readings
@@ -69,7 +71,8 @@ def explained(
     if not enough or np.sqrt((residuals**2).mean(0)).max() <= _ROUNDING:
         return best, explanation
     for make in EXPLAINERS.values():
-        guess = cross_val_predict(make(), inputs, wanted, cv=folds).reshape(residuals.shape)
+        with threadpool_limits(1):  # the same bits on any number of cores, and no threads that wait for each other
+            guess = cross_val_predict(make(), inputs, wanted, cv=folds).reshape(residuals.shape)
         share = 1.0 - float(((residuals - guess) ** 2).sum()) / total
         if share > best:
             best, explanation = share, guess
@@ -99,8 +102,8 @@ def explained_at_end(
         return share
     random, stretch = np.random.default_rng(0), (rows - rows[0]) // steps
     signs = random.choice([-1.0, 1.0], (REDRAWN, stretch[-1] + 1))[:, stretch, None]
-    by_chance = sum(explained(inputs[done], sign * last, folds)[0] >= share for sign in signs)
-    return share if (1 + by_chance) / (1 + REDRAWN) <= SIGNIFICANT else 0.0
+    as_large = (True for sign in signs if explained(inputs[done], sign * last, folds)[0] >= share)
+    return share if len(list(islice(as_large, BY_CHANCE + 1))) <= BY_CHANCE else 0.0
 
 
 def disjoint_folds(rows: Int[np.ndarray, " windows"], steps: int) -> Folds:

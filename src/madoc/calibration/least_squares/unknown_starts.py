@@ -46,6 +46,8 @@ FOLLOWED = (1.0, 0.3, 0.0)
 """Shares in [0, 1] of an initial state's step, of which every window takes the best: at contacts 1 may be too far."""
 LIKE_NOISE = 1.5
 """Cost of a window, in squared standard deviations; noise alone rarely exceeds it, as its mean is 0.8."""
+UNLIKE_NOISE = 4.0
+"""The same where the log shows no contact, so that nothing but what the model lacks, or false readings, make it."""
 PLACINGS = 2
 """Number of epochs of initial states alone where these include places and speeds of bases that no sensor shows."""
 SECOND_CHANCES = 2
@@ -384,14 +386,16 @@ class UnknownStarts:
         """Windows that an initial state explains; all of them if these hold too little information on a direction.
 
         At contacts a search for an initial state sometimes ends in a wrong one, and such a window would bias the
-        parameters. A window is explained if its cost is no outlier among the others' or near that of noise.
+        parameters. A window is explained if its cost is no outlier among the others' or near that of noise. Without
+        contacts one is whose errors are up to twice as large as noise: it counts less by the loss.
         """
         whole = slopes.whole
         if self.loss == "linear" or not whole.any():
             return whole
         costs = window_costs(slopes.residuals, self.loss)
         middle, reach = outlier_limits(costs[whole], self.readings.activity[whole])
-        kept = whole & (costs <= np.maximum(middle + reach, LIKE_NOISE))
+        most = LIKE_NOISE if self.touching.any() else UNLIKE_NOISE
+        kept = whole & (costs <= np.maximum(middle + reach, most))
         weights = loss_slope((slopes.residuals / TUNING[self.loss]) ** 2, self.loss)
         reduced = eliminate(slopes, weights, np.full(len(whole), LEAST_DAMPING)).reduced
         return kept if least_share(reduced.of(kept), reduced.of(whole)) > _SUFFICIENT else whole
