@@ -8,7 +8,7 @@ from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import about_timestep, as_likely, far_beyond_noise, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
-from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
+from madoc.verdict.statistics import NEGLIGIBLE
 from madoc.verdict.systematic import EXPLAINED
 from madoc.verdict.wording import change_of, in_rows, of_area
 
@@ -170,7 +170,11 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
 
 
 def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
-    """How the errors of the best parameters nearby differ from noise, in size and for a reason; else empty."""
+    """How the errors of the best parameters nearby differ from noise, in size and for a reason; else empty.
+
+    Where states can be rebuilt, errors without a reason are compared with those of noise and random forces; where
+    starts are fitted, nothing tells these from what the model lacks, and no reason is needed.
+    """
     errors, direct, reasons = holdout.errors, isinstance(holdout, Predicted), list[str]()
     if holdout.explained > EXPLAINED:
         inputs = "state and action" if direct else "readings and actions"
@@ -181,17 +185,20 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
         lasts = f"it lasts over several rows (correlation {holdout.persistence:.2f})"
         reasons.append(f"{lasts}, as that of a force from outside would")
     reasons += at_end
-    beyond = beyond_noise(errors.nearby_best, errors.noise)
-    if not beyond or not reasons:
-        return _adding_up(holdout) if isinstance(holdout, Predicted) else ""
-    left, noise = max(beyond, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
+    if isinstance(holdout, Predicted) and not (reasons and far_beyond_noise(holdout)):
+        return _adding_up(holdout)
+    if not far_beyond_noise(holdout):
+        return ""
+    pairs = list(zip(errors.nearby_best, errors.noise, strict=True))
+    left, noise = max(pairs, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
     noisy = noise.mean > NEGLIGIBLE
     much = f"{left.mean / noise.mean:.2g} times as much as noise does" if noisy else "none of which is noise"
+    why = f"; that is no chance, as {' and '.join(reasons)}" if reasons else ""
     after = f"after {in_rows(left.steps)}{'' if direct else ' from a fitted start'}"
     return (
         f"the model cannot explain the data: {after} even the parameters nearby that fit the hold-out best err by "
-        f"{left.mean:.2g} of what a signal changes in {in_rows(errors.stride)}, {much}; that is no chance, as "
-        f"{' and '.join(reasons)} ({change_of(errors)}){_where(holdout)}"
+        f"{left.mean:.2g} of what a signal changes in {in_rows(errors.stride)}, {much}{why} "
+        f"({change_of(errors)}){_where(holdout)}"
     )
 
 
