@@ -18,7 +18,7 @@ class Field:
     """A kind of parameter; its place in the model is in `simulation/write.py`.
 
     Attributes:
-        element: `body`, `joint`, `geom`, `actuator` or `signal`; None for a parameter of the whole robot.
+        element: `body`, `joint`, `geom`, `actuator`, `signal` or `action`; None for a parameter of the whole robot.
         unit: The unit; of a field of joints, that for a hinge.
         slide_unit: The unit for a slide joint, where it is another.
         minimum: Smallest value that is physically possible.
@@ -26,6 +26,7 @@ class Field:
         words: What reports call it; if empty, its name.
         missing: What a model lacks that has no such term, in words; empty where nobody looks for that.
         in_model: Whether the value is written into the MuJoCo model; if not, the simulator applies it around the model.
+        of_all: Whether it may have no element, and is then one of the whole robot.
     """
 
     element: str | None
@@ -36,6 +37,7 @@ class Field:
     missing: str = ""
     maximum: float = 1e12
     in_model: bool = True
+    of_all: bool = False
 
 
 AT_END = 0.98
@@ -93,7 +95,8 @@ FIELDS: dict[str, Field] = {
     "gear_backlash": Field("joint", "rad", 0.0, "m", "backlash"),
     "gear_stiffness": Field("joint", "N·m/rad", 0.0, "N/m", "stiffness of the gear"),
     "gear_damping": Field("joint", "N·m·s/rad", 0.0, "N·s/m", "damping of the gear"),
-    "action_delay": Field(None, "s", 0.0, words="delay", maximum=10.0, in_model=False),
+    "action_delay": Field("action", "s", 0.0, words="delay", maximum=10.0, in_model=False, of_all=True),
+    "action_lag": Field("action", "s", 0.0, words="lag", maximum=10.0, in_model=False, of_all=True),
     "signal_bias": Field("signal", "1", words="bias", missing="an offset of the sensor", in_model=False),
 }
 """Every field a parameter can name.
@@ -104,7 +107,8 @@ is how far the centre of mass is from the body's origin, in the direction it has
 from the parent's, in the direction it has: the length of the link between them. `actuator_gain` of a position or
 velocity servo is its kp or kv, and moves the servo's bias with it; `actuator_kv` is the damping of a position servo.
 `jnt_ref` is what a hinge or slide reads, and is commanded to, where the model as drawn has its zero. `action_delay` is
-the time from an action to its effect, `signal_bias` what a sensor reads too much. `dof_drag` is damping that grows with
+the time from an action to its effect, `action_lag` the time constant of a filter of first order that it passes, of all
+actions or of one; `signal_bias` is what a sensor reads too much. `dof_drag` is damping that grows with
 the square of the speed. `contact_time` and `contact_damping` are MuJoCo's `solref`: how long a contact takes to push
 shapes apart, and 1 where it does so without a bounce. A payload adds to the body's own mass and inertia; its moment of
 inertia about each axis is its mass times the square of its radius of gyration. `drive_*` are the numbers of a d.c.
@@ -176,7 +180,8 @@ class Parameter:
 
     def __post_init__(self) -> None:
         kind = self.kind
-        if (kind.element is None) != (self.elements == ()) or "" in self.elements:
+        none = self.elements == ()
+        if ((kind.element is None) != none and not (none and kind.of_all)) or "" in self.elements:
             wanted = "no element" if kind.element is None else f"the name of a {kind.element}"
             raise MadocError(f"parameter field {self.field!r} takes {wanted}, got {self.element!r}")
         if len(set(self.elements)) < len(self.elements):

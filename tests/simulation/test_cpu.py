@@ -65,7 +65,7 @@ def test_a_machine_without_actuators_falls():
     cart = '<body name="cart"><joint name="slide" type="slide"/><geom size="1"/></body>'
     spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{cart}</worldbody></mujoco>")
     simulator = CpuSimulator(replace(spring(), spec=lambda: spec), threads=1)
-    system = CpuSystem(simulator, [[simulator.task.model]], np.zeros(1), np.zeros((1, 1)))
+    system = CpuSystem(simulator, [[simulator.task.model]], np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)))
     fallen = system._simulated(np.zeros((1, 2, 2)), np.zeros((1, 2, 5, 0)))
     np.testing.assert_allclose(fallen[0, :, :, 1], 2 * [-9.81 * 0.002 * np.arange(1, 6)])
 

@@ -7,15 +7,37 @@ from madoc.errors import MadocError
 from madoc.parameters import Parameter
 from madoc.robots import load
 from madoc.simulation.cpu import CpuSimulator
-from madoc.simulation.delay import blend, delay_weights
+from madoc.simulation.delay import action_weights, blend, pending_actions
 from own_robots import CART_SPEC, write_robot
 
 STEP = 0.02
 DELAY = "  - {field: action_delay, low: 0, high: 0.05}\n"
+TWO_CARTS_MODEL = """
+<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
+  <body><joint name="left" type="slide"/><geom size="0.1" mass="1"/></body>
+  <body pos="0 1 0"><joint name="right" type="slide"/><geom size="0.1" mass="1"/></body>
+</worldbody></mujoco>
+"""
+TWO_CARTS = """
+madoc: 1
+name: carts
+model: carts.xml
+control_step: 0.02
+signals:
+  - {name: left, reads: position(left), unit: m}
+  - {name: right, reads: position(right), unit: m}
+actions:
+  - {name: push_left, joint: left, means: force, low: -1, high: 1, unit: N}
+  - {name: push_right, joint: right, means: force, low: -1, high: 1, unit: N}
+parameters:
+  - {field: action_delay, element: push_left, low: 0, high: 0.04}
+  - {field: action_lag, element: push_left, low: 0, high: 0.02}
+"""
 
 
-def weights(delay, physics_steps=2, pending=1):
-    return delay_weights(np.array([delay]), control_step=STEP, physics_steps=physics_steps, pending=pending)[0]
+def weights(delay, physics_steps=2, pending=1, lag=0.0):
+    times = np.array([[delay]]), np.array([[lag]])
+    return action_weights(*times, control_step=STEP, physics_steps=physics_steps, pending=pending)[0, ..., 0]
 
 
 @pytest.mark.parametrize(
@@ -39,13 +61,36 @@ def test_over_several_control_steps():
 
 
 def test_weights_are_shares():
-    found = delay_weights(np.linspace(0.0, 0.06, 61), control_step=STEP, physics_steps=5, pending=3)
-    np.testing.assert_allclose(found.sum(-1), 1.0, atol=1e-12)
-    assert (found >= 0).all()
+    delays, lags = np.meshgrid(np.linspace(0.0, 0.06, 31), [0.0, 1e-4, 0.01, 0.3])
+    times = delays.reshape(-1, 1), lags.reshape(-1, 1)
+    found = action_weights(*times, control_step=STEP, physics_steps=5, pending=3)
+    np.testing.assert_allclose(found.sum(2), 1.0, atol=1e-12)
+    assert (found >= -1e-15).all()
+
+
+def test_a_lag_follows_by_one_time_constant():
+    """Of a command at time 0 it has followed 1 - exp(-t / λ), on average 1 - λ/h (exp(-a / λ) - exp(-b / λ))."""
+    found, end = weights(0.0, lag=0.01, pending=2), np.exp(-np.arange(5))
+    followed = 1.0 - (end[:-1] - end[1:])
+    np.testing.assert_allclose(found[:, 0], followed[:2], atol=1e-12)
+    np.testing.assert_allclose(found[:, 1], followed[2:] - followed[:2], atol=1e-12)
+    assert (pending_actions(0.03, 0.0, STEP), pending_actions(0.03, 0.02, STEP)) == (2, 8)
+
+
+def test_one_drive_follows_later_than_the_other(tmp_path):
+    """The left drive has a delay and a lag of its own, the right one none."""
+    task = load(write_robot(tmp_path, TWO_CARTS, carts=TWO_CARTS_MODEL)).task
+    system = CpuSimulator(task, threads=1).bind(np.array([[0.02, 0.0], [0.0, 0.01], [0.0, 0.0]]))
+    state = np.zeros((3, 1, 4 + 2 * task.pending))
+    after = system.step(state, np.ones((3, 1, 2)))[:, 0]
+    assert after[:, 3] == pytest.approx(after[2, 3])
+    assert after[0, 2] == 0.0
+    # Over 0.02 s a lag of 0.01 s has passed on 1 - (1 - exp(-2)) / 2 of the command.
+    assert after[1, 2] == pytest.approx(after[2, 2] * (1.0 - (1.0 - np.exp(-2.0)) / 2.0))
 
 
 def test_blending_is_the_weighted_sum():
-    shares = np.array([[[0.25, 0.75], [1.0, 0.0]]])
+    shares = np.array([[[0.25, 0.75], [1.0, 0.0]]])[..., None]
     actions = np.array([[[[1.0, 8.0], [-1.0, 4.0]]]])
     np.testing.assert_array_equal(blend(shares, actions), [[[[-0.5, 5.0], [1.0, 8.0]]]])
 

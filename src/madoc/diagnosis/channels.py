@@ -8,6 +8,7 @@ from jaxtyping import Float
 from madoc.data import Dataset
 from madoc.data.findings import Finding, Level
 from madoc.errors import MadocError
+from madoc.identification.noise import resolution_of
 from madoc.robots import Robot
 from madoc.tasks import Task
 
@@ -23,10 +24,6 @@ _STILL = 1e-9
 """Range of the values over the largest of them; up to it, a channel counts as one that never moves."""
 COARSE = 1.0
 """Ratio of the step of a signal's readings to the standard deviation of its change in a row; from it on it is told."""
-_COUNTED = (5, 0.5)
-"""Smallest number of distinct readings, and largest as a share of the rows, between which their step is looked for."""
-_WHOLE = 0.05
-"""Largest distance of a reading from a whole number of steps, in steps: logs are written with few digits."""
 _TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "°": 360.0}
 """A turn by the unit of an angle."""
 
@@ -108,20 +105,6 @@ def channel_findings(dataset: Dataset, parameters: int, channels: tuple[Channel,
     return findings + [
         _step_finding(channel) for channel in signals if channel.resolution > COARSE * channel.step > 0.0
     ]
-
-
-def resolution_of(readings: Float[np.ndarray, " rows"]) -> float:
-    """The step of which all differences of the readings are whole multiples, as of an encoder; 0 where none is seen."""
-    values = np.unique(readings)
-    fewest, most = _COUNTED
-    if not fewest <= len(values) <= most * len(readings):
-        return 0.0
-    gaps, span = np.diff(values), float(values[-1] - values[0])
-    gaps = gaps[gaps > 1e-7 * span]  # smaller ones are rounding errors
-    least = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
-    step = span / max(1.0, np.round(span / least))
-    counts = (values - values[0]) / step
-    return step if np.abs(counts - np.round(counts)).max() < _WHOLE else 0.0
 
 
 def _step_finding(channel: Channel) -> Finding:

@@ -127,7 +127,8 @@ def response_findings(
 def _lag_findings(response: Response, action: str, simulator: Simulator) -> list[Finding]:
     """A warning where a lag is certain, and no calibrated delay can stand for it."""
     step, lag, error = simulator.control_step, response.lag, response.lag_error
-    delays = [row for row in simulator.parameters.parameters if row.field == "action_delay"]
+    of_it = [row for row in simulator.parameters.parameters if not row.elements or action in row.elements]
+    delays = [row for row in of_it if row.field in ("action_delay", "action_lag")]
     covered = any(row.low <= max(lag, response.larger_lag) and lag <= row.high for row in delays)
     if lag < max(LATE * step, CERTAIN * error) or covered:
         return []

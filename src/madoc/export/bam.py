@@ -40,7 +40,7 @@ def bam_files(folder: Path, drives: Sequence[JointDrive]) -> list[Path]:
     return [folder / f"bam-{name}.json" for name in names]
 
 
-def save_bam(path: Path, drive: JointDrive, delay: float) -> None:
+def save_bam(path: Path, drive: JointDrive, delay: float, lag: float = 0.0) -> None:
     """Write the parameters of one drive, its joint's friction and armature, and what BAM cannot say of them.
 
     Friction is BAM's `m1` where MuJoCo's own elements say it, else `m6`: Isaac Lab reads neither `m3` nor `m4`.
@@ -49,6 +49,7 @@ def save_bam(path: Path, drive: JointDrive, delay: float) -> None:
         path: The file.
         drive: The drive at the estimate.
         delay: From a command to its effect, s.
+        lag: Time constant with which the command is followed, s.
     """
     of, strength = drive.numbers, drive.numbers["strength"]
     content = {
@@ -67,13 +68,13 @@ def save_bam(path: Path, drive: JointDrive, delay: float) -> None:
         "error_gain": of["gain"] if drive.means == "position" else 0.0,
         "max_pwm": of["duty_limit"],
         "max_current": None if drive.current_limit is None else strength * drive.current_limit,
-        "not_the_same_here": _lost(drive, delay),
+        "not_the_same_here": _lost(drive, delay, lag),
     }
     with replacing(path) as stream:
         stream.write((json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode())
 
 
-def _lost(drive: JointDrive, delay: float) -> Sequence[str]:
+def _lost(drive: JointDrive, delay: float, lag: float) -> Sequence[str]:
     """What the calibrated drive does and BAM's does not, a clause each, with the size of it."""
     of = drive.numbers
     per_volt = of["strength"] * of["kt"] / of["resistance"]
@@ -90,6 +91,7 @@ def _lost(drive: JointDrive, delay: float) -> Sequence[str]:
         "standstill": drive.supply_from,
         f"drag is left out, {drive.drag * no_load**2:.3g} N·m at the no-load speed of {no_load:.3g} rad/s": drive.drag,
         f"versions of BAM without command_delay leave {1e3 * delay:.3g} ms of delay out": delay,
+        f"a lag of {1e3 * lag:.3g} ms with which the command is followed is left out": lag,
         "backlash and elasticity of the gear are left out": drive.gives,
         "friction by load counts contacts as load, and leaves springs out": any(
             value for name, value in drive.friction.items() if "load" in name or "quadratic" in name

@@ -69,7 +69,7 @@ def save_mjlab(path: Path, robot: Robot, exported: Sequence[Exported]) -> None:
     placed = [field for field in robot.fields if field.partition("_")[0] in _PLACED]
     left = [field for field in robot.fields if field not in placed]
     unsaid += [f"draws do not reach {field}, which stays that of model.xml" for field in left]
-    lost = [*robot.lost, *unsaid, *_biases(exported, "dr.encoder_bias adds it to what is observed")]
+    lost = [*robot.lost, *unsaid, *_around(exported, "dr.encoder_bias adds it to what is observed")]
     if any(each.servo for each in robot.actuators):
         lost.append("commands beyond their range in the spec are not cut off by BuiltinPositionActuatorCfg")
     _write(
@@ -117,7 +117,7 @@ def save_isaac_lab(path: Path, robot: Robot, exported: Sequence[Exported]) -> No
         "isaac_lab_robot.py.j2",
         robot=robot.name,
         version=ISAAC_LAB,
-        lost=[*lost, *_biases(exported, "subtract it from what is logged")],
+        lost=[*lost, *_around(exported, "subtract it from what is logged")],
         kind="DelayedPDActuatorCfg" if lag else "ImplicitActuatorCfg",
         actuators=actuators,
         drawn=drawn,
@@ -191,11 +191,18 @@ def _lag(robot: Robot) -> tuple[int, list[str]]:
     ]
 
 
-def _biases(exported: Sequence[Exported], how: str) -> list[str]:
+def _around(exported: Sequence[Exported], how: str) -> list[str]:
+    """What is not of the model: biases, and how to say them; lags, and delays of single actions."""
+    told = {
+        "signal_bias": how,
+        "action_lag": "no actuator here follows its command with a lag",
+        "action_delay": "it is of one action, and the delay here is of all",
+    }
     return [
-        f"{row.parameter.name} = {row.row.estimate:.6g} {row.row.unit} is not of the model: {how}{row.left_out}"
+        f"{row.parameter.name} = {row.row.estimate:.6g} {row.row.unit} is not of the model: "
+        f"{told[row.parameter.field]}{row.left_out}"
         for row in exported
-        if row.parameter.field == "signal_bias"
+        if row.parameter.field in told and (row.parameter.field != "action_delay" or row.parameter.elements)
     ]
 
 

@@ -59,6 +59,7 @@ def effects(
     stretched = simulation.make(simulator.task.with_time_step(1.0 + CHANGE))
     finer = simulation.make(simulator.task.with_time_step(1.0 / FINER, substeps=FINER))
     fields = {each.field for each in simulator.parameters.parameters}
+    timed = any(each.kind.of_all for each in simulator.parameters.parameters)
     tilts = TILTS if np.any(simulator.task.model.opt.gravity) else ()
     for candidate, other, inputs, change in (
         *(
@@ -75,16 +76,18 @@ def effects(
         (Candidate(SPACING, "", "s", step, step, 0.0), stretched, readings, CHANGE),
         (Candidate(INTEGRATION, "", "", 0.0, 1.0, -np.inf), finer, readings, 1.0),
     ):
-        if candidate.parameter not in fields:
+        if candidate.parameter not in fields and not (candidate.cause == DELAY and timed):
             moved = inputs.residuals(other, point[None], states[None])[0, 0]
             tried.append(candidate)
             found.append((moved - base) / change)
     commands = [(place, channel) for place, channel in enumerate(simulator.task.actions) if channel.command]
     for place, channel in commands if len(commands) > 1 else ():
+        if any(channel.name in each.elements for each in simulator.parameters.parameters if each.kind.of_all):
+            continue
         actions = readings.actions.copy()
         actions[..., place] = late.actions[..., place]
         moved = replace(readings, actions=actions).residuals(simulator, point[None], states[None])[0, 0]
-        tried.append(_late(f"{LATE_DRIVE} ({channel.name})", step))
+        tried.append(_late(LATE_DRIVE, step, f"action_delay.{channel.name}"))
         found.append((moved - base) / _LATER)
     for signal, column in _late_sensors(simulator, readings, base):
         tried.append(_late(f"{LATE_SENSOR} ({signal})", step))
@@ -92,9 +95,9 @@ def effects(
     return tried, np.stack(found, axis=-1)
 
 
-def _late(cause: str, step: float) -> Candidate:
+def _late(cause: str, step: float, parameter: str = "") -> Candidate:
     """A lag of a single drive or sensor, s."""
-    return Candidate(cause, "", "s", 0.0, step, 0.0, known_before=True)
+    return Candidate(cause, parameter, "s", 0.0, step, 0.0, known_before=True)
 
 
 def _late_sensors(

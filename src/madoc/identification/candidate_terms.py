@@ -22,6 +22,7 @@ from madoc.simulation.user_data import is_drive
 from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, linked_bodies, nominal_values
 
 DELAY = "actions that take effect later, by a delay or a lag of the actuator"
+LAG = "commands that drives follow with a lag of first order"
 EARLY = "actions that take effect before they are logged"
 BELOW_MINIMUM = "a value below what is physically possible"
 SATURATION = "a drive that saturates below the limit of its actions"

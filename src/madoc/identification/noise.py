@@ -5,10 +5,14 @@ Of attitudes it is that of small rotations, as in `simulation.attitudes`, but fo
 | estimator | from | assumes |
 |---|---|---|
 | `difference_noise` | the log alone | motion is smooth over five rows |
+| `largest_noise` | the log alone, as an upper bound | errors of consecutive readings are not alike, but for counts |
+| `alternating_noise` | residuals along windows | those of the model are smooth over five rows |
 | `consecutive_noise` | one-step residuals of consecutive rows | their model errors do not alternate in sign |
 | `residual_noise` | all residuals of a fit | the fit leaves nothing but noise |
 | `channel_noise` | all residuals of a fit | most of them are noise |
 """
+
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,7 +20,7 @@ from jaxtyping import Float, Int
 from madoc.data.dataset import Dataset
 from madoc.identification.losses import NORMAL_MAD, robust_deviation
 from madoc.identification.states import states_observed_as
-from madoc.simulation.attitudes import differences, moved
+from madoc.simulation.attitudes import Attitudes, differences, moved
 from madoc.simulation.base import Simulator
 
 OUTLIER = 5.0
@@ -36,29 +40,66 @@ _LEAST_SHARE = 1e-3
 """Smallest deviation relative to the noisiest channel's: no channel has more than a million times another's weight."""
 _SMALLEST = 1e-12
 """Smallest deviation in typical changes of a channel in a step; below it are rounding errors."""
+_COUNTED = (5, 0.5)
+"""Smallest number of distinct readings, and largest as a share of the rows, between which their step is looked for."""
+_WHOLE = 0.05
+"""Largest distance of a reading from a whole number of steps, in steps: logs are written with few digits."""
 
 
 def difference_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:
-    """Noise of a log whose motion is smooth, in each channel's unit: from how second differences alternate.
+    """Noise of a log whose motion is smooth, in each channel's unit, by `alternating_noise` of its readings."""
+    observation = np.asarray(dataset.transitions.observation)
+    starts, ends = dataset.episode_starts, dataset.episode_ends
+    return alternating_noise([observation[start:end] for start, end in zip(starts, ends, strict=True)])
+
+
+def alternating_noise(series: Iterable[Float[np.ndarray, "_ channels"]]) -> Float[np.ndarray, " channels"]:
+    """Noise in series that are smooth but for it: from how their second differences alternate.
 
     Noise gives second differences of neighbouring rows the covariance -4 σ² and those of next neighbours σ². Smooth
-    motion gives both the same; a force that is held for a step makes (c₂ - c₁) / 5 smaller, never larger. What is not
-    significantly above 0 counts as 0.
+    motion gives both the same; a position under a force that is held for a step makes (c₂ - c₁) / 5 smaller, a speed
+    under one that is another in every step makes it larger. What is not significantly above 0 counts as 0.
     """
-    observation = np.asarray(dataset.transitions.observation)
-    parts = [
-        np.diff(observation[start:end], 2, axis=0)
-        for start, end in zip(dataset.episode_starts, dataset.episode_ends, strict=True)
-        if end - start >= _SHORTEST
-    ]
+    every = [np.asarray(each) for each in series]
+    parts = [np.diff(each, 2, axis=0) for each in every if len(each) >= _SHORTEST]
     if not parts:
-        return np.zeros(observation.shape[1])
+        return np.zeros(every[0].shape[1])
     limited = np.split(clipped(np.concatenate(parts)), np.cumsum([len(part) for part in parts[:-1]]))
     first = np.concatenate([part[1:-1] * part[:-2] for part in limited])
     second = np.concatenate([part[2:] * part[:-2] for part in limited])
     variance = (second - first).mean(0) / 5.0
     error = (second - first).std(0) / 5.0 / np.sqrt(len(first))
     return np.asarray(np.sqrt(np.where(variance > _STANDARD_ERRORS * error, variance, 0.0)))
+
+
+def largest_noise(dataset: Dataset, attitudes: Attitudes) -> Float[np.ndarray, " observation"]:
+    """The most noise that a log shows, in each channel's unit: were all second differences noise, its deviation.
+
+    Those of white noise have the variance 6 σ², and motion adds to that. Counts of a sensor differ less where it moves
+    by less than one in a row: their error is at least that of rounding. It is infinite in a log without three rows that
+    follow each other.
+    """
+    observation = np.asarray(dataset.transitions.observation)
+    starts, ends = dataset.episode_starts, dataset.episode_ends
+    runs = (observation[start:end] for start, end in zip(starts, ends, strict=True))
+    parts = [np.diff(differences(attitudes, run[1:], run[:-1]), axis=0) for run in runs if len(run) > 2]
+    second = np.concatenate(parts or [np.full((1, observation.shape[1]), np.inf)])
+    counted = np.array([resolution_of(column) for column in observation.T]) / np.sqrt(12.0)
+    return np.maximum(np.sqrt((second**2).mean(0) / 6.0), counted)
+
+
+def resolution_of(readings: Float[np.ndarray, " rows"]) -> float:
+    """The step of which all differences of the readings are whole multiples, as of an encoder; 0 where none is seen."""
+    values = np.unique(readings)
+    fewest, most = _COUNTED
+    if not fewest <= len(values) <= most * len(readings):
+        return 0.0
+    gaps, span = np.diff(values), float(values[-1] - values[0])
+    gaps = gaps[gaps > 1e-7 * span]  # smaller ones are rounding errors
+    least = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
+    step = span / max(1.0, np.round(span / least))
+    counts = (values - values[0]) / step
+    return step if np.abs(counts - np.round(counts)).max() < _WHOLE else 0.0
 
 
 def consecutive_noise(

@@ -48,7 +48,7 @@ def losses(
     if "start" not in evidence:
         return nothing
     step = simulator.control_step / simulator.task.frame_skip
-    delays = [row.field == "action_delay" for row in simulator.parameters.parameters]
+    delays = [row.field == "action_delay" and not row.elements for row in simulator.parameters.parameters]
     alone = np.where(np.eye(len(mean), dtype=bool), [np.mean(values) for values in own], mean)
     whole = np.where(delays, np.round(mean / step) * step, mean)
     some = draws[:COMPARED]

@@ -118,7 +118,8 @@ def export_run(
         save_mjlab(files["robot for mjlab"], robot, exported)
         save_isaac_lab(files["robot for Isaac Lab"], robot, exported)
     for drive, file in zip(drives, of_drives, strict=True):
-        save_bam(file, drive, _delay(simulator, result.mean))
+        late = (_late(simulator, result.mean, field, of=drive.name) for field in ("action_delay", "action_lag"))
+        save_bam(file, drive, *late)
     for name, file in policies.items():
         save_onnx(NumpyPolicy.load(file), targets[name])
         files[f"policy {name}"] = targets[name]
@@ -170,7 +171,7 @@ def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], field
         physics=physics,
         decimation=task.frame_skip,
         timestep=simulator.control_step / task.frame_skip,
-        delay=_delay(simulator, values),
+        delay=_late(simulator, values, "action_delay"),
         fields=fields,
         lost=lost,
     )
@@ -185,10 +186,11 @@ def _drives(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> l
     return joint_drives(simulator.model(values), at_rest)
 
 
-def _delay(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> float:
-    """From a command to its effect, s."""
+def _late(simulator: Simulator, values: Float[np.ndarray, " parameters"], field: str, of: str | None = None) -> float:
+    """A delay or a lag, s: that of all actions, and with `of` what the actions of an actuator have alone too."""
+    names = {channel.name for channel in simulator.task.actions if channel.actuator == of}
     rows = zip(simulator.parameters.parameters, values.tolist(), strict=True)
-    return sum((value for row, value in rows if row.field == "action_delay"), 0.0)
+    return sum((value for row, value in rows if row.field == field and names.issuperset(row.elements)), 0.0)
 
 
 def _require_ours(folder: Path, files: Iterable[Path]) -> None:

@@ -52,7 +52,7 @@ def _check_distinct(
         held = set(find_elements(model, earlier))
         elements = zip(parameter.elements, find_elements(model, parameter), strict=True)
         shared = {name for name, body in elements if body in held}
-    whole_robot = earlier.kind.element is None
+    whole_robot = not earlier.elements or not parameter.elements
     exclusive = ({"body_mass", "body_mass_and_inertia"}, {"body_inertia", "body_mass_and_inertia"})
     if parameter.name == earlier.name:
         problem = f"the parameter {parameter.name} is on line {line} already; name: one of them"
@@ -75,10 +75,11 @@ def _elements(draft: Draft, model: mujoco.MjModel, index: int) -> tuple[str, ...
     A name or a pattern that finds none is refused with the nearest names.
     """
     given = draft.spec.parameters[index]
-    kind = field_of(given.fields[0]).element
-    if kind is None:
+    field = field_of(given.fields[0])
+    kind = field.element
+    if kind is None or (field.of_all and not given.names):
         return ()
-    names = [signal.name for signal in draft.spec.signals] if kind == "signal" else element_names(model, kind)
+    names = _names(draft, model, kind)
     also = element_names(model, "joint") if kind == "body" else []  # a joint names its body
     found: list[str] = []
     key = next((key for key in ("element", "elements", "each") if getattr(given, key)), "")
@@ -90,6 +91,13 @@ def _elements(draft: Draft, model: mujoco.MjModel, index: int) -> tuple[str, ...
             raise draft.document.unknown(("parameters", index, key, position), what, wanted, names)
         found += [wanted] if known else [name for name in matching if name not in found]
     return tuple(found)
+
+
+def _names(draft: Draft, model: mujoco.MjModel, kind: str) -> list[str]:
+    """Names of the elements of a kind; an action is a command, and no number that a drive takes from the log."""
+    if kind == "signal":
+        return [signal.name for signal in draft.spec.signals]
+    return [action.name for action in draft.spec.actions] if kind == "action" else element_names(model, kind)
 
 
 def _unit_of(draft: Draft, model: mujoco.MjModel, index: int, elements: tuple[str, ...]) -> str:

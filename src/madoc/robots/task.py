@@ -29,6 +29,7 @@ from madoc.robots.spec import (
     RobotSpec,
     read_spec,
 )
+from madoc.simulation.delay import pending_actions
 from madoc.simulation.write import diagonal_bodies
 from madoc.tasks.base import ActionChannel, Batch, Task, never_terminated
 
@@ -102,17 +103,20 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
     if single:
         factory = partial(with_whole_inertia, factory, single)
         model = compiled(factory, files.main)
-    delays = [row.high for row in space.parameters if row.field == "action_delay"]
-    pending = max([int(np.ceil(high / spec.control_step - 1e-9)) for high in delays], default=0)
+    delay, lag = (
+        max((row.high for row in space.parameters if row.field == field), default=0.0)
+        for field in ("action_delay", "action_lag")
+    )
+    pending = pending_actions(delay, lag, spec.control_step)
     if pending > MOST_PENDING:
         raise document.error(
             ("parameters",),
-            f"expected action_delay of at most {MOST_PENDING:,} control steps, got {pending:,}; is it in seconds?",
+            f"expected action_delay and six times action_lag of at most {MOST_PENDING:,} control steps, got "
+            f"{pending:,}; are they in seconds?",
         )
     if signals.read_sensors & signals.layout.accelerating:
         # Such a sensor shows the force in the last physics step, where the action before may hold yet.
-        late = max(delays, default=0.0) + float(model.opt.timestep)
-        pending = max(pending, int(np.ceil(late / spec.control_step - 1e-9)))
+        pending = max(pending, pending_actions(delay + float(model.opt.timestep), lag, spec.control_step))
     names, episode = tuple(signal.name for signal in spec.signals), read_episode(draft, signals, actions)
     if inputs and episode.rewarded:
         raise document.error(

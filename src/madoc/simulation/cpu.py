@@ -1,7 +1,7 @@
 """The CPU backend: MuJoCo's own threaded rollout, all cores, float64."""
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 
@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.errors import MadocError, listed, nearest_hint
-from madoc.parameters import FIELDS, Parameter
+from madoc.parameters import FIELDS, Parameter, ParameterSpace
 from madoc.runs.machine import usable_cores
 from madoc.simulation.arrays import check_field, check_written
-from madoc.simulation.delay import blend, delay_weights
+from madoc.simulation.delay import action_weights, blend
 from madoc.simulation.drives import drive_forces
 from madoc.simulation.touching import collided
 from madoc.simulation.user_data import install_callbacks, needs_callbacks
@@ -55,7 +55,7 @@ class CpuSimulator:
             names = listed((self._model.actuator(index).name or f"number {index}" for index in active), most=4)
             raise MadocError(
                 f"{task.name}: of the actuators {names} with an activation (dyntype) the state is not simulated here; "
-                "take the dyntype out of the model, and calibrate action_delay instead"
+                "take the dyntype out of the model, and calibrate action_lag or action_delay instead"
             )
         whole = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if whole != 1 + self._model.nq + self._model.nv:  # time, positions, velocities
@@ -106,25 +106,32 @@ class CpuSimulator:
             models.append([copy.copy(self._model) for _ in self._conditions])
             for model, conditions in zip(models[-1], self._conditions, strict=True):
                 write_parameters(model, self._data[0], self.parameters.parameters, row, conditions)
-        delay, longest = self._summed(values, "action_delay")[:, 0], self.task.pending * self.control_step
+        delay, lag = self._of_actions(values, "action_delay"), self._of_actions(values, "action_lag")
+        longest = self.task.pending * self.control_step
         if (delay > longest + 1e-9).any():
             raise MadocError(
                 f"expected an action_delay of at most {longest:g} s, got {delay.max():g}: a state of {self.task.name} "
                 f"carries {self.task.pending} past actions; widen the range of its action_delay"
             )
-        return CpuSystem(self, models, np.minimum(delay, longest), self._summed(values, "signal_bias"))
+        return CpuSystem(self, models, np.minimum(delay, longest), lag, self._of_signals(values))
 
-    def _summed(
+    def _of_signals(self, values: Float[np.ndarray, "systems parameters"]) -> Float[np.ndarray, "systems signals"]:
+        """The bias of each signal, 0 where none is calibrated."""
+        return _summed(self.parameters, values, "signal_bias", self.task.signals)
+
+    def _of_actions(
         self, values: Float[np.ndarray, "systems parameters"], field: str
-    ) -> Float[np.ndarray, "systems signals"]:
-        """The values of a field by signal, 0 where none is calibrated; column 0 if the field has no elements."""
-        signals = self.task.signals
-        sums = np.zeros((len(values), max(1, len(signals))))
-        for parameter, column in zip(self.parameters.parameters, values.T, strict=True):
-            if parameter.field == field:
-                for index in [signals.index(element) for element in parameter.elements] or [0]:
-                    sums[:, index] += column
-        return sums
+    ) -> Float[np.ndarray, "systems values"]:
+        """A delay or lag of each value of an action, or one of all where none has its own.
+
+        What a drive takes from the log, as its supply, has no lag.
+        """
+        rows = [row for row in self.parameters.parameters if row.field == field]
+        measured = [not channel.command for channel in self.task.actions] if field == "action_lag" else []
+        if not any(row.elements for row in rows) and not (rows and any(measured)):
+            return _summed(self.parameters, values, field, [])
+        sums = _summed(self.parameters, values, field, [channel.name for channel in self.task.actions])
+        return np.where(measured or False, 0.0, sums)
 
     def _controls(self, action: Float[np.ndarray, "*rows action"]) -> Float[np.ndarray, "*rows control"]:
         """Controls of the model's actuators for an action; 0 for actuators that no action channel drives."""
@@ -175,15 +182,20 @@ class CpuSystem:
         self,
         simulator: CpuSimulator,
         models: list[list[mujoco.MjModel]],
-        delay: Float[np.ndarray, " systems"],
+        delay: Float[np.ndarray, "systems values"],
+        lag: Float[np.ndarray, "systems other_values"],
         bias: Float[np.ndarray, "systems signals"],
     ) -> None:
         self.models, self.count, self._models = [row[0] for row in models], len(models), models
-        self._simulator, self._delay, self._bias = simulator, delay, bias
+        self._simulator, self._delay, self._lag, self._bias = simulator, *np.broadcast_arrays(delay, lag), bias
         self._physical = self.models[0].nq + self.models[0].nv
         self._goals = self._physical + simulator.task.pending * simulator.action_size
         weights = partial(
-            delay_weights, delay, control_step=simulator.control_step, physics_steps=simulator.task.frame_skip
+            action_weights,
+            self._delay,
+            self._lag,
+            control_step=simulator.control_step,
+            physics_steps=simulator.task.frame_skip,
         )
         self._weights = weights(pending=simulator.task.pending)
         # What sensors show is the end of a control step, whose own action is the newest of those pending.
@@ -196,9 +208,9 @@ class CpuSystem:
         new, models = self._simulator.bind(parameters), list(self._models)
         for index, model in zip(systems, new._models, strict=True):
             models[index] = model
-        delay, bias = self._delay.copy(), self._bias.copy()
-        delay[systems], bias[systems] = new._delay, new._bias
-        return CpuSystem(self._simulator, models, delay, bias)
+        delay, lag, bias = self._delay.copy(), self._lag.copy(), self._bias.copy()
+        delay[systems], lag[systems], bias[systems] = new._delay, new._lag, new._bias
+        return CpuSystem(self._simulator, models, delay, lag, bias)
 
     def step(
         self,
@@ -372,15 +384,30 @@ class CpuSystem:
 
 def _check_elements(model: mujoco.MjModel, task: Task, parameter: Parameter) -> None:
     """Refuse a parameter of an element or a number that the model, or for a signal the task, does not have."""
-    if parameter.kind.element != "signal":
+    kind = parameter.kind.element
+    if kind not in ("signal", "action"):
         check_field(model, parameter.field)
         for index in find_elements(model, parameter):
             check_written(model, parameter.field, index)
         return
+    names = task.signals if kind == "signal" else [channel.name for channel in task.actions]
     for element in parameter.elements:
-        if element not in task.signals:
-            hint = nearest_hint(element, task.signals, none="none of its observation's values has a name")
-            raise MadocError(f"{parameter.name}: {task.name} has no signal {element!r}; {hint}")
+        if element not in names:
+            values = "observation's" if kind == "signal" else "action's"
+            hint = nearest_hint(element, names, none=f"none of its {values} values has a name")
+            raise MadocError(f"{parameter.name}: {task.name} has no {kind} {element!r}; {hint}")
+
+
+def _summed(
+    space: ParameterSpace, values: Float[np.ndarray, "systems parameters"], field: str, names: Sequence[str]
+) -> Float[np.ndarray, "systems _"]:
+    """The values of a field by name, 0 where none is calibrated; those without an element count for all."""
+    sums = np.zeros((len(values), max(1, len(names))))
+    for parameter, column in zip(space.parameters, values.T, strict=True):
+        if parameter.field == field:
+            places = [names.index(element) for element in parameter.elements] or slice(None)
+            sums[:, places] += column[:, None]
+    return sums
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -13,7 +14,7 @@ from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
 from madoc.data import stride
 from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
-from madoc.identification.candidate_terms import DELAY, INTEGRATION
+from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
 from madoc.identification.coarseness import FINER, coarseness
 from madoc.identification.excitation import expected_half_widths
 from madoc.identification.fitted_windows import SHORTER, STRIDES, WINDOWS
@@ -34,7 +35,7 @@ from madoc.verdict.adequacy import (
     worth_naming,
 )
 from madoc.verdict.bench import Bench
-from madoc.verdict.remedies import is_of_spec
+from madoc.verdict.remedies import is_of_spec, remedy
 from madoc.verdict.richer import richer_model
 from madoc.verdict.statistics import NEGLIGIBLE
 
@@ -46,8 +47,9 @@ COLUMNS, COLUMNS_OF_A_VALUE = 60, 20
 freedom."""
 EXCHANGED = "exchanged columns"
 """A part of judging without which nothing is tested."""
-NO_DELAY = "look for a limit of speed, a lag or a filter of the drives or of the log before you add a delay to the spec"
-"""What to do where actions take effect late, and a constant delay leaves something over or was not tested."""
+NO_DELAY = "look for a limit of speed or a filter of the drives or of the log before you add a delay to the spec"
+"""What to do where actions take effect late, and delays and lags leave something over or were not tested."""
+_DELAYED = "action_delay"
 BEFORE_OTHERS = 2.0
 """Time left over that of a test, from which it comes before what is to follow, as predictions over longer times."""
 TESTING = 0.7
@@ -169,8 +171,16 @@ def judged(
     contradicting = tuple(each for each in contradicting if unexplained or not each.rough)
     late = next((each for each in contradicting if each.late), None)
     term = missing_term(found) if late is None else _delay(doubts, late)
-    richer, of_richer = _richer(bench, point, own, term, doubts, finer=finer, shorter=shorter)
-    told = tuple(_contradiction(each, richer) for each in contradicting)
+    tested = partial(_richer, bench, point, own, doubts=doubts, finer=finer, shorter=shorter)
+    richer, of_richer = tested(term)
+    if term is not None and richer is not None and richer.left and term.parameter.startswith(_DELAYED):
+        lag = replace(term, cause=LAG, parameter=term.parameter.replace(_DELAYED, "action_lag", 1))
+        with_lag, more = tested(lag)
+        of_richer += more
+        if with_lag is not None and not with_lag.left:
+            terms = tuple(lag if each == term else each for each in found.missing_terms)
+            found, term, richer = replace(found, missing_terms=terms), lag, with_lag
+    told = tuple(_contradiction(each, term, richer) for each in contradicting)
     return replace(found, richer=richer, contradictions=told, control_steps=found.control_steps + of_richer)
 
 
@@ -193,15 +203,16 @@ def _told_apart(found: Measure, doubts: Suspicions, *, finer: bool) -> Measure:
 
 
 def _delay(doubts: Suspicions, late: Finding) -> MissingTerm | None:
-    """The delay of actions, with the value that the check of the log has found where it is the larger one.
+    """The delay of all actions or of the late one, with the value that the check of the log found if that is larger.
 
     Its range is twice that at most: a state carries an action for every control step of it.
     """
-    for term in doubts.terms:
-        if term.cause == DELAY:
-            value = max(term.value, late.late)
-            return replace(term, value=value, standard_error=min(term.standard_error, value / 4.0))
-    return None
+    terms = [term for term in doubts.terms if term.cause == DELAY or term.parameter == f"{_DELAYED}.{late.where}"]
+    if not terms:
+        return None
+    term = max(terms, key=lambda term: abs(term.t))
+    value = max(term.value, late.late)
+    return replace(term, value=value, standard_error=min(term.standard_error, value / 4.0))
 
 
 def _richer(
@@ -209,8 +220,8 @@ def _richer(
     point: Float[np.ndarray, " d"],
     half_widths: Float[np.ndarray, " d"],
     term: MissingTerm | None,
-    doubts: Suspicions,
     *,
+    doubts: Suspicions,
     finer: bool,
     shorter: int,
 ) -> tuple[RicherModel | None, int]:
@@ -224,11 +235,15 @@ def _richer(
     return richer_model(*given, finer=finer, most=_windows_in_time(bench), shorter=shorter)
 
 
-def _contradiction(finding: Finding, richer: RicherModel | None) -> str:
-    """A finding that contradicts the spec, with what to do, unless that is a delay that does not explain the log."""
-    if not finding.late or (richer is not None and not richer.left):
+def _contradiction(finding: Finding, term: MissingTerm | None, richer: RicherModel | None) -> str:
+    """A finding that contradicts the spec, with what to do; where actions are late, a lag if no delay explains it."""
+    explained = richer is not None and not richer.left
+    if finding.late and explained and term is not None and term.cause == LAG:
+        return replace(finding, do=f"a lag of first order explains it: {remedy(term)}").sentence
+    if not finding.late or explained:
         return finding.sentence
-    tried = "a constant delay does not explain it" if richer else "whether a constant delay explains it was not tested"
+    tried = "neither a constant delay nor a lag of first order explains it"
+    tried = tried if richer else "whether a constant delay explains it was not tested"
     return f"{replace(finding, do='').sentence}; {tried}: {NO_DELAY}"
 
 

@@ -3,7 +3,6 @@
 from madoc.identification.candidate_terms import (
     BELOW_MINIMUM,
     EARLY,
-    LATE_SENSOR,
     SATURATION,
     SPACING,
     TILTS,
@@ -39,8 +38,7 @@ OF_JOINTS = {
 }
 """What to do about forces at a joint that the spec has words for."""
 CHANGE_LOG = "log it without its filter, or shift its column by that time"
-CHANGE_DRIVE = "no parameter of a spec adds the lag of one drive (action_delay is that of all): take out its filter"
-"""The same for a sensor and for a drive that are late."""
+"""The same for a sensor that is late."""
 
 
 def value_of(term: MissingTerm) -> str:
@@ -78,7 +76,7 @@ def remedy(term: MissingTerm) -> str:
     if term.cause in REMEDIES:
         return REMEDIES[term.cause]
     if is_late(term.cause):
-        return CHANGE_LOG if term.cause.startswith(LATE_SENSOR) else CHANGE_DRIVE
+        return CHANGE_LOG
     if term.cause.startswith(UNLISTED):
         return LOOK
     return next((told for cause, told in OF_JOINTS.items() if term.cause.startswith(cause)), CHANGE_MACHINE)

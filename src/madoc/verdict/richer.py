@@ -20,6 +20,7 @@ from madoc.identification.states import LoggedStates, states_of
 from madoc.identification.term_tests import LIKELY_FORCE, MissingTerm, named
 from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
+from madoc.simulation.delay import pending_actions
 from madoc.verdict.remedies import line_of
 
 
@@ -52,7 +53,8 @@ def richer_model(
     """
     added, task = line_of(term), simulator.task
     space = ParameterSpace((*simulator.parameters.parameters, added))
-    late = int(np.ceil(added.high / simulator.control_step)) if added.field == "action_delay" else 0
+    delay, lag = (added.high * (added.field == field) for field in ("action_delay", "action_lag"))
+    late = pending_actions(delay, lag, simulator.control_step)
     task = replace(task, parameters=space, pending=max(task.pending, late))
     wide = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER) if finer else task)
     shift = np.array([term.shifts.get(name, 0.0) for name in simulator.parameters.names]) * half_widths
