@@ -6,13 +6,10 @@ Of attitudes it is that of small rotations, as in `simulation.attitudes`, but fo
 |---|---|---|
 | `difference_noise` | the log alone | motion is smooth over five rows |
 | `largest_noise` | the log alone, as an upper bound | errors of consecutive readings are not alike, but for counts |
-| `alternating_noise` | residuals along windows | those of the model are smooth over five rows |
 | `consecutive_noise` | one-step residuals of consecutive rows | their model errors do not alternate in sign |
 | `residual_noise` | all residuals of a fit | the fit leaves nothing but noise |
 | `channel_noise` | all residuals of a fit | most of them are noise |
 """
-
-from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -47,23 +44,20 @@ _WHOLE = 0.05
 
 
 def difference_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:
-    """Noise of a log whose motion is smooth, in each channel's unit, by `alternating_noise` of its readings."""
-    observation = np.asarray(dataset.transitions.observation)
-    starts, ends = dataset.episode_starts, dataset.episode_ends
-    return alternating_noise([observation[start:end] for start, end in zip(starts, ends, strict=True)])
-
-
-def alternating_noise(series: Iterable[Float[np.ndarray, "_ channels"]]) -> Float[np.ndarray, " channels"]:
-    """Noise in series that are smooth but for it: from how their second differences alternate.
+    """Noise of a log whose motion is smooth, in each channel's unit: from how second differences alternate.
 
     Noise gives second differences of neighbouring rows the covariance -4 σ² and those of next neighbours σ². Smooth
     motion gives both the same; a position under a force that is held for a step makes (c₂ - c₁) / 5 smaller, a speed
     under one that is another in every step makes it larger. What is not significantly above 0 counts as 0.
     """
-    every = [np.asarray(each) for each in series]
-    parts = [np.diff(each, 2, axis=0) for each in every if len(each) >= _SHORTEST]
+    observation = np.asarray(dataset.transitions.observation)
+    parts = [
+        np.diff(observation[start:end], 2, axis=0)
+        for start, end in zip(dataset.episode_starts, dataset.episode_ends, strict=True)
+        if end - start >= _SHORTEST
+    ]
     if not parts:
-        return np.zeros(every[0].shape[1])
+        return np.zeros(observation.shape[1])
     limited = np.split(clipped(np.concatenate(parts)), np.cumsum([len(part) for part in parts[:-1]]))
     first = np.concatenate([part[1:-1] * part[:-2] for part in limited])
     second = np.concatenate([part[2:] * part[:-2] for part in limited])

@@ -4,7 +4,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.holdout import Predicted, PredictionErrors
 from madoc.data import stride
@@ -32,6 +32,8 @@ WHOLE_STEPS = 3
 """Number of Gauss-Newton steps on whole windows, at least 1; they begin at the minimum of single steps."""
 _DAMPING = 1e-6
 """Marquardt's damping of a step, relative to the squared lengths of the columns; 0 is none."""
+FEWEST_FREE = 100
+"""Smallest number of rows without a contact, from which alone sensor noise is then told."""
 MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
 
@@ -101,7 +103,7 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
     residuals = replays.residuals(points)
     sizes = replays.magnitudes(residuals)
     best = best_of(sizes)
-    single = _single_steps(bench, points[best], residuals[best])
+    single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
     groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
     signals = bench.simulator.task.signal_names
@@ -186,9 +188,9 @@ def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
         return bench.problem.noise_by_differences
     mid_range = np.zeros((1, len(bench.simulator.parameters)))
     points = np.concatenate([mid_range, nearby_best(bench.replays, mid_range[0])[0]])
-    residuals = bench.replays.residuals(points)
-    best = int(np.argmin(relative_to_first(bench.replays.magnitudes(residuals).mean((0, -1)))))
-    return _single_steps(bench, points[best], residuals[best]).noise * bench.change
+    sizes = bench.replays.magnitudes(bench.replays.residuals(points)).mean((0, -1))
+    best = points[int(np.argmin(relative_to_first(sizes)))]
+    return _single_steps(bench, best).noise * bench.change
 
 
 class _SingleSteps(NamedTuple):
@@ -201,39 +203,32 @@ class _SingleSteps(NamedTuple):
     control_steps: int
 
 
-def _single_steps(
-    bench: Bench, point: Float[np.ndarray, " d"], along: Float[np.ndarray, "windows steps observation"]
-) -> _SingleSteps:
-    """Statistics of single steps at a point, where residuals `along` the windows are known."""
+def _single_steps(bench: Bench, point: Float[np.ndarray, " d"]) -> _SingleSteps:
     held, rows, scale = bench.held_out, bench.judged_rows, bench.change
     residuals = sensors.clipped(_residuals(bench, point, rows))
     first = np.flatnonzero((np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts))
     share, explanation = explained(bench.scaling.features(held.transitions.take(rows))[0], residuals)
-    noise, spent = _alternating(bench, along), len(rows)
+    noise, spent = np.zeros(len(scale)), len(rows)
     if len(first):
-        slopes = sensors.own_slopes(bench.simulator, held, point, rows[first], scale)
+        told = first[_free_of_contacts(bench, rows[first])]
+        slopes = sensors.own_slopes(bench.simulator, held, point, rows[told], scale)
         unexplained = residuals - explanation
-        # All are lower bounds: what is explained of a channel at rest is its own noise in the reading before, and a
-        # contact that forgets the reading before leaves nothing shared.
-        parts = (sensors.consecutive_noise(part[first], part[first + 1], slopes) for part in (unexplained, residuals))
-        noise = np.max([noise, *parts], axis=0)
-        spent += len(first) * (1 + len(scale))
+        # Both are lower bounds: what is explained of a channel at rest is its own noise in the reading before.
+        parts = (sensors.consecutive_noise(part[told], part[told + 1], slopes) for part in (unexplained, residuals))
+        noise = np.maximum(*parts)
+        spent += len(told) * (1 + len(scale))
     together = autocorrelation(residuals[first], residuals[first + 1])
     return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise, spent)
 
 
-def _alternating(
-    bench: Bench, along: Float[np.ndarray, "windows steps observation"]
-) -> Float[np.ndarray, " observation"]:
-    """The noise that alternates in the log and in residuals along windows as well, in typical changes.
+def _free_of_contacts(bench: Bench, rows: Int[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+    """Which rows tell sensor noise: those in which nothing touches, if there are `FEWEST_FREE`, and else all.
 
-    What actions do from row to row alternates in speeds of the log alone, what contacts make of noisy starts in the
-    residuals alone.
+    A contact forgets the reading before, so that consecutive residuals share nothing though readings are noisy.
     """
-    followed = along[np.isfinite(along).all((1, 2))]
-    if not len(followed):
-        return np.zeros(len(bench.change))
-    return np.minimum(sensors.alternating_noise(followed), bench.problem.noise_by_differences / bench.change)
+    states, known = logged_states(bench.held_out, bench.simulator.task)
+    free = bench.simulator.contacts(states[np.searchsorted(known, rows)]) == 0
+    return free if free.sum() >= FEWEST_FREE else np.ones(len(rows), dtype=bool)
 
 
 def _persistence(bench: Bench, point: Float[np.ndarray, " d"]) -> tuple[float, int]:
