@@ -7,7 +7,7 @@ from itertools import product, zip_longest
 
 import mujoco
 
-from madoc.parameters import FIELDS, Parameter, ParameterSpace, field_of
+from madoc.parameters import FIELDS, PAYLOAD, Parameter, ParameterSpace, field_of
 from madoc.robots.drives import friction_parameters
 from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_slide
@@ -30,6 +30,7 @@ def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
                 _check_distinct(draft, model, index, parameter, other, earlier)
             parameters.append(parameter)
             lines.append(index)
+    _check_payloads(draft, parameters, lines)
     parameters += friction_parameters(draft, parameters)
     return ParameterSpace(tuple(by_condition(draft, parameters, lines)))
 
@@ -40,6 +41,19 @@ def by_condition(draft: Draft, parameters: list[Parameter], lines: list[int]) ->
     for parameter, line in zip_longest(parameters, lines):
         by = None if line is None else draft.spec.parameters[line].by
         yield from [parameter] if by is None else (replace(parameter, when=(by, value)) for value in values[by])
+
+
+def _check_payloads(draft: Draft, parameters: list[Parameter], lines: list[int]) -> None:
+    """Refuse the place or the size of a payload without a mass, which would do nothing."""
+    loaded = {element for row in parameters if row.field == PAYLOAD[0] for element in row.elements}
+    for row, line in zip(parameters, lines, strict=True):
+        missing = [element for element in row.elements if row.field in PAYLOAD[1:] and element not in loaded]
+        if missing:
+            problem = (
+                f"{row.field} of {missing[0]!r} does nothing without a mass there; add {{field: {PAYLOAD[0]}, element: "
+                f"{missing[0]}}}, in a narrow range if it is known"
+            )
+            raise draft.document.error(("parameters", line), problem)
 
 
 def _check_distinct(
