@@ -4,7 +4,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from madoc.calibration.holdout import Predicted, PredictionErrors
 from madoc.data import stride
@@ -32,8 +32,6 @@ WHOLE_STEPS = 3
 """Number of Gauss-Newton steps on whole windows, at least 1; they begin at the minimum of single steps."""
 _DAMPING = 1e-6
 """Marquardt's damping of a step, relative to the squared lengths of the columns; 0 is none."""
-FEWEST_FREE = 100
-"""Smallest number of rows without a contact, from which alone sensor noise is then told."""
 MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
 
@@ -210,25 +208,14 @@ def _single_steps(bench: Bench, point: Float[np.ndarray, " d"]) -> _SingleSteps:
     share, explanation = explained(bench.scaling.features(held.transitions.take(rows))[0], residuals)
     noise, spent = np.zeros(len(scale)), len(rows)
     if len(first):
-        told = first[_free_of_contacts(bench, rows[first])]
-        slopes = sensors.own_slopes(bench.simulator, held, point, rows[told], scale)
+        slopes = sensors.own_slopes(bench.simulator, held, point, rows[first], scale)
         unexplained = residuals - explanation
         # Both are lower bounds: what is explained of a channel at rest is its own noise in the reading before.
-        parts = (sensors.consecutive_noise(part[told], part[told + 1], slopes) for part in (unexplained, residuals))
+        parts = (sensors.consecutive_noise(part[first], part[first + 1], slopes) for part in (unexplained, residuals))
         noise = np.maximum(*parts)
-        spent += len(told) * (1 + len(scale))
+        spent += len(first) * (1 + len(scale))
     together = autocorrelation(residuals[first], residuals[first + 1])
     return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise, spent)
-
-
-def _free_of_contacts(bench: Bench, rows: Int[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
-    """Which rows tell sensor noise: those in which nothing touches, if there are `FEWEST_FREE`, and else all.
-
-    A contact forgets the reading before, so that consecutive residuals share nothing though readings are noisy.
-    """
-    states, known = logged_states(bench.held_out, bench.simulator.task)
-    free = bench.simulator.contacts(states[np.searchsorted(known, rows)]) == 0
-    return free if free.sum() >= FEWEST_FREE else np.ones(len(rows), dtype=bool)
 
 
 def _persistence(bench: Bench, point: Float[np.ndarray, " d"]) -> tuple[float, int]:
