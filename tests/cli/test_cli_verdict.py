@@ -115,6 +115,7 @@ def test_rejected_data_ends_auto_with_a_code_of_its_own(log, tmp_path, capsys):
     assert (answer["verdict"]["word"], code) == ("DATA_REJECTED", 13)
 
 
+@pytest.mark.slow
 def test_where_least_squares_refuses_auto_runs_npe_and_says_why(log, tmp_path, capsys):
     whole = data.load(str(log), make("spring"), format=None, max_transitions=None, key=jax.random.key(0))
     lost = disturb(whole, Disturbance(hidden_velocities=True, shuffled="rows"), make("spring"), jax.random.key(0))

@@ -78,6 +78,7 @@ def test_a_truth_outside_the_range_is_found_at_its_end_and_told():
     assert any("at the end of its range: jnt_stiffness.slide" in warning for warning in result.warnings)
 
 
+@pytest.mark.slow
 def test_rows_at_the_mean_are_compared_with_mid_range_where_discriminators_see_raw_states_too():
     raw = quick("madoc", features="raw", patience=0, cloning_epochs=1, updates=2)
     method = replace(raw, agents=replace(raw.agents, reward_size=0.0))

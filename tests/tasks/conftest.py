@@ -14,6 +14,8 @@ def nominal() -> Callable[[Task], CpuSystem]:
     """One system with the task's own model, nothing written into it."""
 
     def build(task: Task) -> CpuSystem:
-        return CpuSystem(CpuSimulator(task, threads=1), [[task.compile()]], np.zeros(1), np.zeros((1, 1)))
+        return CpuSystem(
+            CpuSimulator(task, threads=1), [[task.compile()]], np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1))
+        )
 
     return build
