@@ -20,6 +20,7 @@ from madoc.data import Disturbance, disturb
 from madoc.identification.settling import cost_of_noise
 from robots import SPRING_TRUTH, recorded, spring
 
+NO_COUNTS = np.zeros(3)
 LIMITS = {"least": LIKE_NOISE, "failed": FAILED_WINDOW}
 
 
@@ -135,12 +136,22 @@ def test_windows_with_and_without_contacts_have_their_own_noise_and_those_betwee
     sizes = np.repeat([0.1, 1.0, 30.0], 50)[:, None, None]
     residuals, spare = sizes * random.standard_normal((150, readings, 3)), np.ones((150, readings, 3))
     expected = cost_of_noise("cauchy")[0]
-    assert steady_cost(residuals, spare, contacts, "cauchy") == pytest.approx(expected, rel=0.1)
+    assert steady_cost(residuals, spare, contacts, NO_COUNTS, "cauchy") == pytest.approx(expected, rel=0.1)
     residuals[:50:3] *= 30.0  # every third resting window is not explained
-    assert steady_cost(residuals, spare, contacts, "cauchy") > LONG_TAILS
+    assert steady_cost(residuals, spare, contacts, NO_COUNTS, "cauchy") > LONG_TAILS
     few = slice(41, 109)  # of nine windows that rest, and nine that land; those that fly decide
-    assert steady_cost(residuals[few], spare[few], contacts[few], "cauchy") == pytest.approx(expected, rel=0.1)
+    assert steady_cost(residuals[few], spare[few], contacts[few], NO_COUNTS, "cauchy") == pytest.approx(
+        expected, rel=0.1
+    )
     fewer = slice(91, 150)  # nine that fly are too few, so that all count
     residuals[100::3] *= 30.0
-    assert steady_cost(residuals[fewer], spare[fewer], contacts[fewer], "cauchy") > LONG_TAILS
-    assert steady_cost(residuals[:0], spare[:0], contacts[:0], "cauchy") == 0.0
+    assert steady_cost(residuals[fewer], spare[fewer], contacts[fewer], NO_COUNTS, "cauchy") > LONG_TAILS
+    assert steady_cost(residuals[:0], spare[:0], contacts[:0], NO_COUNTS, "cauchy") == 0.0
+
+
+def test_readings_of_something_at_rest_do_not_make_the_rounding_of_others_a_long_tail():
+    """Two of three windows are at rest, to a tenth of the rounding of counts with which the third is read."""
+    random, contacts, spare = np.random.default_rng(0), np.zeros((90, 4), int), np.ones((90, 4, 3))
+    residuals = np.repeat([0.1, 0.1, 1.0], 30)[:, None, None] * random.uniform(-1.0, 1.0, (90, 4, 3)) * np.sqrt(3.0)
+    assert steady_cost(residuals, spare, contacts, NO_COUNTS, "cauchy") > LONG_TAILS
+    assert steady_cost(residuals, spare, contacts, np.ones(3), "cauchy") < 0.5

@@ -316,6 +316,15 @@ def test_a_small_gain_counts_where_it_is_significant_and_the_rest_is_noise(good)
 
 
 @EITHER
+def test_a_gain_that_noise_hides_within_a_few_rows_counts_over_a_longer_time(good):
+    hidden = changed(good, {"relative": 0.97, "nearby_relative": 0.97, "relative_interval": (0.94, 1.01)})
+    assert judge(hidden).word == "NO_IMPROVEMENT"
+    assert judge(replace(hidden, open_loop=(predicted_over(1.0, 0.2, (0.1, 0.3)),))).word == "CALIBRATED"
+    for less in (predicted_over(1.0, 0.5, (0.4, 0.6)), predicted_over(1.0, 0.2, (0.2, 0.2), windows=4)):
+        assert judge(replace(hidden, open_loop=(less,))).word == "NO_IMPROVEMENT"
+
+
+@EITHER
 def test_a_sentence_names_three_other_terms_at_most(good):
     terms = tuple(
         MissingTerm("Coulomb friction", f"dof_frictionloss.j{joint}", 0.1, 0.01, "N·m", 0.3, 9.0, {"mass": 2.0})

@@ -11,7 +11,7 @@ from madoc.data import Dataset, typical_change
 from madoc.data.disturbing import row_change
 from madoc.errors import MadocError
 from madoc.identification.information import NORMAL_95
-from madoc.identification.noise import difference_noise
+from madoc.identification.noise import difference_noise, rounding_of
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.learning.expectation import noise_of_log
 from madoc.learning.features import LoggedFeatures
@@ -66,6 +66,11 @@ class CalibrationProblem:
     def noise_by_differences(self) -> Float[np.ndarray, " observation"]:
         """Standard deviation of the sensor noise of each channel by differences of successive rows."""
         return difference_noise(self.dataset)
+
+    @cached_property
+    def rounding(self) -> Float[np.ndarray, " observation"]:
+        """Standard deviation of what readings in whole counts are rounded by; 0 for channels that are not."""
+        return rounding_of(self.dataset)
 
     def noise_of_log(self, rows: int) -> Float[np.ndarray, " observation"]:
         """Standard deviation of the sensor noise of each channel, estimated from the log alone by windows of `rows`."""

@@ -78,8 +78,13 @@ def largest_noise(dataset: Dataset, attitudes: Attitudes) -> Float[np.ndarray, "
     runs = (observation[start:end] for start, end in zip(starts, ends, strict=True))
     parts = [np.diff(differences(attitudes, run[1:], run[:-1]), axis=0) for run in runs if len(run) > 2]
     second = np.concatenate(parts or [np.full((1, observation.shape[1]), np.inf)])
-    counted = np.array([resolution_of(column) for column in observation.T]) / np.sqrt(12.0)
-    return np.maximum(np.sqrt((second**2).mean(0) / 6.0), counted)
+    return np.maximum(np.sqrt((second**2).mean(0) / 6.0), rounding_of(dataset))
+
+
+def rounding_of(dataset: Dataset) -> Float[np.ndarray, " observation"]:
+    """Deviation of the rounding of counts, a step over √12, in each channel's unit; 0 where no step is seen."""
+    readings = np.asarray(dataset.transitions.observation)
+    return np.array([resolution_of(column) for column in readings.T]) / np.sqrt(12.0)
 
 
 def resolution_of(readings: Float[np.ndarray, " rows"]) -> float:

@@ -6,6 +6,8 @@ its model lacks something is `USABLE`: its numbers serve in this simulator and a
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from madoc.calibration.holdout import Area, Fitted, HoldOut, OpenLoop, Predicted, PredictionErrors, ToldApart, Verdict
 from madoc.identification.combinations import Combination
 from madoc.identification.information import OPEN
@@ -31,6 +33,8 @@ SKILL = 0.1
 """Skill of the best prediction, at most 1; data is rejected below it, however significant the prediction is."""
 GAINED = 0.75
 """Share in [0, 1] of the possible gain over mid-range on the hold-out; with less, an estimate is no improvement."""
+_TINY = 1e-300
+"""Least error that another one is divided by."""
 MUCH_BETTER = 0.8
 """Error of open-loop predictions over that of the model as given, at or below which an estimate is of use though the
 model lacks something."""
@@ -175,7 +179,8 @@ def _no_improvement(holdout: HoldOut) -> Verdict | None:
     if isinstance(holdout, ToldApart):
         sentence = _no_better_areas(holdout.area_at_mid_range, holdout.area_at_estimate)
     else:
-        sentence = "" if _mid_range_was_right(holdout) else _no_better_errors(holdout)
+        improved = _mid_range_was_right(holdout) or _improved_later(holdout)
+        sentence = "" if improved else _no_better_errors(holdout)
     return Verdict("NO_IMPROVEMENT", sentence) if sentence else None
 
 
@@ -187,6 +192,17 @@ def _mid_range_was_right(holdout: Predicted | Fitted) -> bool:
     other_windows = any(each.causes == (OTHER_WINDOWS,) for each in holdout.alternatives)
     beyond = beyond_noise((*errors.mid_range, *errors.estimate), (*noise, *noise))
     return inside and as_good and not other_windows and not beyond
+
+
+def _improved_later(holdout: Predicted | Fitted) -> bool:
+    """Whether errors are those of noise, and over a longer time much smaller than at mid-range.
+
+    Within a few rows noise may hide what parameters do, as slow robots need longer to go elsewhere.
+    """
+    later = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
+    pairs = ([(error, each.mid_range[name]) for name, error in each.estimate.items()] for each in later)
+    smaller = (np.mean([error / max(before, _TINY) for error, before in each]) for each in pairs if each)
+    return explains_all(holdout) and any(ratio <= 1.0 - GAINED for ratio in smaller)
 
 
 def _no_better_errors(holdout: Predicted | Fitted) -> str:

@@ -63,6 +63,7 @@ def steady_cost(
     residuals: Float[np.ndarray, "windows readings channels"],
     spare: Float[np.ndarray, "windows readings channels"],
     contacts: Int[np.ndarray, "windows readings"],
+    least: Float[np.ndarray, " channels"],
     loss: Loss,
     *,
     steady_alone: bool = False,
@@ -73,7 +74,8 @@ def steady_cost(
     every reading are of one kind, whose cost is in standard deviations of its own noise: a force that disturbs a flying
     body shows less where friction holds it. Kinds of fewer than `FEWEST_STEADY` windows say nothing; if all are, all
     windows count as one kind, or none does where only steady ones may. A contact between two readings is not seen.
-    `spare` is 1 - leverage of each residual.
+    `spare` is 1 - leverage of each residual. No noise is below `least`: that of counts is their rounding, though most
+    readings be of something at rest.
     """
     if not len(residuals):
         return 0.0
@@ -84,8 +86,9 @@ def steady_cost(
         return 0.0
     kinds = kinds or [np.ones_like(steady)]
     costs = [
-        window_costs((residuals[kind] / channel_noise(residuals[kind], spare[kind])).reshape(kind.sum(), -1), loss)
+        window_costs((residuals[kind] / noise).reshape(kind.sum(), -1), loss)
         for kind in kinds
+        for noise in (np.maximum(channel_noise(residuals[kind], spare[kind]), least),)
     ]
     return float(np.concatenate(costs).mean())
 

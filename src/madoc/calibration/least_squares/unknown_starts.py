@@ -69,6 +69,7 @@ class UnknownStarts:
         readings: Actions and observations of the windows.
         guesses: Initial states as the log tells them.
         touching: Whether the log shows a contact in each window.
+        rounding: Deviation of the rounding of counts in typical changes of each channel.
         loss: Loss of residuals in standard deviations of the noise.
         unknown: Whether initial states are unknown.
         failed_cost: Cost at which every window fails.
@@ -80,6 +81,7 @@ class UnknownStarts:
     readings: Readings
     guesses: Float[np.ndarray, "windows state"]
     touching: Bool[np.ndarray, " windows"]
+    rounding: Float[np.ndarray, " channels"]
     loss: Loss
     unknown: ClassVar[bool] = True
     failed_cost: ClassVar[float] = FAILED_WINDOW
@@ -98,7 +100,8 @@ class UnknownStarts:
         """The windows that begin at the given rows."""
         readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
         guesses = problem.states.states[np.searchsorted(problem.states.rows, rows)]
-        return cls(problem.simulator, readings, guesses, touching, loss)
+        rounding = (problem.rounding / problem.typical_change)[: problem.states.measured]
+        return cls(problem.simulator, readings, guesses, touching, rounding, loss)
 
     @staticmethod
     def touched(
@@ -373,7 +376,7 @@ class UnknownStarts:
     ) -> float:
         shape, of_bases = (int(kept.sum()), *self.readings.observed.shape[1:]), bool(self.readings.placed.any())
         residuals, left = slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape)
-        return steady_cost(residuals, left, contacts[kept], self.loss, steady_alone=of_bases)
+        return steady_cost(residuals, left, contacts[kept], self.rounding, self.loss, steady_alone=of_bases)
 
     def _deviation(
         self, slopes: WindowSlopes, spare: Float[np.ndarray, "windows values"], kept: Bool[np.ndarray, " windows"]
