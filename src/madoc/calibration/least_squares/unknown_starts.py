@@ -344,7 +344,9 @@ class UnknownStarts:
             exact=float(deviation.max()) < ROUNDING,
             left_out=1.0 - float(kept.mean()),
             failures=int((~slopes.whole).sum()),
-            steady_cost=0.0 if contacts is None else self._steady_cost(slopes, spare, contacts, kept),
+            steady_cost=0.0
+            if contacts is None
+            else self._steady_cost(slopes, spare, contacts, kept, self.rounding / deviation),
             chattering=chattering,
             more=columns,
         )
@@ -373,10 +375,11 @@ class UnknownStarts:
         spare: Float[np.ndarray, "windows values"],
         contacts: Int[np.ndarray, "windows readings"],
         kept: Bool[np.ndarray, " windows"],
+        least: Float[np.ndarray, " channels"],
     ) -> float:
         shape, of_bases = (int(kept.sum()), *self.readings.observed.shape[1:]), bool(self.readings.placed.any())
         residuals, left = slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape)
-        return steady_cost(residuals, left, contacts[kept], self.rounding, self.loss, steady_alone=of_bases)
+        return steady_cost(residuals, left, contacts[kept], least, self.loss, steady_alone=of_bases)
 
     def _deviation(
         self, slopes: WindowSlopes, spare: Float[np.ndarray, "windows values"], kept: Bool[np.ndarray, " windows"]
