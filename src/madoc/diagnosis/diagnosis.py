@@ -53,7 +53,9 @@ class Diagnosis:
         return any(finding.level == "fatal" for finding in self.findings)
 
 
-def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None, seed: int = 0) -> Diagnosis:
+def check(
+    dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None, seed: int = 0, intervals: bool = True
+) -> Diagnosis:
     """Compare a log with a model before any calibration.
 
     Args:
@@ -61,6 +63,8 @@ def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None,
         simulator: The model and the ranges of its parameters.
         robot: The user's own robot, if it is one: its spec gives units and reasons.
         seed: Seed of the windows that are replayed and of the parameters that are tried.
+        intervals: Whether expected intervals are wanted where initial states have to be fitted for them, which takes
+            as long as the rest; a calibration that follows has its own.
     """
     started = time.monotonic()
     of_rows, of_box, of_actions, of_windows = jax.random.split(jax.random.key(seed), 4)
@@ -93,7 +97,7 @@ def check(dataset: Dataset, simulator: Simulator, *, robot: Robot | None = None,
             spent += explanation.control_steps + steps
         else:
             findings.append(_inexact_states_finding(logged, robot))
-            excitation = excite_unknown(dataset, simulator, logged)
+            excitation = excite_unknown(dataset, simulator, logged, intervals=intervals)
         spent += excitation.control_steps
         findings += excitation_findings(excitation, simulator)
         findings += scale_findings(dataset, simulator, logged, start, only_ratios=excitation.only_ratios)

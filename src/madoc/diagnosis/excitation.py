@@ -130,11 +130,11 @@ def _excited(
     )
 
 
-def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates) -> Excitation:
+def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates, *, intervals: bool) -> Excitation:
     """Which estimates would correlate, where the log's states are not exact, and intervals where they are approximate.
 
     Those are the narrowest that the log allows where parameters and initial states fit some of its windows best, with
-    what is left there for noise; NaN where states are unknown.
+    what is left there for noise; NaN where states are unknown, or no `intervals` are wanted.
     """
     space = simulator.parameters
     strides, count = max(WINDOWS.items())
@@ -147,7 +147,7 @@ def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates)
     certainty, only_ratios = _without_scale(certainty, around, middle, space)
     effect = half = np.full(len(space), np.nan)
     spent = len(points) * len(windows) * windows.steps
-    if logged.kind == "approximate":
+    if intervals and logged.kind == "approximate":
         fitted = windows_of(dataset, logged, scale, fewest=FEWEST + len(space), most=FEWEST + len(space))
         fit = fit_windows(simulator, fitted.readings, fitted.states, middle)
         if fit.counted.any():

@@ -121,7 +121,7 @@ def prepare(order: CalibrationOrder, *, permission: Permission = NO_PERMISSION) 
         machine.check_truth(truth, task)
     simulator = simulation.make(task)
     if machine.robot is not None:
-        diagnosis = check(dataset, simulator, robot=machine.robot)
+        diagnosis = check(dataset, simulator, robot=machine.robot, intervals=False)
         refuse_fatal(diagnosis.findings)
         dataset = replace(dataset, findings=diagnosis.findings)
     return Prepared(order, method, budget, holdout, machine, dataset, simulator, truth)
