@@ -173,6 +173,7 @@ def judged(
     term = missing_term(found) if late is None else _delay(doubts, late)
     tested = partial(_richer, bench, point, own, doubts=doubts, finer=finer, shorter=shorter)
     richer, of_richer = tested(term)
+    with_lag = None
     if term is not None and richer is not None and richer.left and term.parameter.startswith(_DELAYED):
         lag = replace(term, cause=LAG, parameter=term.parameter.replace(_DELAYED, "action_lag", 1))
         with_lag, more = tested(lag)
@@ -180,7 +181,8 @@ def judged(
         if with_lag is not None and not with_lag.left:
             terms = tuple(lag if each == term else each for each in found.missing_terms)
             found, term, richer = replace(found, missing_terms=terms), lag, with_lag
-    told = tuple(_contradiction(each, term, richer) for each in contradicting)
+    tried = [name for name, model in (("constant delay", richer), ("lag of first order", with_lag)) if model]
+    told = tuple(_contradiction(each, term, richer, tried) for each in contradicting)
     return replace(found, richer=richer, contradictions=told, control_steps=found.control_steps + of_richer)
 
 
@@ -235,16 +237,14 @@ def _richer(
     return richer_model(*given, finer=finer, most=_windows_in_time(bench), shorter=shorter)
 
 
-def _contradiction(finding: Finding, term: MissingTerm | None, richer: RicherModel | None) -> str:
-    """A finding that contradicts the spec, with what to do; where actions are late, a lag if no delay explains it."""
-    explained = richer is not None and not richer.left
-    if finding.late and explained and term is not None and term.cause == LAG:
-        return replace(finding, do=f"a lag of first order explains it: {remedy(term)}").sentence
-    if not finding.late or explained:
+def _contradiction(finding: Finding, term: MissingTerm | None, richer: RicherModel | None, tried: Sequence[str]) -> str:
+    """A finding that contradicts the spec, with what to do; for late actions, by what was `tried` for them."""
+    if not finding.late:
         return finding.sentence
-    tried = "neither a constant delay nor a lag of first order explains it"
-    tried = tried if richer else "whether a constant delay explains it was not tested"
-    return f"{replace(finding, do='').sentence}; {tried}: {NO_DELAY}"
+    if term is not None and richer is not None and not richer.left:
+        return replace(finding, do=f"a {tried[-1]} explains it: {remedy(term)}").sentence
+    left = f"no {' and no '.join(tried)} explains it" if tried else "whether a delay explains it was not tested"
+    return f"{replace(finding, do='').sentence}; {left}: {NO_DELAY}"
 
 
 def _best_half_widths(
