@@ -182,7 +182,8 @@ class Parameter:
         kind = self.kind
         none = self.elements == ()
         if ((kind.element is None) != none and not (none and kind.of_all)) or "" in self.elements:
-            wanted = "no element" if kind.element is None else f"the name of a {kind.element}"
+            article = "an" if kind.element and kind.element[0] in "aeiou" else "a"
+            wanted = "no element" if kind.element is None else f"the name of {article} {kind.element}"
             raise MadocError(f"parameter field {self.field!r} takes {wanted}, got {self.element!r}")
         if len(set(self.elements)) < len(self.elements):
             raise MadocError(f"{self.name} names an element twice; a shared value needs each only once")

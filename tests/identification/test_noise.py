@@ -9,9 +9,9 @@ from madoc.identification.noise import (
     clipped,
     consecutive_noise,
     difference_noise,
-    largest_noise,
     own_slopes,
     residual_noise,
+    rounding_of,
 )
 from madoc.simulation.attitudes import differences, moved
 from madoc.types import Transitions
@@ -76,14 +76,11 @@ def test_second_differences_tell_noise_from_motion():
     assert difference_noise(line_of(noise[:4])) == 0.0
 
 
-def test_a_log_bounds_its_noise():
-    """White noise of 0.01 alone is its bound; steps of 0.1 that are hardly ever taken err by 0.1 / √12 = 0.029."""
-    noise = 0.01 * np.random.default_rng(0).standard_normal((5000, 1))
-    assert largest_noise(line_of(noise), ()) == pytest.approx(0.01, rel=0.05)
-    assert largest_noise(line_of(noise + np.sin(np.arange(5000) / 10.0)[:, None]), ()) < 0.011
-    slow = np.round(np.sin(np.arange(5000) / 500.0)[:, None] / 0.1) * 0.1
-    assert largest_noise(line_of(slow), ()) == pytest.approx(0.029, abs=1e-3)
-    assert largest_noise(line_of(noise[:2]), ()) == np.inf
+def test_the_rounding_of_counts():
+    """Steps of 0.1 err by 0.1 / √12 = 0.029; what is not read in steps is not rounded."""
+    time = np.arange(5000)[:, None] / 500.0
+    assert rounding_of(line_of(np.round(np.sin(time) / 0.1) * 0.1)) == pytest.approx(0.029, abs=1e-3)
+    assert rounding_of(line_of(np.sin(time))) == 0.0
 
 
 def test_the_slopes_of_the_spring_by_itself():

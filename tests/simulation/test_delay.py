@@ -169,3 +169,17 @@ def test_a_task_without_signals_has_none_to_bias(cart):
         CpuSimulator(replace(cart.task, parameters=space))
     with pytest.raises(MadocError, match="none of its observation's values has a name"):
         CpuSimulator(replace(cart.task, parameters=space, signals=()))
+
+
+def test_a_delay_of_all_actions_and_one_of_a_single_action_are_refused_together(tmp_path):
+    both = TWO_CARTS + "  - {field: action_delay, low: 0, high: 0.04}\n"
+    with pytest.raises(MadocError, match="of all actions and of one cannot both be calibrated, and line 13 has one"):
+        load(write_robot(tmp_path, both, carts=TWO_CARTS_MODEL))
+    with pytest.raises(MadocError, match="the name of an action"):
+        load(
+            write_robot(
+                tmp_path,
+                TWO_CARTS.replace("push_left, low: 0, high: 0.04", "push, low: 0, high: 1"),
+                carts=TWO_CARTS_MODEL,
+            )
+        )

@@ -84,7 +84,7 @@ def test_a_good_estimate_is_calibrated_and_the_sentence_has_its_numbers(good):
             "that fit the hold-out best err by 0.8 of what a signal",
         ),
         ("MODEL_MISMATCH", LEFT_OVER, {"explained": 0.6}, "actions? explain 60 % of it"),
-        ("MODEL_MISMATCH", {}, {"explained": 0.8}, "as much as noise does; that is no chance, as"),
+        ("MODEL_MISMATCH", {}, {"explained": 0.8}, "which could not be predicted if it were noise; that is"),
         ("MODEL_MISMATCH", LEFT_OVER, {"at_end": ("mass",)}, "mass at the end of the range"),
         ("NOT_IDENTIFIABLE", {}, {"interval_shares": {"mass": 0.1, "damping": 0.7}}, "leaves damping open"),
         ("NO_IMPROVEMENT", {"relative": 1.1, "relative_interval": (0.9, 1.3)}, {}, "not at its end"),
@@ -322,6 +322,12 @@ def test_a_gain_that_noise_hides_within_a_few_rows_counts_over_a_longer_time(goo
     assert judge(replace(hidden, open_loop=(predicted_over(1.0, 0.2, (0.1, 0.3)),))).word == "CALIBRATED"
     for less in (predicted_over(1.0, 0.5, (0.4, 0.6)), predicted_over(1.0, 0.2, (0.2, 0.2), windows=4)):
         assert judge(replace(hidden, open_loop=(less,))).word == "NO_IMPROVEMENT"
+    better = (predicted_over(1.0, 0.2, (0.1, 0.3)),)
+    for worse in ({"relative": 1.3, "relative_interval": (1.2, 1.4)}, {"nearby_relative": 0.5}):
+        assert judge(replace(changed(hidden, worse), open_loop=better)).word == "NO_IMPROVEMENT"
+    still = replace(better[0], estimate={"q": 1.0, "w": 0.0}, mid_range={"q": 1.0, "w": 0.0})
+    assert judge(replace(hidden, open_loop=(still,))).word == "NO_IMPROVEMENT"
+    assert judge(replace(hidden, open_loop=(*better, predicted_over(0.1, 2.0, (1.5, 3.0))))).word == "NO_IMPROVEMENT"
 
 
 @EITHER

@@ -127,8 +127,8 @@ def response_findings(
 def _lag_findings(response: Response, action: str, simulator: Simulator) -> list[Finding]:
     """A warning where a lag is certain, and no calibrated delay can stand for it."""
     step, lag, error = simulator.control_step, response.lag, response.lag_error
-    of_it = [row for row in simulator.parameters.parameters if not row.elements or action in row.elements]
-    delays = [row for row in of_it if row.field in ("action_delay", "action_lag")]
+    timed = [row for row in simulator.parameters.parameters if row.kind.of_all]
+    delays = [row for row in timed if not row.elements or action in row.elements]
     covered = any(row.low <= max(lag, response.larger_lag) and lag <= row.high for row in delays)
     if lag < max(LATE * step, CERTAIN * error) or covered:
         return []
@@ -137,8 +137,10 @@ def _lag_findings(response: Response, action: str, simulator: Simulator) -> list
         "rows)"
     )
     low, high = max(0.0, lag - 2.0 * step), lag + 2.0 * step
-    remedy = f"{{field: action_delay, low: {0.0 if low < step else low:.2g}, high: {high:.2g}}}"
-    verb = "widen the range of the delay to" if delays else "add the parameter"
+    own = f", element: {action}" if any(row.elements for row in timed) else ""
+    remedy = f"{{field: action_delay{own}, low: {0.0 if low < step else low:.2g}, high: {high:.2g}}}"
+    known = any(row.field == "action_delay" for row in delays)
+    verb = "widen the range of the delay to" if known else "add the parameter"
     alike = "a limit of speed, a lag of the motor, a filter on the log or an elastic transmission"
     do = f"if it is a delay, {verb} {remedy}; {alike} would look alike"
     return [Finding("warning", what, action, do, contradicts=lag >= CONTRADICTING * step, late=lag)]

@@ -196,7 +196,7 @@ def _around(exported: Sequence[Exported], how: str) -> list[str]:
     told = {
         "signal_bias": how,
         "action_lag": "no actuator here follows its command with a lag",
-        "action_delay": "it is of one action, and the delay here is of all",
+        "action_delay": "it delays its own actions alone, and a delay here is one for all actuators",
     }
     return [
         f"{row.parameter.name} = {row.row.estimate:.6g} {row.row.unit} is not of the model: "

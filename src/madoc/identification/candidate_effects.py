@@ -59,7 +59,7 @@ def effects(
     stretched = simulation.make(simulator.task.with_time_step(1.0 + CHANGE))
     finer = simulation.make(simulator.task.with_time_step(1.0 / FINER, substeps=FINER))
     fields = {each.field for each in simulator.parameters.parameters}
-    timed = any(each.kind.of_all for each in simulator.parameters.parameters)
+    timed = [each for each in simulator.parameters.parameters if each.kind.of_all]
     tilts = TILTS if np.any(simulator.task.model.opt.gravity) else ()
     for candidate, other, inputs, change in (
         *(
@@ -82,7 +82,7 @@ def effects(
             found.append((moved - base) / change)
     commands = [(place, channel) for place, channel in enumerate(simulator.task.actions) if channel.command]
     for place, channel in commands if len(commands) > 1 else ():
-        if any(channel.name in each.elements for each in simulator.parameters.parameters if each.kind.of_all):
+        if any(not each.elements or channel.name in each.elements for each in timed):
             continue
         actions = readings.actions.copy()
         actions[..., place] = late.actions[..., place]

@@ -236,7 +236,7 @@ def _below_minimum(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[M
         row, found = rows[index], score(products, 1 + len(free) + place)
         if found is None or found.change >= 0.0 or abs(found.t) < SUSPICIOUS:
             continue
-        half, shifts, early = (row.high - row.low) / 2.0, np.zeros(len(rows)), row.field == "action_delay"
+        half, shifts, early = (row.high - row.low) / 2.0, np.zeros(len(rows)), row.kind.of_all
         shifts[free], shifts[index] = found.shifts, found.change
         yield MissingTerm(
             cause=EARLY if early else BELOW_MINIMUM,

@@ -5,7 +5,6 @@ Of attitudes it is that of small rotations, as in `simulation.attitudes`, but fo
 | estimator | from | assumes |
 |---|---|---|
 | `difference_noise` | the log alone | motion is smooth over five rows |
-| `largest_noise` | the log alone, as an upper bound | errors of consecutive readings are not alike, but for counts |
 | `consecutive_noise` | one-step residuals of consecutive rows | their model errors do not alternate in sign |
 | `residual_noise` | all residuals of a fit | the fit leaves nothing but noise |
 | `channel_noise` | all residuals of a fit | most of them are noise |
@@ -17,7 +16,7 @@ from jaxtyping import Float, Int
 from madoc.data.dataset import Dataset
 from madoc.identification.losses import NORMAL_MAD, robust_deviation
 from madoc.identification.states import states_observed_as
-from madoc.simulation.attitudes import Attitudes, differences, moved
+from madoc.simulation.attitudes import differences, moved
 from madoc.simulation.base import Simulator
 
 OUTLIER = 5.0
@@ -64,21 +63,6 @@ def difference_noise(dataset: Dataset) -> Float[np.ndarray, " observation"]:
     variance = (second - first).mean(0) / 5.0
     error = (second - first).std(0) / 5.0 / np.sqrt(len(first))
     return np.asarray(np.sqrt(np.where(variance > _STANDARD_ERRORS * error, variance, 0.0)))
-
-
-def largest_noise(dataset: Dataset, attitudes: Attitudes) -> Float[np.ndarray, " observation"]:
-    """The most noise that a log shows, in each channel's unit: were all second differences noise, its deviation.
-
-    Those of white noise have the variance 6 σ², and motion adds to that. Counts of a sensor differ less where it moves
-    by less than one in a row: their error is at least that of rounding. It is infinite in a log without three rows that
-    follow each other.
-    """
-    observation = np.asarray(dataset.transitions.observation)
-    starts, ends = dataset.episode_starts, dataset.episode_ends
-    runs = (observation[start:end] for start, end in zip(starts, ends, strict=True))
-    parts = [np.diff(differences(attitudes, run[1:], run[:-1]), axis=0) for run in runs if len(run) > 2]
-    second = np.concatenate(parts or [np.full((1, observation.shape[1]), np.inf)])
-    return np.maximum(np.sqrt((second**2).mean(0) / 6.0), rounding_of(dataset))
 
 
 def rounding_of(dataset: Dataset) -> Float[np.ndarray, " observation"]:

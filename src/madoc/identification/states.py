@@ -225,7 +225,7 @@ def with_pending(
     if not len(rows):
         raise MadocError(
             f"a state of {task.name} carries the {task.pending} actions before it, and no episode of {dataset.origin} "
-            "has so many before a row; give it data with its rows in order, or a shorter action_delay"
+            "has so many before a row; give it data with its rows in order, or a shorter action_delay or action_lag"
         )
     action = np.asarray(dataset.transitions.action, dtype=np.float64)
     return np.concatenate([states, *(action[rows - back] for back in range(1, task.pending + 1))], axis=-1), rows

@@ -190,7 +190,10 @@ def _late(simulator: Simulator, values: Float[np.ndarray, " parameters"], field:
     """A delay or a lag, s: that of all actions, and with `of` what the actions of an actuator have alone too."""
     names = {channel.name for channel in simulator.task.actions if channel.actuator == of}
     rows = zip(simulator.parameters.parameters, values.tolist(), strict=True)
-    return sum((value for row, value in rows if row.field == field and names.issuperset(row.elements)), 0.0)
+    felt = (
+        value for row, value in rows if row.field == field and (not row.elements or names.intersection(row.elements))
+    )
+    return sum(felt, 0.0)
 
 
 def _require_ours(folder: Path, files: Iterable[Path]) -> None:

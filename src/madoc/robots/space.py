@@ -30,7 +30,7 @@ def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
                 _check_distinct(draft, model, index, parameter, other, earlier)
             parameters.append(parameter)
             lines.append(index)
-    _check_payloads(draft, parameters, lines)
+    _check_payloads(draft, model, parameters, lines)
     parameters += friction_parameters(draft, parameters)
     return ParameterSpace(tuple(by_condition(draft, parameters, lines)))
 
@@ -43,11 +43,14 @@ def by_condition(draft: Draft, parameters: list[Parameter], lines: list[int]) ->
         yield from [parameter] if by is None else (replace(parameter, when=(by, value)) for value in values[by])
 
 
-def _check_payloads(draft: Draft, parameters: list[Parameter], lines: list[int]) -> None:
+def _check_payloads(draft: Draft, model: mujoco.MjModel, parameters: list[Parameter], lines: list[int]) -> None:
     """Refuse the place or the size of a payload without a mass, which would do nothing."""
-    loaded = {element for row in parameters if row.field == PAYLOAD[0] for element in row.elements}
+    loaded = {body for row in parameters if row.field == PAYLOAD[0] for body in find_elements(model, row)}
     for row, line in zip(parameters, lines, strict=True):
-        missing = [element for element in row.elements if row.field in PAYLOAD[1:] and element not in loaded]
+        if row.field not in PAYLOAD[1:]:
+            continue
+        bodies = zip(row.elements, find_elements(model, row), strict=True)
+        missing = [element for element, body in bodies if body not in loaded]
         if missing:
             problem = (
                 f"{row.field} of {missing[0]!r} does nothing without a mass there; add {{field: {PAYLOAD[0]}, element: "
@@ -68,7 +71,12 @@ def _check_distinct(
         shared = {name for name, body in elements if body in held}
     whole_robot = not earlier.elements or not parameter.elements
     exclusive = ({"body_mass", "body_mass_and_inertia"}, {"body_inertia", "body_mass_and_inertia"})
-    if parameter.name == earlier.name:
+    if parameter.field == earlier.field and whole_robot and parameter.elements != earlier.elements:
+        problem = (
+            f"{parameter.field} of all actions and of one cannot both be calibrated, and line {line} has one already; "
+            "keep that of all, or give each action its own with each:"
+        )
+    elif parameter.name == earlier.name:
         problem = f"the parameter {parameter.name} is on line {line} already; name: one of them"
     elif same_numbers(model, parameter, earlier):
         problem = f"{parameter.name} and {earlier.name} of line {line} are one number of the model; keep one"
@@ -101,7 +109,8 @@ def _elements(draft: Draft, model: mujoco.MjModel, index: int) -> tuple[str, ...
         known = wanted in names or wanted in also
         matching = [name for name in names if fnmatchcase(name, wanted) and name != "world"]
         if not known and (key == "element" or not matching):
-            what = f"the name of a {kind}" + ("" if key == "element" else ", or a pattern with * for several")
+            article = "an" if kind[0] in "aeiou" else "a"
+            what = f"the name of {article} {kind}" + ("" if key == "element" else ", or a pattern with * for several")
             raise draft.document.unknown(("parameters", index, key, position), what, wanted, names)
         found += [wanted] if known else [name for name in matching if name not in found]
     return tuple(found)

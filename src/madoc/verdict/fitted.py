@@ -11,7 +11,7 @@ from madoc.calibration.holdout import AgainstChance, Fitted
 from madoc.data import stride
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
 from madoc.identification.losses import curvature_share, loss_slope, scale_of
-from madoc.identification.noise import largest_noise, residual_noise
+from madoc.identification.noise import residual_noise
 from madoc.identification.replay import slopes_at
 from madoc.simulation.attitudes import moved
 from madoc.verdict.bench import Bench
@@ -41,8 +41,6 @@ def fitted(
     sizes = magnitudes(replays.at_horizons(residuals))
     best = best_of(sizes)
     noise = residual_noise(residuals[best][:, : replays.fitted + 1], len(replays.readings.spread))
-    most = largest_noise(bench.problem.dataset, bench.simulator.task.attitudes) / bench.change
-    noise = np.minimum(noise, most[: len(noise)])
     alone, comparing = _with_noise_alone(bench, replays, points[best], residuals[best], noise)
     observed, actions = replays.readings.observed, replays.readings.actions
     start_and_actions = np.concatenate([observed[:, 0], observed[:, 1], actions.reshape(len(actions), -1)], axis=1)

@@ -33,8 +33,6 @@ SKILL = 0.1
 """Skill of the best prediction, at most 1; data is rejected below it, however significant the prediction is."""
 GAINED = 0.75
 """Share in [0, 1] of the possible gain over mid-range on the hold-out; with less, an estimate is no improvement."""
-_TINY = 1e-300
-"""Least error that another one is divided by."""
 MUCH_BETTER = 0.8
 """Error of open-loop predictions over that of the model as given, at or below which an estimate is of use though the
 model lacks something."""
@@ -195,14 +193,18 @@ def _mid_range_was_right(holdout: Predicted | Fitted) -> bool:
 
 
 def _improved_later(holdout: Predicted | Fitted) -> bool:
-    """Whether errors are those of noise, and over a longer time much smaller than at mid-range.
+    """Whether noise hides within a few rows what parameters do, and later errors are much smaller than at mid-range.
 
-    Within a few rows noise may hide what parameters do, as slow robots need longer to go elsewhere.
+    Slow robots need longer to go elsewhere. Errors are those of noise then, no parameters nearby leave less of
+    mid-range's error, which is not certainly exceeded, and over no length are those of the model as given.
     """
-    later = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
-    pairs = ([(error, each.mid_range[name]) for name, error in each.estimate.items()] for each in later)
-    smaller = (np.mean([error / max(before, _TINY) for error, before in each]) for each in pairs if each)
-    return explains_all(holdout) and any(ratio <= 1.0 - GAINED for ratio in smaller)
+    errors, enough = holdout.errors, [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
+    hidden = errors.nearby_relative > 1.0 - WORTH_GAINING and errors.relative_interval[0] <= 1.0
+    if not (hidden and explains_all(holdout)) or any(each.relative_interval[0] > 1.0 for each in enough):
+        return False
+    pairs = ([(error, each.mid_range[name]) for name, error in each.estimate.items()] for each in enough)
+    moving = ([error / before for error, before in each if before > 0.0] for each in pairs)
+    return any(np.mean(ratios) <= 1.0 - GAINED for ratios in moving if ratios)
 
 
 def _no_better_errors(holdout: Predicted | Fitted) -> str:

@@ -8,7 +8,7 @@ from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import about_timestep, as_likely, far_beyond_noise, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
-from madoc.verdict.statistics import NEGLIGIBLE
+from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
 from madoc.verdict.wording import change_of, in_rows, of_area
 
@@ -33,7 +33,7 @@ def lacking(holdout: HoldOut, *, settled: bool, long_tails: bool) -> Verdict | N
     have longer tails than noise has.
     """
     found = _missing(holdout, missing_term(holdout)) or _mismatch(holdout)
-    if far_beyond_noise(holdout):
+    if far_beyond_noise(holdout) and numerical(holdout) is None:
         found = found or _missing(holdout, missing_term(holdout, least=0.0))
     found = found or (_outside(holdout) if settled else None)
     return found or (_unlike_noise(holdout) if long_tails else None)
@@ -193,6 +193,8 @@ def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
     left, noise = max(pairs, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
     noisy = noise.mean > NEGLIGIBLE
     much = f"{left.mean / noise.mean:.2g} times as much as noise does" if noisy else "none of which is noise"
+    if noisy and not beyond_noise(errors.nearby_best, errors.noise):
+        much = "about what noise was estimated to make, which could not be predicted if it were noise"
     why = f"; that is no chance, as {' and '.join(reasons)}" if reasons else ""
     after = f"after {in_rows(left.steps)}{'' if direct else ' from a fitted start'}"
     return (

@@ -179,7 +179,8 @@ def judged(
         with_lag, more = tested(lag)
         of_richer += more
         if with_lag is not None and not with_lag.left:
-            terms = tuple(lag if each == term else each for each in found.missing_terms)
+            same = (term.cause, term.parameter)
+            terms = tuple(lag if (each.cause, each.parameter) == same else each for each in found.missing_terms)
             found, term, richer = replace(found, missing_terms=terms), lag, with_lag
     tried = [name for name, model in (("constant delay", richer), ("lag of first order", with_lag)) if model]
     told = tuple(_contradiction(each, term, richer, tried) for each in contradicting)

@@ -53,7 +53,10 @@ def richer_model(
     """
     added, task = line_of(term), simulator.task
     space = ParameterSpace((*simulator.parameters.parameters, added))
-    delay, lag = (added.high * (added.field == field) for field in ("action_delay", "action_lag"))
+    delay, lag = (
+        max((row.high for row in space.parameters if row.field == field), default=0.0)
+        for field in ("action_delay", "action_lag")
+    )
     late = pending_actions(delay, lag, simulator.control_step)
     task = replace(task, parameters=space, pending=max(task.pending, late))
     wide = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER) if finer else task)
