@@ -85,6 +85,8 @@ def test_one_drive_follows_later_than_the_other(tmp_path):
     after = system.step(state, np.ones((3, 1, 2)))[:, 0]
     assert after[:, 3] == pytest.approx(after[2, 3])
     assert after[0, 2] == 0.0
+    with pytest.raises(MadocError, match=r"expected an action_delay and 6 times an action_lag of at most 0\.16 s"):
+        CpuSimulator(task, threads=1).bind(np.array([[0.0, 0.03]]))
     # Over 0.02 s a lag of 0.01 s has passed on 1 - (1 - exp(-2)) / 2 of the command.
     assert after[1, 2] == pytest.approx(after[2, 2] * (1.0 - (1.0 - np.exp(-2.0)) / 2.0))
 

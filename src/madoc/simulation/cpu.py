@@ -14,7 +14,7 @@ from madoc.errors import MadocError, listed, nearest_hint
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
 from madoc.runs.machine import usable_cores
 from madoc.simulation.arrays import check_field, check_written
-from madoc.simulation.delay import action_weights, blend
+from madoc.simulation.delay import LAGS, action_weights, blend
 from madoc.simulation.drives import drive_forces
 from madoc.simulation.touching import collided
 from madoc.simulation.user_data import install_callbacks, needs_callbacks
@@ -112,6 +112,13 @@ class CpuSimulator:
             raise MadocError(
                 f"expected an action_delay of at most {longest:g} s, got {delay.max():g}: a state of {self.task.name} "
                 f"carries {self.task.pending} past actions; widen the range of its action_delay"
+            )
+        late = float((delay + LAGS * lag).max(initial=0.0))
+        if late > longest + 1e-9:
+            raise MadocError(
+                f"expected an action_delay and {LAGS:g} times an action_lag of at most {longest:g} s in all, got "
+                f"{late:g}: a state of {self.task.name} carries {self.task.pending} past actions; widen the range of "
+                "its action_lag"
             )
         return CpuSystem(self, models, np.minimum(delay, longest), lag, self._of_signals(values))
 

@@ -85,10 +85,10 @@ def steady_cost(
     if not kinds and steady_alone:
         return 0.0
     kinds = kinds or [np.ones_like(steady)]
+    noises = [np.maximum(channel_noise(residuals[kind], spare[kind]), least) for kind in kinds]
     costs = [
         window_costs((residuals[kind] / noise).reshape(kind.sum(), -1), loss)
-        for kind in kinds
-        for noise in (np.maximum(channel_noise(residuals[kind], spare[kind]), least),)
+        for kind, noise in zip(kinds, noises, strict=True)
     ]
     return float(np.concatenate(costs).mean())
 
