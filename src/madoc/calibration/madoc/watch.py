@@ -38,7 +38,6 @@ class Watch:
         epochs: Number of calibration epochs so far.
         mismatch: Distance of simulated from logged rows in units of the features of s': the blur times the mean
             |reward| over its set value. Without a blur it is the mean |reward|.
-        overlap: Mean overlap of logged and simulated (s, a).
         at_bound: Share of rows whose reward is at its bound.
         best_mismatch: The lowest mismatch since they are compared.
         milestone: The mismatch at the last progress.
@@ -50,7 +49,6 @@ class Watch:
 
     epochs: int
     mismatch: float
-    overlap: float
     at_bound: float
     best_mismatch: float
     milestone: float
@@ -62,7 +60,7 @@ class Watch:
 
 def begin_watch(actors: Actors) -> Watch:
     """The watch before the first epoch."""
-    return Watch(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, actors, 0.0, 0.0)
+    return Watch(0, 0.0, 0.0, 0.0, 0.0, 0, actors, 0.0, 0.0)
 
 
 def observe(
@@ -83,12 +81,10 @@ def observe(
     """
     size, at_bound = metrics["reward_size"], metrics["reward_at_bound"]
     mismatch = metrics["blur"] * size / steered_to if steered_to else size
-    overlap = metrics["overlap"]
     if watch.epochs:
         mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
-        overlap = watch.overlap + SMOOTHING * (overlap - watch.overlap)
-    watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, overlap=overlap, at_bound=at_bound)
+    watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, at_bound=at_bound)
     latest = _mark(replace(watch, best=average, best_mismatch=mismatch))
     if not steered_to:
         return latest
