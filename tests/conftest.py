@@ -7,7 +7,8 @@ import equinox as eqx
 import jax
 import jax.monitoring
 import pytest
-from jaxtyping import install_import_hook
+
+import shapes
 
 # What one worker, or a process that a test starts, has compiled the others load.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "compiled"))
@@ -18,7 +19,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # of each worker: there is one fo
 os.environ["MUJOCO_GL"] = "disable"  # only tests of pictures draw any
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"  # for the processes that tests start
 jax.config.update("jax_numpy_rank_promotion", "raise")
-install_import_hook("madoc", "shapes.checked")  # annotated shapes and types are checked at every call
+shapes.check("madoc")  # annotated shapes and types
 
 _TRACE_EVENT = "/jax/core/compile/jaxpr_trace_duration"
 _traces: list[str] = []

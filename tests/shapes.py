@@ -1,11 +1,13 @@
 """The type checker that the suite runs under: shapes and types of annotations are checked at every call."""
 
+import ast
 import functools
 import inspect
 
 import jax
 import numpy as np
 from beartype import BeartypeConf, beartype
+from jaxtyping import _import_hook, install_import_hook
 
 _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 """An int passes for a float, as in static type checking."""
@@ -43,3 +45,20 @@ def _names_in(method) -> tuple[str, ...]:
 def _is_placeholder(value) -> bool:
     """Whether a leaf stands for an array without being one."""
     return not isinstance(value, jax.Array | np.ndarray | np.generic | int | float | tuple | list)
+
+
+class _OutermostFunctions(_import_hook.JaxtypingTransformer):
+    """Leaves functions within functions as they are.
+
+    They are made anew at every call, and their checkers would be compiled anew with them: half of the suite's time.
+    """
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef:
+        within = any(isinstance(parent, ast.FunctionDef) for parent in self._parents)
+        return node if within else super().visit_FunctionDef(node)
+
+
+def check(package):
+    """Check every call of the functions and methods of a package that is imported from now on."""
+    _import_hook.JaxtypingTransformer = _OutermostFunctions  # there is no public way to choose functions
+    install_import_hook(package, "shapes.checked")
