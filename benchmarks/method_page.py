@@ -6,8 +6,7 @@ from itertools import chain
 from pathlib import Path
 
 from kept import commits
-from paper_cells import printed
-from paper_errors import calibrations, error_cell
+from paper_cells import calibrations, error_cell, printed
 from pooling import OUR_LOGS
 
 PAGE = Path(__file__).parents[1] / "docs" / "concepts" / "which-method.md"

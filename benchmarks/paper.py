@@ -18,8 +18,21 @@ import costs
 import figure_2
 import numpy as np
 from kept import CALIBRATIONS, RESULTS, Study, commits
-from paper_cells import STUDIES, asked, chain_of, how_far, kept, planned, printed, wanted
-from paper_errors import ERRORS, Place, as_asked, in_words, table_of_errors
+from paper_cells import (
+    ERRORS,
+    STUDIES,
+    Place,
+    as_asked,
+    asked,
+    chain_of,
+    how_far,
+    in_words,
+    kept,
+    planned,
+    printed,
+    table_of_errors,
+    wanted,
+)
 from pooling import OUR_LOGS
 
 from madoc.suites.cells import Cell, Kind

@@ -20,7 +20,6 @@ import kept
 import method_page
 import paper
 import paper_cells
-import paper_errors
 import pooling
 import tables
 
@@ -70,7 +69,7 @@ def _height(drawn, name):
 
 
 def test_figure_3b_says_how_many_parameters_and_shares_the_cells_of_all():
-    rows = dict.fromkeys(row for row, _ in paper_errors.places("figure-3b-errors"))
+    rows = dict.fromkeys(row for row, _ in paper_cells.places("figure-3b-errors"))
     assert list(rows) == ["ant-medium, 1 parameter", *(f"ant-medium, {count} parameters" for count in (2, 4, 8, 12))]
     errors, of_table_10 = (
         {cell.name for cell in paper_cells.planned(name).cells} for name in ("figure-3b-errors", "table-10")
@@ -82,7 +81,7 @@ def test_figure_3b_says_how_many_parameters_and_shares_the_cells_of_all():
 def calibrations(tmp_path, monkeypatch):
     """A function that keeps calibrations of hopper-medium for the tables of errors."""
     study = replace(kept.CALIBRATIONS, file=tmp_path / "calibration.jsonl")
-    monkeypatch.setattr(paper_errors, "CALIBRATIONS", study)
+    monkeypatch.setattr(paper_cells, "CALIBRATIONS", study)
 
     def keep(*rows):
         common = {"robot": "hopper", "quality": "medium", "data": "clean", "transitions": 200_000, "budget": 300_000}
@@ -104,7 +103,7 @@ def test_a_table_of_errors_shows_logs_what_is_printed_and_what_was_not_run(calib
         ("npe", 0, 0, 0.7, {}),
         ("least-squares", 0, 0, 0.9, {"data": "hidden"}),
     )
-    told = paper_errors.table_of_errors("table-10")
+    told = paper_cells.table_of_errors("table-10")
     assert pooling.OUR_LOGS in told
     header, row = (
         next(line for line in told.splitlines() if line.startswith(f"| {name} |")) for name in ("task", "hopper-medium")
@@ -121,7 +120,7 @@ def test_a_mean_over_tasks_is_of_one_commit(calibrations):
     walker = {"robot": "walker2d"}
     calibrations(("madoc", 0, 0, 0.1, {}), ("madoc", 0, 0, 0.3, walker), ("oted", 0, 0, 0.1, {}))
     calibrations(("oted", 0, 0, 0.3, walker | {"commit": "b"}))
-    (last,) = [line for line in paper_errors.table_of_errors("table-10").splitlines() if line.startswith("| mean over")]
+    (last,) = [line for line in paper_cells.table_of_errors("table-10").splitlines() if line.startswith("| mean over")]
     assert "| 0.2 (2 tasks) |" in last
     assert "| several commits |" in last
 
@@ -130,15 +129,13 @@ def test_the_kinds_of_credit_are_compared_over_logs(calibrations):
     robot = {"robot": "halfcheetah"}
     for method, errors in (("madoc", (0.2, 0.2, 0.2)), ("madoc-vdn", (0.1, 0.2, 0.4))):
         calibrations(*((method, log, log, error, robot) for log, error in enumerate(errors)))
-    told = paper_errors.table_of_errors("table-12")
+    told = paper_cells.table_of_errors("table-12")
     assert "| error over that of madoc (95 % over logs) | | 1.00 (0.18 to 5.59, 3 logs) |  |  | |" in told
 
 
 def test_a_budget_that_was_run_last_is_shown(calibrations):
     calibrations(("droid", 0, 0, 0.5, {"budget": 1_000_000}), ("droid", 1, 1, 0.1, {}))
-    assert (
-        paper_errors.error_cell(paper_errors.calibrations("table-10")["hopper-medium", "droid"], None) == "0.1 (1 log)"
-    )
+    assert paper_cells.error_cell(paper_cells.calibrations("table-10")["hopper-medium", "droid"], None) == "0.1 (1 log)"
 
 
 def test_returns_show_seeds_refusals_and_what_is_printed():

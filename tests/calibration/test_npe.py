@@ -13,8 +13,7 @@ from madoc.calibration import CalibrationProblem, Npe
 from madoc.calibration.baselines.npe.belief import Belief, doubts, posterior_samples, prior_belief, truncated_box
 from madoc.calibration.baselines.npe.emulator import Cosines, Emulator, emulation_loss, moments, moved
 from madoc.calibration.baselines.npe.flow import Regression
-from madoc.calibration.baselines.npe.moments import Reader, Sets, errors_of, less_noisy
-from madoc.calibration.baselines.npe.summaries import by_halves
+from madoc.calibration.baselines.npe.summaries import Reader, Sets, by_halves, errors_of, less_noisy
 from madoc.data import Disturbance, disturb
 from robots import ARM_TRUTH, recorded, two_link_arm
 

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 
 from affine import affine
-from madoc.calibration.baselines.oted.bandit import (
+from madoc.calibration.baselines.oted.visits import (
     REWARD_BOUND,
     Distribution,
     advantages,
     antithetic_noise,
+    comparable_starts,
+    first_lives,
     mean_rewards,
     natural_step,
+    visits,
 )
-from madoc.calibration.baselines.oted.visits import comparable_starts, first_lives, visits
 from madoc.data.dataset import close_episodes
 from madoc.learning.dynamics_reward import discriminator_loss
 from robots import SPRING_TRUTH, recorded, spring

@@ -6,7 +6,7 @@ import re
 from html import unescape
 
 from madoc.report import write_report
-from madoc.report.film import read_film
+from madoc.report.sections.robustness import read_film
 
 
 def test_a_film_is_read_with_a_sheet_for_each_panel(whole):

@@ -12,20 +12,12 @@ import tyro
 
 from madoc import __version__
 from madoc.commands.answer import EXIT_CODES, Answer, Command
-from madoc.commands.calibrate import Calibrate
-from madoc.commands.check import Check
-from madoc.commands.evaluate import Evaluate
-from madoc.commands.export import Export
-from madoc.commands.learn import Learn
 from madoc.commands.lists import Methods, Tasks
-from madoc.commands.record import Record
-from madoc.commands.report import Report
-from madoc.commands.run import Run
-from madoc.commands.selftest import Selftest
+from madoc.commands.logs import Check, Record, Selftest
+from madoc.commands.results import Export, Report, View
 from madoc.commands.spec import Init, Spec
-from madoc.commands.suite import Suite
-from madoc.commands.view import View
-from madoc.commands.worker import Worker
+from madoc.commands.stages import Calibrate, Evaluate, Learn, Run
+from madoc.commands.suite import Suite, Worker
 from madoc.errors import MadocError, printable
 from madoc.runs.files import json_text
 from madoc.runs.versions import versions

@@ -12,9 +12,8 @@ from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, excite_unknown
 from madoc.diagnosis.explanation import Explanation, action_findings, box_draws, explain, explanation_findings
 from madoc.diagnosis.response import response_findings
-from madoc.diagnosis.scales import scale_findings
+from madoc.diagnosis.scales import scale_findings, timestep_findings
 from madoc.diagnosis.speeds import speed_findings
-from madoc.diagnosis.timestep import timestep_findings
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.robots import Robot
 from madoc.simulation import Simulator

@@ -1,11 +1,12 @@
-"""Scales that no log can show: masses and forces known only relative to each other, and what they rest on."""
+"""What no log can show: scales of masses and forces, and whether the model is integrated finely enough."""
 
 import numpy as np
 from jaxtyping import Float
 
-from madoc.data import Dataset
+from madoc.data import Dataset, typical_change
 from madoc.data.findings import Finding
 from madoc.errors import listed
+from madoc.identification.coarseness import COARSE, FINER, coarseness
 from madoc.identification.states import LoggedStates, probing_rows
 from madoc.identification.windows import evenly
 from madoc.simulation.base import Simulator
@@ -61,3 +62,27 @@ def _scale_of_masses(names: list[str], *, only_ratios: bool) -> Finding:
         "masses and gains that the model takes as known"
     )
     return Finding("note", what, "scale", "weigh a part, or measure a torque, and put that into the model")
+
+
+def timestep_findings(
+    dataset: Dataset, simulator: Simulator, logged: LoggedStates, point: Float[np.ndarray, " d"]
+) -> tuple[list[Finding], int]:
+    """A warning where a finer integration changes predictions by much, and the control steps simulated.
+
+    Args:
+        dataset: The log.
+        simulator: The model.
+        logged: The log's states.
+        point: The parameters in [-1, 1] at which both are simulated.
+    """
+    scale = typical_change(dataset, simulator.task.attitudes)
+    change, spent = coarseness(dataset, logged, simulator, point, scale)
+    if change <= COARSE:
+        return [], spent
+    timestep = simulator.control_step / simulator.task.frame_skip
+    what = (
+        f"its timestep of {timestep:.12g} s is too long: with {timestep / FINER:.12g} s predictions of half of the "
+        f"signals change by {change:.2g} typical changes or more, which parameters would make up for"
+    )
+    remedy = f"give timestep: {timestep / FINER:.12g} in the spec, unless the log is of a simulation with this timestep"
+    return [Finding("warning", what, "the model", remedy)], spent

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.baselines.npe.flow import fitted_density, fresh_flow
-from madoc.calibration.baselines.npe.moments import Points, Reader, Sets, errors_of, less_noisy
+from madoc.calibration.baselines.npe.summaries import Points, Reader, Sets, errors_of, less_noisy
 
 UNLIKELY = 0.95
 """The estimate is doubted where so large a share of simulated sets is nearer to its parameters than the log to it."""

@@ -33,8 +33,7 @@ from madoc.calibration.baselines.npe.emulator import (
     standardised,
     train,
 )
-from madoc.calibration.baselines.npe.moments import Sets
-from madoc.calibration.baselines.npe.summaries import by_halves, logged_moments, set_moments, unpaired
+from madoc.calibration.baselines.npe.summaries import Sets, by_halves, logged_moments, set_moments, unpaired
 from madoc.calibration.cautions import at_end_of_range
 from madoc.calibration.sensing import SensorNoise, noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
 from madoc.errors import MadocError

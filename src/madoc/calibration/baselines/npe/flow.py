@@ -12,7 +12,7 @@ from flowjax.distributions import Normal, Transformed
 from flowjax.flows import masked_autoregressive_flow
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from madoc.calibration.baselines.npe.moments import Points
+from madoc.calibration.baselines.npe.summaries import Points
 from madoc.learning.networks import Scalar, adam, minimise
 
 HELD_OUT = 0.2

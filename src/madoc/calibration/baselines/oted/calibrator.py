@@ -16,14 +16,18 @@ from jaxtyping import Int, PRNGKeyArray, PyTree
 from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.baselines.oted.bandit import (
+from madoc.calibration.baselines.oted.visits import (
     Distribution,
     advantages,
     antithetic_noise,
+    comparable_starts,
+    first_lives,
+    learn,
+    log_ratio,
     mean_rewards,
     natural_step,
+    visits,
 )
-from madoc.calibration.baselines.oted.visits import comparable_starts, first_lives, learn, log_ratio, visits
 from madoc.calibration.baselines.population_search import independent_estimate
 from madoc.calibration.sensing import SensorNoise, noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
 from madoc.errors import MadocError

@@ -1,4 +1,4 @@
-"""A servo of hardware, where its logs are: named by the variable MADOC_XL330, or in shared/data beside the repository.
+"""Machines of hardware, where their logs are: in folders that variables name, or in shared/data beside the repository.
 They are not Madoc's to copy."""
 
 import importlib.util
@@ -13,22 +13,73 @@ from madoc import robots
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
-DATA = Path(os.environ.get("MADOC_XL330", ROOT.parent / "shared" / "data" / "xl330")) / "logs"
+STIFFNESS = 13.0
+"""N·m/rad, of the arm's servo that lifts its shoulder."""
 
 
-@pytest.fixture(scope="module")
-def benchmark():
-    if not DATA.is_dir():
-        pytest.skip("the logs of the XL330 servo are not here; name their folder in MADOC_XL330")
-    place = ROOT / "benchmarks" / "real_servo.py"
+def logs_of(variable, name):
+    """The folder of a machine's logs."""
+    place = Path(os.environ.get(variable, ROOT.parent / "shared" / "data" / name))
+    if not place.is_dir():
+        pytest.skip(f"logs are not here; name their folder in {variable}")
+    return place
+
+
+def benchmark_of(name):
+    """The module benchmarks/NAME.py."""
+    place = ROOT / "benchmarks" / f"{name}.py"
     sys.path.insert(0, str(place.parent))
     try:
-        spec = importlib.util.spec_from_file_location("real_servo", place)
+        spec = importlib.util.spec_from_file_location(name, place)
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
     finally:
         sys.path.remove(str(place.parent))
     return module
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return benchmark_of("real_pendulum").compare(logs_of("MADOC_PENDULUM", "dfki_simple_pendulum"))
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return benchmark_of("real_arm").compare(logs_of("MADOC_SO101", "so101"))
+
+
+@pytest.fixture(scope="module")
+def xl330():
+    return logs_of("MADOC_XL330", "xl330") / "logs"
+
+
+@pytest.fixture(scope="module")
+def servo():
+    return benchmark_of("real_servo")
+
+
+def test_the_arm_is_predicted_better_than_by_the_published_model_and_at_mid_range(arm):
+    for motion, errors in arm["errors"].items():
+        assert errors["madoc"] < 0.55 * errors["published"], motion
+        assert errors["madoc"] < 0.85 * errors["mid-range"], motion
+    assert arm["verdict"]["word"] == "USABLE"
+    low, high = arm["parameters"]["actuator_gain.Pitch_command"]["interval"]
+    assert low < STIFFNESS < high
+
+
+def test_the_run_of_the_pendulum_held_out_is_predicted(pendulum):
+    assert pendulum["verdict"]["word"] == "USABLE"
+    assert pendulum["errors"]["ddp"]["madoc"] < 0.06
+
+
+def test_no_published_parameters_predict_the_pendulum_better(pendulum):
+    for run, errors in pendulum["errors"].items():
+        assert errors["madoc"] <= min(errors.values()), run
+
+
+def test_the_length_of_the_pendulum_is_that_of_the_rod(pendulum):
+    low, high = pendulum["parameters"]["length"]["interval"]
+    assert low < 0.5 < high
 
 
 def integrated(log, gain, values):
@@ -64,17 +115,17 @@ def integrated(log, gain, values):
 
 
 @pytest.mark.parametrize("model", ["M1", "M6"])
-def test_the_published_models_move_as_their_equations_do(benchmark, tmp_path, model):
-    robot = robots.load(benchmark.written(tmp_path, model, benchmark.PUBLISHED[model]))
-    log = DATA / "gain200_sin_time_square.csv"
-    _, whole = benchmark.errors_of(robot, {}, [log])[log.stem]
-    grid, angle = integrated(log, 200, benchmark.PUBLISHED[model])
+def test_the_published_models_of_the_servo_move_as_their_equations_do(servo, xl330, tmp_path, model):
+    robot = robots.load(servo.written(tmp_path, model, servo.PUBLISHED[model]))
+    log = xl330 / "gain200_sin_time_square.csv"
+    _, whole = servo.errors_of(robot, {}, [log])[log.stem]
+    grid, angle = integrated(log, 200, servo.PUBLISHED[model])
     rows = np.genfromtxt(log, delimiter=",", names=True)
     error = np.sqrt(np.mean((angle - np.interp(grid, rows["time"], rows["position"])) ** 2))
     assert whole == pytest.approx(error, rel=0.1)
 
 
-def test_runs_of_a_gain_that_was_never_shown_are_predicted_better_than_by_the_published_models(benchmark):
-    found = benchmark.compare(DATA, 400, "M5", ("horizon=200", "loss=linear"))
+def test_the_servo_at_a_gain_that_was_never_shown_is_predicted_better_than_by_the_published_models(servo, xl330):
+    found = servo.compare(xl330, 400, "M5", ("horizon=200", "loss=linear"))
     of_each = {name: np.mean(list(errors.values()), axis=0) for name, errors in found["errors"].items()}
     assert (of_each["madoc"] < 0.7 * of_each["published M6"]).all()
