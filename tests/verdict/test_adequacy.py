@@ -7,6 +7,7 @@ import pytest
 
 from madoc.calibration.holdout import AgainstChance, Area, ToldApart
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
+from madoc.identification.body_forces import WEAKENING_ALL
 from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, LATE_DRIVE, TILTS, UNLISTED
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
@@ -140,6 +141,12 @@ def test_forces_that_are_not_listed_are_named_where_nothing_listed_explains_half
     assert f"the model lacks {family.cause}: a value of 1 ± 0.08 N·m explains 50 %" in sentence
     assert f"{elsewhere.cause} would explain nearly as much; look there for what the model leaves out" in sentence
     assert "add to the spec" not in sentence
+
+
+def test_drives_that_all_weaken_have_words_in_a_spec():
+    sentence = judge(held(term(WEAKENING_ALL, t=7.5, explained=0.26, parameter=""))).sentence
+    assert "say so (drive: of their actions, whose back-EMF weakens them)" in sentence
+    assert "no parameter of a spec adds it" not in sentence
 
 
 def test_what_is_uncertain_is_not_missing():

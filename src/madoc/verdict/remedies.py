@@ -1,5 +1,6 @@
 """What a user can do about a term that the model lacks."""
 
+from madoc.identification.body_forces import CUBIC_ALL, WEAKENING_ALL
 from madoc.identification.candidate_terms import (
     BELOW_MINIMUM,
     EARLY,
@@ -35,8 +36,11 @@ OF_JOINTS = {
     LOADED: "say under friction: of the spec that it grows with the load (model: M3, or M4 where Stribeck's is there)",
     SLOW: "say under friction: of the spec that it is larger at rest (model: M2, or M4 where it grows with the load)",
     WEAKENING: "say what drives the joint (drive: of its action, whose back-EMF weakens it)",
+    WEAKENING_ALL: "where they are motors of joints, say so (drive: of their actions, whose back-EMF weakens them)",
+    CUBIC_ALL: "where they are motors of joints, say what limits them (drive: of their actions: supply, current_limit "
+    "or saturation)",
 }
-"""What to do about forces at a joint that the spec has words for."""
+"""What to do about forces at joints that the spec has words for."""
 CHANGE_LOG = "log it without its filter, or shift its column by that time"
 """The same for a sensor that is late."""
 
