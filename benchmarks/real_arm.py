@@ -62,7 +62,7 @@ def compare(data: Path, *, thirds: bool = False) -> dict:
         spec = beside_model(data, Path(folder))
         result = calibrated(spec, data, motions, Path(folder) / "all")
         errors = errors_of(spec, data, estimates_of(result))
-        parts = [third_of(spec, data, motions, Path(folder) / motions[0]) for motions in THIRDS if thirds]
+        parts = [calibrated(spec, data, motions, Path(folder) / motions[0]) for motions in THIRDS if thirds]
     return {
         "calibrated_to": motions,
         "unit": "rad, root mean square error of all joint angles over windows of 1 s, commands replayed",
@@ -82,12 +82,7 @@ def beside_model(data: Path, folder: Path) -> Path:
     return Path(shutil.copy(ARM, folder))
 
 
-def third_of(spec: Path, data: Path, motions: Sequence[str], folder: Path) -> dict:
-    """A calibration to a third of the motions, judged by the intervals of the others alone."""
-    return calibrated(spec, data, motions, folder, holdout=None)
-
-
-def calibrated(spec: Path, data: Path, motions: Sequence[str], folder: Path, *, holdout: float | None = 0.2) -> dict:
+def calibrated(spec: Path, data: Path, motions: Sequence[str], folder: Path) -> dict:
     """The command of the documentation, on some of the motions."""
     runs = folder / "logs"
     runs.mkdir(parents=True)
@@ -97,7 +92,7 @@ def calibrated(spec: Path, data: Path, motions: Sequence[str], folder: Path, *, 
         task=str(spec),
         source=pipeline.Source((str(runs),)),
         search=pipeline.Search(method="least-squares", budget=BUDGET),
-        holdout=holdout,
+        holdout=0.2,
     )
     result = pipeline.calibrate_in(folder / "run", order).to_json()
     kept = ("status", "parameters", "verdict", "warnings", "control_steps", "seconds")
