@@ -37,7 +37,7 @@ RECIPES = {
     "hobby-servo": Recipe(
         "Feetech STS3215 and Dynamixel XL330 (BAM); kp of an STS3215 at 7.4 V is 0.556 times its firmware's P",
         (0.001, 0.05),
-        (0.0, 0.3),
+        (0.0, 0.6),  # 0.2 N·m, and a quarter of half of the largest torque, as friction grows with the load
         (0.0, 1.0),
         (4.0, 40.0),
         (0.0, 0.02),
