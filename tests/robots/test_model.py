@@ -20,6 +20,14 @@ from own_robots import CART, CART_SPEC, write_robot
         ),
         (CART.replace("</mujoco>", '<include file="rest.xml"/></mujoco>'), "line 3: .*rest.xml"),
         (
+            CART.replace("</mujoco>", '<equality><joint joint1="rial"/></equality></mujoco>'),
+            "line 3: model cart.xml cannot be read: .*'rial'",
+        ),
+        (
+            CART.replace("</mujoco>", '<sensor><gyro name="gyro" site="imu"/></sensor></mujoco>'),
+            "line 3: model cart.xml cannot be read: .*'imu'",
+        ),
+        (
             CART.replace(
                 "</mujoco>", '<actuator><intvelocity name="a" joint="rail" kp="1" actrange="-1 1"/></actuator></mujoco>'
             ),

@@ -19,6 +19,9 @@ from madoc.simulation.write import OF_A_JOINT, ONE_DOF
 from madoc.tasks.base import compiled_model
 from madoc.tasks.mujoco_versions import refuse_unfit_mujoco
 
+REFERRING = ("sensors", "equalities", "excludes", "pairs", "tendons", "actuators")
+"""Parts of a model that refer to others by name."""
+
 
 def read_model(files: ModelFiles) -> mujoco.MjSpec:
     """A MuJoCo spec of a model, in which joints and actuators without a name are named by what they belong to.
@@ -31,6 +34,12 @@ def read_model(files: ModelFiles) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_string(text, include=includes, assets=assets)
     except (ValueError, mujoco.FatalError) as error:
         raise MadocError(f"model {files.main} cannot be read: {_one_line(error)}") from error
+    copy = spec.copy()  # which leaves out, without a word, what refers to an element that is not there
+    if any(len(getattr(copy, kind)) < len(getattr(spec, kind)) for kind in REFERRING):
+        try:
+            mujoco.MjSpec.from_string(text, include=includes, assets=assets).compile()
+        except (ValueError, mujoco.FatalError) as error:
+            raise MadocError(f"model {files.main} cannot be read: {_one_line(error)}") from error
     _name_by_owner([(joint, joint.parent.name) for joint in spec.joints if len(joint.parent.joints) == 1], spec.joints)
     of_joint = [part for part in spec.actuators if int(part.trntype) in OF_A_JOINT]
     _name_by_owner([(actuator, actuator.target) for actuator in of_joint], spec.actuators)
