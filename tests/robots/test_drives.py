@@ -237,6 +237,20 @@ def test_a_condition_is_read_from_the_name_of_its_file(tmp_path):
     np.testing.assert_allclose(given, [2.0] * 4 + [5.0] * 4, rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ((3, 3, 3, 3, 3), "expected p in run.csv to be one of 2, 5, got 3; add it to values: in the spec"),
+        ((2, 2, 5, 5, 5), "expected one value of p throughout run.csv, got 2 and 5; split the run where it changes"),
+    ],
+)
+def test_a_condition_in_a_column_has_one_of_its_values_throughout_a_run(tmp_path, values, sentence):
+    rows = "".join(f"{0.01 * row:.2f},{0.01 * row},1,0,1,12,{value}\n" for row, value in enumerate(values))
+    (tmp_path / "run.csv").write_text("time,angle,rate,goal,on,volts,p\n" + rows)
+    with pytest.raises(MadocError, match=sentence):
+        logs.read([tmp_path / "run.csv"], load(tmp_path, SERVO_SPEC))
+
+
 def test_the_supply_is_the_mean_of_its_readings_around_a_row(tmp_path):
     """Half a width of 0.01 s holds the readings before and after; at the ends of a run there is one of them."""
     path = written(tmp_path, "p2_a.csv")

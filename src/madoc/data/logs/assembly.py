@@ -24,6 +24,7 @@ from madoc.data.logs.timing import (
 from madoc.data.validation import ACTION_TOLERANCE
 from madoc.errors import MadocError, nearest_hint
 from madoc.robots import Robot
+from madoc.robots.drive_spec import ConditionSpec
 from madoc.robots.spec import LogSpec
 from madoc.types import Transitions
 
@@ -77,6 +78,7 @@ def _with_conditions(run: Run, robot: Robot) -> Run:
     tables = run.tables
     for condition in robot.spec.conditions:
         if condition.file_name is None:
+            _check_condition(run, condition, robot.spec.log.columns.get(condition.name, condition.name))
             continue
         value = condition.value_in(run.name)
         if value not in condition.values:
@@ -89,6 +91,25 @@ def _with_conditions(run: Run, robot: Robot) -> Run:
             replace(table, columns={**table.columns, condition.name: np.full(len(table), value)}) for table in tables
         )
     return replace(run, tables=tables)
+
+
+def _check_condition(run: Run, condition: ConditionSpec, column: str) -> None:
+    """Refuse a run whose column of a condition has another value than the spec's, or more than one."""
+    for table in run.tables:
+        if column not in table.columns or table.columns[column].dtype.kind not in "fiu":
+            continue
+        values = np.unique(table.columns[column])
+        found = values[np.isfinite(values)]
+        if len(found) > 1:
+            raise MadocError(
+                f"expected one value of {condition.name} throughout {run.name}, got {found[0]:g} and {found[1]:g}; "
+                "split the run where it changes"
+            )
+        if len(found) and not np.isclose(found[0], condition.values, rtol=1e-6).any():
+            raise MadocError(
+                f"expected {condition.name} in {run.name} to be one of "
+                f"{', '.join(f'{one:g}' for one in condition.values)}, got {found[0]:g}; add it to values: in the spec"
+            )
 
 
 def _episodes(run: Run, robot: Robot, origin: str, *, clip_actions: bool) -> Dataset:
