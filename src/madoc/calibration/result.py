@@ -223,7 +223,7 @@ class CalibrationResult:
 
     def __str__(self) -> str:
         stream = io.StringIO()
-        console, predictions = Console(file=stream, width=100), self.predictions()
+        console, predictions = Console(file=stream, width=100, markup=False), self.predictions()
         console.print(self.table())
         if predictions is not None:
             console.print(predictions)

@@ -144,7 +144,7 @@ def _print(answer: Answer, *, as_json: bool) -> None:
     from rich.console import Console
     from rich.segment import Segment, Segments
 
-    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    console = Console(markup=False) if sys.stdout.isatty() else Console(markup=False, width=WIDTH)
     with console.capture() as capture:  # printed by hand: Rich would exit at a closed pipe
         for part in answer.text:
             if isinstance(part, str):
