@@ -114,7 +114,8 @@ def _step_finding(channel: Channel) -> Finding:
     of_turn = f", {counts:,.0f} a turn" if whole else ""
     what = f"it is read in steps of {step:.3g}{unit}{of_turn}, and changes by {channel.step:.2g}{unit} in a row"
     remedy = (
-        "single rows show the sensor's steps, not the motion: compare over longer windows, as --set horizon=20 does"
+        "single rows show the sensor's steps, not the motion: compare over longer windows, as "
+        "--set least-squares.horizon=20 does"
     )
     return Finding("warning", what, channel.name, remedy)
 
