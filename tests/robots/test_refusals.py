@@ -174,6 +174,18 @@ CHANGES = [
     ),
     (
         DAMPING,
+        "  - {field: inertia, element: fore, low: -0.1, high: 0.1}",
+        "inertia and body_mass of line 16 are one thing",
+    ),
+    (DAMPING, "  - {field: inertia_alpha, element: fore, low: -0.1, high: 0.1}", ""),
+    (
+        DAMPING,
+        "  - {field: dof_damping, each: ['elb*', elbow], low: 0, high: 1}",
+        "elbow is matched twice; leave one out",
+    ),
+    (DAMPING, "  - {field: body_com, element: world, low: 0, high: 1}", "expected the name of a body, got 'world'"),
+    (
+        DAMPING,
         "  - {field: signal_bias, element: elbow, low: -1, high: 1}",
         "a signal, got 'elbow'; nearest: elbow_angle",
     ),

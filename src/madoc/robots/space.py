@@ -70,22 +70,27 @@ def _check_distinct(
         elements = zip(parameter.elements, find_elements(model, parameter), strict=True)
         shared = {name for name, body in elements if body in held}
     whole_robot = not earlier.elements or not parameter.elements
-    exclusive = ({"body_mass", "body_mass_and_inertia"}, {"body_inertia", "body_mass_and_inertia"})
+    written, before = (draft.spec.parameters[row].field for row in (index, other))
+    exclusive = (
+        {"body_mass", "body_mass_and_inertia"},
+        {"body_inertia", "body_mass_and_inertia"},
+        *({"inertia", one} for one in ("body_mass", "body_mass_and_inertia", "body_inertia", "body_com")),
+    )
     if parameter.field == earlier.field and whole_robot and parameter.elements != earlier.elements:
         problem = (
             f"{parameter.field} of all actions and of one cannot both be calibrated, and line {line} has one already; "
             "keep that of all, or give each action its own with each:"
         )
+    elif parameter.name == earlier.name and other == index:
+        problem = f"{', '.join(parameter.elements)} is matched twice; leave one out"
     elif parameter.name == earlier.name:
         problem = f"the parameter {parameter.name} is on line {line} already; name: one of them"
     elif same_numbers(model, parameter, earlier):
         problem = f"{parameter.name} and {earlier.name} of line {line} are one number of the model; keep one"
     elif parameter.field == earlier.field and shared:
         problem = f"{parameter.field} of {min(shared)!r} is calibrated by line {line} already; keep one of them"
-    elif ({earlier.field, parameter.field} in exclusive and shared) or (
-        parameter.field == earlier.field and whole_robot
-    ):
-        problem = f"{parameter.field} and {earlier.field} of line {line} are one thing; keep one"
+    elif ({written, before} in exclusive and shared) or (parameter.field == earlier.field and whole_robot):
+        problem = f"{written} and {before} of line {line} are one thing; keep one"
     else:
         return
     raise draft.document.error(("parameters", index), problem)
@@ -107,7 +112,7 @@ def _elements(draft: Draft, model: mujoco.MjModel, index: int) -> tuple[str, ...
     key = next((key for key in ("element", "elements", "each") if getattr(given, key)), "")
     for position, wanted in enumerate(given.names):
         known = wanted in names or wanted in also
-        matching = [name for name in names if fnmatchcase(name, wanted) and name != "world"]
+        matching = [name for name in names if fnmatchcase(name, wanted)]
         if not known and (key == "element" or not matching):
             article = "an" if kind[0] in "aeiou" else "a"
             what = f"the name of {article} {kind}" + ("" if key == "element" else ", or a pattern with * for several")
@@ -117,10 +122,15 @@ def _elements(draft: Draft, model: mujoco.MjModel, index: int) -> tuple[str, ...
 
 
 def _names(draft: Draft, model: mujoco.MjModel, kind: str) -> list[str]:
-    """Names of the elements of a kind; an action is a command, and no number that a drive takes from the log."""
+    """Names of the elements of a kind; the world is no body that has anything to calibrate.
+
+    An action is a command, and no number that a drive takes from the log.
+    """
     if kind == "signal":
         return [signal.name for signal in draft.spec.signals]
-    return [action.name for action in draft.spec.actions] if kind == "action" else element_names(model, kind)
+    if kind == "action":
+        return [action.name for action in draft.spec.actions]
+    return [name for name in element_names(model, kind) if (kind, name) != ("body", "world")]
 
 
 def _unit_of(draft: Draft, model: mujoco.MjModel, index: int, elements: tuple[str, ...]) -> str:
