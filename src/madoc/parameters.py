@@ -313,6 +313,17 @@ class ParameterSpace:
             )
         return vector
 
+    def summed(
+        self, values: Float[np.ndarray, "systems parameters"], field: str, names: Sequence[str]
+    ) -> Float[np.ndarray, "systems _"]:
+        """The values of a field by name, 0 where none is calibrated; those without an element count for all."""
+        sums = np.zeros((len(values), max(1, len(names))))
+        for parameter, column in zip(self.parameters, values.T, strict=True):
+            if parameter.field == field:
+                places = [names.index(element) for element in parameter.elements] or slice(None)
+                sums[:, places] += column[:, None]
+        return sums
+
 
 @runtime_checkable
 class ParameterDistribution(Protocol):

@@ -1,7 +1,7 @@
 """The CPU backend: MuJoCo's own threaded rollout, all cores, float64."""
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 
@@ -10,15 +10,14 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.errors import MadocError, listed, nearest_hint
-from madoc.parameters import FIELDS, Parameter, ParameterSpace
+from madoc.errors import MadocError, listed
+from madoc.parameters import FIELDS
 from madoc.runs.machine import usable_cores
-from madoc.simulation.arrays import check_field, check_written
 from madoc.simulation.delay import LAGS, action_weights, blend
 from madoc.simulation.drives import drive_forces
 from madoc.simulation.touching import collided
 from madoc.simulation.user_data import install_callbacks, needs_callbacks
-from madoc.simulation.write import conditions_of, find_elements, write_parameters
+from madoc.simulation.write import check_elements, conditions_of, write_parameters
 from madoc.tasks.base import Task
 
 _CLOCK = 1.0
@@ -64,7 +63,7 @@ class CpuSimulator:
                 "a state, are not supported; take it out, and calibrate action_delay instead"
             )
         for parameter in task.parameters.parameters:
-            _check_elements(self._model, task, parameter)
+            check_elements(self._model, task, parameter)
         self._actuators = [self._model.actuator(channel.actuator).id for channel in task.actions]
         low, high, scale = (
             np.array([getattr(channel, name) for channel in task.actions]) for name in ("low", "high", "scale")
@@ -108,23 +107,19 @@ class CpuSimulator:
                 write_parameters(model, self._data[0], self.parameters.parameters, row, conditions)
         delay, lag = self._of_actions(values, "action_delay"), self._of_actions(values, "action_lag")
         longest = self.task.pending * self.control_step
-        if (delay > longest + 1e-9).any():
-            raise MadocError(
-                f"expected an action_delay of at most {longest:g} s, got {delay.max():g}: a state of {self.task.name} "
-                f"carries {self.task.pending} past actions; widen the range of its action_delay"
-            )
         late = float((delay + LAGS * lag).max(initial=0.0))
         if late > longest + 1e-9:
+            of_lag = f" and {LAGS:g} times an action_lag" if lag.any() else ""
             raise MadocError(
-                f"expected an action_delay and {LAGS:g} times an action_lag of at most {longest:g} s in all, got "
-                f"{late:g}: a state of {self.task.name} carries {self.task.pending} past actions; widen the range of "
-                "its action_lag"
+                f"expected an action_delay{of_lag} of at most {longest:g} s, got {late:g}: a state of "
+                f"{self.task.name} carries {self.task.pending} past actions; widen the range of "
+                f"its {'action_lag' if of_lag else 'action_delay'}"
             )
         return CpuSystem(self, models, np.minimum(delay, longest), lag, self._of_signals(values))
 
     def _of_signals(self, values: Float[np.ndarray, "systems parameters"]) -> Float[np.ndarray, "systems signals"]:
         """The bias of each signal, 0 where none is calibrated."""
-        return _summed(self.parameters, values, "signal_bias", self.task.signals)
+        return self.parameters.summed(values, "signal_bias", self.task.signals)
 
     def _of_actions(
         self, values: Float[np.ndarray, "systems parameters"], field: str
@@ -136,8 +131,8 @@ class CpuSimulator:
         rows = [row for row in self.parameters.parameters if row.field == field]
         measured = [not channel.command for channel in self.task.actions] if field == "action_lag" else []
         if not any(row.elements for row in rows) and not (rows and any(measured)):
-            return _summed(self.parameters, values, field, [])
-        sums = _summed(self.parameters, values, field, [channel.name for channel in self.task.actions])
+            return self.parameters.summed(values, field, [])
+        sums = self.parameters.summed(values, field, [channel.name for channel in self.task.actions])
         return np.where(measured or False, 0.0, sums)
 
     def _controls(self, action: Float[np.ndarray, "*rows action"]) -> Float[np.ndarray, "*rows control"]:
@@ -387,34 +382,6 @@ class CpuSystem:
                 f"expected states of shape ({self.count}, rows, {size}) and actions of shape "
                 f"({self.count}, rows, {simulator.action_size}) for {simulator.task.name}, got {state} and {action}"
             )
-
-
-def _check_elements(model: mujoco.MjModel, task: Task, parameter: Parameter) -> None:
-    """Refuse a parameter of an element or a number that the model, or for a signal the task, does not have."""
-    kind = parameter.kind.element
-    if kind not in ("signal", "action"):
-        check_field(model, parameter.field)
-        for index in find_elements(model, parameter):
-            check_written(model, parameter.field, index)
-        return
-    names = task.signals if kind == "signal" else [channel.name for channel in task.actions]
-    for element in parameter.elements:
-        if element not in names:
-            values = "observation's" if kind == "signal" else "action's"
-            hint = nearest_hint(element, names, none=f"none of its {values} values has a name")
-            raise MadocError(f"{parameter.name}: {task.name} has no {kind} {element!r}; {hint}")
-
-
-def _summed(
-    space: ParameterSpace, values: Float[np.ndarray, "systems parameters"], field: str, names: Sequence[str]
-) -> Float[np.ndarray, "systems _"]:
-    """The values of a field by name, 0 where none is calibrated; those without an element count for all."""
-    sums = np.zeros((len(values), max(1, len(names))))
-    for parameter, column in zip(space.parameters, values.T, strict=True):
-        if parameter.field == field:
-            places = [names.index(element) for element in parameter.elements] or slice(None)
-            sums[:, places] += column[:, None]
-    return sums
 
 
 @contextmanager

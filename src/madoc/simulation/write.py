@@ -10,7 +10,7 @@ import numpy as np
 
 from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
-from madoc.simulation.arrays import numbers_at, write_number
+from madoc.simulation.arrays import check_field, check_written, numbers_at, write_number
 from madoc.simulation.gears import backlash, deflections, gear_numbers, write_backlash
 from madoc.simulation.inertials import (
     DIAGONAL,
@@ -28,6 +28,7 @@ from madoc.simulation.user_data import (
     has_speed_or_load_friction,
     write_elements,
 )
+from madoc.tasks.base import Task
 
 SOLREF_FLOOR = 1e-9
 """Time constant of a contact, s, and damping ratio to which smaller ones are raised, as 0 means another format."""
@@ -118,6 +119,22 @@ def diagonal_bodies(model: mujoco.MjModel, parameter: Parameter) -> list[str]:
         return []
     bodies = zip(parameter.elements, find_elements(model, parameter), strict=True)
     return [name for name, body in bodies if model.body_simple[body] == DIAGONAL]
+
+
+def check_elements(model: mujoco.MjModel, task: Task, parameter: Parameter) -> None:
+    """Refuse a parameter of an element or a number that the model, or for a signal the task, does not have."""
+    kind = parameter.kind.element
+    if kind not in ("signal", "action"):
+        check_field(model, parameter.field)
+        for index in find_elements(model, parameter):
+            check_written(model, parameter.field, index)
+        return
+    names = task.signals if kind == "signal" else [channel.name for channel in task.actions]
+    for element in parameter.elements:
+        if element not in names:
+            values = "observation's" if kind == "signal" else "action's"
+            hint = nearest_hint(element, names, none=f"none of its {values} values has a name")
+            raise MadocError(f"{parameter.name}: {task.name} has no {kind} {element!r}; {hint}")
 
 
 def find_elements(model: mujoco.MjModel, parameter: Parameter) -> list[int]:
