@@ -247,16 +247,12 @@ class UnknownStarts:
         spent = 0
         if refining and not self.touching.any():
             alone = self._tried(plans, states, trials=1, shares=FOLLOWED[:1])
-            if all(self._helps(plan, outcome) for plan, outcome in zip(plans, alone, strict=True)):
+            helping = (plan.kept.any() and one.totals[0] < one.before for plan, one in zip(plans, alone, strict=True))
+            if all(helping):
                 return [outcome.with_no_step() for outcome in alone]
             spent = len(self.readings)
         every = self._tried(plans, states, trials=len(TRIALS) + 1, shares=FOLLOWED)
         return [replace(outcome, simulations=outcome.simulations + spent) for outcome in every]
-
-    @staticmethod
-    def _helps(plan: Plan, outcome: Outcome) -> bool:
-        """Whether the first step of a plan lowers the cost of the windows that count."""
-        return bool(plan.kept.any()) and float(outcome.totals[0]) < outcome.before
 
     def _tried(
         self,
@@ -344,9 +340,7 @@ class UnknownStarts:
             exact=float(deviation.max()) < ROUNDING,
             left_out=1.0 - float(kept.mean()),
             failures=int((~slopes.whole).sum()),
-            steady_cost=0.0
-            if contacts is None
-            else self._steady_cost(slopes, spare, contacts, kept, self.rounding / deviation),
+            steady_cost=self._steady_cost(slopes, spare, contacts, kept, deviation),
             chattering=chattering,
             more=columns,
         )
@@ -373,12 +367,15 @@ class UnknownStarts:
         self,
         slopes: WindowSlopes,
         spare: Float[np.ndarray, "windows values"],
-        contacts: Int[np.ndarray, "windows readings"],
+        contacts: Int[np.ndarray, "windows readings"] | None,
         kept: Bool[np.ndarray, " windows"],
-        least: Float[np.ndarray, " channels"],
+        deviation: Float[np.ndarray, " channels"],
     ) -> float:
+        if contacts is None:
+            return 0.0
         shape, of_bases = (int(kept.sum()), *self.readings.observed.shape[1:]), bool(self.readings.placed.any())
         residuals, left = slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape)
+        least = self.rounding / deviation
         return steady_cost(residuals, left, contacts[kept], least, self.loss, steady_alone=of_bases)
 
     def _deviation(
