@@ -32,14 +32,11 @@ def read_model(files: ModelFiles) -> mujoco.MjSpec:
     text, includes, assets = files.parts()
     try:
         spec = mujoco.MjSpec.from_string(text, include=includes, assets=assets)
+        copy = spec.copy()  # which leaves out, without a word, what refers to an element that is not there
+        if any(len(getattr(copy, kind)) < len(getattr(spec, kind)) for kind in REFERRING):
+            mujoco.MjSpec.from_string(text, include=includes, assets=assets).compile()  # which says what that is
     except (ValueError, mujoco.FatalError) as error:
         raise MadocError(f"model {files.main} cannot be read: {_one_line(error)}") from error
-    copy = spec.copy()  # which leaves out, without a word, what refers to an element that is not there
-    if any(len(getattr(copy, kind)) < len(getattr(spec, kind)) for kind in REFERRING):
-        try:
-            mujoco.MjSpec.from_string(text, include=includes, assets=assets).compile()
-        except (ValueError, mujoco.FatalError) as error:
-            raise MadocError(f"model {files.main} cannot be read: {_one_line(error)}") from error
     _name_by_owner([(joint, joint.parent.name) for joint in spec.joints if len(joint.parent.joints) == 1], spec.joints)
     of_joint = [part for part in spec.actuators if int(part.trntype) in OF_A_JOINT]
     _name_by_owner([(actuator, actuator.target) for actuator in of_joint], spec.actuators)

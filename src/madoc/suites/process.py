@@ -21,8 +21,8 @@ def prepare() -> None:
     compiled = own_folder("compiled", platform.node())
     if compiled is not None:
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(compiled))
-        # What another worker is just writing is compiled here as well.
-        warnings.filterwarnings("ignore", "Error reading persistent compilation cache entry", UserWarning)
+    # What another worker is just writing is compiled here as well.
+    warnings.filterwarnings("ignore", "Error reading persistent compilation cache entry", UserWarning)
     take_core()
 
 
