@@ -10,7 +10,7 @@ TESTS := $(VENV)/tests
 MUJOCO := mujoco==3.8.0 mujoco-core==4.0.1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test test-slow test-versions wheel check figures docs lock clean
+.PHONY: demo test test-slow test-versions wheel check types style layers figures docs lock clean
 
 DEMO := examples/reach
 demo: $(RUNS)  ## the main job on an arm with an unknown load: logs, calibration, policies, evaluation; SEED=1 is another
@@ -49,10 +49,16 @@ wheel: $(TESTS)  ## the package as others get it: built, installed in an empty e
 	$(WHEEL)/env/bin/madoc calibrate examples/arm/arm.yaml --data $(WHEEL)/logs --out $(WHEEL)/run --quiet
 	$(WHEEL)/env/bin/madoc report $(WHEEL)/run
 
-check: $(TESTS)  ## format, lint, types, layers
+check: types style layers  ## format, lint, types, layers; at once with -j
+
+types: $(TESTS)
+	$(BIN)/mypy
+
+style: $(TESTS)
 	$(BIN)/ruff format --check src tests benchmarks examples docs/hooks.py
 	$(BIN)/ruff check src tests benchmarks examples docs/hooks.py
-	$(BIN)/mypy
+
+layers: $(TESTS)
 	$(BIN)/lint-imports
 
 figures: $(TESTS)  ## every measured table and picture of the README and of the documentation, from committed results

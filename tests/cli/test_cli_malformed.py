@@ -105,7 +105,7 @@ MALFORMED = {
     "a model that is no XML": (raw("arm.xml", b"hello"), "cannot be read"),
     "an element MuJoCo lacks": (model("<worldbody>", "<wordbody/><worldbody>"), "wordbody"),
     "a model without mass": (model('mass="0.5"', 'mass="0"'), "does not compile"),
-    "a motor of no joint": (model('joint="elbow" gear', 'joint="knee" gear'), "there are: shoulder"),
+    "a motor of no joint": (model('joint="elbow" gear', 'joint="knee" gear'), "unknown transmission target 'knee'"),
     "an included file that is missing": (model("</mujoco>", '<include file="hand.xml"/></mujoco>'), "hand.xml"),
     # Logs.
     "no log": (none, "expected logs in the folder"),
