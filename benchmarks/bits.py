@@ -43,7 +43,7 @@ CALIBRATIONS = {
     "madoc-paper clean": ("clean", "madoc-paper", 8_000, ["--set", "grouping_epochs=2", "cloning_epochs=2"]),
     "madoc hidden": ("hidden", "madoc", 15_000, SMALL),
     "madoc noisy": ("noisy", "madoc", 15_000, SMALL),
-    "madoc shuffled": ("shuffled", "madoc", 15_000, SMALL),
+    "npe shuffled": ("shuffled", "npe", 20_000, ["--set", "cloning_epochs=5"]),
     **{
         f"{method} {data}": (data, method, 150_000, [])
         for method, data in (
