@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from madoc.calibration.madoc.actors import Actors, initial_actors
+from madoc.calibration.madoc.agents import AgentSettings
 from madoc.calibration.madoc.watch import (
     CLOSE,
     SATURATED,
     SETTLING,
     SMOOTHING,
+    Watch,
     beats_mid_range,
-    begin_watch,
-    compare,
     observe,
     stalled,
     warnings,
@@ -28,14 +28,14 @@ def actors(value):
 def watched(watch, epochs, *, blur=None, size=1.0, at_bound=0.0, estimate=0.0, steered_to=1.0, gain=1.0):
     metrics = {"reward_size": size, "reward_at_bound": at_bound, "overlap": 0.5}
     metrics |= {} if blur is None else {"blur": blur}
+    settings = AgentSettings(reward_size=steered_to, smallest_blur=SMALLEST, first_blur=LARGEST, largest_blur=LARGEST)
     for _ in range(epochs):
-        watch = compare(watch, gain)
-        watch = observe(watch, metrics, actors(estimate), steered_to=steered_to, blur_range=(SMALLEST, LARGEST))
+        watch = observe(watch, metrics, actors(estimate), gain, settings)
     return watch
 
 
 def begun():
-    return begin_watch(initial_actors(2))
+    return Watch(initial_actors(2))
 
 
 def settled(**metrics):

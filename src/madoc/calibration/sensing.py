@@ -1,15 +1,11 @@
 """What methods are told of the sensors, each the same: their noise, and how many rows tell a state."""
 
-from dataclasses import replace
-
-import jax
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.learning.features import HIDDEN_WINDOW, last_rows
-from madoc.simulation.rollout import Rollout
-from madoc.types import NotNegative, named_key
+from madoc.types import NotNegative
 
 SensorNoise = NotNegative | None
 """Noise of the sensors relative to a step's typical change; None estimates it from the log."""
@@ -34,23 +30,3 @@ def noise_deviation(problem: CalibrationProblem, share: SensorNoise, rows: int) 
         return problem.noise_of_log(rows)
     # The logged change holds the noise of two readings; the share is that of the change without noise.
     return share / np.sqrt(1.0 + 2.0 * share**2) * problem.row_change
-
-
-def numbers_recalled(problem: CalibrationProblem, rows: int) -> int:
-    """How many numbers a clone sees of earlier rows where `rows` are compared: it has to tell the state as they do."""
-    return (rows - 1) * (problem.simulator.task.observation_size + problem.simulator.action_size)
-
-
-def with_sensor_noise(rollout: Rollout, deviation: Float[np.ndarray, " observation"], key: PRNGKeyArray) -> Rollout:
-    """The rollout with noise on its observations; the end of a step and the start of the next have the same noise.
-
-    The policy acted on observations without noise. The key may be that of the rollout's actions.
-    """
-    if not deviation.any():
-        return rollout
-    seen = rollout.transitions
-    steps, *others = np.shape(seen.observation)
-    standard = jax.random.normal(named_key(key, "sensor noise"), (steps + 1, *others))
-    noise = deviation * np.asarray(standard, np.float64)
-    noisy = replace(seen, observation=seen.observation + noise[:-1], next_observation=seen.next_observation + noise[1:])
-    return replace(rollout, transitions=noisy)

@@ -114,15 +114,7 @@ class AgentSettings:
                 f"{self.first_blur} and {self.largest_blur}"
             )
 
-    def init(
-        self,
-        *,
-        window: int,
-        observation: int,
-        parameters: int,
-        groups: int,
-        key: PRNGKeyArray,
-    ) -> Agents:
+    def init(self, *, window: int, observation: int, parameters: int, groups: int, key: PRNGKeyArray) -> Agents:
         """Fresh networks; actors, prior and average at N(0, 1). `window` is the number of features of (s, a)."""
         of_discriminators, of_critics = jax.random.split(key)
         bounds = {"bound": self.bound, "pair_bound": self.pair_bound, "dropout": self.dropout}

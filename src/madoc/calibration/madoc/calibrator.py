@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
+from madoc.calibration.free_rollouts import begin_freely, require_rows, roll_freely
 from madoc.calibration.madoc import grouping, watch
 from madoc.calibration.madoc.actors import draw_parameters, squashed
 from madoc.calibration.madoc.agents import AgentSettings
@@ -25,17 +26,14 @@ from madoc.calibration.madoc.value_decomposition import Mixing
 from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.errors import MadocError
 from madoc.learning import replay
-from madoc.learning.cloning import Pairs, cloning_epoch, fresh_clone
+from madoc.learning.cloning import cloning_epoch, fresh_clone
 from madoc.learning.expectation import Expectation, fresh_expectation, learn_expectation, noise_of_log
 from madoc.learning.grouping_vae import GroupingVAE
 from madoc.learning.networks import scalars
-from madoc.simulation.rollout import out_of_step
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 Features = Literal["residual", "raw"]
 """How discriminators see s': what it differs by from what a regression expects of (s, a), or as it is."""
-
-
 PROBES = 2
 """Systems of an epoch whose rows are not learnt from but compared with each other: the actors' mean, and mid-range."""
 
@@ -146,18 +144,21 @@ class Madoc:
                 collection.logged, self.regression_hidden, updates=updates, key=of_expectation
             )
         agents = self.agents.init(window=window, observation=following, parameters=count, groups=groups, key=of_agents)
-        acted, time_limit = self._acted(problem, collection), problem.simulator.task.max_episode_steps
+        systems, length = collection.systems + PROBES, collection.scaling.length
         return MadocState(
-            clone=fresh_clone(acted, self.hidden, learning_rate=self.learning_rate, key=of_policy),
+            clone=fresh_clone(
+                problem.features.pairs(length - 1), self.hidden, learning_rate=self.learning_rate, key=of_policy
+            ),
             expectation=expectation,
             noise=noise,
             grouping=votes,
-            stability=0.0,
             labels=np.arange(count) if groups == count else np.zeros(count, dtype=np.int64),
             agents=agents,
-            rows=collection.empty_rows(self.replay_capacity),
-            walkers=out_of_step(collection.begin(collection.systems + PROBES, of_start), time_limit),
-            watch=watch.begin_watch(agents.average),
+            rows=replay.empty(
+                self.replay_capacity, pair=(window,), following=(following,), parameters=(count,), identity=()
+            ),
+            walkers=begin_freely(problem, length, of_start, systems=systems, rows=collection.rows(systems)),
+            watch=watch.Watch(agents.average),
             key=key,
             grouped=0,
             failures=0,
@@ -166,41 +167,38 @@ class Madoc:
     def step(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         """One epoch of cloning, of regression, of grouping where groups are to be found, or of calibration."""
         if state.clone.epochs < self.cloning_epochs:
-            return self._clone(problem, state)
-        if state.expectation is not None and state.expectation.epochs < self.regression_epochs:
-            return self._expect(problem, state, state.expectation)
-        if state.grouping is not None and state.grouped < self.grouping_epochs:
-            return self._group(problem, state, state.grouping)
-        return self._calibrate(problem, state)
+            following, epoch = self._clone(problem, state)
+        elif state.expectation is not None and state.expectation.epochs < self.regression_epochs:
+            following, epoch = self._expect(problem, state, state.expectation)
+        elif state.grouping is not None and state.grouped < self.grouping_epochs:
+            following, epoch = self._group(problem, state, state.grouping)
+        else:
+            return self._calibrate(problem, state)
+        return following, replace(epoch, fraction=self._prepared(following))
 
     def estimate(self, problem: CalibrationProblem, state: MadocState) -> Estimate:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
         space, (scaled, std) = problem.simulator.parameters, squashed(state.watch.best)
+        collection, voted = self._collection(problem, state.noise), state.grouped == self.grouping_epochs
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
             mean=space.to_physical(scaled),
             std=std * (space.high - space.low) / 2.0,
             groups=tuple(tuple(group) for group in groups),
-            group_stability=state.stability if state.grouped == self.grouping_epochs else None,
+            group_stability=grouping.agreement(state.grouping.schemes) if voted and state.grouping else None,
             failures=state.failures,
-            warnings=(
-                *watch.warnings(state.watch, scaled, space),
-                *self._collection(problem, state.noise).warnings,
-            ),
+            warnings=(*watch.warnings(state.watch, scaled, space), *collection.warnings),
             settled=watch.settled(state.watch),
         )
 
     def embeddings(self, problem: CalibrationProblem, state: MadocState) -> np.ndarray | None:
         """A vector for each parameter, from the VAE's encoder; None before any grouping."""
-        return state.grouping.embeddings() if state.grouping is not None and state.grouped else None
-
-    def _acted(self, problem: CalibrationProblem, collection: Collection) -> Pairs:
-        """What the clone learns from: it sees as many rows as the discriminators, so that it can tell the state."""
-        return problem.features.pairs(collection.scaling.length - 1)
+        votes = state.grouping if state.grouped else None
+        return None if votes is None else np.asarray(votes.vae.embeddings(), np.float64)
 
     def _collection(self, problem: CalibrationProblem, noise: Float[np.ndarray, " observation"]) -> Collection:
         """How rows of this problem are simulated; what is None in the hyperparameters is chosen here."""
-        window = self.window or rows_compared(problem)
+        window = self._length(problem)
         systems, horizon = geometry(len(problem.simulator.parameters))
         scaling, logged = problem.features.windows("raw" if self.features == "raw" else "standardised", window)
         return Collection(
@@ -213,6 +211,10 @@ class Madoc:
             noise=noise,
         )
 
+    def _length(self, problem: CalibrationProblem) -> int:
+        """Rows that discriminators see; as many as the clone, which has to tell the state as they do."""
+        return self.window or rows_compared(problem)
+
     def _group_count(self, problem: CalibrationProblem) -> int:
         """Number of groups."""
         count = len(problem.simulator.parameters)
@@ -222,12 +224,9 @@ class Madoc:
 
     def _prepared(self, state: MadocState) -> float:
         """Share of the epochs of cloning, regression and grouping that are done."""
-        stages = [(state.clone.epochs, self.cloning_epochs)]
-        if state.expectation is not None:
-            stages.append((state.expectation.epochs, self.regression_epochs))
-        if state.grouping is not None:
-            stages.append((state.grouped, self.grouping_epochs))
-        return sum(min(stage) for stage in stages) / max(1, sum(epochs for _, epochs in stages))
+        done = [state.clone.epochs, state.expectation.epochs if state.expectation else 0, state.grouped]
+        regression = self.regression_epochs if state.expectation else 0
+        return sum(done) / (self.cloning_epochs + regression + (self.grouping_epochs if state.grouping else 0))
 
     def _likeness(self, state: MadocState) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
         """How much rows look like logged ones: by what the regression leaves of s', or else by the judges' reward."""
@@ -239,15 +238,14 @@ class Madoc:
     def _clone(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         clone, key, epoch = cloning_epoch(
             state.clone,
-            self._acted(problem, self._collection(problem, state.noise)),
+            problem.features.pairs(self._length(problem) - 1),
             state.key,
             learning_rate=self.learning_rate,
             batch=self.batch,
             updates=self.cloning_updates,
             epochs=self.cloning_epochs,
         )
-        following = replace(state, clone=clone, key=key)
-        return following, replace(epoch, fraction=self._prepared(following))
+        return replace(state, clone=clone, key=key), epoch
 
     def _expect(
         self, problem: CalibrationProblem, state: MadocState, expectation: Expectation
@@ -266,20 +264,28 @@ class Madoc:
         if expectation.epochs == self.regression_epochs and self.sensor_noise is None:
             noise = noise_of_log(problem.dataset, problem.features, collection.scaling.length, expectation)
             following = replace(following, noise=noise)
-        fraction = self._prepared(following)
-        return following, Epoch({"regression_loss": float(loss)}, stage="regression", fraction=fraction)
+        return following, Epoch({"regression_loss": float(loss)}, stage="regression")
 
     def _group(self, problem: CalibrationProblem, state: MadocState, votes: Votes) -> tuple[MadocState, Epoch]:
         count, collection = len(problem.simulator.parameters), self._collection(problem, state.noise)
         of_draws, of_start, of_action, of_restart, of_batches, key = jax.random.split(state.key, 6)
-        draws, walkers = grouping.one_at_a_time(of_draws, count), collection.begin(count, of_start)
-        rollout, _ = collection.roll(state.clone.policy, draws, walkers, (of_action, of_restart))
+        draws, length = grouping.one_at_a_time(of_draws, count), collection.scaling.length
+        walkers = begin_freely(problem, length, of_start, systems=count, rows=collection.rows(count), spread=False)
+        rollout, _ = roll_freely(
+            problem,
+            state.clone.policy,
+            draws,
+            walkers,
+            steps=collection.steps,
+            noise=state.noise,
+            keys=(of_action, of_restart),
+        )
         rows = collection.remember(state.rows, rollout, draws, np.arange(count), collection.scaling.changes)
         grouped = state.grouped + 1
         voting = grouped > self.grouping_epochs - grouping.voting_epochs(self.grouping_epochs)
         votes, loss = grouping.learn_votes(
             votes,
-            _some(rows, collection),
+            require_rows(rows, "madoc", collection.scaling.length),
             of_batches,
             learning_rate=self.learning_rate,
             batch=self.batch,
@@ -292,36 +298,37 @@ class Madoc:
             state,
             grouping=votes,
             labels=grouping.vote(votes.schemes) if done else state.labels,
-            stability=grouping.agreement(votes.schemes) if done else 0.0,
             rows=replay.clear(rows) if done else rows,
             key=key,
             grouped=grouped,
             failures=state.failures + rollout.failures,
         )
-        steps, fraction = rollout.valid.size, self._prepared(following)
-        metrics = {"grouping_loss": loss}
-        return following, Epoch(metrics, control_steps=steps, unbudgeted=steps, stage="grouping", fraction=fraction)
+        steps = rollout.valid.size
+        return following, Epoch({"grouping_loss": loss}, control_steps=steps, unbudgeted=steps, stage="grouping")
 
     def _calibrate(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:
         of_draws, of_action, of_restart, of_updates, key = jax.random.split(state.key, 5)
         collection, expectation = self._collection(problem, state.noise), state.expectation
         draws = np.asarray(draw_parameters(state.agents.actors, of_draws, collection.systems)[0], dtype=np.float64)
         probes = np.stack([squashed(state.agents.actors)[0], np.zeros(draws.shape[1])])
-        everything, walkers = collection.roll(
-            state.clone.policy, np.concatenate([draws, probes]), state.walkers, (of_action, of_restart)
+        everything, walkers = roll_freely(
+            problem,
+            state.clone.policy,
+            np.concatenate([draws, probes]),
+            state.walkers,
+            steps=collection.steps,
+            noise=state.noise,
+            keys=(of_action, of_restart),
         )
         rollout, probed = (everything.of_systems(part) for part in (slice(len(draws)), slice(len(draws), None)))
-        identity, logged = np.zeros(len(draws), np.int64), collection.logged
+        identity = np.zeros(len(draws), np.int64)
         at_mean, at_middle = collection.mean_of(probed, self._likeness(state))
-        watched = watch.compare(state.watch, float(np.nan_to_num(at_mean - at_middle)))
-        if expectation is None:
-            rows = collection.remember(state.rows, rollout, draws, identity)
-        else:
-            rows = collection.remember(state.rows, rollout, draws, identity, expectation.left)
-            logged = logged[0], expectation.logged
+        described = (expectation.left,) if expectation else ()
+        rows = collection.remember(state.rows, rollout, draws, identity, *described)
+        logged = (collection.logged[0], expectation.logged) if expectation else collection.logged
         agents, device_metrics = self.agents.update(
             state.agents,
-            _some(rows, collection),
+            require_rows(rows, "madoc", collection.scaling.length),
             logged,
             jnp.asarray(grouping.members(state.labels, self._group_count(problem))),
             of_updates,
@@ -329,13 +336,8 @@ class Madoc:
             count=self.updates,
         )
         metrics = scalars(device_metrics)
-        watched = watch.observe(
-            watched,
-            metrics,
-            agents.average,
-            steered_to=self.agents.reward_size,
-            blur_range=(self.agents.smallest_blur, self.agents.largest_blur),
-        )
+        gain = float(np.nan_to_num(at_mean - at_middle))
+        watched = watch.observe(state.watch, metrics, agents.average, gain, self.agents)
         following = replace(
             state,
             agents=agents,
@@ -384,17 +386,3 @@ PAPER: dict[str, object] = {
     ),
 }
 """Hyperparameters of the paper (appendix C, and the authors' code) that differ from the defaults."""
-
-
-def _some(rows: replay.Replay, collection: Collection) -> replay.Replay:
-    """The rows simulated so far.
-
-    Raises:
-        MadocError: There are none.
-    """
-    if not int(rows.written):
-        raise MadocError(
-            f"madoc: every row simulated so far diverged or ended within {collection.scaling.length} steps, so "
-            "there is nothing to compare with the log; narrow the ranges of the parameters"
-        )
-    return rows

@@ -1,17 +1,16 @@
-"""How Madoc simulates rows: rollouts of the clone, window length, sensor noise, replay buffer."""
+"""Madoc's choices about simulated rows: how many there are, what they say of a draw, and what is kept of them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.sensing import numbers_recalled, with_sensor_noise
+from madoc.calibration.free_rollouts import windows_of
 from madoc.learning import replay
-from madoc.learning.features import WindowScaling, unbroken, windows_ending
-from madoc.simulation.rollout import Rollout, Walkers, begin, reset_states, roll
-from madoc.types import Policy
+from madoc.learning.features import WindowScaling
+from madoc.simulation.rollout import Rollout
 
 FEW = 16
 """Number of parameters up to which an epoch has few draws, each of them for longer."""
@@ -48,11 +47,9 @@ class Collection:
     logged: tuple[Float[Array, "windows window"], Float[Array, "windows observation"]]
     noise: Float[np.ndarray, " observation"]
 
-    def begin(self, systems: int, key: PRNGKeyArray) -> Walkers:
-        """Rows at the task's resets, as many for each system as the control steps of an epoch allow."""
-        rows = max(1, self.epoch_steps // (systems * self.steps))
-        recalled = numbers_recalled(self.problem, self.scaling.length)
-        return begin(reset_states(self.problem.simulator), key, systems=systems, rows=rows, recalled=recalled)
+    def rows(self, systems: int) -> int:
+        """Rows of each of so many systems, as the control steps of an epoch allow."""
+        return max(1, self.epoch_steps // (systems * self.steps))
 
     def mean_of(
         self, rollout: Rollout, measure: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -61,47 +58,10 @@ class Collection:
 
         NaN for a system without any.
         """
-        window, following, whole = self._windows(rollout)
+        window, following, whole = windows_of(rollout, self.scaling)
         count = whole.sum((0, 2))
         flat = measure(*(part.reshape(-1, part.shape[-1]) for part in (window, following)))
         return np.where(whole, flat.reshape(whole.shape), 0.0).sum((0, 2)) / np.where(count, count, np.nan)
-
-    def _windows(self, rollout: Rollout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Features of the windows of a rollout and of s' after each, and which windows are whole."""
-        seen, length = rollout.transitions, self.scaling.length
-        window, following = self.scaling.features(windows_ending(seen, np.arange(length - 1, len(seen)), length))
-        ended = np.asarray(seen.terminated) | np.asarray(seen.truncated)
-        return window, following, unbroken(rollout.valid, ended, length)
-
-    def roll(
-        self,
-        policy: Policy,
-        draws: Float[np.ndarray, "systems d"],
-        walkers: Walkers,
-        keys: tuple[PRNGKeyArray, PRNGKeyArray],
-    ) -> tuple[Rollout, Walkers]:
-        """Rows with axes (steps, systems, rows), one system for each draw in [-1, 1], with noise on observations.
-
-        The clone acts from the task's resets on. The keys are those of the actions and of the restarts.
-        """
-        simulator = self.problem.simulator
-        rollout, walkers = roll(
-            simulator.bind(simulator.parameters.to_physical(draws)),
-            simulator.task,
-            policy,
-            walkers,
-            steps=self.steps,
-            starts=reset_states(simulator),
-            key=keys[0],
-            restart_key=keys[1],
-        )
-        return with_sensor_noise(rollout, self.noise, keys[0]), walkers
-
-    def empty_rows(self, capacity: int) -> replay.Replay:
-        """A buffer of features, of the draw each row was simulated under, and of the parameter that was varied."""
-        window, following = self.scaling.sizes
-        parameters = len(self.problem.simulator.parameters)
-        return replay.empty(capacity, pair=(window,), following=(following,), parameters=(parameters,), identity=())
 
     def remember(
         self,
@@ -115,7 +75,7 @@ class Collection:
 
         `described` makes of the features of (s, a) and s' those of s' that are kept.
         """
-        window, following, whole = self._windows(rollout)
+        window, following, whole = windows_of(rollout, self.scaling)
         columns = {
             "pair": window,
             "following": described(window, following),

@@ -30,10 +30,6 @@ class Votes:
     optimiser: PyTree
     schemes: Int[np.ndarray, "votes d"]
 
-    def embeddings(self) -> Float[np.ndarray, "d latent"]:
-        """The VAE's embedding of each parameter."""
-        return np.asarray(self.vae.embeddings(), dtype=np.float64)
-
 
 def voting_epochs(epochs: int) -> int:
     """Number of the epochs of grouping, the last ones, in which groups are voted on."""
@@ -89,21 +85,14 @@ def one_at_a_time(key: PRNGKeyArray, count: int) -> Float[np.ndarray, "d d"]:
 
 def cluster(embeddings: Float[Array | np.ndarray, "d latent"], groups: int, seed: int) -> Int[np.ndarray, " d"]:
     """Group labels of parameters, in order of first appearance: k-means of the first three principal components."""
-    if groups == 1:
-        return np.zeros(len(embeddings), dtype=np.int64)
     rows = np.asarray(embeddings, dtype=np.float64)
     from sklearn.cluster import KMeans  # slow to import, and only needed here
     from sklearn.decomposition import PCA
 
     projected = PCA(min(PROJECTED, *rows.shape), svd_solver="full").fit_transform(rows)
     labels = KMeans(groups, n_init=10, random_state=seed).fit_predict(projected)
-    return by_first_appearance(labels)
-
-
-def by_first_appearance(labels: Int[np.ndarray, " d"]) -> Int[np.ndarray, " d"]:
-    """The same groups, numbered in the order in which they first appear."""
-    order = {label: rank for rank, label in enumerate(dict.fromkeys(labels.tolist()))}
-    return np.array([order[label] for label in labels.tolist()])
+    _, first, label = np.unique(labels, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[label]
 
 
 def vote(schemes: Int[np.ndarray, "votes d"]) -> Int[np.ndarray, " d"]:

@@ -26,7 +26,6 @@ class MadocState:
         noise: Standard deviation of the noise that simulated observations are given.
         grouping: The VAE and its votes; None where no groups are found.
         labels: Group of each parameter.
-        stability: Mean adjusted Rand index of the groups with those proposed in other epochs; 0 before there are any.
         agents: Discriminators, critics and actors.
         rows: Buffer of simulated rows.
         walkers: Simulated rows that go on in the next epoch.
@@ -41,7 +40,6 @@ class MadocState:
     noise: Float[np.ndarray, " observation"]
     grouping: Votes | None
     labels: Int[np.ndarray, " d"]
-    stability: float
     agents: Agents
     rows: replay.Replay
     walkers: Walkers

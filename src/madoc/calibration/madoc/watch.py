@@ -8,6 +8,7 @@ import numpy as np
 
 from madoc.calibration.cautions import at_end_of_range
 from madoc.calibration.madoc.actors import Actors
+from madoc.calibration.madoc.agents import AgentSettings
 from madoc.parameters import ParameterSpace
 from madoc.types import Metrics
 
@@ -35,6 +36,7 @@ class Watch:
     """Running averages over epochs, and the best estimate so far.
 
     Attributes:
+        best: The actors' moving average when the mismatch was last close to its lowest.
         epochs: Number of calibration epochs so far.
         mismatch: Distance of simulated from logged rows in units of the features of s': the blur times the mean
             |reward| over its set value. Without a blur it is the mean |reward|.
@@ -42,56 +44,50 @@ class Watch:
         best_mismatch: The lowest mismatch since they are compared.
         milestone: The mismatch at the last progress.
         milestone_epoch: The epoch of the last progress.
-        best: The actors' moving average when the mismatch was last close to its lowest.
         gain: By how much rows at the actors' mean look more like logged ones than rows at mid-range do, on average.
         gain_squared: Average square of that.
     """
 
-    epochs: int
-    mismatch: float
-    at_bound: float
-    best_mismatch: float
-    milestone: float
-    milestone_epoch: int
     best: Actors
-    gain: float
-    gain_squared: float
+    epochs: int = 0
+    mismatch: float = 0.0
+    at_bound: float = 0.0
+    best_mismatch: float = 0.0
+    milestone: float = 0.0
+    milestone_epoch: int = 0
+    gain: float = 0.0
+    gain_squared: float = 0.0
 
 
-def begin_watch(actors: Actors) -> Watch:
-    """The watch before the first epoch."""
-    return Watch(0, 0.0, 0.0, 0.0, 0.0, 0, actors, 0.0, 0.0)
-
-
-def observe(
-    watch: Watch,
-    metrics: Metrics,
-    average: Actors,
-    *,
-    steered_to: float,
-    blur_range: tuple[float, float],
-) -> Watch:
+def observe(watch: Watch, metrics: Metrics, average: Actors, gain: float, settings: AgentSettings) -> Watch:
     """The watch after one more epoch, whose estimate is kept unless an earlier mismatch was clearly lower.
 
-    Without a blur, `metrics` need not have any.
-
-    Mismatches are compared once the discriminators have settled, provided that the mean |reward| is near `steered_to`,
-    its set value, or the blur is at its lower limit. Before that, without a blur (`steered_to` is then 0), and while
-    rewards are at their bound under the largest blur, the latest estimate is kept.
+    `gain` is how much more rows at the actors' mean look like logged ones than rows at mid-range do. It counts, and
+    mismatches are compared, once the discriminators have settled; mismatches if the mean |reward| is near its set
+    value too, or the blur is at its lower limit. Before that, without a blur, and while rewards are at their bound
+    under the largest blur, the latest estimate is kept. Without a blur, `metrics` need not have any.
     """
-    size, at_bound = metrics["reward_size"], metrics["reward_at_bound"]
+    size, at_bound, steered_to = metrics["reward_size"], metrics["reward_at_bound"], settings.reward_size
+    rate = GAIN_SMOOTHING if watch.epochs > SETTLING else 1.0
     mismatch = metrics["blur"] * size / steered_to if steered_to else size
     if watch.epochs:
         mismatch = watch.mismatch + SMOOTHING * (mismatch - watch.mismatch)
         at_bound = watch.at_bound + SMOOTHING * (at_bound - watch.at_bound)
-    watch = replace(watch, epochs=watch.epochs + 1, mismatch=mismatch, at_bound=at_bound)
+    watch = replace(
+        watch,
+        epochs=watch.epochs + 1,
+        mismatch=mismatch,
+        at_bound=at_bound,
+        gain=watch.gain + rate * (gain - watch.gain),
+        gain_squared=watch.gain_squared + rate * (gain**2 - watch.gain_squared),
+    )
     latest = _mark(replace(watch, best=average, best_mismatch=mismatch))
     if not steered_to:
         return latest
-    (smallest, largest), blur = blur_range, metrics["blur"]
-    if watch.epochs <= SETTLING or (blur > 0.99 * largest and at_bound > SATURATED):
+    blur = metrics["blur"]
+    if watch.epochs <= SETTLING or (blur > 0.99 * settings.largest_blur and at_bound > SATURATED):
         return latest
-    if size < LEAST_REWARD * steered_to and blur > 1.01 * smallest:
+    if size < LEAST_REWARD * steered_to and blur > 1.01 * settings.smallest_blur:
         return watch
     lowest = min(mismatch, watch.best_mismatch)
     best = average if mismatch <= (1.0 + CLOSE) * lowest else watch.best
@@ -109,20 +105,6 @@ def stalled(watch: Watch, patience: int) -> str | None:
     if waited < patience:
         return None
     return f"the mismatch of simulated and logged rows has stayed at {watch.best_mismatch:.3g} for {waited} epochs"
-
-
-def compare(watch: Watch, gain: float) -> Watch:
-    """The watch after one more epoch in which rows at the actors' mean were compared with rows at mid-range.
-
-    Epochs before the discriminators have settled do not count.
-    """
-    if watch.epochs <= SETTLING:
-        return replace(watch, gain=gain, gain_squared=gain**2)
-    return replace(
-        watch,
-        gain=watch.gain + GAIN_SMOOTHING * (gain - watch.gain),
-        gain_squared=watch.gain_squared + GAIN_SMOOTHING * (gain**2 - watch.gain_squared),
-    )
 
 
 def beats_mid_range(watch: Watch) -> bool:

@@ -24,12 +24,13 @@ from madoc.calibration.baselines.population_search import (
     next_generation,
     replay_residuals,
 )
-from madoc.calibration.sensing import SensorNoise, noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
+from madoc.calibration.free_rollouts import begin_freely, roll_freely, windows_of, without_starts
+from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.errors import MadocError
 from madoc.identification.windows import first_rows
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
-from madoc.learning.features import HIDDEN_WINDOW, unbroken, windows_ending
-from madoc.simulation.rollout import Walkers, begin, out_of_step, reset_states, roll
+from madoc.learning.features import HIDDEN_WINDOW
+from madoc.simulation.rollout import Walkers
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 
 Evaluation = tuple[Costs, int, int]
@@ -188,14 +189,11 @@ class CmaEs:
 
     def _begin_actor(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Actor:
         of_policy, of_start = jax.random.split(key)
-        simulator, window = problem.simulator, self._window(problem)
+        window, rows = self._window(problem), self.rows or ROWS["policy"]
         clone = fresh_clone(
             problem.features.pairs(window - 1), self.hidden, learning_rate=self.learning_rate, key=of_policy
         )
-        rows = self.rows or ROWS["policy"]
-        recalled = numbers_recalled(problem, window)
-        walkers = begin(reset_states(simulator), of_start, systems=1, rows=rows, recalled=recalled)
-        return Actor(clone, out_of_step(walkers, simulator.task.max_episode_steps))
+        return Actor(clone, begin_freely(problem, window, of_start, systems=1, rows=rows))
 
     def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Epoch]:
         clone, key, epoch = cloning_epoch(
@@ -270,25 +268,19 @@ class CmaEs:
         self, problem: CalibrationProblem, clouds: Clouds, actor: Actor, candidates: Candidates, key: PRNGKeyArray
     ) -> tuple[Evaluation, Actor]:
         """Clouds that the clone visits under each candidate, from where the best one of the last generation stopped."""
-        simulator = problem.simulator
         of_actions, of_restarts = jax.random.split(key)
-        rollout, after = roll(
-            simulator.bind(simulator.parameters.to_physical(candidates)),
-            simulator.task,
+        length = self._window(problem)
+        rollout, after = roll_freely(
+            problem,
             actor.clone.policy,
+            candidates,
             jax.tree.map(lambda part: np.repeat(part, len(candidates), axis=0), actor.walkers),
             steps=self.horizon,
-            starts=reset_states(simulator),
-            key=of_actions,
-            restart_key=of_restarts,
+            noise=noise_deviation(problem, self.sensor_noise, length),
+            keys=(of_actions, of_restarts),
         )
-        length = self._window(problem)
-        seen = with_sensor_noise(rollout, noise_deviation(problem, self.sensor_noise, length), of_actions).transitions
-        scaling, _ = problem.features.windows("standardised", length)
-        # All candidates share the first observation.
-        windows = scaling.features(windows_ending(seen, np.arange(max(1, length - 1), len(seen)), length))[0]
-        whole = unbroken(rollout.valid, np.asarray(seen.terminated) | np.asarray(seen.truncated), length)
-        windows = np.where(whole[-len(windows) :, ..., None], windows, np.nan)
+        windows, _, whole = windows_of(rollout, problem.features.windows("standardised", length)[0])
+        windows = np.where(whole[..., None], windows, np.nan)[without_starts(length)]
         rows = np.swapaxes(windows, 0, 1).reshape(len(candidates), -1, windows.shape[-1])
         costs = discrepancies(clouds.of_pairs(rows), clouds.pair)
         costs = mean_with_failures(costs[:, None])

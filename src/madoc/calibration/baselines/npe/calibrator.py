@@ -35,13 +35,13 @@ from madoc.calibration.baselines.npe.emulator import (
 )
 from madoc.calibration.baselines.npe.summaries import Sets, by_halves, logged_moments, set_moments, unpaired
 from madoc.calibration.cautions import at_end_of_range
-from madoc.calibration.sensing import SensorNoise, noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
-from madoc.errors import MadocError
+from madoc.calibration.free_rollouts import begin_freely, require_rows, roll_freely, windows_of
+from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
-from madoc.learning.features import HIDDEN_WINDOW, unbroken, windows_ending
+from madoc.learning.features import HIDDEN_WINDOW
 from madoc.learning.networks import falling_adam
-from madoc.simulation.rollout import Rollout, Walkers, begin, out_of_step, reset_states, roll
+from madoc.simulation.rollout import Rollout, Walkers
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Positive, check_hyperparameters
 
 WIDTHS = (1.0, 2.0, 4.0)
@@ -156,11 +156,11 @@ class Npe:
         emulator = fresh_emulator(window, size, count, self.hidden, of_emulator)
         kept = size + (self.features if unpaired(problem) else count)
         sets, box = (self.epochs * self.draws, 2), np.ones(count)
-        acted, recalled = problem.features.pairs(length - 1), numbers_recalled(problem, length)
-        walkers = begin(reset_states(simulator), of_start, systems=self.draws, rows=self.rows, recalled=recalled)
         return NpeState(
-            clone=fresh_clone(acted, self.hidden, learning_rate=self.learning_rate, key=of_clone),
-            walkers=out_of_step(walkers, simulator.task.max_episode_steps),
+            clone=fresh_clone(
+                problem.features.pairs(length - 1), self.hidden, learning_rate=self.learning_rate, key=of_clone
+            ),
+            walkers=begin_freely(problem, length, of_start, systems=self.draws, rows=self.rows),
             emulator=emulator,
             optimiser=self._optimiser(emulator),
             rows=replay.empty(self.replay_capacity, window=(window,), following=(size,), scaled=(count,)),
@@ -222,21 +222,18 @@ class Npe:
     def _simulate(self, problem: CalibrationProblem, state: NpeState) -> tuple[NpeState, Epoch]:
         """Rows under draws from the box; after a round of them the posterior, once the emulator is trained."""
         of_draws, of_actions, of_restarts, of_posterior, key = jax.random.split(state.key, 5)
-        simulator = problem.simulator
         uniform = np.asarray(jax.random.uniform(of_draws, (self.draws, len(state.low))), np.float64)
         points = state.low + (state.high - state.low) * uniform
-        rollout, walkers = roll(
-            simulator.bind(simulator.parameters.to_physical(points)),
-            simulator.task,
+        rollout, walkers = roll_freely(
+            problem,
             state.clone.policy,
+            points,
             state.walkers,
             steps=self.horizon,
-            starts=reset_states(simulator),
-            key=of_actions,
-            restart_key=of_restarts,
+            noise=noise_deviation(problem, self.sensor_noise, rows_compared(problem)),
+            keys=(of_actions, of_restarts),
         )
-        noise = noise_deviation(problem, self.sensor_noise, rows_compared(problem))
-        state = self._collect(problem, state, with_sensor_noise(rollout, noise, of_actions), points)
+        state = self._collect(problem, state, rollout, points)
         state = replace(state, walkers=walkers, key=key, failures=state.failures + rollout.failures)
         if state.collected == self.epochs and state.trained:
             state = self._infer(problem, state, of_posterior)
@@ -252,10 +249,8 @@ class Npe:
         Raises:
             MadocError: No window has been whole so far.
         """
-        length, seen = rows_compared(problem), rollout.transitions
-        scaling, _ = problem.features.windows("standardised", length)
-        window, following = scaling.features(windows_ending(seen, np.arange(length - 1, len(seen)), length))
-        valid = unbroken(rollout.valid, np.asarray(seen.terminated) | np.asarray(seen.truncated), length)
+        scaling, _ = problem.features.windows("standardised", rows_compared(problem))
+        window, following, valid = windows_of(rollout, scaling)
         sets, place = state.sets, slice(state.collected * self.draws, (state.collected + 1) * self.draws)
         if state.trained:
             fresh = set_moments(
@@ -267,11 +262,7 @@ class Npe:
         rows = replay.add(
             state.rows, {name: replay.flatten_rows(part, 3) for name, part in columns.items()}, valid.reshape(-1)
         )
-        if not int(rows.written):
-            raise MadocError(
-                f"npe: every row simulated so far diverged or ended within {length} steps, so there is nothing "
-                "to compare with the log; narrow the ranges of the parameters"
-            )
+        require_rows(rows, "npe", scaling.length)
         written = _written(state.points, place, points)
         return replace(state, rows=rows, sets=sets, points=written, collected=state.collected + 1)
 

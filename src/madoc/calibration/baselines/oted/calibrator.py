@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, PRNGKeyArray, PyTree
+from jaxtyping import Float, Int, PRNGKeyArray, PyTree
 from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
@@ -29,13 +29,13 @@ from madoc.calibration.baselines.oted.visits import (
     visits,
 )
 from madoc.calibration.baselines.population_search import independent_estimate
-from madoc.calibration.sensing import SensorNoise, noise_deviation, numbers_recalled, rows_compared, with_sensor_noise
-from madoc.errors import MadocError
+from madoc.calibration.free_rollouts import begin_freely, require_rows, roll_freely, windows_of, without_starts
+from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
-from madoc.learning.features import HIDDEN_WINDOW, last_rows, unbroken, windows_ending
+from madoc.learning.features import HIDDEN_WINDOW, last_rows
 from madoc.learning.networks import Network, adam, moving_average
-from madoc.simulation.rollout import Starts, Walkers, begin, chosen_states, reset_states, roll, unbiased_starts
+from madoc.simulation.rollout import Rollout, Walkers, begin, chosen_states, roll, unbiased_starts
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Positive, Share, check_hyperparameters
 
 
@@ -125,7 +125,9 @@ class Oted:
             discriminator=discriminator,
             discriminator_optimiser=adam(self.learning_rate).init(eqx.filter(discriminator, eqx.is_array)),
             rows=replay.empty(self.replay_capacity, pair=(pair,)),
-            walkers=self._begin(problem, self._starts(problem)[0], of_start),
+            walkers=begin_freely(
+                problem, self._window(problem), of_start, systems=self._systems, rows=self.rows, spread=False
+            ),
             distribution=distribution,
             average=distribution,
             key=key,
@@ -144,15 +146,6 @@ class Oted:
     @property
     def _systems(self) -> int:
         return 2 * (self.draws // 2)
-
-    def _starts(self, problem: CalibrationProblem) -> tuple[Starts, Int[np.ndarray, " rows"]]:
-        """Where rollouts start, and how often the true system visits each logged window from there."""
-        if not self._anew(problem):
-            windows = last_rows(problem.dataset, self._window(problem))
-            return reset_states(problem.simulator), np.ones(len(windows), dtype=np.int64)
-        states, rows = problem.states.exact()
-        chosen = comparable_starts(problem.dataset, rows, self.horizon)
-        return chosen_states(states[chosen]), visits(problem.dataset, rows[chosen], self.horizon)
 
     def _anew(self, problem: CalibrationProblem) -> bool:
         """Whether rollouts start anew at logged states in every epoch."""
@@ -174,47 +167,59 @@ class Oted:
         )
         return replace(state, clone=clone, key=key), epoch
 
-    def _begin(self, problem: CalibrationProblem, starts: Starts, key: PRNGKeyArray) -> Walkers:
-        recalled = numbers_recalled(problem, self._window(problem))
-        return begin(starts, key, systems=self._systems, rows=self.rows, recalled=recalled)
+    def _roll_anew(
+        self,
+        problem: CalibrationProblem,
+        clone: Clone,
+        draws: Float[np.ndarray, "systems d"],
+        of_start: PRNGKeyArray,
+        keys: tuple[PRNGKeyArray, PRNGKeyArray],
+    ) -> tuple[Rollout, Int[np.ndarray, " rows"]]:
+        """Rows that start at logged states, and how often the true system visits each logged row from there.
+
+        Sensors have no noise: where logged states are exact, neither has the log.
+        """
+        simulator, (states, rows) = problem.simulator, problem.states.exact()
+        chosen = comparable_starts(problem.dataset, rows, self.horizon)
+        starts, system = chosen_states(states[chosen]), simulator.bind(simulator.parameters.to_physical(draws))
+        walkers = begin(starts, of_start, systems=self._systems, rows=self.rows)
+        rollout, _ = roll(
+            system,
+            simulator.task,
+            clone.policy,
+            replace(walkers, state=system.unbiased(walkers.state)),
+            steps=self.horizon,
+            starts=unbiased_starts(system, starts),
+            key=keys[0],
+            restart_key=keys[1],
+        )
+        return rollout, visits(problem.dataset, rows[chosen], self.horizon)
 
     def _calibrate(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         of_draws, of_start, of_action, of_restart, of_updates, key = jax.random.split(state.key, 6)
-        simulator, distribution, anew = problem.simulator, state.distribution, self._anew(problem)
+        distribution, length = state.distribution, self._window(problem)
         noise = antithetic_noise(of_draws, self._systems // 2, len(distribution.mean))
         draws = np.tanh(distribution.mean + np.exp(distribution.log_std) * noise)
-        system = simulator.bind(simulator.parameters.to_physical(draws))
-        starts, reached = self._starts(problem)
-        walkers = state.walkers
-        if anew:
-            fresh = self._begin(problem, starts, of_start)
-            starts, walkers = unbiased_starts(system, starts), replace(fresh, state=system.unbiased(fresh.state))
-        rollout, following = roll(
-            system,
-            simulator.task,
-            state.clone.policy,
-            walkers,
-            steps=self.horizon,
-            starts=starts,
-            key=of_action,
-            restart_key=of_restart,
-        )
-        if not anew:
-            rollout = with_sensor_noise(
-                rollout, noise_deviation(problem, self.sensor_noise, self._window(problem)), of_action
+        walkers, keys = state.walkers, (of_action, of_restart)
+        if self._anew(problem):
+            rollout, reached = self._roll_anew(problem, state.clone, draws, of_start, keys)
+            judged = replace(rollout, valid=first_lives(rollout.transitions, rollout.valid))
+        else:
+            reached = np.ones(len(last_rows(problem.dataset, length)), np.int64)
+            rollout, walkers = roll_freely(
+                problem,
+                state.clone.policy,
+                draws,
+                walkers,
+                steps=self.horizon,
+                noise=noise_deviation(problem, self.sensor_noise, length),
+                keys=keys,
             )
-        length, seen = self._window(problem), rollout.transitions
+            judged = rollout
         scaling, (logged, _) = problem.features.windows("standardised", length)
-        # The first pair of a row is its start, which does not depend on the draw.
-        pairs = scaling.features(windows_ending(seen, np.arange(max(1, length - 1), len(seen)), length))[0]
-        lives = first_lives(seen, rollout.valid) if anew else rollout.valid
-        valid = unbroken(lives, np.asarray(seen.terminated) | np.asarray(seen.truncated), length)[-len(pairs) :]
+        pairs, _, valid = (part[without_starts(length)] for part in windows_of(judged, scaling))
         rows = replay.add(state.rows, {"pair": replay.flatten_rows(pairs, 3)}, valid.reshape(-1))
-        if not int(rows.written):
-            raise MadocError(
-                f"oted: every row simulated so far diverged or ended within {length} steps, so there is nothing "
-                "to compare with the log; narrow the ranges of the parameters"
-            )
+        require_rows(rows, "oted", length)
         discriminator, optimiser_state, loss = learn(
             state.discriminator,
             state.discriminator_optimiser,
@@ -236,7 +241,7 @@ class Oted:
             discriminator=discriminator,
             discriminator_optimiser=optimiser_state,
             rows=rows,
-            walkers=state.walkers if anew else following,
+            walkers=walkers,
             distribution=moved,
             average=moving_average(state.average, moved, self.average_rate),
             key=key,
