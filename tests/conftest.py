@@ -13,8 +13,10 @@ import shapes
 # What one worker, or a process that a test starts, has compiled the others load.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "compiled"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-# Tests run a program a few times: optimising it takes longer than that saves.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+# Tests run a program a few times: optimising it takes longer than that saves. Fusion emitters are most of compiling.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of each worker: there is one for each core
 os.environ["MUJOCO_GL"] = "disable"  # only tests of pictures draw any
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"  # for the processes that tests start
