@@ -11,6 +11,7 @@ from madoc.diagnosis.channels import Channel, channel_findings, channels_of
 from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, excite_unknown
 from madoc.diagnosis.explanation import Explanation, action_findings, box_draws, explain, explanation_findings
+from madoc.diagnosis.inertial import inertial_findings
 from madoc.diagnosis.response import response_findings
 from madoc.diagnosis.scales import scale_findings, timestep_findings
 from madoc.diagnosis.speeds import speed_findings
@@ -70,7 +71,7 @@ def check(
     channels = channels_of(dataset, simulator.task, robot)
     findings = [*dataset.findings, *channel_findings(dataset, len(simulator.parameters), channels)]
     about_speeds, late_speeds = speed_findings(dataset, simulator)
-    findings += about_speeds
+    findings += [*about_speeds, *(inertial_findings(dataset, robot, simulator.control_step) if robot else [])]
     explanation, excitation, spent = None, None, 0
     if not any(finding.level == "fatal" for finding in findings):
         logged = states_of(dataset, simulator)

@@ -144,10 +144,15 @@ def _ratio(change: Float[np.ndarray, " rows"], expected: Float[np.ndarray, " row
     return together / power
 
 
-def _unit_finding(pair: _Pair, ratio: float) -> Finding:
+def unit_mistake(ratio: float) -> str:
+    """The mistake of a unit or a sign that explains a ratio of two speeds, as a clause; empty for any other."""
     factors = ((each, text) for factor, text in _UNIT_ERRORS.items() for each in (factor, 1.0 / factor))
-    mistake = next((f": {text}?" for factor, text in factors if abs(ratio / factor - 1.0) < 0.1), "")
-    what = f"it changes {ratio:.3g} times as fast as {pair.speed} says{mistake}"
+    return next((text for factor, text in factors if abs(ratio / factor - 1.0) < 0.1), "")
+
+
+def _unit_finding(pair: _Pair, ratio: float) -> Finding:
+    mistake = unit_mistake(ratio)
+    what = f"it changes {ratio:.3g} times as fast as {pair.speed} says" + (f": {mistake}?" if mistake else "")
     return Finding("warning", what, pair.position, "look at units and signs in the spec and at control_step", True)
 
 
