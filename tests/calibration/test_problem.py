@@ -5,6 +5,7 @@ import numpy as np
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
+from madoc.calibration.calibrate import without_repeats
 from madoc.simulation.sensitivity import insensitive
 from own_robots import CART, CART_SPEC, write_robot
 from robots import recorded
@@ -42,3 +43,9 @@ def test_where_positions_are_hidden_it_probes_where_logged_actions_lead(tmp_path
     assert insensitive(problem.simulator, states, actions, key=jax.random.key(0))[0] == []
     resting = np.zeros((64, 2))  # hanging, gravity pulls at nothing
     assert insensitive(problem.simulator, resting, actions, key=jax.random.key(0))[0] == ["gravity"]
+
+
+def test_what_method_and_check_both_say_is_without_repeats():
+    own = ["the data does not identify mass, gain together; leave one out", "at the end of its range: damping"]
+    doubts = [f"parameters: {own[0]}", "run.csv: the run is cut there"]
+    assert without_repeats(own, doubts) == [*own, "run.csv: the run is cut there"]

@@ -15,6 +15,7 @@ from madoc.identification.noise import difference_noise, rounding_of
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.learning.expectation import noise_of_log
 from madoc.learning.features import LoggedFeatures
+from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.types import Method, State
 
@@ -160,3 +161,9 @@ class Calibrator(Method[CalibrationProblem, State], Protocol[State]):
 
     def estimate(self, problem: CalibrationProblem, state: State) -> Estimate:
         """The best estimate so far."""
+
+
+def at_end_of_range(scaled: Float[np.ndarray, " d"], space: ParameterSpace) -> tuple[str, ...]:
+    """Warn of estimates, scaled to [-1, 1], that are at an end of their range; see `ParameterSpace.at_end`."""
+    ends = space.at_end(scaled)
+    return (f"at the end of its range: {', '.join(ends)}; widen the range or doubt the model",) if ends else ()

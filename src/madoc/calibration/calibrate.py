@@ -1,13 +1,12 @@
 """Run a calibrator on a problem."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
-from madoc.calibration.cautions import exploded, without_repeats
 from madoc.calibration.registry import CALIBRATORS
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
@@ -112,3 +111,19 @@ def _parameters(space: ParameterSpace, estimate: Estimate) -> dict[str, Paramete
         row.name: ParameterEstimate(float(mean), float(std), row.low, row.high, row.unit, interval)
         for row, mean, std, interval in columns
     }
+
+
+def exploded(failures: int, control_steps: int) -> tuple[str, ...]:
+    """Warn of simulated rows, or windows of them, that diverged, if any did."""
+    if not failures:
+        return ()
+    return (
+        f"{failures:,} simulated rows or windows exploded, in {control_steps:,} control steps, and were left out; "
+        "the ranges may hold impossible parameters",
+    )
+
+
+def without_repeats(warnings: Iterable[str], doubts: Iterable[str]) -> list[str]:
+    """The warnings of a method, then the doubts about the data that the method does not state already."""
+    own = list(dict.fromkeys(warnings))
+    return [*own, *(doubt for doubt in doubts if not any(doubt.endswith(sentence) for sentence in own))]

@@ -1,9 +1,7 @@
 """Readings of an inertial measurement unit against each other: quaternions, rates of turn, accelerations."""
 
 from collections import Counter
-from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
@@ -14,6 +12,7 @@ from madoc.diagnosis.speeds import STRETCH, unit_mistake
 from madoc.robots import Robot
 from madoc.robots.expressions import Read
 from madoc.robots.grammar import parse
+from madoc.robots.signals import frame_of, frame_of_attitude, is_accelerometer, is_gyroscope
 
 LENGTH = 0.05
 """Median difference from 1 of the length of a logged quaternion; beyond it, it is no attitude."""
@@ -27,22 +26,6 @@ _MISTAKES = {1.0: "in g", 1e3: "in thousandths of g"}
 """Units of accelerations by the readings of a sensor at rest."""
 _ORDERS = {"w, x, y, z": [0, 1, 2, 3], "x, y, z, w": [3, 0, 1, 2]}
 """Where w, x, y and z are among four columns, by their order; the first is the one that a spec gives."""
-_FRAMES = {
-    mujoco.mjtObj.mjOBJ_XBODY: "xmat",
-    mujoco.mjtObj.mjOBJ_BODY: "ximat",
-    mujoco.mjtObj.mjOBJ_GEOM: "geom_xmat",
-    mujoco.mjtObj.mjOBJ_SITE: "site_xmat",
-    mujoco.mjtObj.mjOBJ_CAMERA: "cam_xmat",
-}
-"""The axes of what a sensor is fixed to, in MjData."""
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """The body that something is fixed to, and its axes in that body, as a rotation."""
-
-    body: int
-    axes: Rotation
 
 
 def inertial_findings(dataset: Dataset, robot: Robot, control_step: float) -> list[Finding]:
@@ -52,7 +35,7 @@ def inertial_findings(dataset: Dataset, robot: Robot, control_step: float) -> li
     """
     model = robot.task.model
     readings = _readings(dataset, robot)
-    rates = {name: read for name, read in readings.items() if _kind(model, name) == mujoco.mjtSensor.mjSENS_GYRO}
+    rates = {name: read for name, read in readings.items() if is_gyroscope(model, name)}
     findings = _incomplete(robot)
     for places in robot.task.attitudes:
         where = ", ".join(robot.signals[place].name for place in places)
@@ -64,15 +47,15 @@ def inertial_findings(dataset: Dataset, robot: Robot, control_step: float) -> li
                 Finding("fatal", what, where, "divide counts by their scale, or leave them out of the spec")
             )
             continue
-        attitude = _frame_of_attitude(model, robot.signals[places[0]].quaternion)
+        attitude = frame_of_attitude(model, robot.signals[places[0]].quaternion)
         for name, rate in rates.items():
-            gyroscope = _frame_of(model, name)
+            gyroscope = frame_of(model, name)
             if attitude is not None and gyroscope is not None and attitude.body == gyroscope.body:
                 to_gyroscope = gyroscope.axes.inv() * attitude.axes
                 findings += _turning(dataset, quaternion, rate, to_gyroscope, where, name, control_step)
     gravity = float(np.linalg.norm(model.opt.gravity))
     for name, read in readings.items():
-        if _kind(model, name) == mujoco.mjtSensor.mjSENS_ACCELEROMETER and gravity:
+        if is_accelerometer(model, name) and gravity:
             findings += _acceleration(name, float(np.median(np.linalg.norm(read, axis=-1))), gravity)
     return findings
 
@@ -90,46 +73,6 @@ def _readings(dataset: Dataset, robot: Robot) -> dict[str, Float[np.ndarray, "ro
             found.setdefault(read.name, {}).setdefault(read.index or 0, (observation[:, place] - affine[1]) / gain)
     whole = {name: values for name, values in found.items() if set(values) == {0, 1, 2}}
     return {name: np.stack([values[axis] for axis in range(3)], axis=-1) for name, values in whole.items()}
-
-
-def _kind(model: mujoco.MjModel, sensor: str) -> int:
-    return int(model.sensor(sensor).type[0])
-
-
-def _frame_of_attitude(model: mujoco.MjModel, source: str) -> _Frame | None:
-    """The frame whose attitude a joint or `sensor(NAME)` tells in the world; None where that is another's."""
-    if source.startswith("sensor("):
-        sensor = next(iter(parse(f"{source}[0]").reads))
-        world = (
-            _kind(model, sensor.name) == mujoco.mjtSensor.mjSENS_FRAMEQUAT and model.sensor(sensor.name).refid[0] < 0
-        )
-        return _frame_of(model, sensor.name) if world else None
-    joint = model.joint(source)
-    free = int(joint.type[0]) == mujoco.mjtJoint.mjJNT_FREE
-    return _Frame(int(joint.bodyid[0]), Rotation.identity()) if free else None
-
-
-def _frame_of(model: mujoco.MjModel, sensor: str) -> _Frame | None:
-    """The frame that a sensor is fixed to; None for kinds of frames that have no axes."""
-    kind, index = mujoco.mjtObj(int(model.sensor(sensor).objtype[0])), int(model.sensor(sensor).objid[0])
-    if kind not in _FRAMES:
-        return None
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    owners = {
-        mujoco.mjtObj.mjOBJ_GEOM: model.geom_bodyid,
-        mujoco.mjtObj.mjOBJ_SITE: model.site_bodyid,
-        mujoco.mjtObj.mjOBJ_CAMERA: model.cam_bodyid,
-    }
-    body = int(owners[kind][index]) if kind in owners else index
-    own, of_body = (
-        Rotation.from_matrix(each[row].reshape(3, 3))
-        for each, row in (
-            (getattr(data, _FRAMES[kind]), index),
-            (data.xmat, body),
-        )
-    )
-    return _Frame(body, of_body.inv() * own)
 
 
 def _turning(

@@ -3,8 +3,10 @@
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import mujoco
+from scipy.spatial.transform import Rotation
 
 from madoc.robots.expressions import Expression, Read
 from madoc.robots.grammar import parse
@@ -19,6 +21,23 @@ _NOT_SI = re.compile(
 _FIRST_OF_QUATERNION = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
 """Index of the quaternion's first component among the positions of a joint of this type."""
 _QUATERNION_SENSORS = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
+
+_FRAMES = {
+    mujoco.mjtObj.mjOBJ_XBODY: "xmat",
+    mujoco.mjtObj.mjOBJ_BODY: "ximat",
+    mujoco.mjtObj.mjOBJ_GEOM: "geom_xmat",
+    mujoco.mjtObj.mjOBJ_SITE: "site_xmat",
+    mujoco.mjtObj.mjOBJ_CAMERA: "cam_xmat",
+}
+"""The axes of what a sensor is fixed to, in MjData."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The body that something is fixed to, and its axes in that body, as a rotation."""
+
+    body: int
+    axes: Rotation
 
 
 def read_signals(draft: Draft, model: mujoco.MjModel) -> Signals:
@@ -111,3 +130,53 @@ def _check_unit(draft: Draft, model: mujoco.MjModel, index: int, expression: Exp
         ("signals", index, "unit"),
         f"{expression.text} is in {plain}, not in {given}; write {converted}unit: {plain}",
     )
+
+
+def is_gyroscope(model: mujoco.MjModel, sensor: str) -> bool:
+    """Whether a sensor shows the rate at which its site turns, in the axes of the site."""
+    return _kind(model, sensor) == mujoco.mjtSensor.mjSENS_GYRO
+
+
+def is_accelerometer(model: mujoco.MjModel, sensor: str) -> bool:
+    """Whether a sensor shows the acceleration of its site, gravity included."""
+    return _kind(model, sensor) == mujoco.mjtSensor.mjSENS_ACCELEROMETER
+
+
+def _kind(model: mujoco.MjModel, sensor: str) -> int:
+    return int(model.sensor(sensor).type[0])
+
+
+def frame_of_attitude(model: mujoco.MjModel, source: str) -> Frame | None:
+    """The frame whose attitude a joint or `sensor(NAME)` tells in the world; None where that is another's."""
+    if source.startswith("sensor("):
+        sensor = next(iter(parse(f"{source}[0]").reads))
+        world = (
+            _kind(model, sensor.name) == mujoco.mjtSensor.mjSENS_FRAMEQUAT and model.sensor(sensor.name).refid[0] < 0
+        )
+        return frame_of(model, sensor.name) if world else None
+    joint = model.joint(source)
+    free = int(joint.type[0]) == mujoco.mjtJoint.mjJNT_FREE
+    return Frame(int(joint.bodyid[0]), Rotation.identity()) if free else None
+
+
+def frame_of(model: mujoco.MjModel, sensor: str) -> Frame | None:
+    """The frame that a sensor is fixed to; None for kinds of frames that have no axes."""
+    kind, index = mujoco.mjtObj(int(model.sensor(sensor).objtype[0])), int(model.sensor(sensor).objid[0])
+    if kind not in _FRAMES:
+        return None
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    owners = {
+        mujoco.mjtObj.mjOBJ_GEOM: model.geom_bodyid,
+        mujoco.mjtObj.mjOBJ_SITE: model.site_bodyid,
+        mujoco.mjtObj.mjOBJ_CAMERA: model.cam_bodyid,
+    }
+    body = int(owners[kind][index]) if kind in owners else index
+    own, of_body = (
+        Rotation.from_matrix(each[row].reshape(3, 3))
+        for each, row in (
+            (getattr(data, _FRAMES[kind]), index),
+            (data.xmat, body),
+        )
+    )
+    return Frame(body, of_body.inv() * own)

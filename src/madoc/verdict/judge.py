@@ -13,9 +13,8 @@ from madoc.identification.combinations import Combination
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.verdict.adequacy import numerical
-from madoc.verdict.mismatch import SEPARABLE, contradicted, lacking
+from madoc.verdict.mismatch import SEPARABLE, change_of, contradicted, in_percent, lacking, of_area
 from madoc.verdict.statistics import FEWEST_GROUPS, WORTH_GAINING, beyond_noise
-from madoc.verdict.wording import change_of, in_percent, of_area
 
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
 ASSUMED_BASE = (

@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 
-from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, ToldApart, Verdict
+import numpy as np
+
+from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, PredictionErrors, ToldApart, Verdict
 from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.term_tests import MissingTerm, named
@@ -10,7 +12,6 @@ from madoc.verdict.adequacy import about_timestep, as_likely, far_beyond_noise, 
 from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
-from madoc.verdict.wording import change_of, in_rows, of_area
 
 WHITE = 0.2
 """Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
@@ -238,3 +239,27 @@ def _separable(before: Area, after: Area, at_end: list[str]) -> str:
         f"at mid-range (0.5 is chance){', and '.join(['', *at_end])}: the model cannot move as the data does, or the "
         "search is not at its end"
     )
+
+
+def change_of(errors: PredictionErrors) -> str:
+    """Errors after the most rows: at mid-range, then at the estimate."""
+    before, after = errors.mid_range[-1], errors.estimate[-1]
+    change = f"of what a signal changes in {in_rows(errors.stride)}"
+    both = f"mid-range errs by {before.mean:.2g} and the estimate by {after.mean:.2g}"
+    return f"{both} {change}, after {in_rows(after.steps)}"
+
+
+def of_area(area: Area) -> str:
+    """An area under the curve, with its interval."""
+    low, high = area.interval
+    return f"{area.area:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def in_rows(count: int) -> str:
+    """A number of rows of a log, which are control steps of its robot."""
+    return "1 row" if count == 1 else f"{count} rows"
+
+
+def in_percent(share: float) -> str:
+    """A share in percent, with three digits near 100; a question mark for one that is not finite."""
+    return f"{100 * share:.{2 if share < 0.995 else 3}g} %" if np.isfinite(share) else "?"

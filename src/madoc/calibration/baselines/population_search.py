@@ -6,10 +6,9 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from madoc.calibration.base import CalibrationProblem, Estimate
+from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
 from madoc.calibration.baselines import evolution
 from madoc.calibration.baselines.evolution import Candidates, Costs, Evolution
-from madoc.calibration.cautions import at_end_of_range
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import Windows, first_rows, windows_at
 from madoc.types import Epoch

@@ -7,8 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.cautions import at_end_of_range
+from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
 from madoc.calibration.least_squares import sentences
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.lengthening import (

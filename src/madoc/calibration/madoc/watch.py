@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 
-from madoc.calibration.cautions import at_end_of_range
+from madoc.calibration.base import at_end_of_range
 from madoc.calibration.madoc.actors import Actors
 from madoc.calibration.madoc.agents import AgentSettings
 from madoc.parameters import ParameterSpace

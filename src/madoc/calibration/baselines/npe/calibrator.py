@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray, PyTree
 from pydantic import Field
 
-from madoc.calibration.base import CalibrationProblem, Estimate
+from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
 from madoc.calibration.baselines.npe.belief import (
     Belief,
     belief_of,
@@ -34,7 +34,6 @@ from madoc.calibration.baselines.npe.emulator import (
     train,
 )
 from madoc.calibration.baselines.npe.summaries import Sets, by_halves, logged_moments, set_moments, unpaired
-from madoc.calibration.cautions import at_end_of_range
 from madoc.calibration.free_rollouts import begin_freely, require_rows, roll_freely, windows_of
 from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.learning import replay
