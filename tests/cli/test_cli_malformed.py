@@ -1,4 +1,4 @@
-"""Forty-four inputs of a robot of one's own that are wrong: one sentence each, exit code 2, nothing written."""
+"""Inputs of a robot of one's own that are wrong: one sentence each, exit code 2, nothing written."""
 
 import sys
 from pathlib import Path
@@ -98,11 +98,25 @@ MALFORMED = {
     "a mass below zero": (spec("low: 0.5, high: 2.0", "low: -0.5, high: 2.0"), "below its physical bound"),
     "a parameter twice": (spec("element: fore", "element: upper"), "on line 14 already"),
     "an empty parameter": (spec("{field: body_mass, element: upper, low: 0.5, high: 2.0}", "{}"), "expected"),
+    "gravity that may point up": (
+        spec("parameters:", "parameters:\n  - {field: gravity, low: -11, high: 11}"),
+        "line 14: gravity is negative where it points down, got a range up to 11",
+    ),
+    "the number of a gear that is not there": (
+        spec("parameters:", "parameters:\n  - {field: gear_stiffness, element: elbow, low: 1, high: 2}"),
+        "line 14: gear_stiffness: joint 'elbow' has no gear; say it under gears:",
+    ),
+    "a decimal comma": (spec("low: 0.5,", "low: 0,5,"), "line 14: expected a word before the colon, got 5; write 0.5"),
+    "a tab": (
+        spec("  - {field: body_mass, element: fore", "\t- {field: body_mass, element: fore"),
+        "indent with spaces",
+    ),
     "no signals": (spec("signals:", "signal:"), "unknown key 'signal'; nearest: signals"),
     # Models.
     "no model": (lambda folder, columns: (folder / "arm.xml").unlink(), "there is no model file"),
     "an empty model": (raw("arm.xml", b""), "cannot be read"),
     "a model that is no XML": (raw("arm.xml", b"hello"), "cannot be read"),
+    "a xacro file": (model("<worldbody>", "<xacro:arm/><worldbody>"), "has xacro macros; expand them first"),
     "an element MuJoCo lacks": (model("<worldbody>", "<wordbody/><worldbody>"), "wordbody"),
     "a model without mass": (model('mass="0.5"', 'mass="0"'), "does not compile"),
     "a motor of no joint": (model('joint="elbow" gear', 'joint="knee" gear'), "unknown transmission target 'knee'"),
@@ -117,6 +131,10 @@ MALFORMED = {
     "no time": (log(time=None), "no column 'time'"),
     "a column twice": (lines(lambda rows: [rows[0].replace("elbow_speed", "elbow"), *rows[1:]]), "'elbow' twice"),
     "a word among numbers": (lines(lambda rows: [*rows[:9], "a" + rows[9], *rows[10:]]), "expected a number"),
+    "a row of units": (
+        lines(lambda rows: [rows[0], ",".join("s" for _ in rows[0].split(",")), *rows[1:]]),
+        "a row of units",
+    ),
     "a line cut short": (lines(lambda rows: [*rows[:-1], rows[-1][:9]]), "cells in every line"),
     "time that goes back": (log(time=(40, 0.0)), "time to go forward"),
     "time in milliseconds": (log(time=(slice(None), 20.0 * np.arange(60))), "is it in ms?"),

@@ -21,6 +21,12 @@ LARGEST = 200_000
 """Largest size of a file in bytes; a larger one is refused. The spec of a robot with a hundred joints has 20,000."""
 DEEPEST = 20
 """Deepest nesting of lists and mappings; anything deeper is refused."""
+_YAML_ADVICE = {
+    "mapping values are not allowed here": "; check the indentation, and put a value that holds a colon in quotes",
+    "found character '\\t'": "; indent with spaces",
+    "expected <block end>": "; check the indentation",
+}
+"""What to do about mistakes of YAML, by a part of the sentence in which its parser tells them."""
 MOST_KEYS = 1000
 """Most keys of one mapping; with more the file is refused before they are looked at."""
 MOST_PARTS = 20_000
@@ -88,7 +94,9 @@ def read_document(
         mark = error.problem_mark or error.context_mark
         where = file if mark is None else f"{file}, line {mark.line + 1}"
         what = "" if isinstance(error, _Refusal) else "this is not YAML: "
-        raise MadocError(f"{where}: {what}{error.problem or error.context}") from error
+        problem = str(error.problem or error.context)
+        advice = next((advice for sign, advice in _YAML_ADVICE.items() if sign in problem), "")
+        raise MadocError(f"{where}: {what}{problem}{advice}") from error
     except YAMLError as error:
         raise MadocError(f"{file}: this is not YAML: {' '.join(str(error).split())}") from error
     except (RecursionError, ValueError) as error:
@@ -155,7 +163,9 @@ class _Constructor(RoundTripConstructor):
         self, node: MappingNode, key_node: Node, mapping: CommentedMap, key: object, value: object
     ) -> bool:
         if not isinstance(key, str):
-            got = "a list or a mapping" if isinstance(key_node.value, list) else f"{key_node.value}; put it in quotes"
+            number = isinstance(key, int | float) and not isinstance(key, bool)
+            advice = "write 0.5 for a decimal 0,5, or put a name in quotes" if number else "put it in quotes"
+            got = "a list or a mapping" if isinstance(key_node.value, list) else f"{key_node.value}; {advice}"
             problem = f"expected a word before the colon, got {got}"
         elif key in mapping:
             problem = f"{key!r} is given twice, first on line {mapping.lc.data[key][0] + 1}; keep one"

@@ -118,7 +118,7 @@ def read_xml(content: bytes, file: str) -> ModelXml:
     """The elements of a file of a model.
 
     Raises:
-        MadocError: It is no XML in UTF-8, has a document type, or asks for more than any model needs.
+        MadocError: It is no XML in UTF-8, has macros or a document type, or asks for more than any model needs.
     """
     try:
         text = content.decode("utf-8-sig")
@@ -131,6 +131,8 @@ def read_xml(content: bytes, file: str) -> ModelXml:
         raise MadocError(
             f"model {file} cannot be read: it is not XML, {expat.ErrorString(error.code)} in line {error.lineno}"
         ) from error
+    if any(element.tag.startswith("xacro:") for element in reading.elements):
+        raise MadocError(f"model {file} has xacro macros; expand them first: xacro {file} > robot.urdf")
     return ModelXml(file, reading.elements[0].tag, tuple(reading.elements))
 
 

@@ -13,7 +13,7 @@ from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_slide
 from madoc.robots.signals import signal_unit
 from madoc.simulation.arrays import check_field
-from madoc.simulation.write import OF_A_JOINT, element_names, find_elements, same_numbers
+from madoc.simulation.write import OF_A_JOINT, element_names, find_elements, nominal_values, same_numbers
 
 
 def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
@@ -26,6 +26,13 @@ def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
         elements = _elements(draft, model, index)
         for field, shared in product(given.fields, [(one,) for one in elements] if given.each else [elements]):
             parameter = given.parameter(field, shared, _unit_of(draft, model, index, shared))
+            with draft.document.at("parameters", index):
+                nominal_values(model, parameter)  # which the model may lack
+            if parameter.field == "gravity" and parameter.high > 0.0:
+                problem = f"gravity is negative where it points down, got a range up to {parameter.high:g}"
+                raise draft.document.error(
+                    ("parameters", index, "high"), f"{problem}; give low: and high: of at most 0"
+                )
             for other, earlier in zip(lines, parameters, strict=True):
                 _check_distinct(draft, model, index, parameter, other, earlier)
             parameters.append(parameter)

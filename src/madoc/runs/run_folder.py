@@ -49,7 +49,8 @@ class RunFolder:
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise MadocError(f"could not make the folder {path}: {error.strerror or error}") from error
+            reason = "a file has that name" if path.is_file() else error.strerror or str(error)
+            raise MadocError(f"could not make the folder {path}: {reason}; take another --out") from error
         with ExitStack() as on_refusal:
             lock = _lock(path)
             on_refusal.callback(lock.release)

@@ -82,10 +82,14 @@ def _with_conditions(run: Run, robot: Robot) -> Run:
             continue
         value = condition.value_in(run.name)
         if value not in condition.values:
-            got = "no number there" if value is None else f"{value:g}"
+            got = (
+                "no number there; name the file so"
+                if value is None
+                else f"{value:g}; add it to values: in the spec, or name the file with a decimal point"
+            )
             raise MadocError(
                 f"expected {condition.name} in the file name {run.name}, as {condition.file_name}, to be one of "
-                f"{', '.join(f'{one:g}' for one in condition.values)}, got {got}; add it to values: in the spec"
+                f"{', '.join(f'{one:g}' for one in condition.values)}, got {got}"
             )
         tables = tuple(
             replace(table, columns={**table.columns, condition.name: np.full(len(table), value)}) for table in tables

@@ -178,13 +178,17 @@ def _number(cell: object, table: Table, name: str, run: str, row: int) -> float:
     except ValueError:
         pass
     shown = bare if len(bare) <= 30 else bare[:27] + "..."
-    raise MadocError(f"expected a number in column {name!r} of {run}, got {shown!r} in {table.place(row)}{_hint(bare)}")
+    raise MadocError(
+        f"expected a number in column {name!r} of {run}, got {shown!r} in {table.place(row)}{_hint(bare, row)}"
+    )
 
 
-def _hint(text: str) -> str:
+def _hint(text: str, row: int) -> str:
     """A likely cause of a cell that is not a number, or what to do about it."""
     if text.count(",") == 1 and text.replace(",", "").lstrip("+-").isdigit():
         return "; a decimal comma? write numbers with a point"
     if text[:4].isdigit() and (":" in text or text[4:5] == "-"):
         return "; a date? write times as seconds"
+    if not row:
+        return "; a row of units below the header? delete it. Leave a cell empty where its value is missing"
     return "; leave the cell empty where the value is missing"
