@@ -54,9 +54,12 @@ def in_folder(path, *, budget=BUDGET, method=None, resume=False, spec=SPEC, **op
 
 def start(path, seconds):
     folders = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "src")]
+    inherited = [
+        folder for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep) if folder
+    ]  # another MuJoCo, say
     return subprocess.Popen(
         [sys.executable, str(Path(__file__).parents[1] / "wandering.py"), str(path), str(seconds)],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(folders), "JAX_PLATFORMS": "cpu"},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([*inherited, *folders]), "JAX_PLATFORMS": "cpu"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
