@@ -106,6 +106,15 @@ def test_a_quaternion_that_turns_the_other_way(told):
     )
 
 
+def test_a_reading_of_zeros_is_a_gap(told):
+    def dropped(columns):
+        return columns | {name: np.where(np.arange(400) % 50 == 10, 0.0, columns[name]) for name in QUATERNION}
+
+    assert told(dropped) == []
+    ((_, where, _),) = told(lambda columns: reordered("xyzw")(dropped(columns)))
+    assert where == "w, x, y, z"
+
+
 @pytest.mark.parametrize(("factor", "length"), [(16384.0, "1.64e+04"), (0.0, "0")])
 def test_four_values_that_are_no_quaternion(told, factor, length):
     (finding,) = told(scaled(QUATERNION, factor))

@@ -40,7 +40,8 @@ def inertial_findings(dataset: Dataset, robot: Robot, control_step: float) -> li
     for places in robot.task.attitudes:
         where = ", ".join(robot.signals[place].name for place in places)
         quaternion = np.asarray(dataset.transitions.observation, np.float64)[:, places]
-        length = float(np.median(np.linalg.norm(quaternion, axis=-1)))
+        lengths = np.linalg.norm(quaternion, axis=-1)
+        length = float(np.median(lengths))
         if abs(length - 1.0) > LENGTH:
             what = f"their length is {length:.3g}, and that of a quaternion is 1"
             findings.append(
@@ -52,7 +53,8 @@ def inertial_findings(dataset: Dataset, robot: Robot, control_step: float) -> li
             gyroscope = frame_of(model, name)
             if attitude is not None and gyroscope is not None and attitude.body == gyroscope.body:
                 to_gyroscope = gyroscope.axes.inv() * attitude.axes
-                findings += _turning(dataset, quaternion, rate, to_gyroscope, where, name, control_step)
+                whole = np.where(lengths[:, None] > 0.5, quaternion, np.nan)  # a reading of zeros is a gap
+                findings += _turning(dataset, whole, rate, to_gyroscope, where, name, control_step)
     gravity = float(np.linalg.norm(model.opt.gravity))
     for name, read in readings.items():
         if is_accelerometer(model, name) and gravity:
@@ -84,9 +86,13 @@ def _turning(
     gyroscope: str,
     control_step: float,
 ) -> list[Finding]:
-    """Findings on the turn of an attitude over stretches of a run, compared with the gyroscope's over the same."""
+    """Findings on the turn of an attitude over stretches of a run, compared with the gyroscope's over the same.
+
+    Stretches that begin or end at a row whose quaternion is NaN are left out.
+    """
     rows = max(1, round(STRETCH / control_step))
     first = _stretches(dataset, rows)
+    first = first[np.isfinite(quaternion[first] + quaternion[first + rows]).all(-1)]
     summed = np.cumsum(np.concatenate([np.zeros((1, 3)), rate]), axis=0)
     ends = 0.5 * (rate[first] + rate[first + rows])
     measured = control_step * (summed[first + rows] - summed[first + 1] + ends)
@@ -94,11 +100,11 @@ def _turning(
         return []
     found: dict[tuple[str, bool], tuple[float, float]] = {}
     for order, columns in _ORDERS.items():
-        turned = Rotation.from_quat(quaternion[:, [*columns[1:], columns[0]]])
+        last_w = [*columns[1:], columns[0]]
+        before, after = (Rotation.from_quat(quaternion[part][:, last_w]) for part in (first, first + rows))
         for inverse in (False, True):
-            attitude = turned.inv() if inverse else turned
-            turn = to_gyroscope.apply((attitude[first].inv() * attitude[first + rows]).as_rotvec())
-            found[order, inverse] = _compared(measured, turn)
+            turned = before * after.inv() if inverse else before.inv() * after
+            found[order, inverse] = _compared(measured, to_gyroscope.apply(turned.as_rotvec()))
     given = next(iter(_ORDERS)), False
     explained, ratio = found[given]
     if explained >= AGREES:
