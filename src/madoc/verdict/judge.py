@@ -73,8 +73,13 @@ def judge(
         or _untested(holdout)
         or _with_an_assumed_base(holdout)
         or (_not_certain(holdout, CHATTER) if chattering else None)
-        or Verdict("CALIBRATED", f"{_how_good(holdout)}, and every parameter is known to within half of its range")
+        or Verdict("CALIBRATED", f"{_how_good(holdout)}, and {_how_sure(holdout)}")
     )
+
+
+def _how_sure(holdout: HoldOut) -> str:
+    """How wide the widest interval is, as a clause."""
+    return f"no 95 % interval covers more than {in_percent(max(holdout.interval_shares.values()))} of its range"
 
 
 def _usable(holdout: HoldOut, lacks: Verdict) -> Verdict | None:

@@ -79,8 +79,8 @@ def about_residuals(problem: CalibrationProblem, search: SearchState) -> tuple[s
 def about_model_errors(horizon: int) -> str:
     """A sentence that longer windows leave more, which is for the verdict to judge: not every cause is the model's."""
     return (
-        f"over {horizon} control steps the simulator leaves more than noise: starts of windows that were not found, or "
-        "something the model lacks, which the verdict tests; intervals are those of the shortest windows"
+        f"over {horizon} control steps the simulator leaves more than noise: starts of windows were not found, "
+        "or the model lacks something, for which the verdict tests; the intervals are those of the shortest windows"
     )
 
 

@@ -29,7 +29,7 @@ def _row(term: MissingTerm, largest: float) -> dict[str, object]:
         "cause": term.cause,
         "parameter": term.parameter,
         "value": value,
-        "t": number(term.t, 2),
+        "t": number(term.t, 3),
         "explained": percent(term.explained),
         "moves": f"{parameter_title(name)} by {number(term.shifts[name], 2)} half-widths",
         "width": round(100.0 * _largest(term) / largest, 2) if largest else 0.0,
