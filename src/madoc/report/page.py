@@ -148,7 +148,7 @@ def _on_holdout(held: HoldOut) -> tuple[str, str, str]:
         note = f"area of a classifier, {low} to {high}; 0.5 is chance"
         return "classifier, simulated or logged", number(held.area_at_estimate.area, 2), note
     value, low, high = map(percent, (held.score, *held.score_interval))
-    return "error on the hold-out", value, f"of that at mid-range, the middle of every range; {low} to {high}"
+    return "error on the hold-out", value, f"of that at mid-range, over all times and signals; {low} to {high}"
 
 
 def _ended(run: Run) -> str:

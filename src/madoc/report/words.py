@@ -17,8 +17,8 @@ TONES = {
 """Class in the style sheet of each verdict's colour."""
 
 _METRIC_WORDS = {
-    "residual": "residual, in typical changes of a step",
-    "moved": "largest move of an estimate; the search ends below 1",
+    "residual": "residual; 1 is what a signal usually changes in a step",
+    "moved": "largest move of an estimate, in tolerances; a stage of the search ends below 1",
     "accuracy_sa": "from (s, a)",
     "accuracy_sas": "from (s, a, s′)",
     "discriminator_loss_sa": "from (s, a)",

@@ -157,7 +157,7 @@ class LeastSquares:
         if not state.finished:
             return state, epoch
         steps = (state.unknown[state.best] if state.estimates_starts else search).epochs
-        converged = f"after {steps} steps on all windows a further step would change no estimate that matters"
+        converged = f"after {steps} iterations on all windows another one would hardly change any estimate"
         return state, replace(epoch, converged=converged)
 
     def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:

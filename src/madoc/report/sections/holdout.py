@@ -25,7 +25,7 @@ def holdout(run: Run) -> dict[str, object] | str:
     facts = [("rows held out", count(held.rows)), ("episodes", count(held.episodes))]
     if not isinstance(held, Fitted):
         areas = (held.area_at_mid_range.area, held.area_at_estimate.area)
-        told = "classifier, simulated or logged: area under its curve, 0.5 is chance"
+        told = "classifier of simulated and logged motion: area under its curve (0.5: it cannot tell them apart)"
         facts.append((told, " → ".join(number(area, 2) for area in areas)))
     data: dict[str, object] = {"facts": facts, "chart": None, "legend": [], "held": held, "units": run.units}
     if isinstance(held, ToldApart) or len(held.errors.estimate) < 2:
