@@ -223,6 +223,12 @@ def test_a_mistake_in_by_is_one_sentence(tmp_path, old, new, sentence):
         robots.load(write_robot(tmp_path, CART_BY.replace(old, new)))
 
 
+def test_a_condition_that_nothing_uses_is_told(tmp_path):
+    assert robots.load(write_robot(tmp_path, CART_BY)).notes == ()
+    (note,) = robots.load(write_robot(tmp_path, CART_BY.replace("by: load, ", ""))).notes
+    assert note == "the condition load has no effect: no by: and no gain_from: names it"
+
+
 def written(folder, name, rate=1.0):
     rows = "".join(f"{0.01 * row:.2f},{0.01 * row * rate},{rate},{row % 2},1,12\n" for row in range(5))
     (folder / name).write_text("time,angle,rate,goal,on,volts\n" + rows)

@@ -167,8 +167,13 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
         )
         for index, (given, expression) in enumerate(zip(spec.signals, signals.expressions, strict=True))
     )
-    kept, idle = tuple(name for name, _ in files.files), idle_actuators(model, actions)
-    return Robot(Path(file), spec, task, shown, signals.undetermined(), idle, kept)
+    used = {line.by for line in spec.parameters} | {channel.name for channel in inputs}
+    unused = (condition.name for condition in spec.conditions if condition.name not in used)
+    notes = (
+        *idle_actuators(model, actions),
+        *(f"the condition {name} has no effect: no by: and no gain_from: names it" for name in unused),
+    )
+    return Robot(Path(file), spec, task, shown, signals.undetermined(), notes, tuple(name for name, _ in files.files))
 
 
 def _model(draft: Draft, file: str) -> tuple[Callable[[], mujoco.MjSpec], mujoco.MjModel, tuple[ActionChannel, ...]]:
