@@ -98,7 +98,7 @@ ERRORS = {
 MEASURES = {"figure-3b-errors": "mean_percent_of_range"}
 """What is shown of an error, where that is not `mean_absolute`: a mean over other parameters has other units."""
 PRINTED = {"table-10", "table-11"}
-"""Tables of errors for which the paper prints figures; they show every method that was run on their tasks by its defaults."""
+"""Tables of errors for which the paper prints figures; they show every method that was run on their tasks as it is."""
 Place = tuple[str, str]
 """Row and column of a table."""
 ROWS = 200_000
