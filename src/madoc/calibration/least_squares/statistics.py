@@ -142,16 +142,16 @@ def alternation(before: Residuals, after: Residuals) -> float:
 
     With noise e alone a residual is about e' - e, as the reading it starts at is noisy as well as the one it ends at.
     The next one is e'' - e', so the correlation is -1/2. A model error has the same sign in the next row. A speed that
-    a servo or a contact holds forgets its noise in a row, so one channel is enough; it counts less the standard errors
-    that chance may make, and residuals are clipped at five robust standard deviations. It is 0 without pairs.
+    a servo or a contact holds forgets its noise in a row, so one channel is enough. Residuals are clipped at five
+    robust standard deviations. It is 0 without pairs, and where chance may make as much.
     """
     if not len(before):
         return 0.0
     most = OUTLIER * NORMAL_MAD * np.maximum(np.median(np.abs(before), axis=0), _SMALLEST)
     first, second = (np.clip(part, -most, most) for part in (before, after))
     power = np.sqrt((first**2).mean(0) * (second**2).mean(0))
-    turns = -(first * second).mean(0) / np.maximum(power, _SMALLEST**2)
-    return float(turns.max()) - BY_CHANCE / np.sqrt(len(before))
+    largest = float((-(first * second).mean(0) / np.maximum(power, _SMALLEST**2)).max())
+    return largest if largest > BY_CHANCE / np.sqrt(len(before)) else 0.0
 
 
 def consecutive_residuals(
