@@ -39,11 +39,13 @@ QUATERNION, GYRO, ACCELEROMETER = (list(SIGNALS)[part] for part in (slice(4), sl
 def told(tmp_path):
     """The findings on a log of a head that looks about, changed by a function of its columns."""
 
-    def run(change=lambda columns: columns, *, of="site", name="imu", left_out=()):
-        model = MODEL.format(of=of, name=name)
+    def run(change=lambda columns: columns, *, of="site", name="imu", left_out=(), called="attitude"):
+        model = MODEL.format(of=of, name=name).replace('"attitude"', f'"{called}"')
         (tmp_path / "head.xml").write_text(model)
         signals = "".join(
-            f'  - {{name: {each}, reads: "sensor({text}"}}\n' for each, text in SIGNALS.items() if each not in left_out
+            f'  - {{name: {each}, reads: "sensor({text.replace("attitude", repr(called))}"}}\n'
+            for each, text in SIGNALS.items()
+            if each not in left_out
         )
         (tmp_path / "head.yaml").write_text(
             f"madoc: 1\nname: head\nmodel: head.xml\ncontrol_step: {STEP}\nsignals:\n{signals}actions:\n"
@@ -95,6 +97,14 @@ def test_an_attitude_of_another_body_is_not_compared(told):
 def test_another_order_of_the_quaternion(told, fixed):
     (finding,) = told(reordered("xyzw"), of=fixed[0], name=fixed[1])
     assert finding == ("warning", "w, x, y, z", "their changes agree with sensor(gyro) as x, y, z, w")
+
+
+def test_a_sensor_may_have_any_name(told):
+    assert told(called="imu-quat") == []
+    ((_, where, _),) = told(reordered("xyzw"), called="imu-quat")
+    assert where == "w, x, y, z"
+    ((_, where, _),) = told(left_out=("w",), called="imu-quat")
+    assert where == "sensor(imu-quat)"
 
 
 def test_a_quaternion_that_turns_the_other_way(told):

@@ -10,7 +10,6 @@ from madoc.data import Dataset
 from madoc.data.findings import Finding
 from madoc.diagnosis.speeds import STRETCH, unit_mistake
 from madoc.robots import Robot
-from madoc.robots.expressions import Read
 from madoc.robots.grammar import parse
 from madoc.robots.signals import frame_of, frame_of_attitude, is_accelerometer, is_gyroscope
 
@@ -147,7 +146,8 @@ def _acceleration(sensor: str, length: float, gravity: float) -> list[Finding]:
 
 def _incomplete(robot: Robot) -> list[Finding]:
     """Findings on sensors of whose quaternion a spec shows some values."""
-    seen = {Read(read.kind, read.name, read.index) for row in robot.signals for read in parse(row.reads).reads}
+    reads = {read for row in robot.signals for read in parse(row.reads).reads}
+    seen = Counter(f"{read.kind}({read.name})" for read in reads)
     shown = Counter(row.quaternion for row in robot.signals if row.quaternion.startswith("sensor("))
     return [
         Finding(
@@ -157,5 +157,5 @@ def _incomplete(robot: Robot) -> list[Finding]:
             "add the others, [0] to [3] are w, x, y and z",
         )
         for source, count in shown.items()
-        if count < 4 and sum(str(read).startswith(source) for read in seen) < 4
+        if count < 4 and seen[source] < 4
     ]

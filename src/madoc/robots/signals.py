@@ -149,11 +149,9 @@ def _kind(model: mujoco.MjModel, sensor: str) -> int:
 def frame_of_attitude(model: mujoco.MjModel, source: str) -> Frame | None:
     """The frame whose attitude a joint or `sensor(NAME)` tells in the world; None where that is another's."""
     if source.startswith("sensor("):
-        sensor = next(iter(parse(f"{source}[0]").reads))
-        world = (
-            _kind(model, sensor.name) == mujoco.mjtSensor.mjSENS_FRAMEQUAT and model.sensor(sensor.name).refid[0] < 0
-        )
-        return frame_of(model, sensor.name) if world else None
+        sensor = source.removeprefix("sensor(").removesuffix(")")
+        world = _kind(model, sensor) == mujoco.mjtSensor.mjSENS_FRAMEQUAT and model.sensor(sensor).refid[0] < 0
+        return frame_of(model, sensor) if world else None
     joint = model.joint(source)
     free = int(joint.type[0]) == mujoco.mjtJoint.mjJNT_FREE
     return Frame(int(joint.bodyid[0]), Rotation.identity()) if free else None
