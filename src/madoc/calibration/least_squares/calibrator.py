@@ -3,12 +3,11 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
-from madoc.calibration.least_squares import sentences
+from madoc.calibration.least_squares import predicting, sentences
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.lengthening import (
     FEWEST,
@@ -17,15 +16,22 @@ from madoc.calibration.least_squares.lengthening import (
     OF_BASES,
     READINGS,
     WIDER,
-    continued,
+    LeastSquaresState,
+    Stage,
+    begun,
+    ended,
     enough,
+    failed,
+    finished,
+    gone_on,
     hopeless,
     horizon_of,
     lengthened,
+    longest_first,
     noise_alone,
     precise,
     tells_more,
-    widened,
+    with_search,
 )
 from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.statistics import alternation, consecutive_residuals, noisy_rows
@@ -36,7 +42,6 @@ from madoc.identification.losses import Loss
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters, named_key
 
 InitialStates = Literal["logged", "estimated"]
-Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening", "widening"]
 LOGGED_HORIZON = 1
 """Length in control steps of a window from a logged state: noise of the state disturbs the first step least."""
 WINDOWS: dict[InitialStates, int] = {"logged": 1000, "estimated": 100}
@@ -50,39 +55,6 @@ STARTING_STRIDES = 1
 NOISY = 0.2
 """Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5, and random forces
 as large as it half of that."""
-MORE = 2
-"""Smallest ratio of the numbers of windows for which more of the shortest ones are worth a search of their own."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class LeastSquaresState:
-    """The state of least squares.
-
-    Attributes:
-        known: The search from logged states; None where they cannot be rebuilt.
-        unknown: Searches with unknown initial states: on the shortest windows, on more of these, and on longer and
-            longer ones; none are needed with stage `logged`.
-        stage: `logged`: from logged states, to the end. `undecided`: from logged states, until residuals show whether
-            these are noisy. `starting`: from logged states, to find parameters for `estimated` to begin at.
-            `estimated`: with unknown initial states on the shortest windows. `lengthening`: the same on longer ones.
-            `widening`: the same on more windows of the shortest length.
-        length: Index of the unknown search in progress.
-        best: Index of the unknown search that has the estimate.
-        finished: 1 once the next step would be too small to matter, else 0.
-    """
-
-    known: SearchState | None
-    unknown: tuple[SearchState, ...]
-    stage: Stage
-    length: int
-    best: int
-    finished: int
-
-    @property
-    def estimates_starts(self) -> bool:
-        """Whether the estimate is that of a search with unknown initial states."""
-        return self.stage in ("estimated", "lengthening", "widening")
 
 
 @dataclass(frozen=True)
@@ -94,10 +66,11 @@ class LeastSquares:
     its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
     has settled, windows become nine times as long, by way of three times where the longest show contacts or fail, while
     that narrows the intervals and residuals remain noise: where motion is smooth, long windows hold more information,
-    and they show model errors. Where contacts forbid longer windows, there are ten times as many of them in the end. By
-    default states are estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of
-    consecutive rows alternate as noise makes them: a reading that is too high makes the step to it look too long and
-    the step from it too short.
+    and they show model errors, after which a last fit is for prediction (see `predicting`), unless `horizon` is given.
+    Where contacts forbid longer windows, there are ten times as many of them in the end. By default states are
+    estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of consecutive rows
+    alternate as noise makes them: a reading that is too high makes the step to it look too long and the step from it
+    too short.
 
     Attributes:
         initial_states: `logged`, `estimated`, or None to choose by the data.
@@ -141,35 +114,60 @@ class LeastSquares:
             stage=stage,
             length=0,
             best=0,
+            prediction=self._prediction(problem, named_key(key, "prediction")),
+            predicting=0,
             finished=0,
         )
 
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
         """Take one damped step of the current search, and decide which search goes on."""
+        if state.predicting:
+            return self._predicting(problem, state)
         if state.estimates_starts:
             search, epoch = self._unknown(problem, state.length).step(problem, state.unknown[state.length])
-            state = self._after_unknown(problem, _with(state, state.length, search))
+            state = self._after_unknown(problem, with_search(state, state.length, search))
         else:
             assert state.known is not None
             search, epoch = self._known(problem).step(problem, state.known)
             state, asking = self._after_known(problem, replace(state, known=search))
             epoch = replace(epoch, control_steps=epoch.control_steps + asking)
+        if state.finished and state.prediction is not None and self._model_errors(problem, state):
+            begun_there = predicting.begun(state.prediction, self._fitted(state).point[0])
+            return replace(state, prediction=begun_there, predicting=1, finished=0), epoch
+        return state, self._converged(state, epoch)
+
+    def _predicting(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
+        """One step of the fit for prediction, which is the last of the searches."""
+        assert state.prediction is not None
+        search = self._search_for_prediction(problem)
+        prediction, epoch = search.step(problem, state.prediction)
+        over = search.settled(prediction) or prediction.epochs >= self.search_epochs
+        state = replace(state, prediction=prediction, finished=int(over))
+        return state, self._converged(state, epoch)
+
+    def _converged(self, state: LeastSquaresState, epoch: Epoch) -> Epoch:
         if not state.finished:
-            return state, epoch
-        steps = (state.unknown[state.best] if state.estimates_starts else search).epochs
-        converged = f"after {steps} iterations on all windows another one would hardly change any estimate"
-        return state, replace(epoch, converged=converged)
+            return epoch
+        steps = self._fitted(state).epochs
+        return replace(
+            epoch, converged=f"after {steps} iterations on all windows another one would hardly change any estimate"
+        )
+
+    def _fitted(self, state: LeastSquaresState) -> SearchState:
+        """The search that has the estimate, or that has it before the fit for prediction."""
+        if state.estimates_starts:
+            return state.unknown[state.best]
+        assert state.known is not None
+        return state.known
 
     def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:
         """The best search's point, with its sandwich covariance and intervals of Student's t."""
-        space = problem.simulator.parameters
+        space, best = problem.simulator.parameters, self._fitted(state)
         if state.estimates_starts:
-            best = state.unknown[state.best]
             windows, settled = best.explained, self._unknown(problem).settled(best)
         else:
-            assert state.known is not None
-            best = state.known
-            windows, settled = self._known(problem).window_count(best), bool(state.finished)
+            known = self._known(problem)
+            windows, settled = known.window_count(best), state.stage == "logged" and known.settled(best)
         point = best.point[0 if best.refining else int(np.argmin(best.cost))]
         spread = best
         if state.best and self._with_model_errors(problem, state) is not None:
@@ -177,23 +175,27 @@ class LeastSquares:
             spread = state.unknown[0]
             windows = spread.explained
         uncertainty = sandwich(spread.bread, spread.meat)
+        predicts = predicting.better(state.prediction, point) if state.predicting else None
+        if predicts is not None:
+            point, uncertainty = predicts.point, predicts.of_both(uncertainty)
         half = (space.high - space.low) / 2.0
         mean = space.to_physical(point)
         covariance = half[:, None] * uncertainty.covariance * half
         errors = quantile(windows, len(space))
         width = half * errors * np.sqrt(np.diag(uncertainty.covariance))
         interval = np.clip(np.stack([mean - width, mean + width], axis=-1), space.low[:, None], space.high[:, None])
-        searches = (*(() if state.known is None else (state.known,)), *state.unknown)
+        searches = (state.known, *state.unknown, state.prediction)
         return Estimate(
             mean=mean,
             std=np.sqrt(np.diag(covariance)),
             groups=(tuple(range(len(space))),),
-            failures=sum(search.failures for search in searches),
+            failures=sum(search.failures for search in searches if search is not None),
             warnings=(
                 *identifiability(uncertainty, space.names),
                 *at_end_of_range(point, space),
                 *(() if settled else (sentences.NOT_SETTLED,)),
                 *self._about_states(problem, state),
+                *(() if predicts is None else (sentences.PREDICTS,)),
             ),
             covariance=covariance,
             interval=interval,
@@ -211,10 +213,12 @@ class LeastSquares:
             steps += self._known(problem).whole_run(problem, state.known, epochs)
         if state.stage != "undecided":
             for length, search in enumerate(state.unknown):
-                skipped = LONGER <= length < len(state.unknown) - 1 and _longest_first(state.unknown)
+                skipped = LONGER <= length < len(state.unknown) - 1 and longest_first(state.unknown)
                 if (skipped and not search.epochs) or (length == WIDER and state.stage != "widening"):
                     continue
                 steps += self._unknown(problem, length).whole_run(problem, search, refining_epochs)
+        if state.predicting and state.prediction is not None:
+            steps += self._search_for_prediction(problem).whole_run(problem, state.prediction, refining_epochs)
         return steps
 
     def _first_stage(self, problem: CalibrationProblem) -> Stage:
@@ -278,12 +282,12 @@ class LeastSquares:
         assert known is not None
         settled = self._known(problem).settled(known)
         if state.stage == "starting" and known.refining:
-            return _begun(state, known), asking
+            return begun(state, known), asking
         if state.stage == "undecided" and (settled or (known.refining and not known.epochs)):
             if np.sqrt(known.cost[0]) >= sentences.EXACT:
                 pairs, asking = consecutive_residuals(problem, known.point[0], known.rows)
                 if alternation(*pairs) > NOISY:
-                    return _begun(state, known), asking
+                    return begun(state, known), asking
             state = replace(state, stage="logged" if settled else "undecided")
         return replace(state, finished=int(settled and state.stage == "logged")), asking
 
@@ -309,28 +313,51 @@ class LeastSquares:
             last = length == LONGER and not search.touching.any()
             lost = not last and hopeless(search, searches[0], searches[state.best])
             lost = lost or search.epochs >= self.search_epochs
-            return _failed(state) if length >= LONGER and lost and not search.waiting else state
+            return failed(state) if length >= LONGER and lost and not search.waiting else state
         if length == WIDER:
-            return _finished(state, WIDER)
+            return finished(state, WIDER)
         if length and not self._noise_alone(problem, state, length):
             if search.touching.any():
-                return _ended(state, state.best if search.rough else 0)
-            return _finished(state, LONGER) if length == LONGER else _failed(state)
+                return ended(state, state.best if search.rough else 0)
+            return finished(state, LONGER) if length == LONGER else failed(state)
         if length and not tells_more(search, searches[state.best]):
-            return _failed(state)
+            return failed(state)
         if float(search.deviation.max()) < sentences.EXACT or (not length and search.rough and precise(search)):
-            return _finished(state, length)
+            return finished(state, length)
         following = max(length + 1, LONGER)
-        if not length and _longest_first(searches) and enough(searches[-1], search):
+        if not length and longest_first(searches) and enough(searches[-1], search):
             following = len(searches) - 1
         if following == len(searches) or self._unknown(problem).settled(searches[following]):
-            return _ended(state, length)
-        return _lengthening(replace(state, best=length), following)
+            return ended(state, length)
+        return gone_on(replace(state, best=length), following)
 
     def _noise_alone(self, problem: CalibrationProblem, state: LeastSquaresState, length: int) -> bool:
         """Whether residuals of windows of this length are the noise that those of the shortest windows are."""
         readings = self._unknown(problem, length).horizon + 1
         return noise_alone(state.unknown[length], state.unknown[0], readings)
+
+    def _model_errors(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool:
+        """Whether anything shows that the model lacks something, so that another estimate may predict better.
+
+        From logged states, which have no noise, that is more than rounding errors; from estimated ones long tails of
+        the residuals, or more than noise on longer windows, whether or not a search on these has settled.
+        """
+        best = self._fitted(state)
+        if not state.estimates_starts:
+            return float(np.sqrt(best.cost[0])) >= sentences.EXACT
+        tried = [length for length in range(LONGER, len(state.unknown)) if state.unknown[length].epochs]
+        return sentences.have_long_tails(problem, best) or not all(
+            self._noise_alone(problem, state, length) for length in tried
+        )
+
+    def _search_for_prediction(self, problem: CalibrationProblem) -> Search:
+        return predicting.search_of(problem, self.search_epochs, self.tolerance)
+
+    def _prediction(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState | None:
+        """The fit for prediction before it has begun; there is none where the user chose the windows' length."""
+        if self.horizon is not None:
+            return None
+        return predicting.windows_for(problem, self._search_for_prediction(problem), key)
 
     def _with_model_errors(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:
         """Index of the first longer windows, none shorter than the estimate's, that leave more than noise, or None."""
@@ -354,47 +381,3 @@ class LeastSquares:
         if longer is not None:
             return (*about, sentences.about_model_errors(self._unknown(problem, longer).horizon))
         return about
-
-
-def _begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
-    """The stage of unknown initial states, begun at the best point of the search from logged ones."""
-    first = replace(state.unknown[0], point=known.point[:1].copy())
-    return replace(_with(state, 0, first), stage="estimated")
-
-
-def _longest_first(searches: tuple[SearchState, ...]) -> bool:
-    """Whether there are longer windows, and the log shows no contact in the longest."""
-    return len(searches) > LONGER and not searches[-1].touching.any()
-
-
-def _failed(state: LeastSquaresState) -> LeastSquaresState:
-    """The state after a search on longer windows in vain: the next shorter ones begin, unless they had their turn."""
-    shorter = state.length - 1
-    if shorter < LONGER or state.unknown[shorter].epochs:
-        return _ended(state, state.best)
-    return _lengthening(state, shorter)
-
-
-def _lengthening(state: LeastSquaresState, length: int) -> LeastSquaresState:
-    """The state in which windows of this length begin where the best search is, or the end if too few are explained."""
-    best, longer = state.unknown[state.best], state.unknown[length]
-    if not enough(longer, best):
-        return _ended(state, state.best)
-    return replace(_with(state, length, continued(longer, best)), stage="lengthening", length=length)
-
-
-def _ended(state: LeastSquaresState, best: int) -> LeastSquaresState:
-    """The end of lengthening; if only the shortest windows are explained, as at contacts, more of them follow."""
-    first, wider = state.unknown[:LONGER]
-    if best or not first.rough or len(wider.rows) < MORE * len(first.rows):
-        return _finished(state, best)
-    return replace(_with(state, WIDER, widened(wider, first)), stage="widening", best=0, length=WIDER)
-
-
-def _finished(state: LeastSquaresState, best: int) -> LeastSquaresState:
-    return replace(state, best=best, length=best, finished=1)
-
-
-def _with(state: LeastSquaresState, length: int, search: SearchState) -> LeastSquaresState:
-    """The state with this search in place of the one of its length."""
-    return replace(state, unknown=(*state.unknown[:length], search, *state.unknown[length + 1 :]))

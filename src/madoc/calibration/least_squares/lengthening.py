@@ -4,8 +4,10 @@ They begin where shorter ones do, whose initial states are estimated already, so
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -17,6 +19,7 @@ from madoc.data import Dataset
 from madoc.identification.information import half_width, sandwich
 from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
+Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening", "widening"]
 LENGTHS = (1, 1, 3, 9)
 """Length of the windows of each search, relative to the first's; the second has more windows."""
 WIDER, LONGER = 1, 2
@@ -44,7 +47,44 @@ PRECISE = 5e-3
 """Half of a 95 % interval as a share of the parameter's range, up to which an estimate is precise."""
 CHANCE = 3.0
 """Autocorrelation in its standard errors under white noise; above it residuals are not white."""
+MORE = 2
+"""Smallest ratio of the numbers of windows for which more of the shortest ones are worth a search of their own."""
 _SMALLEST = 1e-100
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LeastSquaresState:
+    """The state of least squares.
+
+    Attributes:
+        known: The search from logged states; None where they cannot be rebuilt.
+        unknown: Searches with unknown initial states: on the shortest windows, on more of these, and on longer and
+            longer ones; none are needed with stage `logged`.
+        stage: `logged`: from logged states, to the end. `undecided`: from logged states, until residuals show whether
+            these are noisy. `starting`: from logged states, to find parameters for `estimated` to begin at.
+            `estimated`: with unknown initial states on the shortest windows. `lengthening`: the same on longer ones.
+            `widening`: the same on more windows of the shortest length.
+        length: Index of the unknown search in progress.
+        best: Index of the unknown search that has the estimate.
+        prediction: The search for parameters that predict best; None where the log does not serve for one.
+        predicting: 1 once that has begun, else 0.
+        finished: 1 once the next step would be too small to matter, else 0.
+    """
+
+    known: SearchState | None
+    unknown: tuple[SearchState, ...]
+    stage: Stage
+    length: int
+    best: int
+    prediction: SearchState | None
+    predicting: int
+    finished: int
+
+    @property
+    def estimates_starts(self) -> bool:
+        """Whether the estimate is that of a search with unknown initial states."""
+        return self.stage in ("estimated", "lengthening", "widening")
 
 
 def horizon_of(dataset: Dataset, fewest: int, scales: int = 1) -> int:
@@ -160,3 +200,48 @@ def tells_more(longer: SearchState, shorter: SearchState) -> bool:
     widths = (half_width(sandwich(each.bread, each.meat).covariance, each.explained) for each in (longer, shorter))
     now, then = (np.log(np.maximum(width, _SMALLEST)).mean() for width in widths)
     return bool(now < then)
+
+
+def begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
+    """The stage of unknown initial states, begun at the best point of the search from logged ones."""
+    first = replace(state.unknown[0], point=known.point[:1].copy())
+    return replace(with_search(state, 0, first), stage="estimated")
+
+
+def longest_first(searches: tuple[SearchState, ...]) -> bool:
+    """Whether there are longer windows, and the log shows no contact in the longest."""
+    return len(searches) > LONGER and not searches[-1].touching.any()
+
+
+def failed(state: LeastSquaresState) -> LeastSquaresState:
+    """The state after a search on longer windows in vain: the next shorter ones begin, unless they had their turn."""
+    shorter = state.length - 1
+    if shorter < LONGER or state.unknown[shorter].epochs:
+        return ended(state, state.best)
+    return gone_on(state, shorter)
+
+
+def gone_on(state: LeastSquaresState, length: int) -> LeastSquaresState:
+    """The state in which windows of this length begin where the best search is, or the end if too few are explained."""
+    best, longer = state.unknown[state.best], state.unknown[length]
+    if not enough(longer, best):
+        return ended(state, state.best)
+    return replace(with_search(state, length, continued(longer, best)), stage="lengthening", length=length)
+
+
+def ended(state: LeastSquaresState, best: int) -> LeastSquaresState:
+    """The end of lengthening; if only the shortest windows are explained, as at contacts, more of them follow."""
+    first, wider = state.unknown[:LONGER]
+    if best or not first.rough or len(wider.rows) < MORE * len(first.rows):
+        return finished(state, best)
+    return replace(with_search(state, WIDER, widened(wider, first)), stage="widening", best=0, length=WIDER)
+
+
+def finished(state: LeastSquaresState, best: int) -> LeastSquaresState:
+    """The end of all, with this search's estimate."""
+    return replace(state, best=best, length=best, finished=1)
+
+
+def with_search(state: LeastSquaresState, length: int, search: SearchState) -> LeastSquaresState:
+    """The state with this search in place of the one of its length."""
+    return replace(state, unknown=(*state.unknown[:length], search, *state.unknown[length + 1 :]))
