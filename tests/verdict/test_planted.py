@@ -31,6 +31,16 @@ def test_a_model_that_can_is_calibrated_and_its_noise_is_told(robot, noise):
         assert left.mean == pytest.approx(alone.mean, rel=0.25, abs=1e-6)
 
 
+def test_an_open_parameter_at_an_end_of_its_range_says_nothing_of_what_lies_beyond():
+    task, truth = ROBOTS["spring"]
+    judged, mean = bench(log_of("spring"), task), task.parameters.vector(truth)
+    mean[2] = task.parameters.high[2]
+    ends = np.stack([task.parameters.low, task.parameters.high], axis=-1)
+    narrow = np.stack([mean - 0.01, np.minimum(mean + 0.01, task.parameters.high)], axis=-1)
+    assert measured(judged, mean, narrow).at_end == ("body_mass.cart",)
+    assert measured(judged, mean, ends).at_end == ()
+
+
 @EVERY
 @pytest.mark.parametrize(
     "noise", [0.0, pytest.param(0.1, marks=pytest.mark.slow), pytest.param(0.3, marks=pytest.mark.slow)]

@@ -160,7 +160,7 @@ class Judged:
         imitated: Terms that the model has none of and parameters imitate, which the intervals do not cover.
         richer: The model with the likeliest term, where a parameter of a spec adds it and there was time to test it.
         tested: False where the log cannot tell whether the model lacks a term: it is too short, or tells no states.
-        at_end: Parameters estimated at an end of their range that is no physical bound.
+        at_end: Parameters estimated at an end of their range that is no physical bound, but for those that are open.
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
         coarseness: By how many typical changes predictions one stride ahead change where the model is integrated in
             steps of a quarter of the length, the median over signals; 0 for a robot without a spec.

@@ -18,6 +18,7 @@ from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
 from madoc.identification.coarseness import FINER, coarseness
 from madoc.identification.excitation import expected_half_widths
 from madoc.identification.fitted_windows import SHORTER, STRIDES, WINDOWS
+from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
 from madoc.identification.term_tests import FEWEST, MissingTerm
 from madoc.identification.windows import horizons
@@ -159,7 +160,7 @@ def judged(
         tested=doubts.tested and EXCHANGED not in bench.left_out,
         coarseness=coarse,
         finer=finer,
-        at_end=space.at_end(point),
+        at_end=_at_end(space, point, shares),
         base_from_contacts=bool(bench.states.placed.any()),
         concentration=doubts.concentration,
     )
@@ -185,6 +186,12 @@ def judged(
     tried = [name for name, model in (("constant delay", richer), ("lag of first order", with_lag)) if model]
     told = tuple(_contradiction(each, term, richer, tried) for each in contradicting)
     return replace(found, richer=richer, contradictions=told, control_steps=found.control_steps + of_richer)
+
+
+def _at_end(space: ParameterSpace, point: Float[np.ndarray, " d"], shares: Float[np.ndarray, " d"]) -> tuple[str, ...]:
+    """Which estimates are at an end of their range; one that the data leaves open says nothing of what lies beyond."""
+    told = {name for name, share in zip(space.names, shares.tolist(), strict=True) if share < OPEN}
+    return tuple(name for name in space.at_end(point) if name in told)
 
 
 def _worth_keeping(terms: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:
