@@ -182,10 +182,10 @@ def test_signals_are_drawn_in_whole_runs_with_residuals(whole):
         [0.1, 0.1, None],
     ]
     assert [line["visible"] for line in figure["data"]] == [True] * 5 + [False] * 5
-    # 0 to 4 measured, and 5 in the model as given, with 6 % of air; residuals of 0.1 and of 1
+    # 0 to 4 measured, and 5 in the model as given, with 6 % of air; residuals of 0.1, and of 1 cut at 0.1 + 2 % of 4
     low, high = figure["layout"]["meta"]["yaxis"][0]
     assert (low, high) == (pytest.approx(-0.3), pytest.approx(5.3))
-    assert figure["layout"]["meta"]["yaxis2"][0] == pytest.approx([0.1 - 0.054, 1.0 + 0.054])
+    assert figure["layout"]["meta"]["yaxis2"][0] == pytest.approx([0.1 - 0.0048, 0.18 + 0.0048])
     assert "<option>&lt;second&gt;.csv</option>" in drawn(whole, "signals")
 
 

@@ -77,6 +77,9 @@ def signals(run: Run) -> dict[str, object] | str:
     return shown | {"names": evidence.names, "chosen": int(whole.argmax()), "fitted": fitted}
 
 
+LEFT, LEAST = 2.0, 0.02
+"""Ranges of the calibrated model's residuals, and share of the signal's, by which those of the model as given extend
+their axis at most, each way: else it would show the calibrated ones as a flat line."""
 _LINES = (
     ("measured", "measured", {"width": 6}, 0.4, "y"),
     ("before", "your model as given", {"width": 1.5, "dash": "dash"}, 1.0, "y"),
@@ -103,7 +106,9 @@ def _replayed(evidence: Evidence, signal: int, every: int, whole: Int[np.ndarray
         missed = {name: values[name] - values["measured"] for name in ("before", "after")}
         width = float(np.ptp(values["measured"][np.isfinite(values["measured"])]))
         ranges["yaxis"].append(_fit([values["measured"], values["after"]], values["before"], width))
-        ranges["yaxis2"].append(_fit([missed["after"]], missed["before"], width))
+        left = missed["after"][np.isfinite(missed["after"])]
+        far = max(LEFT * float(np.ptp(left)) if len(left) else 0.0, LEAST * width)
+        ranges["yaxis2"].append(_fit([left], missed["before"], far))
         for array, name, pen, opacity, axis in _LINES:
             y = rounded((values if axis == "y" else missed)[array][::every])
             step = {"x0": 0.0, "dx": float(evidence.time[1]) * every, "y": y, "yaxis": axis}

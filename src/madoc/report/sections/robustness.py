@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from madoc.report.reading import Run, read_arrays
+from madoc.report.reading import Evidence, Run, read_arrays
 from madoc.report.sections.outcome import POLICIES
 
 
@@ -20,12 +20,14 @@ class Film:
         time: Time of each picture, s.
         size: Width and height of a picture in pixels.
         columns: Pictures in a row of a sheet.
+        still: The picture that is shown until the film is played.
     """
 
     sheets: dict[str, str]
     time: Float[np.ndarray, " frames"]
     size: tuple[int, int]
     columns: int
+    still: int = 0
 
     @property
     def rows(self) -> int:
@@ -65,7 +67,17 @@ def motion(run: Run) -> dict[str, object] | str:
     whole = np.isfinite(run.evidence.measured).all(-1).sum(1)
     longest, shown = float(run.evidence.time[whole.max() - 1]), float(seen.time[-1])
     cut = shown if shown < longest - 1e-9 else None
-    return {"film": seen, "name": run.evidence.names[int(whole.argmax())], "cut": cut}
+    still = farthest_apart(run.evidence, int(whole.argmax()), seen.time)
+    return {"film": replace(seen, still=still), "name": run.evidence.names[int(whole.argmax())], "cut": cut}
+
+
+def farthest_apart(evidence: Evidence, run: int, time: Float[np.ndarray, " frames"]) -> int:
+    """The picture in which the model as given is farthest from what was measured: at the start all are alike."""
+    if evidence.before is None:
+        return 0
+    rows = np.searchsorted(evidence.time, time - 1e-9).clip(max=len(evidence.time) - 1)
+    missed = (evidence.before - evidence.measured)[run, rows] / np.where(evidence.scale > 0, evidence.scale, 1.0)
+    return int(np.nan_to_num((missed**2).sum(-1)).argmax())
 
 
 def film(run: Run) -> dict[str, object] | str:

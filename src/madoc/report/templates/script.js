@@ -53,10 +53,10 @@
     });
 
   for (const film of all("[data-film]")) {
-    const { time, columns } = JSON.parse(film.dataset.film);
+    const { time, columns, still } = JSON.parse(film.dataset.film);
     const sheets = all(".sheet", film), [play, slider, told] = all("button, input, output", film);
     const rows = Math.ceil(time.length / columns);
-    let playing = 0;
+    let playing = 0, begun = false;
     const show = (index) => {
       const across = (100 * (index % columns)) / (columns - 1);
       const down = (100 * Math.floor(index / columns)) / Math.max(1, rows - 1);
@@ -71,7 +71,8 @@
     };
     play.addEventListener("click", () => {
       if (playing) return stop();
-      const last = time.length - 1, first = Number(slider.value) < last ? Number(slider.value) : 0;
+      const last = time.length - 1, first = begun && Number(slider.value) < last ? Number(slider.value) : 0;
+      begun = true;
       const began = performance.now();
       const next = (now) => {
         const at = time[first] + (now - began) / 1000;
@@ -86,9 +87,10 @@
     });
     slider.addEventListener("input", () => {
       stop();
+      begun = true;
       show(Number(slider.value));
     });
-    show(0);
+    show(still);
   }
 
   if (!charts.length) return;
