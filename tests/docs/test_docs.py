@@ -1,4 +1,4 @@
-"""Every code block of the documentation runs, page by page, in an empty folder with the examples beside it."""
+"""Every code block of the documentation runs, page by page, in an empty folder with the examples beside it; and an example."""
 
 import importlib.util
 import os
@@ -188,3 +188,11 @@ def test_the_site_is_built_and_fetches_nothing(tmp_path):
     )
     assert not [page.name for page in pages if fetched.search(page.read_text())]
     assert "<math" in (site / "concepts" / "equations.html").read_text()
+
+
+def test_the_first_example_finds_its_spring():
+    command = [sys.executable, ROOT / "examples" / "01_spring.py"]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=280, check=True)
+    error = re.search(r"([\d.]+) % of range", ran.stdout)
+    assert error, ran.stdout
+    assert float(error[1]) < 5.0
