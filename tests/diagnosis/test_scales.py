@@ -1,5 +1,6 @@
 """Scales that no log can show, found from the model."""
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ from mujoco_log import recorded
 from madoc import identification, robots, simulation
 from madoc.data import logs, stride
 from madoc.diagnosis import check
+from madoc.diagnosis.scales import range_findings
 from madoc.identification.coarseness import COARSE, coarseness
 from madoc.identification.states import states_of
-from own_robots import CART, CART_SPEC
+from own_robots import BOUNCER, BOUNCER_SPEC, CART, CART_SPEC, task_of
+from robots import recorded as planted
 
 SCALED = (
     SPEC.replace("body_mass", "body_mass_and_inertia")
@@ -143,3 +146,31 @@ def test_smooth_motion_hardly_depends_on_the_timestep(tmp_path):
     change, spent = coarseness(dataset, states_of(dataset, simulator), simulator, middle, np.ones(2))
     assert 0.0 < change < COARSE / 10
     assert spent == 2 * 64 * stride(dataset)
+
+
+@pytest.mark.parametrize(
+    ("line", "level", "sentence"),
+    [
+        (
+            "action_delay, low: 0, high: 9",
+            "fatal",
+            "up to 9 s late in the ranges of delays and lags, and the longest run",
+        ),
+        ("payload_x, element: fore, low: -50, high: 50", "warning", "payload_x.fore: the load may be 50 m off, and"),
+    ],
+)
+def test_ranges_that_cannot_be(told, tmp_path, line, level, sentence):
+    spec = SPEC + "  - {field: payload_mass, element: fore, low: 0, high: 1}\n  - {field: " + line + "}\n"
+    found = told(arm_of(tmp_path, spec), recorded(300))
+    assert any(sentence in each and level == found_level for found_level, each in found), found
+
+
+def test_contacts_too_stiff_for_the_timestep(tmp_path):
+    contact = "  - {field: contact_time, element: foot, low: 0.0001, high: 0.02}\n"
+    spec = BOUNCER_SPEC.replace("max_episode_steps", contact + "max_episode_steps")
+    leg = BOUNCER.replace('size=".05" pos', 'name="foot" size=".05" pos')
+    task = task_of(tmp_path, spec, bouncer=leg)
+    truth = dict(zip(task.parameters.names, task.parameters.middle.tolist(), strict=True))
+    dataset = planted(task, truth, 60, jax.random.key(0))
+    (found,) = range_findings(dataset, simulation.make(task, threads=1))
+    assert found.sentence.startswith("contact_time.foot: values below two timesteps, 0.01 s, change nothing")

@@ -1,4 +1,4 @@
-"""Every code block of the documentation runs, page by page, in an empty folder with the examples beside it; and an example."""
+"""Every code block of the documentation runs, page by page, in an empty folder with the examples; so does the first."""
 
 import importlib.util
 import os

@@ -116,11 +116,23 @@ def _one_sentence(box: str) -> str:
     paragraphs = [text.strip("─ ") for text in paragraphs]
     if not paragraphs:
         return " ".join(box.split())
-    parts = [re.sub(r"^Error parsing \S+: ", "", paragraphs[0]).rstrip(".")]
+    parts = [_plain(paragraphs[0], box)]
     parts += [text for text in paragraphs[1:-1] if text.startswith(("Perhaps", "Available"))][:1]
     read_on = paragraphs[-1] if paragraphs[-1].startswith("For full") else ""
     read_on = read_on[read_on.find("madoc") :]
     return "; ".join([*parts, f"see {read_on}"] if read_on else parts)
+
+
+def _plain(text: str, box: str) -> str:
+    """The first paragraph of a box of tyro in the words of other refusals."""
+    wrong = re.match(r"Error parsing (\S+): .*?'([^']*)'", text)
+    if wrong and ("int()" in text or "float" in text):
+        kind = "a whole number" if "int()" in text else "a number"
+        return f"{wrong[1]}: expected {kind}, got {wrong[2]!r}"
+    if text.startswith("Missing from "):
+        names = re.findall(r"^. {5}([-A-Z]\S+)", box[: box.index("─" * 10, box.index(text[:12]))], re.MULTILINE)
+        return f"{text[len('Missing from ') : text.index(':')]}: {' and '.join(names)} must be given"
+    return re.sub(r"^Error parsing \S+: ", "", text).replace("Expected 1 values", "Expected one").rstrip(".")
 
 
 @contextlib.contextmanager

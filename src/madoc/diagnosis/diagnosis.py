@@ -13,7 +13,7 @@ from madoc.diagnosis.excitation import Excitation, excitation_findings, excite, 
 from madoc.diagnosis.explanation import Explanation, action_findings, box_draws, explain, explanation_findings
 from madoc.diagnosis.inertial import inertial_findings
 from madoc.diagnosis.response import response_findings
-from madoc.diagnosis.scales import scale_findings, timestep_findings
+from madoc.diagnosis.scales import range_findings, scale_findings, timestep_findings
 from madoc.diagnosis.speeds import speed_findings
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.robots import Robot
@@ -70,6 +70,7 @@ def check(
     of_rows, of_box, of_actions, of_windows = jax.random.split(jax.random.key(seed), 4)
     channels = channels_of(dataset, simulator.task, robot)
     findings = [*dataset.findings, *channel_findings(dataset, len(simulator.parameters), channels)]
+    findings += range_findings(dataset, simulator)
     about_speeds, late_speeds = speed_findings(dataset, simulator)
     findings += [*about_speeds, *(inertial_findings(dataset, robot, simulator.control_step) if robot else [])]
     explanation, excitation, spent = None, None, 0

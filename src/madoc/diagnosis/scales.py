@@ -1,4 +1,4 @@
-"""What no log can show: scales of masses and forces, and whether the model is integrated finely enough."""
+"""What no log can show: scales of masses and forces, impossible ranges, whether a model is integrated finely enough."""
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +14,9 @@ from madoc.simulation.response import hidden_scales, mass_like
 
 _ROWS = 16
 """Number of states at which a scale is tried."""
+_PLACES = ("payload_x", "payload_y", "payload_z")
+FARTHEST = 10.0
+"""Distance of a payload from its body in sizes of the whole model, beyond which it is hardly in m."""
 
 
 def scale_findings(
@@ -62,6 +65,28 @@ def _scale_of_masses(names: list[str], *, only_ratios: bool) -> Finding:
         "masses and gains that the model takes as known"
     )
     return Finding("note", what, "scale", "weigh a part, or measure a torque, and put that into the model")
+
+
+def range_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
+    """Ranges that cannot be: delays as long as runs of a log, loads far off, contacts too stiff for the timestep."""
+    task, findings = simulator.task, []
+    longest = int((dataset.episode_ends - dataset.episode_starts).max())
+    if task.pending >= longest > 1:
+        what = (
+            f"commands act up to {simulator.control_step * task.pending:.3g} s late in the ranges of delays and lags, "
+            f"and the longest run of the log has {simulator.control_step * longest:.3g} s"
+        )
+        findings.append(Finding("fatal", what, "parameters", "give action_delay and action_lag shorter ranges, in s"))
+    size, shortest = float(task.model.stat.extent), 2.0 * float(task.model.opt.timestep)
+    for row in simulator.parameters.parameters:
+        far = max(abs(row.low), abs(row.high))
+        if row.field in _PLACES and far > FARTHEST * size:
+            what = f"the load may be {far:.3g} m off, and the whole model is {size:.2g} m in size"
+            findings.append(Finding("warning", what, row.name, "give its place in m, in the frame of the body"))
+        if row.field == "contact_time" and row.low < shortest:
+            what = f"values below two timesteps, {shortest:.3g} s, change nothing, as MuJoCo takes that for them"
+            findings.append(Finding("warning", what, row.name, "begin its range there, or shorten the timestep"))
+    return findings
 
 
 def timestep_findings(
