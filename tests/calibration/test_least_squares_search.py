@@ -10,7 +10,7 @@ from madoc import simulation, tasks
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome, Plan
-from madoc.calibration.least_squares.search import Search, chosen
+from madoc.calibration.least_squares.search import Search
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Disturbance, disturb
 from madoc.identification.losses import ALL_FAILED
@@ -26,18 +26,18 @@ def outcome(*totals, before=4.0):
 
 
 def test_the_step_that_helps_most_is_taken_and_its_damping_kept():
-    assert chosen(outcome(3.0, 1.0, 2.0, 4.0)) == (1, 1.0)
-    assert chosen(outcome(1.0, 3.0, 2.0, 4.0)) == (0, 1e-2)
+    assert outcome(3.0, 1.0, 2.0, 4.0).chosen() == (1, 1.0)
+    assert outcome(1.0, 3.0, 2.0, 4.0).chosen() == (0, 1e-2)
 
 
 def test_where_no_step_helps_none_is_taken_and_damping_grows():
-    assert chosen(outcome(5.0, 4.0, 6.0, 4.0)) == (3, 1e3)
-    assert chosen(outcome(4.0, 4.0, 4.0, 4.0)) == (3, 1e3)
+    assert outcome(5.0, 4.0, 6.0, 4.0).chosen() == (3, 1e3)
+    assert outcome(4.0, 4.0, 4.0, 4.0).chosen() == (3, 1e3)
 
 
 def test_a_step_tried_alone_is_compared_with_staying():
-    assert chosen(outcome(3.0).with_no_step()) == (0, 1e-2)
-    assert chosen(outcome(4.0).with_no_step()) == (1, 1e3)
+    assert outcome(3.0).with_no_step().chosen() == (0, 1e-2)
+    assert outcome(4.0).with_no_step().chosen() == (1, 1e3)
 
 
 def test_the_share_that_a_step_saves():
@@ -136,7 +136,7 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     astray = replace(plan, steps=np.concatenate([[1.0 - plan.point], plan.steps[1:]]))
     (outcome,) = windows.outcomes([astray], state.states, refining=True)
     assert outcome.simulations == 40 * (tried + 4 * 3)  # it does not help: every step with every share of the states'
-    assert chosen(outcome)[0] != 0
+    assert outcome.chosen()[0] != 0
     # After many steps one of half a standard error settles, five times as long as before, and counts as an error.
     while not search.settled(state):
         before, state = state, search.step(problem, state)[0]

@@ -92,3 +92,9 @@ class Outcome:
     def saved(self, trial: int) -> float:
         """Share of the cost that a step saves."""
         return 1.0 - float(self.totals[trial]) / max(self.before, _SMALLEST)
+
+    def chosen(self) -> tuple[int, float]:
+        """Index of the step with the smallest cost, the last one for none, and the factor of the damping."""
+        last = len(self.totals) - 1
+        trial = int(np.argmin(self.totals))
+        return (trial, TRIALS[trial]) if self.totals[trial] < self.totals[last] else (last, 1e3)

@@ -214,7 +214,7 @@ class Search:
         count = self.window_count(state)
         new = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}
         for index, (plan, outcome) in enumerate(zip(plans, outcomes, strict=True)):
-            trial, factor = chosen(outcome)
+            trial, factor = outcome.chosen()
             followed, damping = outcome.followed[trial], float(state.damping[index])
             new["point"][index] = np.clip(state.point[index] + plan.steps[trial], -1.0, 1.0)
             change = followed[:, None] * plan.state_steps[trial] * plan.spread
@@ -393,10 +393,3 @@ def _of_last_step(plan: Plan) -> Float[np.ndarray, "d d"]:
     """What the least damped step adds to the scatter of the cost's gradient, where it counts as an error."""
     pull = plan.bread @ plan.steps[0]
     return np.outer(pull, pull)
-
-
-def chosen(outcome: Outcome) -> tuple[int, float]:
-    """Index of the step with the smallest cost, the last one for none, and the factor of the damping."""
-    last = len(outcome.totals) - 1
-    trial = int(np.argmin(outcome.totals))
-    return (trial, TRIALS[trial]) if outcome.totals[trial] < outcome.totals[last] else (last, 1e3)

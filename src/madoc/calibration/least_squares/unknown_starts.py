@@ -189,8 +189,7 @@ class UnknownStarts:
         point = np.clip(plan.point + plan.steps[0], -1.0, 1.0)
         states = states + self.readings.in_state_units(plan.state_steps[0], states.shape[1])
         damping, simulations = np.full(len(states), FIRST_DAMPING), 0
-        of_bases = bool(self.readings.placed.any())
-        for width in RESETTLING[of_bases:]:
+        for width in RESETTLING[(of_bases := bool(self.readings.placed.any())) :]:
             after = settle(self.simulator, self.readings, point, states, damping, width * errors, self.loss)
             states, damping, simulations = after.states, after.damping, simulations + after.simulations
         residuals = self.readings.residuals(self.simulator, point[None], states[None])[0, 0]
@@ -349,11 +348,16 @@ class UnknownStarts:
         self, slopes: WindowSlopes, spare: Float[np.ndarray, "windows values"], *, refining: bool
     ) -> tuple[Bool[np.ndarray, " windows"], Float[np.ndarray, " channels"]]:
         """The windows that count, and the noise of each channel, which divides residuals; one for all at first."""
-        deviation = self._deviation(slopes, spare, slopes.whole)
+        shape = (-1, *self.readings.observed.shape[1:])
+
+        def noise_in(some: Bool[np.ndarray, " windows"]) -> Float[np.ndarray, " channels"]:
+            return channel_noise(*(part[some].reshape(shape) for part in (slopes.residuals, spare)))
+
+        deviation = noise_in(slopes.whole)
         if not refining:
             return slopes.whole, np.full(len(deviation), np.median(deviation))
         kept = self._trusted(slopes.over(np.tile(deviation, self.readings.steps + 1)))
-        return kept, self._deviation(slopes, spare, kept)
+        return kept, noise_in(kept)
 
     def _contacts(
         self, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
@@ -373,17 +377,9 @@ class UnknownStarts:
     ) -> float:
         if contacts is None:
             return 0.0
-        shape, of_bases = (int(kept.sum()), *self.readings.observed.shape[1:]), bool(self.readings.placed.any())
-        residuals, left = slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape)
-        least = self.rounding / deviation
-        return steady_cost(residuals, left, contacts[kept], least, self.loss, steady_alone=of_bases)
-
-    def _deviation(
-        self, slopes: WindowSlopes, spare: Float[np.ndarray, "windows values"], kept: Bool[np.ndarray, " windows"]
-    ) -> Float[np.ndarray, " channels"]:
-        """Each channel's noise in the windows kept."""
-        shape = (int(kept.sum()), *self.readings.observed.shape[1:])
-        return channel_noise(slopes.residuals[kept].reshape(shape), spare[kept].reshape(shape))
+        shape, of_bases = (-1, *self.readings.observed.shape[1:]), bool(self.readings.placed.any())
+        residuals, left = (part[kept].reshape(shape) for part in (slopes.residuals, spare))
+        return steady_cost(residuals, left, contacts[kept], self.rounding / deviation, self.loss, steady_alone=of_bases)
 
     def _trusted(self, slopes: WindowSlopes) -> Bool[np.ndarray, " windows"]:
         """Windows that an initial state explains; all of them if these hold too little information on a direction.
