@@ -214,6 +214,16 @@ def test_an_end_of_a_range_says_nothing_while_the_search_has_not_settled(good):
     assert "had not settled" in unsettled.sentence
 
 
+@EITHER
+def test_a_search_that_has_not_settled_is_of_use_where_it_predicts_much_better(good):
+    over = (predicted_over(1.0, 0.1, (0.08, 0.12)),)
+    said = judge(replace(good, open_loop=over), settled=False)
+    assert said.word == "USABLE" and "the search had not settled" in said.sentence
+    worse = (*over, predicted_over(0.1, 1.5, (1.2, 1.8)))
+    for open_loop in ((), worse):
+        assert judge(replace(good, open_loop=open_loop), settled=False).word == "NO_IMPROVEMENT"
+
+
 def test_residuals_that_last_are_a_mismatch():
     verdict = judge(changed(PREDICTED, LEFT_OVER, persistence=0.5))
     assert verdict.word == "MODEL_MISMATCH"

@@ -1,7 +1,7 @@
 """The verdict on an estimate: one word, and a sentence with the numbers behind it.
 
 It answers two questions: does the simulator predict, and can the numbers be believed? An estimate that predicts though
-its model lacks something is `USABLE`: its numbers serve in this simulator and are not those of the machine.
+its model lacks something, or its search had not ended, is `USABLE`: its numbers serve in this simulator.
 """
 
 from collections.abc import Sequence
@@ -48,8 +48,9 @@ def judge(
     """The first verdict that applies: rejected data, a model that lacks something, open parameters, no improvement.
 
     What the model lacks makes an estimate `USABLE` where it predicts much better than the model as given, and else a
-    mismatch. A log that is too short to tell whether the model lacks a term, or tells no states, leaves its parameters
-    open. Where contacts chatter and errors are those of noise, tests of terms say nothing.
+    mismatch; one of a search that had not settled is `USABLE` there too, and else no improvement. A log that is too
+    short to tell whether the model lacks a term, or tells no states, leaves its parameters open. Where contacts chatter
+    and errors are those of noise, tests of terms say nothing.
 
     Args:
         holdout: What the hold-out says of the estimate.
@@ -69,7 +70,7 @@ def judge(
     return (
         _open(holdout, combinations)
         or _no_improvement(holdout)
-        or (None if settled else Verdict("NO_IMPROVEMENT", f"{_how_good(holdout)}, but {UNSETTLED}"))
+        or (None if settled else _unsettled(holdout))
         or _untested(holdout)
         or _with_an_assumed_base(holdout)
         or (_not_certain(holdout, CHATTER) if chattering else None)
@@ -169,6 +170,12 @@ def _with_an_assumed_base(holdout: HoldOut) -> Verdict | None:
     if not holdout.base_from_contacts:
         return None
     return _not_certain(holdout, ASSUMED_BASE)
+
+
+def _unsettled(holdout: HoldOut) -> Verdict:
+    """A search that had not come to its end, and may still have come far enough to be of use."""
+    found = _usable(holdout, Verdict("NO_IMPROVEMENT", UNSETTLED))
+    return found or Verdict("NO_IMPROVEMENT", f"{_how_good(holdout)}, but {UNSETTLED}")
 
 
 def _not_certain(holdout: HoldOut, why: str) -> Verdict:
