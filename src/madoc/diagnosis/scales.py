@@ -74,7 +74,7 @@ def range_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
     if task.pending >= longest > 1:
         what = (
             f"commands act up to {simulator.control_step * task.pending:.3g} s late in the ranges of delays and lags, "
-            f"and the longest run of the log has {simulator.control_step * longest:.3g} s"
+            f"and the longest stretch of the log without a gap has {simulator.control_step * longest:.3g} s"
         )
         findings.append(Finding("fatal", what, "parameters", "give action_delay and action_lag shorter ranges, in s"))
     size, shortest = float(task.model.stat.extent), 2.0 * float(task.model.opt.timestep)
@@ -84,8 +84,9 @@ def range_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
             what = f"the load may be {far:.3g} m off, and the whole model is {size:.2g} m in size"
             findings.append(Finding("warning", what, row.name, "give its place in m, in the frame of the body"))
         if row.field == "contact_time" and row.low < shortest:
-            what = f"values below two timesteps, {shortest:.3g} s, change nothing, as MuJoCo takes that for them"
-            findings.append(Finding("warning", what, row.name, "begin its range there, or shorten the timestep"))
+            what = f"MuJoCo takes two timesteps, {shortest:.3g} s, where the time constant of a contact is shorter"
+            remedy = "begin the range there, or shorten the timestep, unless the other geom's value makes it longer"
+            findings.append(Finding("note", what, row.name, remedy))
     return findings
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
-from madoc.calibration.least_squares import predicting, sentences
+from madoc.calibration.least_squares import sentences
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.lengthening import (
     FEWEST,
@@ -66,11 +66,10 @@ class LeastSquares:
     its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
     has settled, windows become nine times as long, by way of three times where the longest show contacts or fail, while
     that narrows the intervals and residuals remain noise: where motion is smooth, long windows hold more information,
-    and they show model errors, after which a last fit is for prediction (see `predicting`), unless `horizon` is given.
-    Where contacts forbid longer windows, there are ten times as many of them in the end. By default states are
-    estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of consecutive rows
-    alternate as noise makes them: a reading that is too high makes the step to it look too long and the step from it
-    too short.
+    and they show model errors. Where contacts forbid longer windows, there are ten times as many of them in the end. By
+    default states are estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of
+    consecutive rows alternate as noise makes them: a reading that is too high makes the step to it look too long and
+    the step from it too short.
 
     Attributes:
         initial_states: `logged`, `estimated`, or None to choose by the data.
@@ -114,15 +113,11 @@ class LeastSquares:
             stage=stage,
             length=0,
             best=0,
-            prediction=self._prediction(problem, named_key(key, "prediction")),
-            predicting=0,
             finished=0,
         )
 
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
         """Take one damped step of the current search, and decide which search goes on."""
-        if state.predicting:
-            return self._predicting(problem, state)
         if state.estimates_starts:
             search, epoch = self._unknown(problem, state.length).step(problem, state.unknown[state.length])
             state = self._after_unknown(problem, with_search(state, state.length, search))
@@ -131,30 +126,14 @@ class LeastSquares:
             search, epoch = self._known(problem).step(problem, state.known)
             state, asking = self._after_known(problem, replace(state, known=search))
             epoch = replace(epoch, control_steps=epoch.control_steps + asking)
-        if state.finished and state.prediction is not None and self._model_errors(problem, state):
-            begun_there = predicting.begun(state.prediction, self._fitted(state).point[0])
-            return replace(state, prediction=begun_there, predicting=1, finished=0), epoch
-        return state, self._converged(state, epoch)
-
-    def _predicting(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
-        """One step of the fit for prediction, which is the last of the searches."""
-        assert state.prediction is not None
-        search = self._search_for_prediction(problem)
-        prediction, epoch = search.step(problem, state.prediction)
-        over = search.settled(prediction) or prediction.epochs >= self.search_epochs
-        state = replace(state, prediction=prediction, finished=int(over))
-        return state, self._converged(state, epoch)
-
-    def _converged(self, state: LeastSquaresState, epoch: Epoch) -> Epoch:
         if not state.finished:
-            return epoch
+            return state, epoch
         steps = self._fitted(state).epochs
-        return replace(
-            epoch, converged=f"after {steps} iterations on all windows another one would hardly change any estimate"
-        )
+        converged = f"after {steps} iterations on all windows another one would hardly change any estimate"
+        return state, replace(epoch, converged=converged)
 
     def _fitted(self, state: LeastSquaresState) -> SearchState:
-        """The search that has the estimate, or that has it before the fit for prediction."""
+        """The search that has the estimate."""
         if state.estimates_starts:
             return state.unknown[state.best]
         assert state.known is not None
@@ -166,8 +145,7 @@ class LeastSquares:
         if state.estimates_starts:
             windows, settled = best.explained, self._unknown(problem).settled(best)
         else:
-            known = self._known(problem)
-            windows, settled = known.window_count(best), state.stage == "logged" and known.settled(best)
+            windows, settled = self._known(problem).window_count(best), bool(state.finished)
         point = best.point[0 if best.refining else int(np.argmin(best.cost))]
         spread = best
         if state.best and self._with_model_errors(problem, state) is not None:
@@ -175,27 +153,23 @@ class LeastSquares:
             spread = state.unknown[0]
             windows = spread.explained
         uncertainty = sandwich(spread.bread, spread.meat)
-        predicts = predicting.better(state.prediction, point) if state.predicting else None
-        if predicts is not None:
-            point, uncertainty = predicts.point, predicts.of_both(uncertainty)
         half = (space.high - space.low) / 2.0
         mean = space.to_physical(point)
         covariance = half[:, None] * uncertainty.covariance * half
         errors = quantile(windows, len(space))
         width = half * errors * np.sqrt(np.diag(uncertainty.covariance))
         interval = np.clip(np.stack([mean - width, mean + width], axis=-1), space.low[:, None], space.high[:, None])
-        searches = (state.known, *state.unknown, state.prediction)
+        searches = (*(() if state.known is None else (state.known,)), *state.unknown)
         return Estimate(
             mean=mean,
             std=np.sqrt(np.diag(covariance)),
             groups=(tuple(range(len(space))),),
-            failures=sum(search.failures for search in searches if search is not None),
+            failures=sum(search.failures for search in searches),
             warnings=(
                 *identifiability(uncertainty, space.names),
                 *at_end_of_range(point, space),
                 *(() if settled else (sentences.NOT_SETTLED,)),
                 *self._about_states(problem, state),
-                *(() if predicts is None else (sentences.PREDICTS,)),
             ),
             covariance=covariance,
             interval=interval,
@@ -217,8 +191,6 @@ class LeastSquares:
                 if (skipped and not search.epochs) or (length == WIDER and state.stage != "widening"):
                     continue
                 steps += self._unknown(problem, length).whole_run(problem, search, refining_epochs)
-        if state.predicting and state.prediction is not None:
-            steps += self._search_for_prediction(problem).whole_run(problem, state.prediction, refining_epochs)
         return steps
 
     def _first_stage(self, problem: CalibrationProblem) -> Stage:
@@ -335,29 +307,6 @@ class LeastSquares:
         """Whether residuals of windows of this length are the noise that those of the shortest windows are."""
         readings = self._unknown(problem, length).horizon + 1
         return noise_alone(state.unknown[length], state.unknown[0], readings)
-
-    def _model_errors(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool:
-        """Whether anything shows that the model lacks something, so that another estimate may predict better.
-
-        From logged states, which have no noise, that is more than rounding errors; from estimated ones long tails of
-        the residuals, or more than noise on longer windows, whether or not a search on these has settled.
-        """
-        best = self._fitted(state)
-        if not state.estimates_starts:
-            return float(np.sqrt(best.cost[0])) >= sentences.EXACT
-        tried = [length for length in range(LONGER, len(state.unknown)) if state.unknown[length].epochs]
-        return sentences.have_long_tails(problem, best) or not all(
-            self._noise_alone(problem, state, length) for length in tried
-        )
-
-    def _search_for_prediction(self, problem: CalibrationProblem) -> Search:
-        return predicting.search_of(problem, self.search_epochs, self.tolerance)
-
-    def _prediction(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState | None:
-        """The fit for prediction before it has begun; there is none where the user chose the windows' length."""
-        if self.horizon is not None:
-            return None
-        return predicting.windows_for(problem, self._search_for_prediction(problem), key)
 
     def _with_model_errors(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:
         """Index of the first longer windows, none shorter than the estimate's, that leave more than noise, or None."""

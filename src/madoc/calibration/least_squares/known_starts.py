@@ -56,25 +56,14 @@ class KnownStarts:
         return cls(problem, windows_at(problem.dataset, states, rows, horizon), touching, loss)
 
     @staticmethod
-    def logged(
-        problem: CalibrationProblem,
-    ) -> tuple[Float[np.ndarray, "states state"], Int[np.ndarray, " states"]]:
-        """The states at which windows can begin, and their rows.
-
-        Raises:
-            MadocError: The log's observations do not determine them.
-        """
-        return problem.states.exact()
-
-    @classmethod
     def touched(
-        cls, problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
+        problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
     ) -> Bool[np.ndarray, " windows"]:
         """Whether bodies were in contact at any logged state of a window, from its first to its last."""
-        return touched(problem, *cls.logged(problem), rows, horizon)
+        return touched(problem, *problem.states.exact(), rows, horizon)
 
-    @classmethod
-    def possible_rows(cls, problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
+    @staticmethod
+    def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
         """Rows at which windows can begin that do not overlap: intervals assume that windows are independent.
 
         Single steps may be neighbours, which share a reading. Where that is noisy, their residuals alternate, and the
@@ -84,7 +73,7 @@ class KnownStarts:
             MadocError: No state can be rebuilt, no episode is long enough, or there are fewer values than parameters.
         """
         pick = first_rows if horizon == 1 else disjoint_windows
-        rows = cls.logged(problem)[1]
+        rows = problem.states.exact()[1]
         rows = rows[pick(problem.dataset, rows, horizon)]
         count, values = len(problem.simulator.parameters), problem.simulator.task.observation_size
         windows = min(most, len(rows))

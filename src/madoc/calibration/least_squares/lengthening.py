@@ -67,8 +67,6 @@ class LeastSquaresState:
             `widening`: the same on more windows of the shortest length.
         length: Index of the unknown search in progress.
         best: Index of the unknown search that has the estimate.
-        prediction: The search for parameters that predict best; None where the log does not serve for one.
-        predicting: 1 once that has begun, else 0.
         finished: 1 once the next step would be too small to matter, else 0.
     """
 
@@ -77,8 +75,6 @@ class LeastSquaresState:
     stage: Stage
     length: int
     best: int
-    prediction: SearchState | None
-    predicting: int
     finished: int
 
     @property

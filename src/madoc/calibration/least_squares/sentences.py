@@ -21,10 +21,6 @@ NOT_SETTLED = (
 STILL_LENGTHENING = (
     "longer windows, or more of them, were under way when it ended: a larger budget may narrow the intervals"
 )
-PREDICTS = (
-    "the model lacks something, so the estimate is the one that predicts motion best over a second from measured "
-    "states; its distance from the estimate that fits short windows best counts as an error"
-)
 
 
 def about_estimated_states(problem: CalibrationProblem, search: SearchState, horizon: int) -> str:
