@@ -19,6 +19,7 @@ import payload
 import planted
 import planted_servo
 import rates
+import wrong_friction
 from disturbances import disturbed, settled_wrongly
 from kept import CALIBRATIONS, POLICIES, RESULTS, SYSID, Study, commits, is_time
 from pooling import by_log, label, order, shown
@@ -155,7 +156,10 @@ def verdicts() -> str:
         f"{planted_servo.table(planted_servo.STUDY.rows())}\n\n"
         "`python benchmarks/legged.py`: a quadruped of three position servos a leg that trots for 15 s and logs its "
         "joint encoders and an IMU alone, all defaults and 300 s, judging included.\n\n"
-        f"{legged.table(legged.STUDY.rows())}\n"
+        f"{legged.table(legged.STUDY.rows())}\n\n"
+        "`python benchmarks/wrong_friction.py`: arms with friction by speed and load, in a model of Coulomb and viscous "
+        "friction alone; predictions over a second of runs never shown, beside those of the best parameters.\n\n"
+        f"{wrong_friction.table(wrong_friction.STUDY.rows())}\n"
     )
 
 
