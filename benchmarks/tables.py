@@ -158,7 +158,7 @@ def verdicts() -> str:
         "joint encoders and an IMU alone, all defaults and 300 s, judging included.\n\n"
         f"{legged.table(legged.STUDY.rows())}\n\n"
         "`python benchmarks/wrong_friction.py`: arms with friction by speed and load, in a model of Coulomb and "
-        "viscous friction alone; predictions over a second of runs never shown, beside those of the best parameters.\n\n"
+        "viscous friction alone; predictions over a second of unseen runs, beside those of the best parameters.\n\n"
         f"{wrong_friction.table(wrong_friction.STUDY.rows())}\n"
     )
 
