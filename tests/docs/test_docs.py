@@ -1,4 +1,4 @@
-"""Every code block of the documentation runs, page by page, in an empty folder with the examples; so does the first."""
+"""Every code block of the documentation runs, page by page, in a folder with the examples; one of these does too."""
 
 import importlib.util
 import os

@@ -144,13 +144,14 @@ def judged(
         coarse, of_steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
     ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
     shares = _shares(space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own, doubts)
+    of_range = dict(zip(space.names, shares.tolist(), strict=True))
     signals = bench.simulator.task.signal_names[: len(noise)]
     found = record(
         split=bench.split,
         rows=len(bench.held_out),
         episodes=len(bench.held_out.episode_starts),
         estimate=dict(zip(space.names, point.tolist(), strict=True)),
-        interval_shares=dict(zip(space.names, shares.tolist(), strict=True)),
+        interval_shares=of_range,
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
         control_steps=control_steps + of_widths + of_columns + of_steps + doubts.control_steps,
@@ -160,7 +161,7 @@ def judged(
         tested=doubts.tested and EXCHANGED not in bench.left_out,
         coarseness=coarse,
         finer=finer,
-        at_end=_at_end(space, point, shares),
+        at_end=tuple(name for name in space.at_end(point) if of_range[name] < OPEN),  # an open one tells of no end
         base_from_contacts=bool(bench.states.placed.any()),
         concentration=doubts.concentration,
     )
@@ -186,12 +187,6 @@ def judged(
     tried = [name for name, model in (("constant delay", richer), ("lag of first order", with_lag)) if model]
     told = tuple(_contradiction(each, term, richer, tried) for each in contradicting)
     return replace(found, richer=richer, contradictions=told, control_steps=found.control_steps + of_richer)
-
-
-def _at_end(space: ParameterSpace, point: Float[np.ndarray, " d"], shares: Float[np.ndarray, " d"]) -> tuple[str, ...]:
-    """Which estimates are at an end of their range; one that the data leaves open says nothing of what lies beyond."""
-    told = {name for name, share in zip(space.names, shares.tolist(), strict=True) if share < OPEN}
-    return tuple(name for name in space.at_end(point) if name in told)
 
 
 def _worth_keeping(terms: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:

@@ -1,4 +1,6 @@
-"""Longer windows: where motion is smooth they narrow the intervals, as fewer readings serve to fit initial states.
+"""Longer windows, and the state that goes on from one length to the next.
+
+Where motion is smooth they narrow the intervals, as fewer readings serve to fit initial states.
 
 They begin where shorter ones do, whose initial states are estimated already, so a search on them starts near its end.
 """
