@@ -167,6 +167,13 @@ def test_an_estimate_under_contacts_that_chatter_is_never_calibrated():
     assert "contacts chatter" in judge(beyond, chattering=True).sentence
 
 
+def test_an_estimate_that_makes_up_for_what_the_model_lacks_is_never_calibrated():
+    over = (predicted_over(1.0, 0.4, (0.3, 0.6)),)
+    verdict = judge(replace(PREDICTED, open_loop=over), effective=True)
+    assert verdict.word == "USABLE" and "leaves more than noise" in verdict.sentence
+    assert judge(PREDICTED, effective=True).word == "NOT_IDENTIFIABLE"
+
+
 def test_a_base_that_only_contacts_show_is_never_calibrated():
     assert judge(PREDICTED).word == "CALIBRATED"
     over = (predicted_over(1.0, 0.4, (0.3, 0.6)),)

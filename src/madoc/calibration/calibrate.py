@@ -84,6 +84,7 @@ def calibrate(
         settled=estimate.settled,
         long_tails=estimate.long_tails,
         chattering=estimate.chattering,
+        effective=estimate.effective,
         group_stability=estimate.group_stability,
         problem=problem,
     )

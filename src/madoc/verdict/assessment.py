@@ -83,6 +83,7 @@ def assess(
         settled=result.settled,
         long_tails=result.long_tails,
         chattering=result.chattering,
+        effective=result.effective,
         combinations=widened.combinations,
     )
     better = beats_mid_range(holdout) or explains_all(holdout)

@@ -26,6 +26,10 @@ CHATTER = (
     "well than their intervals say; soften the contacts of the model, or log with less noise what is near the ground"
 )
 """What an estimate's intervals do not count."""
+EFFECTIVE = (
+    "the model leaves more than noise, and other values predict better than those that explain short windows best: it "
+    "lacks something, whose effect the estimates make up for"
+)
 CHANCE = 0.01
 """Significance level in [0, 1]: data is rejected where no prediction is better than chance at this level."""
 SKILL = 0.1
@@ -43,6 +47,7 @@ def judge(
     settled: bool = True,
     long_tails: bool = False,
     chattering: bool = False,
+    effective: bool = False,
     combinations: Sequence[Combination] = (),
 ) -> Verdict:
     """The first verdict that applies: rejected data, a model that lacks something, open parameters, no improvement.
@@ -57,6 +62,7 @@ def judge(
         settled: Whether the search that led to it came to its end.
         long_tails: Whether its residuals have longer tails than noise has.
         chattering: Whether contacts chattered in its search, so that its intervals are too narrow.
+        effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         combinations: What the log tells of parameters that it leaves open.
     """
     refused = _rejected(holdout) or contradicted(holdout)
@@ -74,6 +80,7 @@ def judge(
         or _untested(holdout)
         or _with_an_assumed_base(holdout)
         or (_not_certain(holdout, CHATTER) if chattering else None)
+        or (_not_certain(holdout, EFFECTIVE) if effective else None)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and {_how_sure(holdout)}")
     )
 

@@ -7,10 +7,9 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
-from madoc.calibration.least_squares import sentences
+from madoc.calibration.least_squares import predicting, sentences
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.lengthening import (
-    FEWEST,
     LENGTHS,
     LONGER,
     OF_BASES,
@@ -33,6 +32,7 @@ from madoc.calibration.least_squares.lengthening import (
     tells_more,
     with_search,
 )
+from madoc.calibration.least_squares.plan import FEWEST
 from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.statistics import alternation, consecutive_residuals, noisy_rows
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
@@ -113,27 +113,45 @@ class LeastSquares:
             stage=stage,
             length=0,
             best=0,
+            prediction=None if self.horizon is not None else predicting.windows_for(problem),
             finished=0,
         )
 
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
         """Take one damped step of the current search, and decide which search goes on."""
-        if state.estimates_starts:
+        if state.prediction is not None and state.prediction.progress == "under way":
+            prediction, epoch = predicting.step(problem, state.prediction)
+            state = replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
+        elif state.estimates_starts:
             search, epoch = self._unknown(problem, state.length).step(problem, state.unknown[state.length])
             state = self._after_unknown(problem, with_search(state, state.length, search))
+            state, epoch = self._then_predicting(problem, state, epoch)
         else:
             assert state.known is not None
             search, epoch = self._known(problem).step(problem, state.known)
             state, asking = self._after_known(problem, replace(state, known=search))
             epoch = replace(epoch, control_steps=epoch.control_steps + asking)
+            state, epoch = self._then_predicting(problem, state, epoch)
         if not state.finished:
             return state, epoch
         steps = self._fitted(state).epochs
         converged = f"after {steps} iterations on all windows another one would hardly change any estimate"
         return state, replace(epoch, converged=converged)
 
+    def _then_predicting(
+        self, problem: CalibrationProblem, state: LeastSquaresState, epoch: Epoch
+    ) -> tuple[LeastSquaresState, Epoch]:
+        """Begin the fit for prediction once the searches have ended, if they left more than noise."""
+        prediction = state.prediction
+        if not state.finished or prediction is None or not self._leaves_more_than_noise(problem, state):
+            return state, epoch
+        horizon = self._unknown(problem).horizon if state.estimates_starts else 0
+        prediction, spent = predicting.begun(problem, prediction, self._fitted(state).point[0], horizon)
+        state = replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
+        return state, replace(epoch, control_steps=epoch.control_steps + spent)
+
     def _fitted(self, state: LeastSquaresState) -> SearchState:
-        """The search that has the estimate."""
+        """The search that has the estimate, but for one that predicts better."""
         if state.estimates_starts:
             return state.unknown[state.best]
         assert state.known is not None
@@ -153,6 +171,9 @@ class LeastSquares:
             spread = state.unknown[0]
             windows = spread.explained
         uncertainty = sandwich(spread.bread, spread.meat)
+        prediction, progress = state.prediction, state.prediction.progress if state.prediction else "not begun"
+        if prediction is not None and progress == "better":
+            point, uncertainty = prediction.point, prediction.of_both(uncertainty)
         half = (space.high - space.low) / 2.0
         mean = space.to_physical(point)
         covariance = half[:, None] * uncertainty.covariance * half
@@ -170,6 +191,8 @@ class LeastSquares:
                 *at_end_of_range(point, space),
                 *(() if settled else (sentences.NOT_SETTLED,)),
                 *self._about_states(problem, state),
+                *((sentences.PREDICTS,) if progress == "better" else ()),
+                *((sentences.STILL_PREDICTING,) if progress == "under way" else ()),
             ),
             covariance=covariance,
             interval=interval,
@@ -177,6 +200,7 @@ class LeastSquares:
             settled=settled,
             long_tails=settled and state.estimates_starts and sentences.have_long_tails(problem, best),
             chattering=bool(state.estimates_starts and best.chattering),
+            effective=progress == "better",
         )
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:
@@ -307,6 +331,19 @@ class LeastSquares:
         """Whether residuals of windows of this length are the noise that those of the shortest windows are."""
         readings = self._unknown(problem, length).horizon + 1
         return noise_alone(state.unknown[length], state.unknown[0], readings)
+
+    def _leaves_more_than_noise(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool:
+        """Whether the model may lack something, so that another estimate may predict better.
+
+        From logged states, which have no noise, that is more than rounding errors; from estimated ones long tails of
+        the residuals, or more than noise on longer windows, whether or not a search on these has settled.
+        """
+        best = self._fitted(state)
+        if not state.estimates_starts:
+            return float(np.sqrt(best.cost[0])) >= sentences.EXACT
+        tried = [length for length in range(LONGER, len(state.unknown)) if state.unknown[length].epochs]
+        noise = all(self._noise_alone(problem, state, length) for length in tried)
+        return not noise or sentences.have_long_tails(problem, best)
 
     def _with_model_errors(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:
         """Index of the first longer windows, none shorter than the estimate's, that leave more than noise, or None."""

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.plan import FIRST_DAMPING
+from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING
+from madoc.calibration.least_squares.predicting import Prediction
 from madoc.calibration.least_squares.search import SearchState, epochs_of_states
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Dataset
@@ -34,8 +35,6 @@ READINGS = 2
 OF_BASES = 3
 """Length of the first windows relative to the time scale where these also tell where a base is, which no sensor does:
 the readings of several steps of the legs bear it out, those of one do not."""
-FEWEST = 5
-"""Smallest number of windows beyond that of parameters; with fewer, Student's t would widen the intervals much."""
 AS_WELL = 1.2
 """Ratio of a channel's noise to that of the first windows, at least 1; above it longer windows show model errors."""
 HOPELESS = 2.0
@@ -69,6 +68,7 @@ class LeastSquaresState:
             `widening`: the same on more windows of the shortest length.
         length: Index of the unknown search in progress.
         best: Index of the unknown search that has the estimate.
+        prediction: The fit for prediction, the last; None where the log does not serve for one.
         finished: 1 once the next step would be too small to matter, else 0.
     """
 
@@ -77,6 +77,7 @@ class LeastSquaresState:
     stage: Stage
     length: int
     best: int
+    prediction: Prediction | None
     finished: int
 
     @property
