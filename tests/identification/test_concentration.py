@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from madoc.identification.concentration import Concentration, concentration
+from madoc.identification.concentration import alike as alike_in_a_row
 from madoc.identification.fitted_windows import Fit, LoggedWindows
 from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.replay import Readings
@@ -66,3 +67,20 @@ def test_a_signal_is_told_where_it_has_most():
     errors = alike()
     errors[..., 1] *= 3.0
     assert found(errors) == Concentration(0.0, "", None, "speed")
+
+
+def test_what_is_left_is_alike_in_a_row_where_it_is_not_noise():
+    """By hand, in 100 windows of 5 readings of 3 signals: 4 products of neighbours to 5 squares."""
+    readings = Readings(np.zeros((100, STEPS, 1)), np.zeros((100, 5, 3)), np.ones(3), np.ones(2), np.zeros(2, bool))
+
+    def of(errors):
+        slopes = WindowSlopes(errors.reshape(100, 15), *(np.zeros((100, 15, 0)),) * 2, np.ones(100, bool))
+        fit = Fit(np.zeros(0), np.zeros((100, 0)), slopes, np.zeros((100, 15, 0)), slopes.whole, 0)
+        return alike_in_a_row(fit, readings)
+
+    assert of(alike()) == pytest.approx(0.8)
+    assert of(alike() * np.array([1.0, -1.0, 1.0, -1.0, 1.0])[:, None]) == pytest.approx(-0.8)
+    assert of(1e-4 * alike()) == pytest.approx(0.008)  # rounding errors of a simulation are no sensor's
+    small = alike() * np.array([1.0, 0.0, 0.0])  # a signal whose errors last, beside the noise of another
+    loud = np.random.default_rng(0).standard_normal((100, 5, 3)) * np.array([0.0, 10.0, 0.0])
+    assert abs(of(small + loud)) < 0.1

@@ -134,7 +134,7 @@ class RicherModel:
 
     Attributes:
         parameter: The parameter that was added, as `dof_frictionloss.hinge`.
-        left: Terms that this model seems to lack in turn, in words, the most significant first; none where it explains
+        left: What this model seems to lack in turn, in words, the most significant term first; none where it explains
             the log.
     """
 

@@ -1,4 +1,4 @@
-"""Where in a log, and in which of its signals, most of what the model leaves unexplained is."""
+"""Where in a log, and in which of its signals, most of what the model leaves is, and whether it is noise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,11 +8,16 @@ from jaxtyping import Float, Int
 
 from madoc.data.dataset import Dataset
 from madoc.identification.fitted_windows import Fit, LoggedWindows
+from madoc.identification.replay import Readings
 
 MOST = 0.5
 """Share in (0, 1) of the squared residuals that a place must hold to be told."""
 SHORT = 0.1
 """Largest share in (0, 1) of the windows that a stretch may have to be told; a run may have `MOST` of `MOST`."""
+
+
+LEAST = 1e-3
+"""Residual in typical changes of a stride; no sensor is more precise, so smaller ones are alike by chance."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,16 @@ def concentration(
     if in_run > MOST and (runs == run).mean() <= MOST * MOST:
         return Concentration(in_run, name, None, signal)
     return Concentration(0.0, "", None, signal) if signal else None
+
+
+def alike(fit: Fit, readings: Readings) -> float:
+    """Correlation of what a fit leaves of a reading with what it leaves of the next, all signals in typical changes.
+
+    It is about 0 for noise. What is smaller than `LEAST` counts as 0.
+    """
+    left = fit.left[fit.counted & fit.slopes.whole].reshape(-1, *readings.observed.shape[1:])
+    square = max(float((left**2).sum()), LEAST**2 * max(1, left.size))
+    return float((left[:, 1:] * left[:, :-1]).sum()) / square
 
 
 def _shortest(share: Float[np.ndarray, " windows"], runs: Int[np.ndarray, " windows"]) -> tuple[int, int]:

@@ -22,7 +22,7 @@ from madoc.identification.candidate_terms import (
     candidates,
     is_late,
 )
-from madoc.identification.concentration import Concentration, concentration
+from madoc.identification.concentration import Concentration, alike, concentration
 from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import Fit, LoggedWindows, fit_windows, negligible, products_of, windows_of
 from madoc.identification.information import NORMAL_95
@@ -72,8 +72,9 @@ class Suspicions:
         alternatives: Other estimates that it does not exclude.
         imitated: Terms that the model has none of and of which the log cannot tell whether they are missing.
         control_steps: Control steps that were simulated to find that out.
-        tested: Whether there were states to begin at, and enough windows to find anything.
+        tested: Whether there were states to begin at, and enough windows.
         concentration: Where most of what the model leaves unexplained is; None where no place stands out.
+        alike: Correlation of what the fitted model leaves of a reading with what it leaves of the next; 0 for noise.
     """
 
     terms: tuple[MissingTerm, ...] = ()
@@ -82,6 +83,7 @@ class Suspicions:
     control_steps: int = 0
     tested: bool = True
     concentration: Concentration | None = None
+    alike: float = 0.0
 
 
 def suspicions(
@@ -106,8 +108,7 @@ def suspicions(
             parameters would pass for missing terms.
         half_widths: Half of each parameter's 95 % interval in [-1, 1].
         scale: Typical change of each signal in a step.
-        of_other_model: Whether the estimate is another model's, so that other windows may move it for a reason:
-            alternatives then move by that as well.
+        of_other_model: Whether the estimate is another model's; alternatives then move by what other windows move it.
         most: Largest number of windows; None for the usual one.
         shorter: How many times as short and as many windows are.
     """
@@ -139,10 +140,9 @@ def suspicions(
     terms = [fitted.get(term.parameter, term) for term in terms]
     others += [*with_chosen, *_of_friction(tests, chosen), *_of_forces(tests, chosen)]
     most_significant_first = sorted(terms, key=lambda term: -abs(term.t))
-    imitated = tuple(imitated_terms(tests))
-    spent += of_parts + of_fit
     where = concentration(dataset, windows, fit, simulator.task.signal_names, simulator.control_step)
-    return Suspicions(tuple(most_significant_first), tuple(others), imitated, spent, concentration=where)
+    found = tuple(most_significant_first), tuple(others), tuple(imitated_terms(tests))
+    return Suspicions(*found, spent + of_parts + of_fit, concentration=where, alike=alike(fit, readings))
 
 
 def _effects(

@@ -80,7 +80,7 @@ def judge(
         or _untested(holdout)
         or _with_an_assumed_base(holdout)
         or (_not_certain(holdout, CHATTER) if chattering else None)
-        or (_not_certain(holdout, EFFECTIVE) if effective else None)
+        or (_not_certain(holdout, EFFECTIVE) if effective and numerical(holdout) is None else None)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and {_how_sure(holdout)}")
     )
 

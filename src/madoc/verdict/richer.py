@@ -1,8 +1,8 @@
 """The model with the parameter that it seems to lack: whether that is what it lacks is tested before anybody adds it.
 
 A term may explain much of the residuals because it acts somewhat like what is missing. The model with it is therefore
-fitted to the same windows and put to the same tests: only where these find nothing more is it the cause, as far as
-the log tells.
+fitted to the same windows and put to the same tests: only where these find nothing more, and what it leaves is noise,
+is it the cause, as far as the log tells.
 """
 
 from dataclasses import replace
@@ -21,6 +21,7 @@ from madoc.identification.term_tests import LIKELY_FORCE, MissingTerm, named
 from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.simulation.delay import pending_actions
+from madoc.verdict.mismatch import WHITE
 from madoc.verdict.remedies import line_of
 
 
@@ -67,5 +68,6 @@ def richer_model(
     at = np.clip(start, -1.0, 1.0)
     found = suspicions(dataset, logged, wide, at, widths, scale, of_other_model=True, most=most, shorter=shorter)
     left = [each for each in found.terms if each.cause != INTEGRATION and abs(each.t) >= LIKELY_FORCE]
+    more = (f"something that lasts over several rows (correlation {found.alike:.2f})",) if found.alike > WHITE else ()
     steps = found.control_steps * (FINER if finer else 1)
-    return RicherModel(term.parameter, tuple(map(named, left))) if found.tested else None, steps
+    return RicherModel(term.parameter, (*map(named, left), *more)) if found.tested else None, steps
