@@ -63,6 +63,14 @@ def ended(method, problem):
     return state
 
 
+def prediction(count, scale=1.0):
+    """The state of a fit of so many parameters on two windows, at the middle of all ranges."""
+    none, covariance = np.zeros(count), np.zeros((count, count))
+    return Prediction(
+        "under way", np.arange(2), np.zeros((2, 1)), none, none, none, scale, 0.0, 1.0, covariance, epochs=0, rounds=0
+    )
+
+
 def test_windows_last_a_second_and_there_are_none_in_a_log_that_is_too_short(pendulum):
     problem = problem_of(pendulum, log_of(pendulum, TRUTH, 0))
     state = predicting.windows_for(problem)
@@ -98,9 +106,7 @@ def test_squares_are_weighted_so_that_they_sum_up_to_the_errors_and_steps_lower_
     slopes = Linearisation(np.array([[1.0, 1.0], [2.0, -2.0]]), np.array([[[1.0], [1.0]], [[0.0], [2.0]]]))
     weighted = predicting._weighted(slopes)
     np.testing.assert_allclose((weighted.residuals**2).sum(-1), [1.0, 2.0])
-    state = Prediction(
-        "under way", np.arange(2), np.zeros((2, 1)), np.zeros(1), np.zeros(1), 1.5, 0.0, 1.0, np.zeros((1, 1)), 0
-    )
+    state = prediction(1, scale=1.5)
     # Gradient (1 + 1) / 2 + (0 - 4) / 4 = 0 at the first estimate; at 0.15 the term pulls back by 3 / 0.15.
     np.testing.assert_allclose(predicting._step(state, slopes, 0.0), [0.0], atol=1e-12)
     away = predicting._step(replace(state, point=np.array([0.15])), slopes, 0.0)
@@ -110,10 +116,7 @@ def test_squares_are_weighted_so_that_they_sum_up_to_the_errors_and_steps_lower_
 
 
 def test_the_uncertainty_is_that_of_both_estimates_and_of_their_distance():
-    state = Prediction(
-        "better", np.arange(2), np.zeros((2, 1)), np.zeros(3), np.zeros(3), 1.0, 0.0, 1.0, 0.01 * np.eye(3), 0
-    )
-    state = replace(state, point=np.array([0.5, 0.0, 0.0]))
+    state = replace(prediction(3), best=np.array([0.5, 0.0, 0.0]), covariance=0.01 * np.eye(3))
     both = state.of_both(Uncertainty(0.04 * np.eye(3), np.eye(3), np.zeros((0, 3))))
     np.testing.assert_allclose(both.covariance, np.diag([0.04 + 0.01 + 0.25, 0.05, 0.05]))
 

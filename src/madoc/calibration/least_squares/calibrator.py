@@ -173,7 +173,7 @@ class LeastSquares:
         uncertainty = sandwich(spread.bread, spread.meat)
         prediction, progress = state.prediction, state.prediction.progress if state.prediction else "not begun"
         if prediction is not None and progress == "better":
-            point, uncertainty = prediction.point, prediction.of_both(uncertainty)
+            point, uncertainty = prediction.best, prediction.of_both(uncertainty)
         half = (space.high - space.low) / 2.0
         mean = space.to_physical(point)
         covariance = half[:, None] * uncertainty.covariance * half

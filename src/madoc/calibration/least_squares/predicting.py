@@ -4,13 +4,13 @@ Each window's free initial state explains a part of what a wrong model gets wron
 short windows best are not those that predict best. Here initial states are held where the readings after them put them,
 and parameters alone explain the second that follows, as in the predictions that a verdict tells of. What is minimised
 is the mean of the windows' errors, of which a few that go wrong are a small part, and a term that keeps parameters near
-the first estimate where windows hardly tell them:
+the estimate so far, θ₁, where windows hardly tell them:
 
     mean_w √(mean_t r²) + e ‖θ - θ₁‖² / (n l²), with e the mean error at θ₁, n windows and a reach l.
 
 Steps are Gauss-Newton's on squares weighted by each window's error at the last point, which bound it from above (Hunter
 and Lange 2004). If the model is right, such an estimate has more noise and no advantage, so it counts only where it
-predicts better than the first one in windows that it was not fitted to.
+predicts better than θ₁ in windows that it was not fitted to; it then takes the place of θ₁, for as long as that is so.
 """
 
 from dataclasses import dataclass, replace
@@ -37,13 +37,13 @@ SECONDS = 1.0
 VALUES = 30_000_000
 """Largest number of simulated values of an epoch's derivatives, which bounds its memory to a few times 240 MB."""
 REACH = 0.15
-"""Distance in [-1, 1] from the first estimate that counts as much as the mean error of one window."""
+"""Distance in [-1, 1] from the estimate so far that counts as much as the mean error of one window."""
 LEAST = 0.3
 """Smallest error of a window relative to their mean by which its squares are weighted, in (0, 1]."""
-EPOCHS = 10
-"""Largest number of steps."""
+EPOCHS, ROUNDS = 10, 5
+"""Largest numbers of steps until an estimate is compared with the one so far, and of estimates that take its place."""
 SETTLED = 1e-3
-"""Share in [0, 1] of the cost; after a step that saves less the fit has settled."""
+"""Share in [0, 1] of the cost; after a step that saves less the estimates are compared."""
 STEPS = 6
 """Number of damped steps of an initial state, which begins where the log says."""
 FOLDS = 10
@@ -65,28 +65,32 @@ class Prediction:
         rows: First rows of the windows.
         states: Their initial states, held once the fit has begun.
         first: The estimate at which it begins, in [-1, 1].
-        point: Its own.
-        scale: Mean error of the windows at the first one, in typical changes of a channel.
-        cost: Mean error at the point and the term that keeps it near the first one.
+        best: The first one, or the last that predicted better than the one before.
+        point: The one that moves.
+        scale: Mean error of the windows at the best one, in typical changes of a channel; 0 before the first step.
+        cost: Mean error at the point and the term that keeps it near the best one.
         damping: λ of the next step.
-        covariance: Covariance of the estimate by what windows differ.
-        epochs: Number of steps so far.
+        covariance: Covariance of the point by what windows differ.
+        epochs: Number of steps since an estimate was compared.
+        rounds: Number of estimates that predicted better.
     """
 
     progress: Progress
     rows: Int[np.ndarray, " windows"]
     states: Float[np.ndarray, "windows state"]
     first: Float[np.ndarray, " d"]
+    best: Float[np.ndarray, " d"]
     point: Float[np.ndarray, " d"]
     scale: float
     cost: float
     damping: float
     covariance: Float[np.ndarray, "d d"]
     epochs: int
+    rounds: int
 
     def of_both(self, other: Uncertainty) -> Uncertainty:
         """The other's uncertainty with this one's, and with the distance of the two as an error of its own."""
-        shift = self.point - self.first
+        shift = self.best - self.first
         return replace(other, covariance=other.covariance + self.covariance + np.outer(shift, shift))
 
 
@@ -105,10 +109,19 @@ def windows_for(problem: CalibrationProblem) -> Prediction | None:
     chosen = evenly(disjoint_windows(problem.dataset, rows, horizon), most)
     if len(chosen) < FEWEST + count:
         return None
-    none = np.zeros(count)
-    covariance = np.zeros((count, count))
     return Prediction(
-        "not begun", rows[chosen], states[chosen], none, none, 0.0, 0.0, FIRST_DAMPING, covariance, epochs=0
+        progress="not begun",
+        rows=rows[chosen],
+        states=states[chosen],
+        first=np.zeros(count),
+        best=np.zeros(count),
+        point=np.zeros(count),
+        scale=0.0,
+        cost=0.0,
+        damping=FIRST_DAMPING,
+        covariance=np.zeros((count, count)),
+        epochs=0,
+        rounds=0,
     )
 
 
@@ -129,11 +142,12 @@ def begun(
         for _ in range(STEPS):
             after = settling.settle(problem.simulator, readings, point, states, damping, narrow, "cauchy")
             states, damping, simulations = after.states, after.damping, simulations + after.simulations
-    return replace(state, progress="under way", states=states, first=point, point=point), simulations * horizon
+    at_estimate = replace(state, progress="under way", states=states, first=point, best=point, point=point)
+    return at_estimate, simulations * horizon
 
 
 def step(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, Epoch]:
-    """Take the best of some damped steps; with the last, the estimate is compared with the first one."""
+    """Take the best of some damped steps; with the last of a round, the estimate is compared with the one so far."""
     around = difference_points(state.point)
     residuals = _residuals(problem, state, around)
     slopes, errors = linearise(around, residuals), _errors(residuals[0])
@@ -157,8 +171,8 @@ def step(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, Ep
         epochs=state.epochs + 1,
     )
     if over:
-        verdict, more = _compared(problem, state)
-        state, spent = replace(state, progress=verdict), spent + more
+        state, more = _compared(problem, state)
+        spent += more
     metrics = {"residual": min(before, state.cost), "moved": float(np.abs(steps[best]).max() * helps)}
     return state, Epoch(metrics, spent, stage="predicting")
 
@@ -192,8 +206,8 @@ def _errors(residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray
 
 
 def _cost(state: Prediction, point: Float[np.ndarray, " d"], errors: Float[np.ndarray, " windows"]) -> float:
-    """The mean error and the term that keeps the point near the first one; infinite if any simulation failed."""
-    away = float(((point - state.first) ** 2).sum()) / (len(errors) * REACH**2)
+    """The mean error and the term that keeps the point near the best one; infinite if any simulation failed."""
+    away = float(((point - state.best) ** 2).sum()) / (len(errors) * REACH**2)
     return float(errors.mean()) + state.scale * away
 
 
@@ -205,14 +219,14 @@ def _weighted(slopes: Linearisation) -> Linearisation:
 
 
 def _step(state: Prediction, slopes: Linearisation, damping: float) -> Float[np.ndarray, " d"]:
-    """The damped Gauss-Newton step of the weighted squares and the term that keeps the point near the first one.
+    """The damped Gauss-Newton step of the weighted squares and the term that keeps the point near the best one.
 
     That an error is half of the squares that bound it gives the latter its factor of 2.
     """
     weighted, count = _weighted(slopes), len(state.point)
     near = np.sqrt(2.0 * state.scale) / REACH
     rows = np.column_stack([weighted.jacobian.reshape(-1, count), weighted.residuals.reshape(-1)])
-    held = np.column_stack([near * np.eye(count), near * (state.point - state.first)])
+    held = np.column_stack([near * np.eye(count), near * (state.point - state.best)])
     factor = triangle(np.concatenate([rows, held]))
     return damped_step(factor[:count, :count], factor[:count, count], state.point, damping)
 
@@ -226,22 +240,32 @@ def _covariance(state: Prediction, slopes: Linearisation) -> Float[np.ndarray, "
     return inverse @ (scores.T @ scores) @ inverse
 
 
-def _compared(problem: CalibrationProblem, state: Prediction) -> tuple[Progress, int]:
-    """Whether the estimate is better than the first one, and the control steps simulated.
+def _compared(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, int]:
+    """The state once the point is compared with the best estimate so far, and the control steps simulated."""
+    better, spent = _is_better(problem, state)
+    if better and state.rounds + 1 < ROUNDS:
+        state = replace(state, scale=0.0, damping=FIRST_DAMPING, epochs=0)
+    else:
+        state = replace(state, progress="better" if better or state.rounds else "no better")
+    return replace(state, best=state.point, rounds=state.rounds + 1) if better else state, spent
+
+
+def _is_better(problem: CalibrationProblem, state: Prediction) -> tuple[bool, int]:
+    """Whether the point predicts better than the best estimate so far, and the control steps simulated.
 
     Every stretch of the log is predicted by parameters that were fitted to the others, by one Gauss-Newton step from
-    those fitted to all. An estimate at an end of a range is none where the first one is inside: a wider range would
-    give another one.
+    those fitted to all. A point at an end of a range is none where the best one is inside: a wider range would give
+    another one.
     """
     space, around = problem.simulator.parameters, difference_points(state.point)
-    if set(space.at_end(state.point)) - set(space.at_end(state.first)):
-        return "no better", 0
+    if set(space.at_end(state.point)) - set(space.at_end(state.best)):
+        return False, 0
     residuals = _residuals(problem, state, around)
     whole = np.isfinite(residuals).all((0, 2))
     slopes, stretch = linearise(around, residuals), np.arange(int(whole.sum())) * FOLDS // max(1, int(whole.sum()))
     without = [state.point + _step(state, slopes.of(stretch != each), _LITTLE) for each in np.unique(stretch)]
-    errors = _errors(_residuals(problem, state, np.stack([*without, state.first])))[:, whole]
+    errors = _errors(_residuals(problem, state, np.stack([*without, state.best])))[:, whole]
     found = errors[stretch, np.arange(len(stretch))]
     spent = (len(around) + len(errors)) * len(state.rows) * horizon_of(problem)
-    better = len(stretch) >= FEWEST + len(space) and found.mean() <= (1.0 - GAIN) * errors[-1].mean()
-    return "better" if better else "no better", spent
+    enough = len(stretch) >= FEWEST + len(space)
+    return enough and bool(found.mean() <= (1.0 - GAIN) * errors[-1].mean()), spent
