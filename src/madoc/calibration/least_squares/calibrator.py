@@ -258,7 +258,7 @@ class LeastSquares:
         """
         shortest = self._unknown(problem)
         first = shortest.init(problem, key)
-        searches = [first, replace(shortest, windows=self.windows or MOST, searches=1).init(problem, key)]
+        searches = [first, replace(shortest, windows=self.windows or MOST, searches=1).init(problem, key, first.rows)]
         one_length = self.horizon is not None or problem.states.placed.any()
         for length in range(LONGER, LONGER if one_length else len(LENGTHS)):
             most = READINGS * len(first.rows) // LENGTHS[length]

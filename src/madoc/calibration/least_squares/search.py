@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome, Plan
+from madoc.calibration.least_squares.telling import telling_first
 from madoc.calibration.least_squares.unknown_starts import SECOND_CHANCES, UnknownStarts
 from madoc.identification import settling
 from madoc.identification.information import SETTLED, sandwich
@@ -124,8 +125,10 @@ class Search:
     search_epochs: int
     tolerance: float
 
-    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
-        """Draw the windows, and put the first search at mid-range, the others at random places.
+    def init(
+        self, problem: CalibrationProblem, key: PRNGKeyArray, first: Int[np.ndarray, " some"] | None = None
+    ) -> SearchState:
+        """Draw the windows, after the `first` if these are given; put one search at mid-range, others at random places.
 
         Raises:
             MadocError: No state is known well enough, no episode is long enough, or there are too few values.
@@ -133,8 +136,10 @@ class Search:
         of_windows, of_starts = jax.random.split(key)
         count = len(problem.simulator.parameters)
         possible = self.starts.possible_rows(problem, self.horizon, self.windows)
-        drawn = min(self.windows, len(possible))
-        rows = possible[generator(of_windows).permutation(len(possible))[:drawn]]
+        rows = possible[generator(of_windows).permutation(len(possible))]
+        if self.starts.unknown:
+            rows = telling_first(problem, rows, self.horizon, self.windows, self.search_windows, first)
+        rows = rows[: self.windows]
         points = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
         points[0] = 0.0
         logged = problem.states
