@@ -14,7 +14,7 @@ from madoc.identification.losses import TUNING, loss_slope, loss_value, scale_of
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.score_tests import Products
-from madoc.identification.settling import with_bases_settled
+from madoc.identification.settling import with_contacts_settled
 from madoc.identification.states import LoggedStates
 from madoc.identification.windows import disjoint_windows, evenly, longest_fit
 from madoc.simulation.base import Simulator
@@ -163,7 +163,7 @@ def fit_windows(
     more at the parameters found, so that outlying readings count little.
     """
     unknown = np.zeros((len(readings), readings.observed[0].size, len(point)))
-    states, simulations = with_bases_settled(simulator, readings, point, states)
+    states, simulations = with_contacts_settled(simulator, readings, point, states)
     spent = simulations * readings.steps
     fit = _settled(simulator, readings, _sloped(simulator, readings, states, point, spent, by_parameters=unknown))
     fit = _sloped_by_parameters(simulator, readings, fit)

@@ -27,6 +27,8 @@ PLACED_ALONE = 3
 """Number of steps of places and speeds that no sensor shows, before all values of an initial state move."""
 RESTARTS = 5
 """Number of times that windows whose residuals are more than noise begin anew, near the guess of their state."""
+ANEW = 2
+"""The same for windows that the model is tested by, of which a few may stay where they are."""
 FARTHEST = 30.0
 """Largest error of a guess in standard errors of the state: that of a velocity that jumps between two positions."""
 BEYOND = 3.0
@@ -183,6 +185,38 @@ def with_bases_settled(
     )
     first = settle(simulator, readings, point, guesses, damping, none, "cauchy")
     after = restart(simulator, readings, point, guesses, first, "cauchy", random)
+    return after.states, after.simulations
+
+
+def with_contacts_settled(
+    simulator: Simulator,
+    readings: Readings,
+    point: Float[np.ndarray, " d"],
+    guesses: Float[np.ndarray, "windows state"],
+) -> tuple[Float[np.ndarray, "windows state"], int]:
+    """Initial states from near which those of single windows can be fitted, and the simulations that it took.
+
+    Where windows begin in contact they settle by differences of all `WIDTHS`, until residuals of nearly all windows are
+    noise, and then begin anew where they are not: what states in wrong minima leave would pass for what the model lacks.
+    """
+    if readings.placed.any():
+        return with_bases_settled(simulator, readings, point, guesses)
+    known, values = guesses[np.isfinite(guesses).all(-1)], readings.observed[0].size
+    if not len(known) or not simulator.contacts(known, simulator.parameters.to_physical(point.clip(-1.0, 1.0))).any():
+        return guesses, 0
+    after, simulations = None, 0
+    for width in WIDTHS:
+        states = guesses if after is None else after.states
+        damping = np.full(len(guesses), FIRST_DAMPING) if after is None else after.damping
+        errors = np.zeros(len(readings.spread)) if after is None else after.errors
+        after = settle(simulator, readings, point, states, damping, width * errors, "cauchy")
+        simulations += after.simulations
+        if after.unexplained(values, "cauchy").mean() <= FEW:
+            return after.states, simulations
+    assert after is not None
+    after = replace(after, simulations=simulations)
+    for again in range(ANEW):
+        after = restart(simulator, readings, point, guesses, after, "cauchy", np.random.default_rng(again))
     return after.states, after.simulations
 
 
