@@ -11,7 +11,7 @@ from madoc.data import stride
 from madoc.identification import noise as sensors
 from madoc.identification.gauss_newton import descend
 from madoc.identification.states import logged_states
-from madoc.identification.windows import evenly
+from madoc.identification.windows import consecutive_rows, evenly
 from madoc.simulation.attitudes import differences
 from madoc.verdict.bench import Bench
 from madoc.verdict.prediction import nearby_best
@@ -34,6 +34,9 @@ _DAMPING = 1e-6
 """Marquardt's damping of a step, relative to the squared lengths of the columns; 0 is none."""
 MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
+BY_NOISE = 0.1
+"""Share in [0, 1] of rows whose contacts are neither those of the row before nor of the row after; with more, noise
+makes them."""
 
 
 def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
@@ -75,6 +78,20 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
 def noise_hides_gain(bench: Bench) -> bool:
     """Whether the best parameters near mid-range predict no better than that, because all errors are those of noise."""
     return hides_gain(_replayed(bench, np.zeros(len(bench.simulator.parameters))).errors)
+
+
+def noise_makes_contacts(bench: Bench) -> bool:
+    """Whether contacts begin or end for a single row so often in the hold-out that noise decides on them, not motion.
+
+    Replays from logged states then err by what contacts make of noise, least where these are soft.
+    """
+    states, rows = logged_states(bench.held_out, bench.simulator.task)
+    counts = bench.simulator.contacts(states[:MOST_ROWS])
+    within = consecutive_rows(bench.held_out, rows)
+    middle = within[1:][np.diff(within) == 1]
+    middle = middle[middle < len(counts) - 1]
+    before, here, after = (counts[middle + shift] for shift in (-1, 0, 1))
+    return bool(len(middle)) and float(((before != here) & (here != after)).mean()) > BY_NOISE
 
 
 class _Replayed(NamedTuple):
