@@ -196,8 +196,8 @@ def with_contacts_settled(
 ) -> tuple[Float[np.ndarray, "windows state"], int]:
     """Initial states from near which those of single windows can be fitted, and the simulations that it took.
 
-    Where windows begin in contact they settle by differences of all `WIDTHS`, until residuals of nearly all windows are
-    noise, and then begin anew where they are not: what states in wrong minima leave would pass for what the model lacks.
+    Where windows begin in contact they settle by differences of all `WIDTHS`, until residuals of nearly all are noise,
+    and then begin anew where they are not: what states in wrong minima leave would pass for what the model lacks.
     """
     if readings.placed.any():
         return with_bases_settled(simulator, readings, point, guesses)
