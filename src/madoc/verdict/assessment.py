@@ -106,7 +106,7 @@ def measured(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.nda
     """
     point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
     bench.tell("predictions of single steps and short windows")
-    noisy = bench.states_known and (noise_makes_contacts(bench) or noise_hides_gain(bench))
+    noisy = bench.states_known and (noise_makes_contacts(bench, point) or noise_hides_gain(bench))
     if bench.states_known and (not noisy or bench.fitted is None):
         return predicted(bench, point, interval)
     if bench.fitted is not None:

@@ -20,6 +20,7 @@ from madoc.verdict.statistics import (
     NEGLIGIBLE,
     beside_random,
     best_of,
+    beyond_noise,
     hides_gain,
     independent_groups,
     prediction_errors,
@@ -80,10 +81,11 @@ def noise_hides_gain(bench: Bench) -> bool:
     return hides_gain(_replayed(bench, np.zeros(len(bench.simulator.parameters))).errors)
 
 
-def noise_makes_contacts(bench: Bench) -> bool:
+def noise_makes_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     """Whether contacts begin or end for a single row so often in the hold-out that noise decides on them, not motion.
 
-    Replays from logged states then err by what contacts make of noise, least where these are soft.
+    Replays from logged states then err by what contacts make of noise, least where these are soft. That is no excuse
+    for an estimate whose errors are far larger than noise.
     """
     states, rows = logged_states(bench.held_out, bench.simulator.task)
     counts = bench.simulator.contacts(states[:MOST_ROWS])
@@ -91,7 +93,10 @@ def noise_makes_contacts(bench: Bench) -> bool:
     middle = within[1:][np.diff(within) == 1]
     middle = middle[middle < len(counts) - 1]
     before, here, after = (counts[middle + shift] for shift in (-1, 0, 1))
-    return bool(len(middle)) and float(((before != here) & (here != after)).mean()) > BY_NOISE
+    if not len(middle) or float(((before != here) & (here != after)).mean()) <= BY_NOISE:
+        return False
+    errors = _replayed(bench, point).errors
+    return not beyond_noise(errors.estimate, errors.noise)
 
 
 class _Replayed(NamedTuple):
