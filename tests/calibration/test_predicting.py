@@ -9,7 +9,7 @@ import pytest
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares
 from madoc.calibration.least_squares import predicting
-from madoc.calibration.least_squares.predicting import Prediction, medians_of_three
+from madoc.calibration.least_squares.predicting import Prediction, medians_of_three, predicts_better
 from madoc.calibration.least_squares.sentences import PREDICTS
 from madoc.data import Disturbance, disturb
 from madoc.identification.information import Uncertainty
@@ -63,18 +63,18 @@ def ended(method, problem):
     return state
 
 
-def prediction(count, scale=1.0):
+def prediction(count, error=1.0):
     """The state of a fit of so many parameters on two windows, at the middle of all ranges."""
-    none, covariance = np.zeros(count), np.zeros((count, count))
-    return Prediction(
-        "under way", np.arange(2), np.zeros((2, 1)), none, none, none, scale, 0.0, 1.0, covariance, epochs=0, rounds=0
-    )
+    none, rows = np.zeros(count), np.arange(2)
+    held = {"rows": rows, "states": np.zeros((2, 1)), "kept": rows >= 0}
+    points = {"first": none, "best": none, "point": none, "covariance": np.zeros((count, count))}
+    return Prediction("under way", **held, **points, error=error, cost=0.0, damping=1.0, epochs=0, rounds=0)
 
 
 def test_windows_last_a_second_and_there_are_none_in_a_log_that_is_too_short(pendulum):
     problem = problem_of(pendulum, log_of(pendulum, TRUTH, 0))
     state = predicting.windows_for(problem)
-    assert predicting.horizon_of(problem) == 50
+    assert predicting.steps_of_a_second(problem) == 50
     assert len(state.rows) == 20 * 3  # of 20 episodes of 200 rows
     assert (np.diff(state.rows) > 50).all()
     short = problem_of(pendulum, log_of(pendulum, TRUTH, 0, 400))
@@ -96,6 +96,44 @@ def test_initial_states_are_fitted_to_the_readings_after_them_and_then_held(pend
     assert epoch.stage == "predicting"
 
 
+def test_a_start_that_a_false_reading_spoils_is_left_out_and_no_reading_is_of_the_next_run(pendulum):
+    log = log_of(pendulum, TRUTH, 0)
+    problem = problem_of(pendulum, log)
+    state, point = predicting.windows_for(problem), pendulum.parameters.to_unit(pendulum.parameters.vector(TRUTH))
+    spoilt = state.rows[7]
+    seen = np.array(problem.dataset.transitions.observation, np.float64)
+    seen[spoilt : spoilt + 4] += 50.0 * problem.typical_change
+    transitions = replace(problem.dataset.transitions, observation=seen, next_observation=np.roll(seen, -1, axis=0))
+    false = CalibrationProblem(replace(problem.dataset, transitions=transitions), problem.simulator)
+    begun, _ = predicting.begun(false, state, point, 10_000)  # longer than a second, to the end of which windows fit
+    assert not begun.kept[7]
+    assert begun.kept.mean() > 0.9
+    assert predicting._residuals(false, begun, point[None]).shape[1] == begun.kept.sum()
+
+
+def test_a_window_that_fails_ends_the_fit_with_the_estimate_so_far(pendulum):
+    problem = problem_of(pendulum, log_of(pendulum, TRUTH, 0))
+    begun, _ = predicting.begun(problem, predicting.windows_for(problem), np.zeros(3), 0)
+    broken = replace(begun, states=np.where(np.arange(60)[:, None] == 3, np.nan, begun.states))
+    after, _ = predicting.step(problem, broken)
+    assert after.progress == "no better"
+    assert predicting.step(problem, replace(broken, rounds=1))[0].progress == "better"
+    np.testing.assert_array_equal(after.best, np.zeros(3))
+
+
+def test_an_estimate_is_better_by_more_than_chance_and_not_in_a_few_windows_alone():
+    before = 1.0 + 0.1 * np.random.default_rng(0).standard_normal(40)
+    noise = 0.1 * np.random.default_rng(1).standard_normal(40)
+    assert predicts_better(0.95 * before, before)
+    assert not predicts_better(0.995 * before, before)  # certain, but not worth it
+    assert not predicts_better(0.99 * before + noise - noise.mean(), before)  # no more than its standard error
+    assert not predicts_better(before, before)
+    few = np.where(np.arange(40) < 12, 0.5, 1.01) * before  # much better in 12 of 40
+    assert few.mean() < 0.9 * before.mean()
+    assert not predicts_better(few, before)
+    assert not predicts_better(np.full(40, np.inf), before)
+
+
 def test_a_false_reading_is_no_median_of_three_and_a_lasting_error_is():
     values = np.array([0.0, 9.0, 0.1, 0.2, 0.3, 0.4, -9.0, 0.5])[:, None]
     np.testing.assert_array_equal(medians_of_three(values)[:, 0], [0.1, 0.2, 0.2, 0.3, 0.3, 0.4])
@@ -106,7 +144,7 @@ def test_squares_are_weighted_so_that_they_sum_up_to_the_errors_and_steps_lower_
     slopes = Linearisation(np.array([[1.0, 1.0], [2.0, -2.0]]), np.array([[[1.0], [1.0]], [[0.0], [2.0]]]))
     weighted = predicting._weighted(slopes)
     np.testing.assert_allclose((weighted.residuals**2).sum(-1), [1.0, 2.0])
-    state = prediction(1, scale=1.5)
+    state = prediction(1, error=1.5)
     # Gradient (1 + 1) / 2 + (0 - 4) / 4 = 0 at the first estimate; at 0.15 the term pulls back by 3 / 0.15.
     np.testing.assert_allclose(predicting._step(state, slopes, 0.0), [0.0], atol=1e-12)
     away = predicting._step(replace(state, point=np.array([0.15])), slopes, 0.0)

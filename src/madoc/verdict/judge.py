@@ -28,7 +28,7 @@ CHATTER = (
 """What an estimate's intervals do not count."""
 EFFECTIVE = (
     "the model leaves more than noise, and other values predict better than those that explain short windows best: it "
-    "lacks something, whose effect the estimates make up for"
+    "seems to lack something, whose effect the estimates make up for"
 )
 CHANCE = 0.01
 """Significance level in [0, 1]: data is rejected where no prediction is better than chance at this level."""

@@ -113,7 +113,7 @@ class LeastSquares:
             stage=stage,
             length=0,
             best=0,
-            prediction=None if self.horizon is not None else predicting.windows_for(problem),
+            prediction=None if self.horizon or self.initial_states else predicting.windows_for(problem),
             finished=0,
         )
 
@@ -143,7 +143,11 @@ class LeastSquares:
     ) -> tuple[LeastSquaresState, Epoch]:
         """Begin the fit for prediction once the searches have ended, if they left more than noise."""
         prediction = state.prediction
-        if not state.finished or prediction is None or not self._leaves_more_than_noise(problem, state):
+        if not state.finished or prediction is None:
+            return state, epoch
+        more, asking = self._leaves_more_than_noise(problem, state)
+        epoch = replace(epoch, control_steps=epoch.control_steps + asking)
+        if not more:
             return state, epoch
         horizon = self._unknown(problem).horizon if state.estimates_starts else 0
         prediction, spent = predicting.begun(problem, prediction, self._fitted(state).point[0], horizon)
@@ -163,7 +167,7 @@ class LeastSquares:
         if state.estimates_starts:
             windows, settled = best.explained, self._unknown(problem).settled(best)
         else:
-            windows, settled = self._known(problem).window_count(best), bool(state.finished)
+            windows, settled = self._known(problem).window_count(best), state.searched
         point = best.point[0 if best.refining else int(np.argmin(best.cost))]
         spread = best
         if state.best and self._with_model_errors(problem, state) is not None:
@@ -332,18 +336,22 @@ class LeastSquares:
         readings = self._unknown(problem, length).horizon + 1
         return noise_alone(state.unknown[length], state.unknown[0], readings)
 
-    def _leaves_more_than_noise(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool:
-        """Whether the model may lack something, so that another estimate may predict better.
+    def _leaves_more_than_noise(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[bool, int]:
+        """Whether the model may lack something, so that another estimate may predict better; also control steps.
 
-        From logged states, which have no noise, that is more than rounding errors; from estimated ones long tails of
-        the residuals, or more than noise on longer windows, whether or not a search on these has settled.
+        From logged states, which have no noise, that is residuals that are alike in consecutive rows, as those of
+        random forces are not; from estimated ones long tails of the residuals, or more than noise on longer windows,
+        whether or not a search on these has settled.
         """
         best = self._fitted(state)
         if not state.estimates_starts:
-            return float(np.sqrt(best.cost[0])) >= sentences.EXACT
+            if float(np.sqrt(best.cost[0])) < sentences.EXACT:
+                return False, 0
+            (before, after), asking = consecutive_residuals(problem, best.point[0], best.rows)
+            return alternation(before, -after) > 0.0, asking
         tried = [length for length in range(LONGER, len(state.unknown)) if state.unknown[length].epochs]
         noise = all(self._noise_alone(problem, state, length) for length in tried)
-        return not noise or sentences.have_long_tails(problem, best)
+        return not noise or sentences.have_long_tails(problem, best), 0
 
     def _with_model_errors(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:
         """Index of the first longer windows, none shorter than the estimate's, that leave more than noise, or None."""
@@ -361,7 +369,7 @@ class LeastSquares:
         about = (sentences.about_estimated_states(problem, best, horizon), *sentences.about_residuals(problem, best))
         if float(best.deviation.max()) < sentences.EXACT:
             return about
-        if state.stage in ("lengthening", "widening") and not state.finished:
+        if state.stage in ("lengthening", "widening") and not state.searched:
             return (*about, sentences.STILL_LENGTHENING)
         longer = self._with_model_errors(problem, state)
         if longer is not None:

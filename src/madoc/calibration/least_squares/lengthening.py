@@ -85,6 +85,11 @@ class LeastSquaresState:
         """Whether the estimate is that of a search with unknown initial states."""
         return self.stage in ("estimated", "lengthening", "widening")
 
+    @property
+    def searched(self) -> bool:
+        """Whether the searches have come to their end, and at most the fit for prediction has not."""
+        return bool(self.finished) or (self.prediction is not None and self.prediction.progress == "under way")
+
 
 def horizon_of(dataset: Dataset, fewest: int, scales: int = 1) -> int:
     """Length in control steps of the first windows with unknown initial states: as many of the robot's time scales.

@@ -18,16 +18,18 @@ from typing import Literal
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS
 from madoc.calibration.least_squares.statistics import touched
+from madoc.calibration.least_squares.unknown_starts import UNLIKE_NOISE
 from madoc.identification import settling
 from madoc.identification.gauss_newton import damped_step, triangle
 from madoc.identification.information import Uncertainty
 from madoc.identification.linearisation import Linearisation, difference_points, linearise
 from madoc.identification.replay import Readings, window_residuals
+from madoc.identification.settling import restart, settle
 from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit, windows_at
 from madoc.types import Epoch
 
@@ -44,12 +46,14 @@ EPOCHS, ROUNDS = 10, 5
 """Largest numbers of steps until an estimate is compared with the one so far, and of estimates that take its place."""
 SETTLED = 1e-3
 """Share in [0, 1] of the cost; after a step that saves less the estimates are compared."""
-STEPS = 6
-"""Number of damped steps of an initial state, which begins where the log says."""
+STEPS, ANEW = 6, 2
+"""Numbers of damped steps of an initial state, which begins where the log says, and of times that it begins anew."""
 FOLDS = 10
 """Number of stretches of the log, each of which is predicted by parameters that were fitted to the others."""
 GAIN = 0.01
 """Share in [0, 1] of the error of prediction, the least that is worth an estimate of its own."""
+MANY = 1.0 / 3.0
+"""Share in [0, 1] of the windows that must be predicted better."""
 _LITTLE = 1e-6
 """Relative damping of the step that leaves a stretch out."""
 _SMALLEST = 1e-100
@@ -64,13 +68,14 @@ class Prediction:
         progress: How far it is: `not begun`, `under way`, or ended with an estimate that is `better` or `no better`.
         rows: First rows of the windows.
         states: Their initial states, held once the fit has begun.
+        kept: Windows whose initial state explains the first readings; the others count for nothing.
         first: The estimate at which it begins, in [-1, 1].
         best: The first one, or the last that predicted better than the one before.
         point: The one that moves.
-        scale: Mean error of the windows at the best one, in typical changes of a channel; 0 before the first step.
+        error: Mean error of the windows at the best one, in typical changes of a channel; 0 before the first step.
         cost: Mean error at the point and the term that keeps it near the best one.
         damping: λ of the next step.
-        covariance: Covariance of the point by what windows differ.
+        covariance: Covariance of the point before the last step, by what windows differ.
         epochs: Number of steps since an estimate was compared.
         rounds: Number of estimates that predicted better.
     """
@@ -78,10 +83,11 @@ class Prediction:
     progress: Progress
     rows: Int[np.ndarray, " windows"]
     states: Float[np.ndarray, "windows state"]
+    kept: Bool[np.ndarray, " windows"]
     first: Float[np.ndarray, " d"]
     best: Float[np.ndarray, " d"]
     point: Float[np.ndarray, " d"]
-    scale: float
+    error: float
     cost: float
     damping: float
     covariance: Float[np.ndarray, "d d"]
@@ -94,16 +100,17 @@ class Prediction:
         return replace(other, covariance=other.covariance + self.covariance + np.outer(shift, shift))
 
 
-def horizon_of(problem: CalibrationProblem) -> int:
+def steps_of_a_second(problem: CalibrationProblem) -> int:
     """Length of the predictions in control steps."""
     return max(3, round(SECONDS / problem.simulator.control_step))
 
 
 def windows_for(problem: CalibrationProblem) -> Prediction | None:
     """The fit before it has begun; None where the log has too few stretches of a second, or where a base is unknown."""
-    count, horizon = len(problem.simulator.parameters), horizon_of(problem)
+    count, horizon = len(problem.simulator.parameters), steps_of_a_second(problem)
     states, rows = problem.states.guesses()
-    most = VALUES // (horizon * problem.simulator.task.observation_size * (1 + 2 * count))
+    size = max(problem.simulator.task.observation_size, states.shape[1])
+    most = VALUES // (horizon * size * max(1 + 2 * count, FOLDS + 1))
     if problem.states.placed.any() or not len(rows_that_fit(problem.dataset, rows, horizon)):
         return None
     chosen = evenly(disjoint_windows(problem.dataset, rows, horizon), most)
@@ -113,10 +120,11 @@ def windows_for(problem: CalibrationProblem) -> Prediction | None:
         progress="not begun",
         rows=rows[chosen],
         states=states[chosen],
+        kept=np.ones(len(chosen), bool),
         first=np.zeros(count),
         best=np.zeros(count),
         point=np.zeros(count),
-        scale=0.0,
+        error=0.0,
         cost=0.0,
         damping=FIRST_DAMPING,
         covariance=np.zeros((count, count)),
@@ -130,20 +138,27 @@ def begun(
 ) -> tuple[Prediction, int]:
     """The fit at an estimate, and the control steps simulated to fit initial states to readings of `horizon` rows.
 
-    With none, states are exact as logged. Where the log shows contacts it ends at once: from states with errors they
-    begin and end at other times.
+    With none, states are exact as logged. Windows whose readings no initial state explains, as where one of the first
+    is false, begin anew, and are left out if that does not help. Where the log shows contacts the fit ends at once:
+    from states with errors they begin and end at other times.
     """
-    if touched(problem, *problem.states.guesses(), state.rows, horizon_of(problem)).any():
+    if touched(problem, *problem.states.guesses(), state.rows, steps_of_a_second(problem)).any():
         return replace(state, progress="no better"), 0
-    states, simulations = state.states, 0
-    if horizon:
-        readings = Readings.at(problem.dataset, problem.states, state.rows, horizon, problem.typical_change)
-        damping, narrow = np.full(len(states), settling.FIRST_DAMPING), np.zeros(len(readings.spread))
-        for _ in range(STEPS):
-            after = settling.settle(problem.simulator, readings, point, states, damping, narrow, "cauchy")
-            states, damping, simulations = after.states, after.damping, simulations + after.simulations
-    at_estimate = replace(state, progress="under way", states=states, first=point, best=point, point=point)
-    return at_estimate, simulations * horizon
+    at_estimate = replace(state, progress="under way", first=point, best=point, point=point)
+    if not horizon:
+        return at_estimate, 0
+    horizon = min(horizon, steps_of_a_second(problem))
+    readings = Readings.at(problem.dataset, problem.states, state.rows, horizon, problem.typical_change)
+    given, narrow = (problem.simulator, readings, point), np.zeros(len(readings.spread))
+    after = settle(*given, state.states, np.full(len(state.rows), settling.FIRST_DAMPING), narrow, "cauchy")
+    for _ in range(STEPS - 1):
+        spent = after.simulations
+        after = settle(*given, after.states, after.damping, narrow, "cauchy")
+        after = replace(after, simulations=after.simulations + spent)
+    for again in range(ANEW):
+        after = restart(*given, state.states, after, "cauchy", np.random.default_rng(again))
+    kept = after.costs <= UNLIKE_NOISE
+    return replace(at_estimate, states=after.states, kept=kept), after.simulations * horizon
 
 
 def step(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, Epoch]:
@@ -151,21 +166,22 @@ def step(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, Ep
     around = difference_points(state.point)
     residuals = _residuals(problem, state, around)
     slopes, errors = linearise(around, residuals), _errors(residuals[0])
-    scale = state.scale or float(errors[np.isfinite(errors)].mean())
-    state = replace(state, scale=scale)
+    spent = (len(around) + len(TRIALS)) * int(state.kept.sum()) * steps_of_a_second(problem)
+    if len(slopes.residuals) < len(errors) or len(errors) < FEWEST + len(state.point):
+        return replace(state, progress=_ended(state)), Epoch({}, spent, stage="predicting")
+    state = replace(state, error=state.error or float(errors.mean()))
     before = _cost(state, state.point, errors)
     steps = [_step(state, slopes, state.damping * factor) for factor in TRIALS]
     tried = _errors(_residuals(problem, state, state.point + np.stack(steps)))
     costs = [_cost(state, state.point + each, error) for each, error in zip(steps, tried, strict=True)]
     best = int(np.argmin(costs))
     helps = costs[best] < before
-    spent = (len(around) + len(steps)) * len(state.rows) * horizon_of(problem)
-    over = state.epochs + 1 >= EPOCHS or not np.isfinite(before)
+    over = state.epochs + 1 >= EPOCHS
     over = over or (helps and costs[best] > (1.0 - SETTLED) * before) or (not helps and state.damping > 1.0)
     state = replace(
         state,
         point=state.point + steps[best] if helps else state.point,
-        cost=costs[best] if helps else min(before, 1.0 / _SMALLEST),
+        cost=costs[best] if helps else before,
         damping=max(1e-10, state.damping * TRIALS[best]) if helps else 1e3 * state.damping,
         covariance=_covariance(state, slopes),
         epochs=state.epochs + 1,
@@ -173,7 +189,7 @@ def step(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, Ep
     if over:
         state, more = _compared(problem, state)
         spent += more
-    metrics = {"residual": min(before, state.cost), "moved": float(np.abs(steps[best]).max() * helps)}
+    metrics = {"residual": min(before, costs[best]), "moved": float(np.abs(steps[best]).max() * helps)}
     return state, Epoch(metrics, spent, stage="predicting")
 
 
@@ -192,7 +208,7 @@ def _residuals(
     problem: CalibrationProblem, state: Prediction, points: Float[np.ndarray, "points d"]
 ) -> Float[np.ndarray, "points windows values"]:
     """Medians of three residuals in typical changes of what is measured; NaN in windows whose simulation failed."""
-    windows = windows_at(problem.dataset, state.states, state.rows, horizon_of(problem))
+    windows = windows_at(problem.dataset, state.states[state.kept], state.rows[state.kept], steps_of_a_second(problem))
     residuals = window_residuals(problem.simulator, windows, points, problem.typical_change)
     of_channels = residuals.reshape(*residuals.shape[:2], windows.steps, -1)[..., : problem.states.measured]
     return medians_of_three(of_channels).reshape(*residuals.shape[:2], -1)
@@ -208,7 +224,7 @@ def _errors(residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray
 def _cost(state: Prediction, point: Float[np.ndarray, " d"], errors: Float[np.ndarray, " windows"]) -> float:
     """The mean error and the term that keeps the point near the best one; infinite if any simulation failed."""
     away = float(((point - state.best) ** 2).sum()) / (len(errors) * REACH**2)
-    return float(errors.mean()) + state.scale * away
+    return float(errors.mean()) + state.error * away
 
 
 def _weighted(slopes: Linearisation) -> Linearisation:
@@ -224,7 +240,7 @@ def _step(state: Prediction, slopes: Linearisation, damping: float) -> Float[np.
     That an error is half of the squares that bound it gives the latter its factor of 2.
     """
     weighted, count = _weighted(slopes), len(state.point)
-    near = np.sqrt(2.0 * state.scale) / REACH
+    near = np.sqrt(2.0 * state.error) / REACH
     rows = np.column_stack([weighted.jacobian.reshape(-1, count), weighted.residuals.reshape(-1)])
     held = np.column_stack([near * np.eye(count), near * (state.point - state.best)])
     factor = triangle(np.concatenate([rows, held]))
@@ -236,7 +252,7 @@ def _covariance(state: Prediction, slopes: Linearisation) -> Float[np.ndarray, "
     weighted, count = _weighted(slopes), len(state.point)
     scores = np.einsum("wv,wvd->wd", weighted.residuals, weighted.jacobian)
     flat = weighted.jacobian.reshape(-1, count)
-    inverse = np.linalg.pinv(flat.T @ flat + 2.0 * state.scale / REACH**2 * np.eye(count), hermitian=True)
+    inverse = np.linalg.pinv(flat.T @ flat + 2.0 * state.error / REACH**2 * np.eye(count), hermitian=True)
     return inverse @ (scores.T @ scores) @ inverse
 
 
@@ -244,28 +260,47 @@ def _compared(problem: CalibrationProblem, state: Prediction) -> tuple[Predictio
     """The state once the point is compared with the best estimate so far, and the control steps simulated."""
     better, spent = _is_better(problem, state)
     if better and state.rounds + 1 < ROUNDS:
-        state = replace(state, scale=0.0, damping=FIRST_DAMPING, epochs=0)
+        state = replace(state, error=0.0, damping=FIRST_DAMPING, epochs=0)
     else:
-        state = replace(state, progress="better" if better or state.rounds else "no better")
+        state = replace(state, progress="better" if better else _ended(state))
     return replace(state, best=state.point, rounds=state.rounds + 1) if better else state, spent
+
+
+def _ended(state: Prediction) -> Progress:
+    """What a fit whose point is no better comes to: the best estimate before it."""
+    return "better" if state.rounds else "no better"
 
 
 def _is_better(problem: CalibrationProblem, state: Prediction) -> tuple[bool, int]:
     """Whether the point predicts better than the best estimate so far, and the control steps simulated.
 
-    Every stretch of the log is predicted by parameters that were fitted to the others, by one Gauss-Newton step from
-    those fitted to all. A point at an end of a range is none where the best one is inside: a wider range would give
-    another one.
+    Every stretch of the log is predicted by parameters that were fitted to the others: the point moved by what leaving
+    the stretch out changes of a Gauss-Newton step. A point at an end of a range is none where the best one is inside: a
+    wider range would give another one.
     """
     space, around = problem.simulator.parameters, difference_points(state.point)
-    if set(space.at_end(state.point)) - set(space.at_end(state.best)):
+    outside = set(space.at_end(state.point)) - set(space.at_end(state.best))
+    if outside or (state.point == state.best).all():
         return False, 0
     residuals = _residuals(problem, state, around)
-    whole = np.isfinite(residuals).all((0, 2))
-    slopes, stretch = linearise(around, residuals), np.arange(int(whole.sum())) * FOLDS // max(1, int(whole.sum()))
-    without = [state.point + _step(state, slopes.of(stretch != each), _LITTLE) for each in np.unique(stretch)]
-    errors = _errors(_residuals(problem, state, np.stack([*without, state.best])))[:, whole]
-    found = errors[stretch, np.arange(len(stretch))]
-    spent = (len(around) + len(errors)) * len(state.rows) * horizon_of(problem)
-    enough = len(stretch) >= FEWEST + len(space)
-    return enough and bool(found.mean() <= (1.0 - GAIN) * errors[-1].mean()), spent
+    slopes = linearise(around, residuals)
+    windows = len(slopes.residuals)
+    spent = (len(around) + FOLDS + 1) * int(state.kept.sum()) * steps_of_a_second(problem)
+    if windows < residuals.shape[1]:
+        return False, spent
+    stretch, whole = np.arange(windows) * FOLDS // windows, _step(state, slopes, _LITTLE)
+    without = [state.point + _step(state, slopes.of(stretch != each), _LITTLE) - whole for each in range(FOLDS)]
+    errors = _errors(_residuals(problem, state, np.stack([*without, state.best]).clip(-1.0, 1.0)))
+    return predicts_better(errors[stretch, np.arange(windows)], errors[-1]), spent
+
+
+def predicts_better(found: Float[np.ndarray, " windows"], before: Float[np.ndarray, " windows"]) -> bool:
+    """Whether errors are smaller by a share that is worth it and by more than their standard error, not in a few alone.
+
+    A window whose start is wrong has errors that are larger than all others' together, and then decides alone.
+    """
+    if not (np.isfinite(found).all() and np.isfinite(before).all()):
+        return False
+    gain = before - found
+    sure = gain.mean() > max(GAIN * before.mean(), gain.std() / np.sqrt(len(gain)))
+    return bool(sure and (gain > 0.0).mean() >= MANY)
