@@ -1,4 +1,4 @@
-"""A last fit for prediction, where the model leaves more than noise: a second ahead, from states that windows fitted.
+"""A last fit for prediction, where the model leaves more than noise: a second ahead, from fitted states.
 
 Each window's free initial state explains a part of what a wrong model gets wrong, so that the parameters that fit
 short windows best are not those that predict best. Here initial states are held where the readings after them put them,
