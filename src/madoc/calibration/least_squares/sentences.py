@@ -22,8 +22,8 @@ STILL_LENGTHENING = (
     "longer windows, or more of them, were under way when it ended: a larger budget may narrow the intervals"
 )
 PREDICTS = (
-    "the model leaves more than noise, so the estimate is the one that predicts motion best over a second; its distance "
-    "from the estimate that fits short windows best counts as an error"
+    "the model leaves more than noise, so the estimate is the one that predicts motion best over a second; its "
+    "distance from the estimate that fits short windows best counts as an error"
 )
 STILL_PREDICTING = (
     "a fit for prediction, as the model leaves more than noise, was under way when it ended: with a larger budget the "
