@@ -36,6 +36,8 @@ from madoc.types import Epoch
 Progress = Literal["not begun", "under way", "better", "no better"]
 SECONDS = 1.0
 """Length of the predictions, the longest of those that a verdict compares besides whole runs."""
+MOST = 200
+"""Largest number of windows: with 24 parameters, those of a real arm, an epoch of 900 takes 20 s and of 200 4 s."""
 VALUES = 30_000_000
 """Largest number of simulated values of an epoch's derivatives, which bounds its memory to a few times 240 MB."""
 REACH = 0.15
@@ -110,7 +112,7 @@ def windows_for(problem: CalibrationProblem) -> Prediction | None:
     count, horizon = len(problem.simulator.parameters), steps_of_a_second(problem)
     states, rows = problem.states.guesses()
     size = max(problem.simulator.task.observation_size, states.shape[1])
-    most = VALUES // (horizon * size * max(1 + 2 * count, FOLDS + 1))
+    most = min(MOST, VALUES // (horizon * size * max(1 + 2 * count, FOLDS + 1)))
     if problem.states.placed.any() or not len(rows_that_fit(problem.dataset, rows, horizon)):
         return None
     chosen = evenly(disjoint_windows(problem.dataset, rows, horizon), most)
