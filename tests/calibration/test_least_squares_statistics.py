@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from madoc import simulation
+from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares
 from madoc.calibration.least_squares.sentences import LONG_TAILS, about_residuals, have_long_tails
 from madoc.calibration.least_squares.statistics import (
@@ -14,13 +14,17 @@ from madoc.calibration.least_squares.statistics import (
     consecutive_residuals,
     outlier_limits,
     steady_cost,
+    telling_first,
 )
 from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE
 from madoc.data import Disturbance, disturb
 from madoc.identification.settling import cost_of_noise
+from own_robots import BOUNCER, BOUNCER_SPEC, write_robot
 from robots import SPRING_TRUTH, recorded, spring
 
 NO_COUNTS = np.zeros(3)
+LEG_TRUTH = {"body_mass.trunk": 2.0, "body_mass.leg": 0.5, "dof_damping.knee": 5.0}
+CONTACT = "  - {field: contact_time, element: foot, low: 0.02, high: 0.1}\n"
 LIMITS = {"least": LIKE_NOISE, "failed": FAILED_WINDOW}
 
 
@@ -163,3 +167,30 @@ def test_readings_of_something_at_rest_do_not_make_the_rounding_of_others_a_long
     residuals = np.repeat([0.1, 0.1, 1.0], 30)[:, None, None] * random.uniform(-1.0, 1.0, (90, 4, 3)) * np.sqrt(3.0)
     assert steady_cost(residuals, spare, contacts, NO_COUNTS, "cauchy") > LONG_TAILS
     assert steady_cost(residuals, spare, contacts, np.ones(3), "cauchy") < 0.5
+
+
+def test_every_other_of_the_windows_searched_first_tells_much(tmp_path):
+    model = BOUNCER.replace('size=".05" pos', 'name="foot" size=".05" pos')
+    spec = BOUNCER_SPEC.replace("max_episode_steps", CONTACT + "max_episode_steps")
+    task = robots.load(write_robot(tmp_path, spec, bouncer=model)).task
+    problem = CalibrationProblem(
+        recorded(task, LEG_TRUTH | {"contact_time.foot": 0.03}, 1200, jax.random.key(0)),
+        simulation.make(task, threads=1),
+    )
+    rows = np.random.default_rng(0).permutation(np.arange(0, 1190, 10))
+    ordered = telling_first(problem, rows, 8, 40, 20)
+    np.testing.assert_array_equal(np.sort(ordered), np.sort(rows))
+    others = ordered[1:20:2]
+    np.testing.assert_array_equal(others, [row for row in rows if row not in ordered[:20:2]][:10])
+    counts = problem.simulator.contacts(problem.states.states)
+    changes = [[len(np.unique(counts[row : row + 9])) > 1 for row in part] for part in (ordered[:20:2], rows)]
+    assert np.mean(changes[0]) > np.mean(changes[1])  # landings and jumps tell of the contact's time constant
+    np.testing.assert_array_equal(telling_first(problem, rows, 8, 40, 20, ordered[:40])[:40], ordered[:40])
+    np.testing.assert_array_equal(telling_first(problem, rows, 8, len(rows), 20), rows)  # all are drawn anyway
+
+
+def test_nothing_changes_without_contacts():
+    task = spring(max_episode_steps=100)
+    problem = CalibrationProblem(recorded(task, SPRING_TRUTH, 400, jax.random.key(0)), simulation.make(task, threads=1))
+    rows = np.random.default_rng(0).permutation(np.arange(0, 390, 10))
+    np.testing.assert_array_equal(telling_first(problem, rows, 8, 20, 10), rows)

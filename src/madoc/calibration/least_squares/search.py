@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome, Plan
-from madoc.calibration.least_squares.telling import telling_first
+from madoc.calibration.least_squares.statistics import telling_first
 from madoc.calibration.least_squares.unknown_starts import SECOND_CHANCES, UnknownStarts
 from madoc.identification import settling
 from madoc.identification.information import SETTLED, sandwich

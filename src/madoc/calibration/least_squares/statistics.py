@@ -5,9 +5,10 @@ from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.data import stride
+from madoc.identification.linearisation import WIDE
 from madoc.identification.losses import NORMAL_MAD, Loss
 from madoc.identification.noise import OUTLIER, channel_noise
-from madoc.identification.replay import window_residuals
+from madoc.identification.replay import Readings, window_residuals
 from madoc.identification.settling import window_costs
 from madoc.identification.windows import consecutive_rows, windows_at
 
@@ -19,6 +20,8 @@ BY_CHANCE = 3.0
 """Standard errors of a correlation, by which the most negative one of several channels may be so by chance."""
 _LARGEST = 3.0
 """Standard deviations of the noise at which residuals are clipped before they are correlated."""
+COMPARED = 6
+"""Number of windows that are compared for each that is drawn; comparing all of a long log would take too long."""
 _SMALLEST = 1e-12
 """Residual in typical changes of a channel; smaller ones are rounding errors."""
 
@@ -179,3 +182,50 @@ def noisy_rows(problem: CalibrationProblem) -> bool:
     """
     loud = problem.noise_by_differences > NOISY_STRIDE * problem.typical_change
     return stride(problem.dataset) > 1 and bool(loud.any())
+
+
+def telling_first(
+    problem: CalibrationProblem,
+    rows: Int[np.ndarray, " windows"],
+    horizon: int,
+    drawn: int,
+    searched: int,
+    first: Int[np.ndarray, " some"] | None = None,
+) -> Int[np.ndarray, " windows"]:
+    """Rows of windows in random order, of which every other of those `searched` first is one that tells most.
+
+    A ball that bounces a few times and then lies still tells of its bounces in a few windows of hundreds. Of those
+    drawn by chance, too few are of these, and what they would tell passes for windows that no initial state explains.
+    The others remain random: windows that tell much are also those whose initial states are hardest to find. Nothing
+    changes where as many are `drawn` as there are, or where the log shows no contact. Those that come `first` are not
+    chosen anew where they are given.
+    """
+    if first is not None:
+        return np.concatenate([first, rows[~np.isin(rows, first)]])
+    compared = rows[: COMPARED * drawn]
+    if drawn >= len(rows) or not touched(problem, *problem.states.guesses(), compared, horizon).any():
+        return rows
+    telling = compared[np.argsort(-_shares(problem, compared, horizon), kind="stable")[: min(drawn, searched) // 2]]
+    others = rows[~np.isin(rows, telling)]
+    pairs = np.stack([telling, others[: len(telling)]], axis=1)
+    return np.concatenate([pairs.ravel(), others[len(telling) :]])
+
+
+def _shares(
+    problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
+) -> Float[np.ndarray, " windows"]:
+    """How much of all that the windows tell of the parameters each of them does, as the sum over all directions.
+
+    This is the leverage of a linear regression, by differences from mid-range that are wide enough to show beside the
+    jumps of contacts. It takes windows · (1 + d) · horizon control steps.
+    """
+    readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
+    guesses = problem.states.states[np.searchsorted(problem.states.rows, rows)]
+    count = len(problem.simulator.parameters)
+    points = np.concatenate([np.zeros((1, count)), WIDE * np.eye(count)])
+    seen = readings.residuals(problem.simulator, points, np.repeat(guesses[None], len(points), axis=0))[:, 0]
+    with np.errstate(invalid="ignore"):
+        changes = np.moveaxis(seen[1:] - seen[0], 0, -1)
+    changes = np.where(np.isfinite(changes).all((1, 2), keepdims=True), changes, 0.0)
+    told = np.einsum("wvd,wve->wde", changes, changes)
+    return np.einsum("wde,ed->w", told, np.linalg.pinv(told.sum(0), hermitian=True))
