@@ -68,7 +68,7 @@ def prediction(count, error=1.0):
     none, rows = np.zeros(count), np.arange(2)
     held = {"rows": rows, "states": np.zeros((2, 1)), "kept": rows >= 0}
     points = {"first": none, "best": none, "point": none, "covariance": np.zeros((count, count))}
-    return Prediction("under way", **held, **points, error=error, cost=0.0, damping=1.0, epochs=0, rounds=0)
+    return Prediction("under way", **held, **points, error=error, damping=1.0, epochs=0, rounds=0)
 
 
 def test_windows_last_a_second_and_there_are_none_in_a_log_that_is_too_short(pendulum):

@@ -166,6 +166,38 @@ def restart(
     )
 
 
+def settled(
+    simulator: Simulator,
+    readings: Readings,
+    point: Float[np.ndarray, " d"],
+    guesses: Float[np.ndarray, "windows state"],
+    widths: tuple[float, ...],
+    anew: int,
+    *,
+    until_noise: bool = False,
+) -> Settled:
+    """Initial states after steps by differences of these widths, in standard errors, and so many new beginnings.
+
+    They end early once residuals of nearly all windows are noise, where that is asked for.
+    """
+    states, damping, errors = guesses, np.full(len(guesses), FIRST_DAMPING), np.zeros(len(readings.spread))
+    simulations = 0
+    for width in widths:
+        after = settle(simulator, readings, point, states, damping, width * errors, "cauchy")
+        states, damping, errors, simulations = (
+            after.states,
+            after.damping,
+            after.errors,
+            simulations + after.simulations,
+        )
+        after = replace(after, simulations=simulations)
+        if until_noise and after.unexplained(readings.observed[0].size, "cauchy").mean() <= FEW:
+            return after
+    for again in range(anew):
+        after = restart(simulator, readings, point, guesses, after, "cauchy", np.random.default_rng(again))
+    return after
+
+
 def with_bases_settled(
     simulator: Simulator,
     readings: Readings,
@@ -178,13 +210,7 @@ def with_bases_settled(
     """
     if not readings.placed.any():
         return guesses, 0
-    random, damping, none = (
-        np.random.default_rng(0),
-        np.full(len(guesses), FIRST_DAMPING),
-        np.zeros(len(readings.spread)),
-    )
-    first = settle(simulator, readings, point, guesses, damping, none, "cauchy")
-    after = restart(simulator, readings, point, guesses, first, "cauchy", random)
+    after = settled(simulator, readings, point, guesses, (0.0,), 1)
     return after.states, after.simulations
 
 
@@ -201,22 +227,10 @@ def with_contacts_settled(
     """
     if readings.placed.any():
         return with_bases_settled(simulator, readings, point, guesses)
-    known, values = guesses[np.isfinite(guesses).all(-1)], readings.observed[0].size
+    known = guesses[np.isfinite(guesses).all(-1)]
     if not len(known) or not simulator.contacts(known, simulator.parameters.to_physical(point.clip(-1.0, 1.0))).any():
         return guesses, 0
-    after, simulations = None, 0
-    for width in WIDTHS:
-        states = guesses if after is None else after.states
-        damping = np.full(len(guesses), FIRST_DAMPING) if after is None else after.damping
-        errors = np.zeros(len(readings.spread)) if after is None else after.errors
-        after = settle(simulator, readings, point, states, damping, width * errors, "cauchy")
-        simulations += after.simulations
-        if after.unexplained(values, "cauchy").mean() <= FEW:
-            return after.states, simulations
-    assert after is not None
-    after = replace(after, simulations=simulations)
-    for again in range(ANEW):
-        after = restart(simulator, readings, point, guesses, after, "cauchy", np.random.default_rng(again))
+    after = settled(simulator, readings, point, guesses, WIDTHS, ANEW, until_noise=True)
     return after.states, after.simulations
 
 
