@@ -66,7 +66,7 @@ def ended(method, problem):
 def prediction(count, error=1.0):
     """The state of a fit of so many parameters on two windows, at the middle of all ranges."""
     none, rows = np.zeros(count), np.arange(2)
-    held = {"rows": rows, "states": np.zeros((2, 1)), "kept": rows >= 0}
+    held = {"rows": rows, "states": np.zeros((2, 1)), "kept": rows >= 0, "noise": 0.0}
     points = {"first": none, "best": none, "point": none, "covariance": np.zeros((count, count))}
     return Prediction("under way", **held, **points, error=error, damping=1.0, epochs=0, rounds=0)
 
@@ -119,6 +119,16 @@ def test_a_window_that_fails_ends_the_fit_with_the_estimate_so_far(pendulum):
     assert after.progress == "no better"
     assert predicting.step(problem, replace(broken, rounds=1))[0].progress == "better"
     np.testing.assert_array_equal(after.best, np.zeros(3))
+
+
+def test_errors_of_noise_alone_end_the_fit(pendulum):
+    """A right model's parameters, a little off, as short windows may tell them less precisely than a second does."""
+    problem = problem_of(pendulum, log_of(pendulum, TRUTH, 0))
+    point = pendulum.parameters.to_unit(pendulum.parameters.vector(TRUTH))
+    for off, progress in ((1e-3, "no better"), (0.2, "under way")):
+        begun, _ = predicting.begun(problem, predicting.windows_for(problem), point + off, 20)
+        assert begun.noise > 0.0
+        assert predicting.step(problem, begun)[0].progress == progress
 
 
 def test_an_estimate_is_better_by_more_than_chance_and_not_in_a_few_windows_alone():

@@ -43,6 +43,8 @@ REACH = 0.15
 """Distance in [-1, 1] from the estimate so far that counts as much as the mean error of one window."""
 LEAST = 0.3
 """Smallest error of a window relative to their mean by which its squares are weighted, in (0, 1]."""
+ABOVE_NOISE = 2.0
+"""Error over a second relative to the sensors' noise, at least 1; up to it noise in starts and readings makes it."""
 EPOCHS, ROUNDS = 10, 5
 """Largest numbers of steps until an estimate is compared with the one so far, and of estimates that take its place."""
 SETTLED = 1e-3
@@ -70,6 +72,7 @@ class Prediction:
         rows: First rows of the windows.
         states: Their initial states, held once the fit has begun.
         kept: Windows whose initial state explains the first readings; the others count for nothing.
+        noise: Root mean square of the sensors' noise in typical changes; 0 where states are exact.
         first: The estimate at which it begins, in [-1, 1].
         best: The first one, or the last that predicted better than the one before.
         point: The one that moves.
@@ -84,6 +87,7 @@ class Prediction:
     rows: Int[np.ndarray, " windows"]
     states: Float[np.ndarray, "windows state"]
     kept: Bool[np.ndarray, " windows"]
+    noise: float
     first: Float[np.ndarray, " d"]
     best: Float[np.ndarray, " d"]
     point: Float[np.ndarray, " d"]
@@ -120,6 +124,7 @@ def windows_for(problem: CalibrationProblem) -> Prediction | None:
         rows=rows[chosen],
         states=states[chosen],
         kept=np.ones(len(chosen), bool),
+        noise=0.0,
         first=np.zeros(count),
         best=np.zeros(count),
         point=np.zeros(count),
@@ -149,16 +154,22 @@ def begun(
     readings = Readings.at(problem.dataset, problem.states, state.rows, horizon, problem.typical_change)
     after = settled(problem.simulator, readings, point, state.states, NARROW, ANEW)
     kept = after.costs <= UNLIKE_NOISE
-    return replace(at_estimate, states=after.states, kept=kept), after.simulations * horizon
+    noise = float(np.sqrt((after.deviation**2).mean()))
+    return replace(at_estimate, states=after.states, kept=kept, noise=noise), after.simulations * horizon
 
 
 def step(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, Epoch]:
-    """Take the best of some damped steps; with the last of a round, the estimate is compared with the one so far."""
+    """Take the best of some damped steps; with the last of a round, the estimate is compared with the one so far.
+
+    Where errors are those of noise there is nothing to make up for, and the fit ends: a second may then tell a right
+    model's parameters more precisely than short windows, which is no sign that it lacks something.
+    """
     around = difference_points(state.point)
     residuals = _residuals(problem, state, around)
     slopes, errors = linearise(around, residuals), _errors(residuals[0])
     spent = (len(around) + len(TRIALS)) * int(state.kept.sum()) * steps_of_a_second(problem)
-    if len(slopes.residuals) < len(errors) or len(errors) < FEWEST + len(state.point):
+    noise_alone = not state.rounds and not state.epochs and float(errors.mean()) <= ABOVE_NOISE * state.noise
+    if noise_alone or len(slopes.residuals) < len(errors) or len(errors) < FEWEST + len(state.point):
         return replace(state, progress=_ended(state)), Epoch({}, spent, stage="predicting")
     state = replace(state, error=state.error or float(errors.mean()))
     before = _cost(state, state.point, errors)
