@@ -186,3 +186,13 @@ class CountingSimulator:
 
         system.roll_out = counted
         return system
+
+
+CELL = """\
+  - task: spring.yaml
+    data: log.npz
+    method: least-squares
+    budget: 400
+    set: {windows: 4}
+"""
+"""A cell of a suite's file: a calibration of some hundredths of a second."""

@@ -1,16 +1,25 @@
 """Rollouts: rows that end start again, time limits truncate, failed rows are counted, nothing leaks across ends."""
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import madoc.tasks
+from madoc.runs.machine import choosable_cores
 from madoc.simulation.cpu import CpuSimulator
 from madoc.simulation.rollout import act, begin, chosen_states, reset_states, roll
 
 KEY = jax.random.key(0)
 OTHER = jax.random.key(1)
+TESTS = Path(__file__).parents[1]
+CORES = choosable_cores()
 
 
 def push(observation, key=None):
@@ -229,3 +238,25 @@ def test_starts(hopper):
     logged = np.arange(12.0).reshape(6, 2)
     drawn = chosen_states(logged)(KEY, 200)
     assert {tuple(row) for row in drawn} == {tuple(row) for row in logged}
+
+
+def calibrated_on(cores):
+    folders = [str(TESTS), str(TESTS.parent / "src")]
+    plain = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    done = subprocess.run(
+        ["taskset", "--cpu-list", ",".join(map(str, cores)), sys.executable, str(TESTS / "calibrating.py"), "wide"],
+        env=plain | {"PYTHONPATH": os.pathsep.join(folders), "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(len(CORES) < 2, reason="this machine has one core, or none to choose")
+def test_same_seed_same_result_at_one_and_two_threads():
+    one, two = calibrated_on(CORES[:1]), calibrated_on(CORES[:2])
+    assert (one["threads"], two["threads"]) == (1, 2)
+    assert one["mean"] == two["mean"]

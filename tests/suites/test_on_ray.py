@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from suite_files import CELL
 
 from madoc.commands.main import main
 from madoc.suites import on_ray
 from madoc.suites.cells import write_plan
 from madoc.suites.claims import claimed, outcome_of
 from madoc.suites.planning import plan_of
+from robots import CELL
 
 ROOT = Path(__file__).parents[2]
 with_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="the extra ray is not installed")

@@ -1,13 +1,13 @@
 import shutil
 
 import pytest
-from suite_files import CELL
 
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
 from madoc.suites import checks
 from madoc.suites.cells import read_plans, write_plan
 from madoc.suites.options import keys_of
 from madoc.suites.planning import plan_of
+from robots import CELL
 
 
 def names(path):

@@ -4,13 +4,13 @@ import csv
 import json
 
 import pytest
-from suite_files import CELL
 
 from madoc.commands.main import main
 from madoc.suites.cells import write_plan
 from madoc.suites.claims import claimed
 from madoc.suites.planning import plan_of
 from madoc.suites.worker import work
+from robots import CELL
 
 
 def told(capsys, *words):

@@ -3,9 +3,9 @@
 import shutil
 
 import pytest
-from suite_files import CELL
 
 from madoc.commands.main import main
+from robots import CELL
 
 GRID = CELL + "    grid:\n"
 

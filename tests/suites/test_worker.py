@@ -5,7 +5,6 @@ import threading
 from dataclasses import replace
 
 import pytest
-from suite_files import CELL
 
 from madoc.errors import MadocError, NotAllowed
 from madoc.pipeline.orders import Permission
@@ -16,6 +15,7 @@ from madoc.suites.claims import MOST_ATTEMPTS, attempts_of, claimed, outcome_of,
 from madoc.suites.planning import plan_of
 from madoc.suites.standing import Standing
 from madoc.suites.worker import work
+from robots import CELL
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """The behaviour policies of `madoc record`: SAC at several stages of its training in each target, shipped as float16.
 
-`benchmarks/train_behaviours.py` trained them, `benchmarks/select_behaviours.py` chose the stages. A quality is
+`benchmarks/behaviours.py` trained them and chose the stages. A quality is
 one stage or several in equal shares: D4RL's `medium` (a third of expert), `medium-replay` (the way up to it),
 `medium-expert` (half and half); NeoRL's `neorl-low`, `neorl-medium`, `neorl-high` (25, 50, 75 % of expert).
 """
