@@ -26,13 +26,9 @@ from madoc.identification.information import (
 )
 from madoc.identification.linearisation import (
     DIFFERENCE,
-    WIDE,
     Linearisation,
-    WindowSlopes,
     difference_points,
     linearise,
-    may_chatter,
-    without_chatter,
 )
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import windows_at
@@ -150,20 +146,6 @@ def test_a_jump_beside_the_point_is_no_slope():
     slope, jump = 2.0 * points[:, 0], np.where(points[:, 0] > 0.5 * DIFFERENCE, 7.0, 0.0)
     found = linearise(points, np.stack([slope, slope + jump, slope - jump], axis=-1)[:, None])
     np.testing.assert_allclose(found.jacobian[0, :, 0], [2.0, 2.0, 2.0])
-
-
-def test_a_slope_of_chatter_is_that_of_a_wide_difference():
-    """All windows have the slope 2; one has jumps of 1 beside it, as large however near the next point is."""
-    wide = difference_points(np.zeros(1), WIDE)
-    jumps = np.array([0.0, 1.0, -1.0])[:, None, None] * np.array([0.0, 0.0, 0.0, 1.0])[None, :, None]
-    narrow, far = (2.0 * points[:, :, None] + jumps for points in (difference_points(np.zeros(1)), wide))
-    by_parameters = np.array([2.0, 2.0, 2.0, 2.0 + 1.0 / DIFFERENCE])[:, None, None]
-    slopes = WindowSlopes(narrow[0], by_parameters, np.zeros((4, 1, 0)), np.ones(4, bool))
-    assert may_chatter(slopes)
-    found = without_chatter(slopes, wide, far)
-    np.testing.assert_allclose(found.by_parameters[:, 0, 0], [2.0, 2.0, 2.0, 2.0 + 1.0 / WIDE])
-    assert (found.chattering, found.more) == (0.25, 3)
-    assert not may_chatter(replace(slopes, by_parameters=np.full((4, 1, 1), 2.0)))
 
 
 def test_windows_that_failed_under_any_parameter_are_left_out_of_the_slopes():

@@ -157,16 +157,6 @@ def test_what_is_hardly_better_at_an_end_or_contradicted_stays_a_mismatch(good, 
     assert judge(replace(lacking, open_loop=())).word == "MODEL_MISMATCH"
 
 
-def test_an_estimate_under_contacts_that_chatter_is_never_calibrated():
-    over = (predicted_over(1.0, 0.4, (0.3, 0.6)),)
-    verdict = judge(replace(PREDICTED, open_loop=over), chattering=True)
-    assert verdict.word == "USABLE" and "contacts chatter" in verdict.sentence
-    assert judge(PREDICTED, chattering=True).word == "NOT_IDENTIFIABLE"
-    assert "not settled" in judge(PREDICTED, chattering=True, settled=False).sentence
-    beyond = changed(PREDICTED, LEFT_OVER)  # errors beyond those of noise, for no reason that is seen
-    assert "contacts chatter" in judge(beyond, chattering=True).sentence
-
-
 def test_an_estimate_that_makes_up_for_what_the_model_lacks_is_never_calibrated():
     over = (predicted_over(1.0, 0.4, (0.3, 0.6)),)
     verdict = judge(replace(PREDICTED, open_loop=over), effective=True)

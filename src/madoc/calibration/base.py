@@ -127,8 +127,6 @@ class Estimate:
             the estimate: least squares until its steps are small, Madoc until its discriminators can have settled.
         long_tails: Whether residuals have longer tails than noise has: the model does not explain some stretches of the
             log, and the intervals do not count that. False where the method does not estimate the noise.
-        chattering: Whether contacts chatter at noisy states, so that derivatives are averages over wide ranges, which
-            the intervals do not count.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
@@ -144,7 +142,6 @@ class Estimate:
     quantile: float = NORMAL_95
     settled: bool = True
     long_tails: bool = False
-    chattering: bool = False
     effective: bool = False
     group_stability: float | None = None
 

@@ -83,7 +83,6 @@ def calibrate(
         combinations=[] if told is None else list(combinations(space, estimate.mean, told, estimate.quantile)),
         settled=estimate.settled,
         long_tails=estimate.long_tails,
-        chattering=estimate.chattering,
         effective=estimate.effective,
         group_stability=estimate.group_stability,
         problem=problem,

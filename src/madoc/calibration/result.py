@@ -66,7 +66,6 @@ class CalibrationResult:
         combinations: Sums and products of parameters that the log tells though it leaves each of them open.
         settled: False where the method can tell that its search is not at its end; its intervals mean nothing before.
         long_tails: Whether residuals have longer tails than noise has, which intervals do not count.
-        chattering: Whether contacts chatter at noisy states, which intervals do not count.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
             groups, 0 for chance; None where the method did not find groups.
@@ -93,7 +92,6 @@ class CalibrationResult:
     combinations: list[Combination] = field(default_factory=list)
     settled: bool = True
     long_tails: bool = False
-    chattering: bool = False
     effective: bool = False
     group_stability: float | None = None
     chosen: str | None = None

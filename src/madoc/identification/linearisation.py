@@ -9,12 +9,6 @@ DIFFERENCE = 1e-4
 """Half width of a central difference in [-1, 1], and width of a one-sided one. Truncation errors are 1e-8 of the third
 derivative and 5e-5 of the second; rounding of next states (1e-16, and the solver's 1e-10 at contacts) divided by it is
 below 1e-6 of a typical derivative."""
-WIDE = 0.4
-"""The same where contacts chatter: over so wide a range the average slope shows beside their jumps (statistical
-linearisation, Gelb 1974, section 6.2)."""
-CHATTER = 10.0
-"""Length of a window's column of derivatives over that of its wide differences, or of most windows, above which it is,
-or may be, of chatter alone. Where a foot touches down it is at most a few times as long."""
 TORN = 0.5
 """Difference of the one-sided derivatives relative to the larger one, above which a value jumps or bends there."""
 
@@ -52,16 +46,12 @@ class WindowSlopes:
         by_parameters: Derivatives by parameters in [-1, 1].
         by_states: Derivatives by the window's own initial state, in standard deviations of each value over the log.
         whole: Windows in which no simulation failed; the others are 0 everywhere.
-        chattering: Share in [0, 1] of the windows' columns by parameters that are of wide differences.
-        more: Simulations of every window that these took.
     """
 
     residuals: Float[np.ndarray, "windows values"]
     by_parameters: Float[np.ndarray, "windows values d"]
     by_states: Float[np.ndarray, "windows values n"]
     whole: Bool[np.ndarray, " windows"]
-    chattering: float = 0.0
-    more: int = 0
 
     @property
     def finite(self) -> Bool[np.ndarray, " windows"]:
@@ -130,34 +120,6 @@ def slopes_of_windows(
         parts = (by_points[0], _differences(points, by_points), by_states)
     residuals, by_parameters, by_states = (np.where(whole[:, None], part, 0.0) for part in parts)
     return WindowSlopes(residuals, np.moveaxis(by_parameters, 0, -1), np.moveaxis(by_states, 0, -1), whole)
-
-
-def may_chatter(slopes: WindowSlopes) -> bool:
-    """Whether some window's derivatives by a parameter are so much larger than most that they may be of chatter."""
-    lengths = np.linalg.norm(slopes.by_parameters[slopes.whole], axis=1)
-    return bool(len(lengths)) and bool((lengths.max(0) > CHATTER * np.quantile(lengths, 0.25, axis=0)).any())
-
-
-def without_chatter(
-    slopes: WindowSlopes, points: Float[np.ndarray, "points d"], residuals: Float[np.ndarray, "points windows values"]
-) -> WindowSlopes:
-    """Derivatives by parameters, those of wide differences in windows where the narrow ones are of chatter.
-
-    Contacts that hold a body up and are stiff turn the smallest change into another sequence of jumps. Its size does
-    not depend on the width of a difference, so that narrow ones are as large as they are short, and say nothing.
-
-    Args:
-        slopes: Derivatives by narrow differences.
-        points: `difference_points` of the width `WIDE`.
-        residuals: Residuals at these.
-    """
-    count = slopes.by_parameters.shape[-1]
-    apart = np.diagonal(points[1 : count + 1] - points[count + 1 :])
-    with np.errstate(invalid="ignore"):
-        wide = np.moveaxis((residuals[1 : count + 1] - residuals[count + 1 :]) / apart[:, None, None], 0, -1)
-    chatters = np.linalg.norm(slopes.by_parameters, axis=1) > CHATTER * np.linalg.norm(wide, axis=1)  # not if it fails
-    by_parameters = np.where(chatters[:, None], wide, slopes.by_parameters)
-    return replace(slopes, by_parameters=by_parameters, chattering=float(chatters.mean()), more=len(points))
 
 
 def _differences(

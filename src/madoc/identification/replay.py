@@ -9,13 +9,10 @@ from jaxtyping import Bool, Float, Int
 from madoc.data.dataset import Dataset, spread_of
 from madoc.identification.linearisation import (
     DIFFERENCE,
-    WIDE,
     WindowSlopes,
     difference_points,
-    may_chatter,
     one_sided_points,
     slopes_of_windows,
-    without_chatter,
 )
 from madoc.identification.states import LoggedStates
 from madoc.identification.windows import Windows, readings_at
@@ -164,7 +161,6 @@ def slopes_at(
     central: bool = True,
     width: Float[np.ndarray, " physical"] | None = None,
     placed_alone: bool = False,
-    chattering: bool = False,
 ) -> list[WindowSlopes]:
     """Residuals and their derivatives around every point's parameters and initial states, in two batches.
 
@@ -173,8 +169,7 @@ def slopes_at(
     `initial_states` only the former, and n is 0. Differences are `DIFFERENCE` wide, those by initial states `width`
     where that is larger, in standard deviations of each value over the log. Derivatives by values of initial states
     that sensors show are 0 where those that are `placed` count alone. It takes points · windows · (1 + 2 d + n) · steps
-    control steps, or (1 + d + n) of one-sided differences. With `chattering` differences by parameters are taken over a
-    wide range where contacts may chatter, as of `linearisation.without_chatter`, for another 1 + 2 d.
+    control steps, or (1 + d + n) of one-sided differences.
     """
     count, windows, size = states.shape
     neighbours = difference_points if central else one_sided_points
@@ -190,26 +185,7 @@ def slopes_at(
         shifted = states[:, None] + shift[:, None]
         by_shifts = np.repeat(by_points[:, :1], len(moving), axis=1)
         by_shifts[:, moving] = readings.residuals(simulator, points, shifted.reshape(count, -1, size))
-    found = [slopes_of_windows(*parts, widths) for parts in zip(around, by_points, by_shifts, strict=True)]
-    if not chattering:
-        return found
-    return [
-        _without_chatter(simulator, readings, *each) if may_chatter(each[0]) else each[0]
-        for each in zip(found, points, states, strict=True)
-    ]
-
-
-def _without_chatter(
-    simulator: Simulator,
-    readings: Readings,
-    slopes: WindowSlopes,
-    point: Float[np.ndarray, " d"],
-    states: Float[np.ndarray, "windows state"],
-) -> WindowSlopes:
-    """`linearisation.without_chatter`, with what it needs simulated."""
-    wide = difference_points(point, WIDE)
-    residuals = readings.residuals(simulator, wide, np.repeat(states[None], len(wide), axis=0))[:, 0]
-    return without_chatter(slopes, wide, residuals)
+    return [slopes_of_windows(*parts, widths) for parts in zip(around, by_points, by_shifts, strict=True)]
 
 
 def _observations(

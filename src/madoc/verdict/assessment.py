@@ -82,7 +82,6 @@ def assess(
         holdout,
         settled=result.settled,
         long_tails=result.long_tails,
-        chattering=result.chattering,
         effective=result.effective,
         combinations=widened.combinations,
     )

@@ -21,11 +21,6 @@ ASSUMED_BASE = (
     "no sensor shows where the base is and how fast it moves: both were taken from contacts that stand still, "
     "which was not tested; log the base by motion capture, for a while at least, to be sure of the values"
 )
-CHATTER = (
-    "contacts chatter when they are simulated from states as noisy as the log's, so that parameters are known less "
-    "well than their intervals say; soften the contacts of the model, or log with less noise what is near the ground"
-)
-"""What an estimate's intervals do not count."""
 EFFECTIVE = (
     "the model leaves more than noise, and other values predict better than those that explain short windows best: it "
     "seems to lack something, whose effect the estimates make up for"
@@ -46,7 +41,6 @@ def judge(
     *,
     settled: bool = True,
     long_tails: bool = False,
-    chattering: bool = False,
     effective: bool = False,
     combinations: Sequence[Combination] = (),
 ) -> Verdict:
@@ -54,22 +48,18 @@ def judge(
 
     What the model lacks makes an estimate `USABLE` where it predicts much better than the model as given, and else a
     mismatch; one of a search that had not settled is `USABLE` there too, and else no improvement. A log that is too
-    short to tell whether the model lacks a term, or tells no states, leaves its parameters open. Where contacts chatter
-    and errors are those of noise, tests of terms say nothing.
+    short to tell whether the model lacks a term, or tells no states, leaves its parameters open.
 
     Args:
         holdout: What the hold-out says of the estimate.
         settled: Whether the search that led to it came to its end.
         long_tails: Whether its residuals have longer tails than noise has.
-        chattering: Whether contacts chattered in its search, so that its intervals are too narrow.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         combinations: What the log tells of parameters that it leaves open.
     """
     refused = _rejected(holdout) or contradicted(holdout)
     if refused:
         return refused
-    if chattering and settled and explains_all(holdout):
-        return _not_certain(holdout, CHATTER)
     lacks = lacking(holdout, settled=settled, long_tails=long_tails)
     if lacks:
         return (_usable(holdout, lacks) if settled else None) or lacks
@@ -79,7 +69,6 @@ def judge(
         or (None if settled else _unsettled(holdout))
         or _untested(holdout)
         or _with_an_assumed_base(holdout)
-        or (_not_certain(holdout, CHATTER) if chattering else None)
         or (_not_certain(holdout, EFFECTIVE) if effective and numerical(holdout) is None else None)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and {_how_sure(holdout)}")
     )
@@ -225,10 +214,18 @@ def _improved_later(holdout: Predicted | Fitted) -> bool:
     return any(np.mean(ratios) <= 1.0 - GAINED for ratios in moving if ratios)
 
 
+def _certainly_later(holdout: Predicted | Fitted) -> bool:
+    """Whether predictions over some time are certainly better than those of the model as given, and over none worse."""
+    enough = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
+    worse = any(each.relative_interval[0] > 1.0 for each in enough)
+    return not worse and any(each.relative_interval[1] < 1.0 for each in enough)
+
+
 def _no_better_errors(holdout: Predicted | Fitted) -> str:
     """Why an estimate is no improvement by its prediction errors; empty if it is one.
 
-    A small gain is one as well if it is significant and leaves noise alone, which then is most of any error.
+    A small gain is one as well if it is significant and leaves noise alone, which then is most of any error; and one
+    that is not significant, if it leaves noise alone and predictions over longer times are certainly better.
     """
     errors, only_noise = holdout.errors, beats_mid_range(holdout) and explains_all(holdout)
     if errors.nearby_relative > 1.0 - WORTH_GAINING and not only_noise:
@@ -237,7 +234,8 @@ def _no_better_errors(holdout: Predicted | Fitted) -> str:
             f"hold-out ({change_of(errors)})"
         )
     gained = (1.0 - errors.relative) / (1.0 - errors.nearby_relative)
-    if errors.relative_interval[1] < 1.0 and gained >= GAINED:
+    certain = errors.relative_interval[1] < 1.0 or (explains_all(holdout) and _certainly_later(holdout))
+    if certain and gained >= GAINED:
         return ""
     return (
         f"{_how_small(errors)}, where parameters nearby leave {in_percent(errors.nearby_relative)}: the search is not "

@@ -7,18 +7,17 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
-from madoc.calibration.least_squares import predicting, sentences
+from madoc.calibration.least_squares import filtering, predicting, sentences
+from madoc.calibration.least_squares.filtering import Found
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.lengthening import (
     LENGTHS,
     LONGER,
     OF_BASES,
     READINGS,
-    WIDER,
     LeastSquaresState,
     Stage,
     begun,
-    ended,
     enough,
     failed,
     finished,
@@ -28,7 +27,6 @@ from madoc.calibration.least_squares.lengthening import (
     lengthened,
     longest_first,
     noise_alone,
-    precise,
     tells_more,
     with_search,
 )
@@ -46,8 +44,6 @@ LOGGED_HORIZON = 1
 """Length in control steps of a window from a logged state: noise of the state disturbs the first step least."""
 WINDOWS: dict[InitialStates, int] = {"logged": 1000, "estimated": 100}
 """Largest number of windows in the end."""
-MOST = 1000
-"""Largest number of windows with estimated initial states where contacts forbid longer ones, which would tell more."""
 SEARCH_WINDOWS: dict[InitialStates, int] = {"logged": 64, "estimated": 24}
 """Largest number of windows while searching."""
 STARTING_STRIDES = 1
@@ -66,7 +62,8 @@ class LeastSquares:
     its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
     has settled, windows become nine times as long, by way of three times where the longest show contacts or fail, while
     that narrows the intervals and residuals remain noise: where motion is smooth, long windows hold more information,
-    and they show model errors. Where contacts forbid longer windows, there are ten times as many of them in the end. By
+    and they show model errors. Where most windows show contacts and states are measured, an ensemble filter takes the
+    place of initial states (`filtering`). By
     default states are estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of
     consecutive rows alternate as noise makes them: a reading that is too high makes the step to it look too long and
     the step from it too short.
@@ -76,8 +73,7 @@ class LeastSquares:
         horizon: Length of a window in control steps; the observation after each of them counts. None is 1 from logged
             states, and with estimated ones `horizon_of` the data, then 9 or 3 times as many.
         loss: `linear`, or a robust one (`huber`, `soft-l1`, `cauchy`) whose scale follows the residuals.
-        windows: Largest number of windows. None is 1000 from logged states, 100 with estimated ones, or
-            1000 where contacts forbid longer windows.
+        windows: Largest number of windows. None is 1000 from logged states, and 100 with estimated ones.
         searches: Number of points to search from: mid-range, then random ones. The best goes on.
         search_windows: Largest number of windows while searching. None is 64 from logged states, else 24.
         search_epochs: Largest number of epochs of searching, which ends once the best search has settled.
@@ -107,13 +103,19 @@ class LeastSquares:
         """
         problem.require_pairs()
         stage = self._first_stage(problem)
+        chosen = self.horizon is not None or self.initial_states is not None
+        filtered = None if chosen else filtering.of_contacts(problem, named_key(key, "ensembles"))
+        if stage == "estimated" and filtered is not None:
+            stage = "filtering"
+        fits_starts = stage != "logged" and filtered is None
         return LeastSquaresState(
-            known=None if stage == "estimated" else self._known(problem).init(problem, key),
-            unknown=() if stage == "logged" else self._all_lengths(problem, named_key(key, "unknown starts")),
+            known=None if stage in ("estimated", "filtering") else self._known(problem).init(problem, key),
+            unknown=self._all_lengths(problem, named_key(key, "unknown starts")) if fits_starts else (),
             stage=stage,
             length=0,
             best=0,
-            prediction=None if self.horizon or self.initial_states else predicting.windows_for(problem),
+            filtered=filtered,
+            prediction=None if chosen else predicting.windows_for(problem),
             finished=0,
         )
 
@@ -122,6 +124,10 @@ class LeastSquares:
         if state.prediction is not None and state.prediction.progress == "under way":
             prediction, epoch = predicting.step(problem, state.prediction)
             state = replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
+        elif state.stage == "filtering":
+            assert state.filtered is not None
+            by_filter, epoch = filtering.step(problem, state.filtered, self.loss)
+            state = replace(state, filtered=by_filter, finished=int(by_filter.settled))
         elif state.estimates_starts:
             search, epoch = self._unknown(problem, state.length).step(problem, state.unknown[state.length])
             state = self._after_unknown(problem, with_search(state, state.length, search))
@@ -134,8 +140,8 @@ class LeastSquares:
             state, epoch = self._then_predicting(problem, state, epoch)
         if not state.finished:
             return state, epoch
-        steps = self._fitted(state).epochs
-        converged = f"after {steps} iterations on all windows another one would hardly change any estimate"
+        steps = state.filtered.epochs if state.filtered and state.stage == "filtering" else self._fitted(state).epochs
+        converged = f"after {steps} iterations another one would hardly change any estimate"
         return state, replace(epoch, converged=converged)
 
     def _then_predicting(
@@ -155,36 +161,49 @@ class LeastSquares:
         return state, replace(epoch, control_steps=epoch.control_steps + spent)
 
     def _fitted(self, state: LeastSquaresState) -> SearchState:
-        """The search that has the estimate, but for one that predicts better."""
+        """The search with windows of fitted or known states that has the estimate, but for one that predicts better."""
         if state.estimates_starts:
             return state.unknown[state.best]
         assert state.known is not None
         return state.known
 
-    def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:
-        """The best search's point, with its sandwich covariance and intervals of Student's t."""
-        space, best = problem.simulator.parameters, self._fitted(state)
+    def _found(self, problem: CalibrationProblem, state: LeastSquaresState) -> Found:
+        """What the search in progress, or the best one, has found."""
+        if state.stage == "filtering":
+            assert state.filtered is not None
+            return state.filtered.found
+        best = self._fitted(state)
         if state.estimates_starts:
             windows, settled = best.explained, self._unknown(problem).settled(best)
         else:
             windows, settled = self._known(problem).window_count(best), state.searched
-        point = best.point[0 if best.refining else int(np.argmin(best.cost))]
         spread = best
         if state.best and self._with_model_errors(problem, state) is not None:
             # Model errors bias all lengths, and only the wide intervals of the shortest may cover that.
             spread = state.unknown[0]
             windows = spread.explained
-        uncertainty = sandwich(spread.bread, spread.meat)
+        return Found(
+            point=best.point[0 if best.refining else int(np.argmin(best.cost))],
+            uncertainty=sandwich(spread.bread, spread.meat),
+            windows=windows,
+            settled=settled,
+            long_tails=settled and state.estimates_starts and sentences.have_long_tails(problem, best),
+        )
+
+    def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:
+        """The best search's point, with its sandwich covariance and intervals of Student's t."""
+        space, found = problem.simulator.parameters, self._found(problem, state)
+        point, uncertainty = found.point, found.uncertainty
         prediction, progress = state.prediction, state.prediction.progress if state.prediction else "not begun"
         if prediction is not None and progress == "better":
             point, uncertainty = prediction.best, prediction.of_both(uncertainty)
         half = (space.high - space.low) / 2.0
         mean = space.to_physical(point)
         covariance = half[:, None] * uncertainty.covariance * half
-        errors = quantile(windows, len(space))
+        errors = quantile(found.windows, len(space))
         width = half * errors * np.sqrt(np.diag(uncertainty.covariance))
         interval = np.clip(np.stack([mean - width, mean + width], axis=-1), space.low[:, None], space.high[:, None])
-        searches = (*(() if state.known is None else (state.known,)), *state.unknown)
+        searches = (each for each in (state.known, state.filtered, *state.unknown) if each is not None)
         return Estimate(
             mean=mean,
             std=np.sqrt(np.diag(covariance)),
@@ -193,7 +212,7 @@ class LeastSquares:
             warnings=(
                 *identifiability(uncertainty, space.names),
                 *at_end_of_range(point, space),
-                *(() if settled else (sentences.NOT_SETTLED,)),
+                *(() if found.settled else (sentences.NOT_SETTLED,)),
                 *self._about_states(problem, state),
                 *((sentences.PREDICTS,) if progress == "better" else ()),
                 *((sentences.STILL_PREDICTING,) if progress == "under way" else ()),
@@ -201,9 +220,8 @@ class LeastSquares:
             covariance=covariance,
             interval=interval,
             quantile=errors,
-            settled=settled,
-            long_tails=settled and state.estimates_starts and sentences.have_long_tails(problem, best),
-            chattering=bool(state.estimates_starts and best.chattering),
+            settled=found.settled,
+            long_tails=found.long_tails,
             effective=progress == "better",
         )
 
@@ -213,10 +231,12 @@ class LeastSquares:
         if state.known is not None:
             epochs = 0 if state.stage == "starting" else refining_epochs
             steps += self._known(problem).whole_run(problem, state.known, epochs)
+        if state.filtered is not None and state.stage in ("starting", "filtering"):
+            steps += filtering.whole_run(problem, state.filtered)
         if state.stage != "undecided":
             for length, search in enumerate(state.unknown):
                 skipped = LONGER <= length < len(state.unknown) - 1 and longest_first(state.unknown)
-                if (skipped and not search.epochs) or (length == WIDER and state.stage != "widening"):
+                if skipped and not search.epochs:
                     continue
                 steps += self._unknown(problem, length).whole_run(problem, search, refining_epochs)
         return steps
@@ -255,19 +275,17 @@ class LeastSquares:
         return Search(starts, self.loss, horizon, windows, searches, search_windows, self.search_epochs, self.tolerance)
 
     def _all_lengths(self, problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[SearchState, ...]:
-        """Searches on few and many of the shortest windows, and on every length that the episodes are long enough for.
+        """Searches on the shortest windows, and on every length that the episodes are long enough for.
 
         If `horizon` is given, there is one length, and where sensors do not show where a base is: longer windows hold
         more contacts that begin and end, and would tell little more.
         """
-        shortest = self._unknown(problem)
-        first = shortest.init(problem, key)
-        searches = [first, replace(shortest, windows=self.windows or MOST, searches=1).init(problem, key, first.rows)]
+        first = self._unknown(problem).init(problem, key)
+        searches = [first]
         one_length = self.horizon is not None or problem.states.placed.any()
         for length in range(LONGER, LONGER if one_length else len(LENGTHS)):
             most = READINGS * len(first.rows) // LENGTHS[length]
-            shorter = searches[-1] if length > LONGER else first
-            longer = lengthened(problem, shorter, self._unknown(problem, length).horizon, most)
+            longer = lengthened(problem, searches[-1], self._unknown(problem, length).horizon, most)
             if longer is None:
                 break
             searches.append(longer)
@@ -294,8 +312,6 @@ class LeastSquares:
     def _after_unknown(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
         """Go on to longer windows once a search has settled, while they narrow the intervals.
 
-        At contacts, where a search takes longest, none follows the first if that is precise.
-
         Where the log shows no contact in the longest, these come first: motion is smooth, and they mostly serve. Where
         they do not, shorter ones have their turn, and then the longest again unless they have settled.
 
@@ -314,21 +330,19 @@ class LeastSquares:
             lost = not last and hopeless(search, searches[0], searches[state.best])
             lost = lost or search.epochs >= self.search_epochs
             return failed(state) if length >= LONGER and lost and not search.waiting else state
-        if length == WIDER:
-            return finished(state, WIDER)
         if length and not self._noise_alone(problem, state, length):
             if search.touching.any():
-                return ended(state, state.best if search.rough else 0)
+                return finished(state, state.best if search.rough else 0)
             return finished(state, LONGER) if length == LONGER else failed(state)
         if length and not tells_more(search, searches[state.best]):
             return failed(state)
-        if float(search.deviation.max()) < sentences.EXACT or (not length and search.rough and precise(search)):
+        if float(search.deviation.max()) < sentences.EXACT:
             return finished(state, length)
-        following = max(length + 1, LONGER)
+        following = length + 1
         if not length and longest_first(searches) and enough(searches[-1], search):
             following = len(searches) - 1
         if following == len(searches) or self._unknown(problem).settled(searches[following]):
-            return ended(state, length)
+            return finished(state, length)
         return gone_on(replace(state, best=length), following)
 
     def _noise_alone(self, problem: CalibrationProblem, state: LeastSquaresState, length: int) -> bool:
@@ -363,13 +377,16 @@ class LeastSquares:
 
     def _about_states(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
         """Sentences on estimated initial states, unless the user asked for them."""
+        if state.stage == "filtering":
+            assert state.filtered is not None
+            return sentences.about_filtered_states(problem, state.filtered)
         if not state.estimates_starts or self.initial_states is not None:
             return ()
         best, horizon = state.unknown[state.best], self._unknown(problem, state.best).horizon
         about = (sentences.about_estimated_states(problem, best, horizon), *sentences.about_residuals(problem, best))
         if float(best.deviation.max()) < sentences.EXACT:
             return about
-        if state.stage in ("lengthening", "widening") and not state.searched:
+        if state.stage == "lengthening" and not state.searched:
             return (*about, sentences.STILL_LENGTHENING)
         longer = self._with_model_errors(problem, state)
         if longer is not None:

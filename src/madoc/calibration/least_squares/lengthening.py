@@ -14,19 +14,20 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.least_squares.filtering import FilterState
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING
 from madoc.calibration.least_squares.predicting import Prediction
-from madoc.calibration.least_squares.search import SearchState, epochs_of_states
+from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Dataset
 from madoc.identification.information import half_width, sandwich
 from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
-Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening", "widening"]
-LENGTHS = (1, 1, 3, 9)
-"""Length of the windows of each search, relative to the first's; the second has more windows."""
-WIDER, LONGER = 1, 2
-"""Indices of the search on more windows of the first length, and of the first one on longer windows."""
+Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening", "filtering"]
+LENGTHS = (1, 3, 9)
+"""Length of the windows of each search, relative to the first's."""
+LONGER = 1
+"""Index of the first search on longer windows."""
 SHORTEST = 3
 """Smallest length of the first windows in control steps: shorter ones hold little information besides their initial
 state."""
@@ -44,12 +45,8 @@ FIRST_STEPS = 3
 inexact."""
 LEFT_OUT = 0.1
 """Share in [0, 1] of windows; longer windows are refused if more than this share of them is newly unexplained."""
-PRECISE = 5e-3
-"""Half of a 95 % interval as a share of the parameter's range, up to which an estimate is precise."""
 CHANCE = 3.0
 """Autocorrelation in its standard errors under white noise; above it residuals are not white."""
-MORE = 2
-"""Smallest ratio of the numbers of windows for which more of the shortest ones are worth a search of their own."""
 _SMALLEST = 1e-100
 
 
@@ -60,14 +57,16 @@ class LeastSquaresState:
 
     Attributes:
         known: The search from logged states; None where they cannot be rebuilt.
-        unknown: Searches with unknown initial states: on the shortest windows, on more of these, and on longer and
-            longer ones; none are needed with stage `logged`.
+        unknown: Searches with unknown initial states: on the shortest windows, and on longer and longer
+            ones; none are needed with stage `logged`.
         stage: `logged`: from logged states, to the end. `undecided`: from logged states, until residuals show whether
             these are noisy. `starting`: from logged states, to find parameters for `estimated` to begin at.
             `estimated`: with unknown initial states on the shortest windows. `lengthening`: the same on longer ones.
-            `widening`: the same on more windows of the shortest length.
+            `filtering`: by an ensemble filter.
         length: Index of the unknown search in progress.
         best: Index of the unknown search that has the estimate.
+        filtered: The search by an ensemble filter, which takes the place of those with unknown initial states where
+            most windows show contacts; else None.
         prediction: The fit for prediction, the last; None where the log does not serve for one.
         finished: 1 once the next step would be too small to matter, else 0.
     """
@@ -77,13 +76,14 @@ class LeastSquaresState:
     stage: Stage
     length: int
     best: int
+    filtered: FilterState | None
     prediction: Prediction | None
     finished: int
 
     @property
     def estimates_starts(self) -> bool:
         """Whether the estimate is that of a search with unknown initial states."""
-        return self.stage in ("estimated", "lengthening", "widening")
+        return self.stage in ("estimated", "lengthening")
 
     @property
     def searched(self) -> bool:
@@ -137,25 +137,8 @@ def continued(longer: SearchState, shorter: SearchState) -> SearchState:
         state_errors=shorter.state_errors,
         damping=np.full_like(longer.damping, FIRST_DAMPING),
         state_damping=np.full_like(longer.state_damping, FIRST_DAMPING),
-        chattering=shorter.chattering,
-        waiting=epochs_of_states(shorter.chattering),
+        waiting=UnknownStarts.waiting,
         epochs=0,
-    )
-
-
-def widened(wider: SearchState, first: SearchState) -> SearchState:
-    """The search on more windows with the parameters of the first one, and its initial states of the same windows."""
-    states = wider.states.copy()
-    states[0, : len(first.rows)] = first.states[0]
-    return replace(
-        wider,
-        point=first.point[:1].copy(),
-        states=states,
-        state_errors=first.state_errors,
-        rough=first.rough,
-        chattering=first.chattering,
-        refining=1,
-        waiting=epochs_of_states(first.chattering),
     )
 
 
@@ -189,12 +172,6 @@ def noise_alone(longer: SearchState, first: SearchState, readings: int) -> bool:
     return quiet and longer.autocorrelation <= CHANCE / math.sqrt(max(1, longer.explained * readings))
 
 
-def precise(search: SearchState) -> bool:
-    """Whether the interval of every parameter is so narrow that more windows are not worth their time."""
-    width = half_width(sandwich(search.bread, search.meat).covariance, search.explained)
-    return bool((0.5 * width <= PRECISE).all())
-
-
 def tells_more(longer: SearchState, shorter: SearchState) -> bool:
     """Whether as many longer windows are explained, and intervals are narrower, on average over parameters."""
     fewest = FEWEST + longer.point.shape[1]
@@ -207,7 +184,9 @@ def tells_more(longer: SearchState, shorter: SearchState) -> bool:
 
 
 def begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
-    """The stage of unknown initial states, begun at the best point of the search from logged ones."""
+    """The stage after logged initial states where these are noisy, begun at the best point of the search from them."""
+    if state.filtered is not None:
+        return replace(state, filtered=replace(state.filtered, point=known.point[0].copy()), stage="filtering")
     first = replace(state.unknown[0], point=known.point[:1].copy())
     return replace(with_search(state, 0, first), stage="estimated")
 
@@ -221,7 +200,7 @@ def failed(state: LeastSquaresState) -> LeastSquaresState:
     """The state after a search on longer windows in vain: the next shorter ones begin, unless they had their turn."""
     shorter = state.length - 1
     if shorter < LONGER or state.unknown[shorter].epochs:
-        return ended(state, state.best)
+        return finished(state, state.best)
     return gone_on(state, shorter)
 
 
@@ -229,16 +208,8 @@ def gone_on(state: LeastSquaresState, length: int) -> LeastSquaresState:
     """The state in which windows of this length begin where the best search is, or the end if too few are explained."""
     best, longer = state.unknown[state.best], state.unknown[length]
     if not enough(longer, best):
-        return ended(state, state.best)
+        return finished(state, state.best)
     return replace(with_search(state, length, continued(longer, best)), stage="lengthening", length=length)
-
-
-def ended(state: LeastSquaresState, best: int) -> LeastSquaresState:
-    """The end of lengthening; if only the shortest windows are explained, as at contacts, more of them follow."""
-    first, wider = state.unknown[:LONGER]
-    if best or not first.rough or len(wider.rows) < MORE * len(first.rows):
-        return finished(state, best)
-    return replace(with_search(state, WIDER, widened(wider, first)), stage="widening", best=0, length=WIDER)
 
 
 def finished(state: LeastSquaresState, best: int) -> LeastSquaresState:

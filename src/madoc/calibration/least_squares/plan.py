@@ -37,8 +37,6 @@ class Plan:
         exact: Whether residuals are rounding errors, so that their size cannot show whether initial states still move.
         left_out: Share of the windows that the cost does not count.
         steady_cost: Cost of the windows in which no contact begins or ends; 0 while searching and for known states.
-        chattering: Share in [0, 1] of the derivatives that had to be of wide differences.
-        more: Simulations of every window that these took.
     """
 
     point: Float[np.ndarray, " d"]
@@ -57,8 +55,6 @@ class Plan:
     exact: bool = True
     left_out: float = 0.0
     steady_cost: float = 0.0
-    chattering: float = 0.0
-    more: int = 0
 
     def comparable(self, cost: float) -> float:
         """A cost in typical changes, by which searches are compared; a window left out adds a whole change."""

@@ -31,13 +31,8 @@ step, which moves the parameters by about as much."""
 FOUND = (0.5, 0.9)
 """Shares in [0, 1]. If narrowing differences and restarts leave at most this share of the unexplained windows, or of
 the size of all residuals, those windows lacked an initial state, not a better model."""
-WITHOUT_RESTARTS = 2
-"""Number of steps of initial states that a search on all windows begins with where contacts chatter."""
 FIRST_STEPS = 2
 """Number of steps of initial states at contacts with whose result those of the following steps are compared."""
-CHATTERING = 0.1
-"""Share in [0, 1] of the derivatives that are of contacts that chatter; with more, costs chatter too and hide what a
-small step gains, and windows that begin anew end no better."""
 LEAST_STEP = 5e-3
 """Step in [-1, 1], a quarter of a percent of a range; where sensors do not show where a base is, none smaller follows:
 a few of its windows end in another contact after each."""
@@ -78,7 +73,6 @@ class SearchState:
             of all windows' residuals in typical changes.
         rough: 1 where wide differences and restarts have found initial states, as at contacts: each step of the
             parameters is then followed by several of the states; else 0.
-        chattering: 1 where contacts chatter: steps are then as if `rough`, without restarts; else 0.
         waiting: Number of epochs to come in which only initial states move.
         epochs: Number of epochs of this stage so far, those of waiting not counted.
         failures: Number of windows whose simulation failed.
@@ -103,7 +97,6 @@ class SearchState:
     settled_at: Float[np.ndarray, " d"]
     missed: tuple[float, float]
     rough: int
-    chattering: int
     waiting: int
     epochs: int
     failures: int
@@ -125,10 +118,8 @@ class Search:
     search_epochs: int
     tolerance: float
 
-    def init(
-        self, problem: CalibrationProblem, key: PRNGKeyArray, first: Int[np.ndarray, " some"] | None = None
-    ) -> SearchState:
-        """Draw the windows, after the `first` if these are given; put one search at mid-range, others at random places.
+    def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
+        """Draw the windows; put one search at mid-range, others at random places.
 
         Raises:
             MadocError: No state is known well enough, no episode is long enough, or there are too few values.
@@ -138,7 +129,7 @@ class Search:
         possible = self.starts.possible_rows(problem, self.horizon, self.windows)
         rows = possible[generator(of_windows).permutation(len(possible))]
         if self.starts.unknown:
-            rows = telling_first(problem, rows, self.horizon, self.windows, self.search_windows, first)
+            rows = telling_first(problem, rows, self.horizon, self.windows, self.search_windows)
         rows = rows[: self.windows]
         points = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
         points[0] = 0.0
@@ -164,7 +155,6 @@ class Search:
             settled_at=np.zeros(count),
             missed=(0.0, 0.0),
             rough=0,
-            chattering=0,
             waiting=0,
             epochs=0,
             failures=0,
@@ -176,7 +166,7 @@ class Search:
         windows = self.starts.at(problem, state.rows[:count], state.touching[:count], self.horizon, self.loss)
         if isinstance(windows, UnknownStarts) and state.waiting:
             return self._settled_states(windows, state)
-        if isinstance(windows, UnknownStarts) and (state.rough or (state.chattering and state.refining)):
+        if isinstance(windows, UnknownStarts) and state.rough:
             return self._profiled(windows, state)
         points, states = state.point[:running], state.states[:running, :count]
         damping, state_damping = state.damping[:running], state.state_damping[:running, :count]
@@ -195,7 +185,6 @@ class Search:
             explained=int(best.kept.sum()),
             steady_cost=best.steady_cost,
             autocorrelation=best.autocorrelation,
-            chattering=max(state.chattering, int(best.chattering > CHATTERING)),
             epochs=state.epochs + 1,
             failures=state.failures + sum(each.failures for each in plans) + sum(each.failures for each in outcomes),
         )
@@ -209,7 +198,6 @@ class Search:
             following = self._refined(following, leader)
         stage = "calibrating" if state.refining else "searching"
         spent = self._derivative_steps(problem, state) + self.horizon * sum(each.simulations for each in outcomes)
-        spent += self.horizon * count * sum(each.more for each in plans)
         return following, Epoch(metrics, spent, stage=stage)
 
     def _advanced(
@@ -253,7 +241,7 @@ class Search:
             settled_at=state.point[0].copy(),
             missed=before,
             rough=max(state.rough, int(found)),
-            waiting=0 if smooth or (state.chattering and waiting <= settling.RESTARTS) else waiting,
+            waiting=0 if smooth else waiting,
             failures=state.failures + after.failures,
         )
         metrics = {"residual": missed[1], "noise": float(np.median(after.deviation))}
@@ -270,8 +258,7 @@ class Search:
         states = state.states[:1]
         undamped = np.full(states.shape[:2], settling.DAMPING_RANGE[0])
         (plan,) = windows.plans(state.point[:1], states, state.damping[:1], undamped, refining=True)
-        chances = 0 if state.chattering else SECOND_CHANCES
-        after, better, cost = windows.profiled(plan, states[0], state.state_errors, chances)
+        after, better, cost = windows.profiled(plan, states[0], state.state_errors, SECOND_CHANCES)
         damping = TRIALS[0] * state.damping[0] if better else max(1e3 * state.damping[0], SHORTER)
         new, step = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}, plan.steps[0]
         if better:
@@ -292,17 +279,16 @@ class Search:
             explained=int(plan.kept.sum()),
             steady_cost=plan.steady_cost,
             autocorrelation=plan.autocorrelation,
-            chattering=max(state.chattering, int(plan.chattering > CHATTERING)),
             epochs=state.epochs + 1,
             failures=state.failures + plan.failures + after.failures,
         )
         noise = float(np.median(plan.deviation))
         metrics = {"residual": float(np.sqrt(cost)) * noise, "moved": float(following.moved[0]), "noise": noise}
         far = self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0
-        if following.moved[0] < 1.0 and far and not (of_bases or state.chattering):  # with these every step looks anew
+        if following.moved[0] < 1.0 and far and not of_bases:  # with these every step looks anew
             moved = np.maximum(following.moved, 1.0)
             following = replace(following, waiting=settling.RESTARTS, moved=moved)
-        columns = 2 + 2 * len(step) + len(plan.spread) + plan.more  # one for the contacts
+        columns = 2 + 2 * len(step) + len(plan.spread)  # one for the contacts
         spent = len(state.rows) * columns + after.simulations
         return following, Epoch(metrics, spent * self.horizon, stage="calibrating")
 
@@ -385,13 +371,8 @@ class Search:
         if self.starts.waiting:
             searches["damping"] = np.full(self.searches, FIRST_DAMPING)
             searches["state_damping"] = np.full_like(state.state_damping, FIRST_DAMPING)
-        waiting = epochs_of_states(state.chattering) if self.starts.waiting else 0
+        waiting = self.starts.waiting
         return replace(state, **searches, refining=1, waiting=waiting, epochs=0)
-
-
-def epochs_of_states(chattering: int) -> int:
-    """Number of epochs of initial states alone that begin a search on new windows: a few where contacts chatter."""
-    return settling.RESTARTS + WITHOUT_RESTARTS if chattering else UnknownStarts.waiting
 
 
 def _of_last_step(plan: Plan) -> Float[np.ndarray, "d d"]:

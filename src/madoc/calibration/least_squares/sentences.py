@@ -1,20 +1,21 @@
 """The warnings that least squares adds to an estimate."""
 
 import numpy as np
+from jaxtyping import Float
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.least_squares.filtering import FilterState, horizon_of
 from madoc.calibration.least_squares.search import SearchState
+from madoc.calibration.least_squares.statistics import LONG_TAILS
 from madoc.data import stride
 
-LONG_TAILS = 1.1
-"""Cost of residuals, in squared standard deviations; above it they are not normal noise, whose cost is 0.8 with
-Cauchy's loss and 1 with squares."""
 MOST_LEFT_OUT = 0.05
 """Share in [0, 1] of windows that no initial state explains; without contacts, noise alone leaves out fewer."""
 FEWEST_LEFT_OUT = 3
 """Number of windows; fewer may be left out by chance, however few there are."""
 EXACT = 1e-6
 """Residual in typical changes of a stride; smaller ones mean that states were logged without noise."""
+TAILS = "residuals have longer tails than noise has: the intervals are too narrow"
 NOT_SETTLED = (
     "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"
 )
@@ -33,23 +34,43 @@ STILL_PREDICTING = (
 
 def about_estimated_states(problem: CalibrationProblem, search: SearchState, horizon: int) -> str:
     """A sentence that initial states were estimated, why the data needed it, and how large the noise is."""
-    if problem.states.kind != "exact":
-        why = "states cannot be rebuilt from the data"
-    elif problem.dataset.disturbance.velocities == "differences":
-        why = "velocities are differences of positions, which are what it compares"
-    elif problem.dataset.disturbance.noise:
-        why = "the data is noisy"
-    else:
-        why = "the log is noisy: residuals of consecutive rows alternate in sign"
     sentence = (
-        f"the initial state of each window of {horizon} control steps was estimated with the parameters, as {why}"
+        f"the initial state of each window of {horizon} control steps was estimated with the parameters, as "
+        f"{_why_states_are_not_known(problem)}"
     )
     if not search.refining:
         return sentence
-    noise = 100.0 * float(np.median(search.deviation))
+    return f"{sentence}; {_how_large(problem, search.deviation)}, and the intervals allow for it"
+
+
+def about_filtered_states(problem: CalibrationProblem, search: FilterState) -> tuple[str, ...]:
+    """Sentences that readings were predicted by an ensemble filter, why, how large the noise is and its tails."""
+    sentence = (
+        f"every reading in windows of {horizon_of(problem)} control steps was predicted by an ensemble filter from "
+        f"those before it, as {_why_states_are_not_known(problem)}, and bodies touch"
+    )
+    if not search.epochs:
+        return (sentence,)
+    tails = (TAILS,) if search.found.long_tails else ()
+    return (f"{sentence}; {_how_large(problem, search.noise)}, and the intervals allow for it", *tails)
+
+
+def _why_states_are_not_known(problem: CalibrationProblem) -> str:
+    """Why the log's states do not serve as they are."""
+    if problem.states.kind != "exact":
+        return "states cannot be rebuilt from the data"
+    if problem.dataset.disturbance.velocities == "differences":
+        return "velocities are differences of positions, which are what it compares"
+    if problem.dataset.disturbance.noise:
+        return "the data is noisy"
+    return "the log is noisy: residuals of consecutive rows alternate in sign"
+
+
+def _how_large(problem: CalibrationProblem, noise: Float[np.ndarray, " channels"]) -> str:
+    """The noise of the median channel."""
     rows = stride(problem.dataset)
     change = "a step's typical change" if rows == 1 else f"the typical change in {rows} steps"
-    return f"{sentence}; the noise found is {noise:.2g} % of {change}, and the intervals allow for it"
+    return f"the noise found is {100.0 * float(np.median(noise)):.2g} % of {change}"
 
 
 def have_long_tails(problem: CalibrationProblem, search: SearchState) -> bool:
@@ -75,12 +96,11 @@ def about_residuals(problem: CalibrationProblem, search: SearchState) -> tuple[s
         f"{left_out} of {windows} windows count for nothing: no initial state found explains them as "
         "well as others, as where contacts begin, or their simulation failed"
     )
-    tails = "residuals have longer tails than noise has: the intervals are too narrow"
     jumps = (
         "residuals have longer tails than noise has only where contacts begin or end, or where windows of different "
         "contacts are taken together; the verdict does not count that"
     )
-    long = [tails] if have_long_tails(problem, search) else [jumps] if search.cost[0] > LONG_TAILS else []
+    long = [TAILS] if have_long_tails(problem, search) else [jumps] if search.cost[0] > LONG_TAILS else []
     return (*([sentence] if left_out else []), *long)
 
 

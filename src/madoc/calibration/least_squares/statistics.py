@@ -5,13 +5,15 @@ from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.data import stride
-from madoc.identification.linearisation import WIDE
 from madoc.identification.losses import NORMAL_MAD, Loss
 from madoc.identification.noise import OUTLIER, channel_noise
 from madoc.identification.replay import Readings, window_residuals
 from madoc.identification.settling import window_costs
 from madoc.identification.windows import consecutive_rows, windows_at
 
+LONG_TAILS = 1.1
+"""Cost of residuals, in squared standard deviations; above it they are not normal noise, whose cost is 0.8 with
+Cauchy's loss and 1 with squares."""
 FEWEST_STEADY = 10
 """Smallest number of windows of a kind whose noise is estimated by itself."""
 NOISY_STRIDE = 1e-3
@@ -20,6 +22,8 @@ BY_CHANCE = 3.0
 """Standard errors of a correlation, by which the most negative one of several channels may be so by chance."""
 _LARGEST = 3.0
 """Standard deviations of the noise at which residuals are clipped before they are correlated."""
+WIDE = 0.4
+"""Width in [-1, 1] of the differences by which windows are compared: wide enough to show beside the jumps of contacts."""
 COMPARED = 6
 """Number of windows that are compared for each that is drawn; comparing all of a long log would take too long."""
 _SMALLEST = 1e-12
@@ -190,18 +194,14 @@ def telling_first(
     horizon: int,
     drawn: int,
     searched: int,
-    first: Int[np.ndarray, " some"] | None = None,
 ) -> Int[np.ndarray, " windows"]:
     """Rows of windows in random order, of which every other of those `searched` first is one that tells most.
 
     A ball that bounces a few times and then lies still tells of its bounces in a few windows of hundreds. Of those
     drawn by chance, too few are of these, and what they would tell passes for windows that no initial state explains.
     The others remain random: windows that tell much are also those whose initial states are hardest to find. Nothing
-    changes where as many are `drawn` as there are, or where the log shows no contact. Those that come `first` are not
-    chosen anew where they are given.
+    changes where as many are `drawn` as there are, or where the log shows no contact.
     """
-    if first is not None:
-        return np.concatenate([first, rows[~np.isin(rows, first)]])
     compared = rows[: COMPARED * drawn]
     if drawn >= len(rows) or not touched(problem, *problem.states.guesses(), compared, horizon).any():
         return rows
@@ -216,8 +216,7 @@ def _shares(
 ) -> Float[np.ndarray, " windows"]:
     """How much of all that the windows tell of the parameters each of them does, as the sum over all directions.
 
-    This is the leverage of a linear regression, by differences from mid-range that are wide enough to show beside the
-    jumps of contacts. It takes windows · (1 + d) · horizon control steps.
+    This is the leverage of a linear regression on differences from mid-range. It takes windows · (1 + d) · horizon control steps.
     """
     readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
     guesses = problem.states.states[np.searchsorted(problem.states.rows, rows)]

@@ -226,7 +226,6 @@ class UnknownStarts:
             states,
             central=bool(self.touching.any()),
             placed_alone=bool(self.readings.placed.any()) and not refining,
-            chattering=bool(self.touching.any()),
         )
         searches = zip(slopes, points, damping.tolist(), state_damping, strict=True)
         return [
@@ -308,7 +307,6 @@ class UnknownStarts:
         """
         least = np.full(len(state_damping), LEAST_DAMPING)
         spare = eliminate(slopes, np.ones_like(slopes.residuals), least).spare
-        chattering, columns = slopes.chattering, slopes.more
         kept, deviation = self._weighted(slopes, spare, refining=contacts is not None)
         slopes = slopes.over(np.tile(deviation, self.readings.steps + 1))
         z = (slopes.residuals / TUNING[self.loss]) ** 2
@@ -340,8 +338,6 @@ class UnknownStarts:
             left_out=1.0 - float(kept.mean()),
             failures=int((~slopes.whole).sum()),
             steady_cost=self._steady_cost(slopes, spare, contacts, kept, deviation),
-            chattering=chattering,
-            more=columns,
         )
 
     def _weighted(

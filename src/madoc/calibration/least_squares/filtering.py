@@ -1,0 +1,396 @@
+"""The search where bodies touch and the log is noisy: prediction errors of an ensemble filter instead of fitted starts.
+
+Every reading of a window is predicted from those before it (`identification.ensembles`), so nothing but the parameters
+is unknown, and each prediction error depends on no later noise: at the right parameters errors are uncorrelated with
+anything known before them (prediction error method, Ljung 1999, chapter 7).
+
+Derivatives are differences as wide as they must be to show beside the chance of contacts, which a finite ensemble does
+not average out. That chance would bias a least-squares step, whose residuals and derivatives share it, and shorten it.
+So two independent ensembles a and b are simulated, whose chance is not the same: the derivatives of each are
+instruments for the other (Reiersol 1941). A step p solves
+
+    (Jaᵀ W Jb + Jbᵀ W Ja) p = -(Jbᵀ W ra + Jaᵀ W rb),
+
+with W the weights of the robust loss, and the same products, by windows, give its covariance.
+"""
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
+
+from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.least_squares.plan import FEWEST
+from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
+from madoc.data import stride
+from madoc.identification.ensembles import Innovations, innovations, members_at
+from madoc.identification.gauss_newton import damped_step
+from madoc.identification.information import Uncertainty, sandwich
+from madoc.identification.linearisation import LEAST_CURVATURE
+from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
+from madoc.identification.replay import Readings
+from madoc.identification.settling import window_costs
+from madoc.identification.windows import disjoint_windows
+from madoc.types import Epoch, generator
+
+STRIDES = 20
+"""Length of a window in strides: after a few of them the filter knows the state as well as it ever does."""
+LONGEST_WINDOW = 30
+"""Largest length of a window in control steps, as each is a step of the filter, however little moves in it."""
+MOST, EARLY = 40, 16
+"""Largest number of windows, and in the first epochs, in which steps are large."""
+EARLY_EPOCHS = 4
+"""Number of the first epochs."""
+MEMBERS = 16
+"""Number of states in an ensemble."""
+WIDTH, WIDTHS = 0.1, (0.05, 0.4)
+"""Width of a difference in [-1, 1] at first, and its smallest and largest."""
+ALIKE = (0.3, 0.8)
+"""Share in [0, 1] of a column's squares that both ensembles agree on, below which its difference is made twice as wide,
+as it shows more of chance than of a slope, and above which half as wide."""
+LONGEST = 0.5
+"""Largest change of a parameter in an epoch, in [-1, 1]."""
+TRIALS = (1e-2, 1.0, 1e2)
+"""Factors of the last damping that helped, tried at once."""
+DAMPED = 10.0
+"""Factor of the damping where none helps."""
+WORSE = 2.0
+"""Mean change of the windows' surprise in its standard errors; above it a step certainly makes it worse."""
+FIRST_DAMPING, DAMPING = 1e-2, (1e-4, 1e2)
+"""Damping of the first step relative to the columns' squared lengths, and its smallest and largest."""
+AGREEING = 1e-3
+"""Smallest eigenvalue of the products of both ensembles' derivatives, relative to those of each with itself."""
+LARGEST_SHARE = 0.1
+"""Share in [0, 1] of the sum of squares of all windows' derivatives above which a window counts less."""
+NEAR, LIKE_CHANCE = 4.0, 1.5
+"""Steps in standard errors, below which epochs are averaged, and below which the mean is at its end."""
+AVERAGED = 1
+"""Smallest number of epochs whose mean with the one before them may be the end."""
+USUAL_EPOCHS = 8
+"""Number of epochs that most searches take, for the time that is told to be left."""
+NOISE_CHANGE = (0.1, 4.0)
+"""Smallest and largest factor of a channel's noise variance from an epoch to the next."""
+NOISE_SETTLED = 0.5
+"""Relative change of a noise variance, below which it is as good as known."""
+OF_CLIPPED = 0.9950
+"""Mean square of a normal value of variance 1, clipped at nine."""
+LEAST_NOISE = 1e-3
+"""Smallest noise of a channel in its typical changes at the start, and relative to the noisiest one's later."""
+MOSTLY = 0.5
+"""Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts."""
+ROUNDS = 10
+"""Number of times that windows of too large a share are weighted less."""
+_SMALLEST = 1e-100
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search has found.
+
+    Attributes:
+        point: The parameters, in [-1, 1].
+        uncertainty: That of the point.
+        windows: Number of independent windows that tell it.
+        settled: Whether the search has come to its end.
+        long_tails: Whether residuals have longer tails than noise has.
+    """
+
+    point: Float[np.ndarray, " d"]
+    uncertainty: Uncertainty
+    windows: int
+    settled: bool
+    long_tails: bool
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class FilterState:
+    """The state of the search.
+
+    Attributes:
+        point: The parameters, in [-1, 1].
+        rows: First rows of the windows, in random order.
+        widths: Width of each parameter's difference in [-1, 1].
+        noise: Noise of each channel in its typical changes.
+        seed: Seed of the ensembles' random numbers.
+        gradients: Each window's gradient of the cost, the mean of the epochs that are averaged.
+        products: Of both ensembles' derivatives, the curvature of the cost, as a mean as well.
+        squares: Of each ensemble's with itself, which chance makes larger.
+        meat: Scatter of the gradients before the last step.
+        moved: The largest component of the last step in its standard errors.
+        damping: λ of the next step.
+        cost: Mean loss of a whitened prediction error before it, in squared standard deviations.
+        explained: Number of windows in which no simulation failed.
+        quiet: 1 once no noise has changed much from one epoch to the next.
+        averaged: Number of epochs whose mean with the one before them the last step was by.
+        epochs: Number of epochs.
+        failures: Number of windows whose simulation failed.
+    """
+
+    point: Float[np.ndarray, " d"]
+    rows: Int[np.ndarray, " windows"]
+    widths: Float[np.ndarray, " d"]
+    noise: Float[np.ndarray, " channels"]
+    seed: int
+    gradients: Float[np.ndarray, "windows d"]
+    products: Float[np.ndarray, "d d"]
+    squares: Float[np.ndarray, " d"]
+    meat: Float[np.ndarray, "d d"]
+    moved: float
+    damping: float
+    cost: float
+    explained: int
+    quiet: int
+    averaged: int
+    epochs: int
+    failures: int
+
+    @property
+    def settled(self) -> bool:
+        """Whether the last step, on all windows and in known noise, may be chance."""
+        enough = self.explained >= FEWEST + len(self.point)
+        return enough and self.averaged >= AVERAGED and bool(self.quiet) and self.moved < LIKE_CHANCE
+
+    @property
+    def near(self) -> bool:
+        """Whether the next step is to be by the mean of this epoch and those that follow."""
+        return self.epochs > EARLY_EPOCHS and bool(self.quiet) and self.moved < NEAR
+
+    @property
+    def found(self) -> Found:
+        """The point, with its uncertainty by the last epoch."""
+        bread = agreed(self.products, self.squares) if self.epochs else self.products
+        long_tails = self.settled and self.cost > LONG_TAILS
+        return Found(self.point, sandwich(bread, self.meat), self.explained, self.settled, long_tails)
+
+
+def horizon_of(problem: CalibrationProblem) -> int:
+    """Length of the windows in control steps, short enough for twice as many of them as are needed."""
+    fewest = 2 * (FEWEST + len(problem.simulator.parameters))
+    return max(1, min(STRIDES * stride(problem.dataset), LONGEST_WINDOW, len(problem.dataset) // fewest - 1))
+
+
+def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState | None:
+    """The search before it has begun; None where few windows show contacts, or the log does not tell states.
+
+    It does where sensors show all positions, and velocities as well unless those are differences of positions.
+    """
+    states, count = problem.states, len(problem.simulator.parameters)
+    derived = states.measured < problem.simulator.task.observation_size
+    if not states.starts_known or states.placed.any() or (states.kind == "exact" and derived):
+        return None
+    rows = disjoint_windows(problem.dataset, states.rows, horizon_of(problem))
+    if len(rows) < FEWEST + count:
+        return None
+    rows = generator(key).permutation(rows)[:MOST]
+    if touched(problem, *states.guesses(), rows, horizon_of(problem)).mean() < MOSTLY:
+        return None
+    by_differences = (problem.noise_by_differences / problem.typical_change)[: states.measured]
+    return FilterState(
+        point=np.zeros(count),
+        rows=rows,
+        widths=np.full(count, WIDTH),
+        noise=np.maximum(by_differences, LEAST_NOISE),
+        seed=int(np.asarray(jax.random.key_data(key))[-1]),
+        gradients=np.zeros((len(rows), count)),
+        products=np.zeros((count, count)),
+        squares=np.zeros(count),
+        meat=np.zeros((count, count)),
+        moved=0.0,
+        damping=FIRST_DAMPING,
+        cost=0.0,
+        explained=0,
+        quiet=0,
+        averaged=0,
+        epochs=0,
+        failures=0,
+    )
+
+
+def epoch_steps(problem: CalibrationProblem, windows: int) -> int:
+    """Control steps of an epoch on so many windows."""
+    systems = 2 * (1 + len(problem.simulator.parameters)) + len(TRIALS)
+    return systems * windows * MEMBERS * horizon_of(problem)
+
+
+def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
+    """About how many control steps a whole search takes."""
+    later = USUAL_EPOCHS - EARLY_EPOCHS
+    return EARLY_EPOCHS * epoch_steps(problem, EARLY) + later * epoch_steps(problem, len(state.rows))
+
+
+def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[FilterState, Epoch]:
+    """One step of the parameters, and the noise of every channel by how large its prediction errors were.
+
+    Once the noise is known and the end is near it is by the mean of all epochs since, so that the chance of ensembles
+    averages out.
+    """
+    rows = state.rows if state.epochs >= EARLY_EPOCHS else state.rows[:EARLY]
+    readings = Readings.at(problem.dataset, problem.states, rows, horizon_of(problem), problem.typical_change)
+    sides = [_Side.of(problem, state, readings, rows, sign) for sign in (1, -1)]
+    whole = sides[0].found.whole & sides[1].found.whole
+    pulls, products, squares = _products(sides[0], sides[1], whole, loss)
+    gradients = np.zeros_like(state.gradients)
+    gradients[np.flatnonzero(whole)] = pulls
+    averaged = state.averaged + 1 if state.near else 0
+    if averaged:
+        gradients, products, squares = (
+            old + (new - old) / (averaged + 1)
+            for old, new in (
+                (state.gradients, gradients),
+                (state.products, products),
+                (state.squares, squares),
+            )
+        )
+    bread = agreed(products, squares)
+    factor = np.linalg.cholesky(bread).T
+    target = np.linalg.solve(factor.T, gradients.sum(0))
+    undamped = damped_step(factor, target, state.point, 0.0)
+    taken, damping = _taken(problem, state, readings, sides[0], factor, target, loss)
+    meat = gradients.T @ gradients * len(rows) / max(1, len(rows) - len(state.point))
+    error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), _SMALLEST))
+    ratio = np.mean([each.noise_ratio() for each in sides], axis=0)
+    noise = state.noise * np.sqrt(np.clip(ratio, *NOISE_CHANGE))
+    rounding = (problem.rounding / problem.typical_change)[: len(noise)]
+    following = replace(
+        state,
+        point=state.point + taken,
+        damping=damping,
+        widths=np.clip(state.widths * _wider(products, squares), *WIDTHS),
+        noise=np.maximum(noise, np.maximum(rounding, LEAST_NOISE * noise.max())),
+        gradients=gradients + bread @ taken / len(rows),
+        products=products,
+        squares=squares,
+        meat=meat,
+        moved=float((np.abs(undamped) / error).max()),
+        cost=float(np.mean([window_costs(each.errors(), loss)[whole] for each in sides])) if whole.any() else 0.0,
+        explained=int(whole.sum()),
+        quiet=int((np.abs(ratio - 1.0) < NOISE_SETTLED).all()),
+        averaged=averaged,
+        epochs=state.epochs + 1,
+        failures=state.failures + int((~whole).sum()),
+    )
+    metrics = {"residual": float(np.sqrt(following.cost)), "moved": following.moved, "noise": float(np.median(noise))}
+    return following, Epoch(metrics, epoch_steps(problem, len(rows)), stage="calibrating")
+
+
+def _taken(
+    problem: CalibrationProblem,
+    state: FilterState,
+    readings: Readings,
+    side: "_Side",
+    factor: Float[np.ndarray, "d d"],
+    target: Float[np.ndarray, " d"],
+    loss: Loss,
+) -> tuple[Float[np.ndarray, " d"], float]:
+    """The step after which one of the ensembles is surprised least by the readings, and the damping of the next one.
+
+    Near the end chance decides which that is, so the whole step is taken there unless it certainly makes it worse.
+    There is none, and the next is damped more, where none helps.
+    """
+    damping = state.damping * np.array(TRIALS)
+    damping[0] *= not state.near
+    steps = [damped_step(factor, target, state.point, each) for each in damping.tolist()]
+    tried = np.clip(steps, -LONGEST, LONGEST)
+    after = innovations(problem.simulator, readings, state.point + tried, side.members, state.noise)
+    change = after.surprise(loss) - side.found.surprise(loss)[0]
+    best = int(np.argmin(change.mean(1)))
+    if state.near and change[0].mean() <= WORSE * change[0].std() / np.sqrt(len(change[0])):
+        best = 0
+    elif not change[best].mean() < 0.0:
+        return np.zeros_like(target), min(state.damping * DAMPED, DAMPING[1])
+    return tried[best], float(np.clip(damping[best], *DAMPING))
+
+
+@dataclass(frozen=True)
+class _Side:
+    """What one of the two ensembles says.
+
+    Attributes:
+        members: Its states at the first readings.
+        found: Prediction errors at the point and at its neighbours.
+        apart: How far each neighbour is from the point in its parameter.
+    """
+
+    members: Float[np.ndarray, "windows members state"]
+    found: Innovations
+    apart: Float[np.ndarray, " d"]
+
+    @classmethod
+    def of(
+        cls,
+        problem: CalibrationProblem,
+        state: FilterState,
+        readings: Readings,
+        rows: Int[np.ndarray, " windows"],
+        sign: int,
+    ) -> "_Side":
+        """The ensemble whose differences lead upwards, or downwards, but never out of a range."""
+        random = np.random.default_rng([state.seed, state.epochs, 1 + sign])
+        noise = state.noise * readings.scale
+        members = members_at(problem.dataset, problem.states, problem.simulator, rows, noise, MEMBERS, random)
+        apart = np.where(np.abs(state.point + sign * state.widths) <= 1.0, sign, -sign) * state.widths
+        points = np.concatenate([state.point[None], state.point + np.diag(apart)])
+        return cls(members, innovations(problem.simulator, readings, points, members, state.noise), apart)
+
+    def errors(self) -> Float[np.ndarray, "windows values"]:
+        """Whitened prediction errors at the point, of all channels but those that never differ."""
+        errors = self.found.whitened()[0]
+        return errors[..., (errors != 0.0).any((0, 1))].reshape(len(errors), -1)
+
+    def slopes(self) -> Float[np.ndarray, "windows values d"]:
+        """The derivatives of these by the parameters."""
+        errors = self.found.whitened()
+        kept = (errors[0] != 0.0).any((0, 1))
+        change = (errors[1:] - errors[0])[..., kept].reshape(len(self.apart), errors.shape[1], -1)
+        return np.moveaxis(change / self.apart[:, None, None], 0, -1)
+
+    def noise_ratio(self) -> Float[np.ndarray, " channels"]:
+        """Mean square of each channel's prediction errors over their variance, outliers clipped; 1 if they are all 0.
+
+        This is Huber's (1964) second proposal for a scale, with a cut at three standard deviations.
+        """
+        relative = (self.found.mean[0] ** 2 / self.found.variances())[self.found.whole].reshape(
+            -1, self.found.mean.shape[-1]
+        )
+        clipped = np.minimum(relative, 9.0).mean(0) / OF_CLIPPED if len(relative) else np.zeros(relative.shape[-1])
+        return np.where(clipped == 0.0, 1.0, clipped)
+
+
+def _products(
+    first: _Side, second: _Side, whole: Bool[np.ndarray, " windows"], loss: Loss
+) -> tuple[Float[np.ndarray, "windows d"], Float[np.ndarray, "d d"], Float[np.ndarray, " d"]]:
+    """The gradient of each window's cost, and products of both ensembles' derivatives and squares of each's own.
+
+    A window in which derivatives are chance alone has much larger ones than the others, so none has more than
+    `LARGEST_SHARE` of the squares of a column.
+    """
+    errors, slopes = (first.errors()[whole], second.errors()[whole]), (first.slopes()[whole], second.slopes()[whole])
+    z = ((errors[0] + errors[1]) / 2.0 / TUNING[loss]) ** 2
+    weights = loss_slope(z, loss)
+    squares = sum(np.einsum("wv,wvd->wd", weights, each**2) for each in slopes) / 2.0
+    counted = np.ones(len(squares))
+    for _ in range(ROUNDS):
+        share = counted[:, None] * squares / np.maximum((counted[:, None] * squares).sum(0), _SMALLEST)
+        counted = counted / np.maximum(1.0, share.max(1, initial=0.0) / LARGEST_SHARE)
+    weights = weights * counted[:, None]
+    pulls = (
+        np.einsum("wv,wvd->wd", weights * mine, other) for mine, other in zip(errors, reversed(slopes), strict=True)
+    )
+    both = np.einsum("wv,wvd,wve->de", weights, *slopes)
+    curvature = max(curvature_share(z, loss), LEAST_CURVATURE)
+    return sum(pulls) / 2.0, curvature * (both + both.T) / 2.0, curvature * (counted[:, None] * squares).sum(0)
+
+
+def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
+    """The products, with the eigenvalues of correlations at least `AGREEING`: by chance they may be negative."""
+    lengths = np.sqrt(np.maximum(squares, _SMALLEST))
+    values, vectors = np.linalg.eigh(products / np.outer(lengths, lengths))
+    return (vectors * np.maximum(values, AGREEING)) @ vectors.T * np.outer(lengths, lengths)
+
+
+def _wider(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+    """Factors of the widths of the differences, by how much of a column both ensembles agree on."""
+    alike = np.diag(products) / np.maximum(squares, _SMALLEST)
+    return np.select([alike < ALIKE[0], alike > ALIKE[1]], [2.0, 0.5], 1.0)

@@ -1,0 +1,174 @@
+"""An ensemble filter worked by hand, and the search by its prediction errors: a foot that slides under noise."""
+
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+import pytest
+
+from madoc import robots, simulation
+from madoc.calibration import CalibrationProblem
+from madoc.calibration.least_squares import filtering
+from madoc.calibration.least_squares.calibrator import LeastSquares
+from madoc.calibration.least_squares.filtering import _products, _Side, agreed, of_contacts
+from madoc.data import Disturbance, disturb
+from madoc.identification.ensembles import FARTHEST, Innovations, followed, innovations, members_at
+from madoc.identification.replay import Readings
+from madoc.runs.checkpoint import load, save
+from own_robots import write_robot
+from robots import SPRING_TRUTH, recorded, spring
+
+FOOT = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <geom name="ground" type="plane" size="9 9 1" friction="0.05"/>
+    <body name="foot" pos="0 0 0.05">
+      <joint name="along" type="slide" axis="1 0 0"/><joint name="up" type="slide" axis="0 0 1"/>
+      <geom name="sole" type="sphere" size="0.05" mass="1" friction="0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="along" ctrlrange="-9 9"/></actuator>
+</mujoco>
+"""
+FOOT_SPEC = """\
+madoc: 1
+name: foot
+model: foot.xml
+control_step: 0.01
+signals:
+  - {name: along, reads: position(along)}
+  - {name: up, reads: position(up)}
+  - {name: along_speed, reads: velocity(along)}
+  - {name: up_speed, reads: velocity(up)}
+actions:
+  - {name: push, actuator: push, low: -9, high: 9}
+parameters:
+  - {field: geom_friction, element: sole, name: friction, low: 0.1, high: 1}
+  - {field: body_mass, element: foot, name: mass, low: 0.5, high: 2}
+"""
+FOOT_TRUTH = {"friction": 0.4, "mass": 0.8}
+NOISE = {"along": 5e-4, "up": 5e-4, "along_speed": 5e-3, "up_speed": 5e-3}
+
+
+@dataclass(frozen=True)
+class Given(_Side):
+    """An ensemble whose errors and slopes are given."""
+
+    by_hand: tuple[np.ndarray, np.ndarray]
+
+    def errors(self):
+        return self.by_hand[0]
+
+    def slopes(self):
+        return self.by_hand[1]
+
+
+def given(errors, slopes):
+    nothing = np.zeros((1, len(errors), 1, 1))
+    found = Innovations(nothing, nothing[..., None], np.ones(len(errors), bool))
+    return Given(np.zeros((len(errors), 1, 1)), found, np.zeros(slopes.shape[-1]), (errors, slopes))
+
+
+def problem_of_foot(folder, rows=900):
+    """A log whose heights are as noisy as a camera's, many times as deep as the foot sinks in."""
+    task = robots.load(write_robot(folder, FOOT_SPEC, foot=FOOT)).task
+    log = recorded(task, FOOT_TRUTH, rows, jax.random.key(0))
+    random, logged = np.random.default_rng(0), log.transitions
+    here, there = (np.array(part, np.float64) for part in (logged.observation, logged.next_observation))
+    error = random.standard_normal((len(here) + 1, 4)) * [*NOISE.values()]
+    last = np.isin(np.arange(len(here)), log.episode_ends - 1)
+    following = np.where(last[:, None], random.standard_normal(here.shape) * [*NOISE.values()], error[1:])
+    noisy = replace(logged, observation=here + error[:-1], next_observation=there + following)
+    return CalibrationProblem(replace(log, transitions=noisy), simulation.make(task, threads=1))
+
+
+def test_states_follow_a_reading_by_kalmans_gain():
+    """By hand: two states with a variance of 2 and a reading of noise 1 that is 2 below them: K = 2/3, P = 2/3."""
+    states, apart, factor = np.array([[4.0], [2.0]]), np.array([[3.0], [1.0]]), np.array([[np.sqrt(3.0)]])
+    after = followed(states, apart, factor)
+    assert after.mean() == pytest.approx(3.0 - 2.0 * 2.0 / 3.0)
+    assert after.var(ddof=1) == pytest.approx(2.0 / 3.0)
+    false = followed(states, apart + 1000.0, factor)
+    assert false.mean() == pytest.approx(3.0 - FARTHEST * 2.0 / np.sqrt(3.0))
+
+
+def test_prediction_errors_of_the_right_model_are_white_and_of_variance_one():
+    task = spring(max_episode_steps=100)
+    log = disturb(recorded(task, SPRING_TRUTH, 600, jax.random.key(0)), Disturbance(noise=0.1), task, jax.random.key(1))
+    problem = CalibrationProblem(replace(log, disturbance=Disturbance()), simulation.make(task, threads=1))
+    rows = np.arange(0, 600, 25)
+    readings = Readings.at(problem.dataset, problem.states, rows, 20, problem.typical_change)
+    noise = 0.1 * np.ones(len(readings.scale))
+    random = np.random.default_rng(0)
+    members = members_at(problem.dataset, problem.states, problem.simulator, rows, noise * readings.scale, 200, random)
+    around = members - problem.states.states[np.searchsorted(problem.states.rows, rows)][:, None]
+    np.testing.assert_allclose(around.std((0, 1)), noise * readings.scale, rtol=0.05)
+    truth = task.parameters.to_unit(task.parameters.vector(SPRING_TRUTH))
+    found = innovations(problem.simulator, readings, np.stack([truth, -truth]), members, noise)
+    errors = found.whitened()[0]
+    assert found.whole.all()
+    assert errors.var() == pytest.approx(1.0, rel=0.1)
+    assert abs((errors[:, 1:] * errors[:, :-1]).mean()) < 0.1
+    surprise = found.surprise("linear").mean(1)
+    assert surprise[0] < surprise[1]
+
+
+def test_chance_biases_no_product_of_two_ensembles():
+    """Slopes of 1 with chance of variance 4: squares are 5, products 1; the gradient is that of the errors alone."""
+    random, windows = np.random.default_rng(0), 4000
+    errors = 0.3 + 0.1 * random.standard_normal((windows, 1))
+
+    def side():
+        chance = 2.0 * random.standard_normal((windows, 1, 1))
+        return given(errors + 0.1 * chance[..., 0], 1.0 + chance)
+
+    gradients, products, squares = _products(side(), side(), np.ones(windows, bool), "linear")
+    assert products[0, 0] / windows == pytest.approx(1.0, abs=0.15)
+    assert squares[0] / windows == pytest.approx(5.0, rel=0.1)
+    assert gradients.mean() == pytest.approx(0.3, abs=0.05)  # with its own slopes an ensemble's would be 0.7
+    np.testing.assert_allclose(agreed(np.array([[-1.0]]), np.array([4.0])), [[4.0 * filtering.AGREEING]])
+
+
+def test_a_window_of_chance_alone_does_not_decide():
+    """Of eleven windows one has slopes a thousand times as large as the others'."""
+    slopes = np.ones((11, 1, 1))
+    slopes[0] = 1000.0
+    side = given(np.ones((11, 1)), slopes)
+    gradients, _, squares = _products(side, side, np.ones(11, bool), "linear")
+    assert squares[0] < 1.2 * 10.0
+    assert gradients[0, 0] < gradients[1, 0]
+
+
+def test_a_foot_that_slides_under_noise(tmp_path):
+    problem = problem_of_foot(tmp_path)
+    method, space = LeastSquares(), problem.simulator.parameters
+    state = method.init(problem, jax.random.key(0))
+    assert state.filtered is not None and not state.unknown
+    while not state.finished:
+        before, (state, epoch) = state, method.step(problem, state)
+        if state.stage == "filtering" and state.filtered.epochs == 2:
+            assert epoch.control_steps == filtering.epoch_steps(problem, filtering.EARLY)
+            save(tmp_path / "checkpoint.npz", before, {})
+            second = state
+    assert state.stage == "filtering" and epoch.converged
+    estimate, truth = method.estimate(problem, state), space.vector(FOOT_TRUTH)
+    assert ((estimate.interval[:, 0] <= truth) & (truth <= estimate.interval[:, 1])).all()
+    assert (np.diff(estimate.interval, axis=1)[:, 0] < 0.05 * (space.high - space.low)).all()
+    assert estimate.settled and not estimate.long_tails
+    found = state.filtered.noise * problem.typical_change
+    np.testing.assert_allclose(found, [*NOISE.values()], rtol=0.4)
+    assert any("predicted by an ensemble filter" in warning for warning in estimate.warnings)
+    resumed, _ = load(tmp_path / "checkpoint.npz", method.init(problem, jax.random.key(0)))
+    again, _ = method.step(problem, resumed)
+    for kept, other in zip(jax.tree.leaves(second), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(kept, other)
+
+
+def test_logs_without_contacts_or_with_a_horizon_of_the_users_fit_initial_states(tmp_path):
+    task = spring(max_episode_steps=100)
+    log = recorded(task, SPRING_TRUTH, 600, jax.random.key(0))
+    assert of_contacts(CalibrationProblem(log, simulation.make(task, threads=1)), jax.random.key(0)) is None
+    problem = problem_of_foot(tmp_path)
+    assert LeastSquares(horizon=5).init(problem, jax.random.key(0)).filtered is None
+    assert of_contacts(problem, jax.random.key(0)) is not None
