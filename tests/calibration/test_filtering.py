@@ -66,14 +66,14 @@ class Given(_Side):
 
 def given(errors, slopes):
     nothing = np.zeros((1, len(errors), 1, 1))
-    found = Innovations(nothing, nothing[..., None], np.ones(len(errors), bool))
-    return Given(np.zeros((len(errors), 1, 1)), found, np.zeros(slopes.shape[-1]), (errors, slopes))
+    found = Innovations(nothing, nothing[..., None], np.ones((1, len(errors)), bool))
+    return Given(np.zeros((len(errors), 1, 1)), found, np.zeros(slopes.shape[-1]), 0, (errors, slopes))
 
 
-def problem_of_foot(folder, rows=900):
+def problem_of_foot(folder, rows=900, spec=FOOT_SPEC):
     """A log whose heights are as noisy as a camera's, many times as deep as the foot sinks in."""
-    task = robots.load(write_robot(folder, FOOT_SPEC, foot=FOOT)).task
-    log = recorded(task, FOOT_TRUTH, rows, jax.random.key(0))
+    task = robots.load(write_robot(folder, spec, foot=FOOT)).task
+    log = recorded(task, {"action_delay": 0.01, **FOOT_TRUTH} if task.pending else FOOT_TRUTH, rows, jax.random.key(0))
     random, logged = np.random.default_rng(0), log.transitions
     here, there = (np.array(part, np.float64) for part in (logged.observation, logged.next_observation))
     error = random.standard_normal((len(here) + 1, 4)) * [*NOISE.values()]
@@ -85,12 +85,17 @@ def problem_of_foot(folder, rows=900):
 
 def test_states_follow_a_reading_by_kalmans_gain():
     """By hand: two states with a variance of 2 and a reading of noise 1 that is 2 below them: K = 2/3, P = 2/3."""
-    states, apart, factor = np.array([[4.0], [2.0]]), np.array([[3.0], [1.0]]), np.array([[np.sqrt(3.0)]])
+    states, apart = np.array([4.0, 2.0]).reshape(1, 1, 2, 1), np.array([3.0, 1.0]).reshape(1, 1, 2, 1)
+    factor = np.full((1, 1, 1, 1), np.sqrt(3.0))
     after = followed(states, apart, factor)
     assert after.mean() == pytest.approx(3.0 - 2.0 * 2.0 / 3.0)
     assert after.var(ddof=1) == pytest.approx(2.0 / 3.0)
     false = followed(states, apart + 1000.0, factor)
     assert false.mean() == pytest.approx(3.0 - FARTHEST * 2.0 / np.sqrt(3.0))
+    both = followed(
+        *(np.concatenate(pair) for pair in ((states, states), (apart + 1000.0, apart + 500.0), (factor, factor)))
+    )
+    assert 3.0 - both[1].mean() == pytest.approx(0.5 * (3.0 - both[0].mean()), rel=0.01)  # the first system decides
 
 
 def test_prediction_errors_of_the_right_model_are_white_and_of_variance_one():
@@ -123,7 +128,7 @@ def test_chance_biases_no_product_of_two_ensembles():
         chance = 2.0 * random.standard_normal((windows, 1, 1))
         return given(errors + 0.1 * chance[..., 0], 1.0 + chance)
 
-    gradients, products, squares = _products(side(), side(), np.ones(windows, bool), "linear")
+    gradients, products, squares, _ = _products(side(), side(), np.ones(windows, bool), "linear")
     assert products[0, 0] / windows == pytest.approx(1.0, abs=0.15)
     assert squares[0] / windows == pytest.approx(5.0, rel=0.1)
     assert gradients.mean() == pytest.approx(0.3, abs=0.05)  # with its own slopes an ensemble's would be 0.7
@@ -135,9 +140,10 @@ def test_a_window_of_chance_alone_does_not_decide():
     slopes = np.ones((11, 1, 1))
     slopes[0] = 1000.0
     side = given(np.ones((11, 1)), slopes)
-    gradients, _, squares = _products(side, side, np.ones(11, bool), "linear")
-    assert squares[0] < 1.2 * 10.0
+    gradients, _, squares, shares = _products(side, side, np.ones(11, bool), "linear")
+    assert squares[0] < 1.3 * 10.0
     assert gradients[0, 0] < gradients[1, 0]
+    assert shares[0] < 0.2 and shares.sum() == pytest.approx(1.0)
 
 
 def test_a_foot_that_slides_under_noise(tmp_path):
@@ -163,6 +169,32 @@ def test_a_foot_that_slides_under_noise(tmp_path):
     again, _ = method.step(problem, resumed)
     for kept, other in zip(jax.tree.leaves(second), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(kept, other)
+
+
+@pytest.mark.parametrize("loss", ["linear", "cauchy"])
+def test_the_gradient_at_the_truth_is_none_though_chance_is_shared(loss):
+    """Errors are noise and an ensemble's chance, which is also in its own slopes, a tenth of a range wide."""
+    random, shape = np.random.default_rng(0), (2000, 10)
+    noise = random.standard_normal(shape)
+
+    def side():
+        here, there = 0.5 * random.standard_normal((2, *shape))
+        return given(noise + here, (3.0 + (there - here) / 0.1)[..., None])
+
+    gradients, *_ = _products(side(), side(), np.ones(len(noise), bool), loss)
+    assert abs(gradients.mean()) < 3.0 * gradients.std() / np.sqrt(len(gradients))
+
+
+def test_windows_begin_at_rows_whose_states_are_known_and_episodes_may_be_short(tmp_path):
+    short = spring(max_episode_steps=15)
+    log = recorded(short, SPRING_TRUTH, 600, jax.random.key(0))
+    assert of_contacts(CalibrationProblem(log, simulation.make(short, threads=1)), jax.random.key(0)) is None
+    delayed = FOOT_SPEC + "  - {field: action_delay, low: 0, high: 0.05}\nmax_episode_steps: 60\n"
+    problem = problem_of_foot(tmp_path, spec=delayed)
+    search = of_contacts(problem, jax.random.key(0))
+    assert np.isin(search.rows, problem.states.rows).all()
+    ends = problem.dataset.episode_ends[problem.dataset.episode_of(search.rows)]
+    assert (search.rows + filtering.horizon_of(problem) <= ends).all()
 
 
 def test_logs_without_contacts_or_with_a_horizon_of_the_users_fit_initial_states(tmp_path):

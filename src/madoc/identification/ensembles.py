@@ -15,7 +15,7 @@ from madoc.data.dataset import Dataset
 from madoc.identification.losses import Loss
 from madoc.identification.replay import Readings
 from madoc.identification.settling import FAILED_WINDOW, window_costs
-from madoc.identification.states import LoggedStates, states_observed_as, states_of
+from madoc.identification.states import LoggedStates, states_of
 from madoc.simulation.attitudes import differences, moved
 from madoc.simulation.base import Simulator
 
@@ -30,12 +30,12 @@ class Innovations:
     Attributes:
         mean: Predicted mean minus the reading, in standard deviations of the sensors' noise.
         factor: Lower triangular L with L Lᵀ the covariance of that, the sensors' noise included.
-        whole: Windows in which no simulation failed.
+        whole: Windows in which no simulation failed, by system.
     """
 
     mean: Float[np.ndarray, "systems windows steps channels"]
     factor: Float[np.ndarray, "systems windows steps channels channels"]
-    whole: Bool[np.ndarray, " windows"]
+    whole: Bool[np.ndarray, "systems windows"]
 
     def whitened(self) -> Float[np.ndarray, "systems windows steps channels"]:
         """L⁻¹ (prediction - reading), all with the L of the first system: of variance 1 there if the model is right."""
@@ -65,6 +65,9 @@ def innovations(
 ) -> Innovations:
     """Predict each reading after the first at every point, and move the members by it before the next one.
 
+    What is too far from the first point's prediction to be followed is followed as little at the others, so that they
+    differ from it in their parameters alone.
+
     The members are states as likely as the first reading; `noise` is that of the sensors in typical changes. Spends
     systems · windows · members · steps control steps.
     """
@@ -73,7 +76,7 @@ def innovations(
     every = (len(points), windows * count, size)
     states = system.unbiased(np.broadcast_to(members.reshape(every[1:]), every).copy())
     shape, channels = (len(points), windows, readings.steps, len(noise)), len(noise)
-    mean, factor, whole = np.zeros(shape), np.zeros((*shape, channels)), np.ones(windows, bool)
+    mean, factor, whole = np.zeros(shape), np.zeros((*shape, channels)), np.ones(shape[:2], bool)
     for step in range(readings.steps):
         actions = np.repeat(readings.actions[:, step], count, axis=0)
         after = system.step(states, np.broadcast_to(actions, (*every[:2], actions.shape[-1])))
@@ -82,12 +85,12 @@ def innovations(
         seen = system.observe(after)[..., :channels].reshape(*shape[:2], count, channels)
         apart = differences(simulator.task.attitudes, seen, readings.observed[:, step + 1, None])
         apart = apart / (readings.scale * noise)
-        whole &= finite.reshape(*shape[:2], count).all((0, 2)) & np.isfinite(apart).all((0, 2, 3))
-        grouped = np.where(whole[:, None, None], after.reshape(*shape[:2], count, size), 0.0)
-        apart = np.where(whole[:, None, None], apart, 0.0)
+        whole &= finite.reshape(*shape[:2], count).all(2) & np.isfinite(apart).all((2, 3))
+        grouped = np.where(whole[..., None, None], after.reshape(*shape[:2], count, size), 0.0)
+        apart = np.where(whole[..., None, None], apart, 0.0)
         mean[:, :, step], factor[:, :, step] = apart.mean(2), _covariance_factor(apart)
         grouped[..., :physical] = followed(grouped[..., :physical], apart, factor[:, :, step])
-        states = np.where(whole[:, None, None], grouped, members).reshape(every)
+        states = np.where(whole[..., None, None], grouped, members).reshape(every)
     return Innovations(mean, factor, whole)
 
 
@@ -101,10 +104,10 @@ def _covariance_factor(
 
 
 def followed(
-    states: Float[np.ndarray, "*rows members physical"],
-    apart: Float[np.ndarray, "*rows members channels"],
-    factor: Float[np.ndarray, "*rows channels channels"],
-) -> Float[np.ndarray, "*rows members physical"]:
+    states: Float[np.ndarray, "systems windows members physical"],
+    apart: Float[np.ndarray, "systems windows members channels"],
+    factor: Float[np.ndarray, "systems windows channels channels"],
+) -> Float[np.ndarray, "systems windows members physical"]:
     """The states after a reading, from which theirs are so far `apart` in standard deviations of its noise.
 
     The mean moves by Kalman's gain K = P Hᵀ S⁻¹, the deviations from it by P Hᵀ L⁻ᵀ (L + 1)⁻¹, S = L Lᵀ, after which
@@ -114,7 +117,8 @@ def followed(
     around, shown = states - middle, apart - observed
     inverse = np.linalg.inv(factor)
     gain = np.swapaxes(around, -1, -2) @ shown / (states.shape[-2] - 1) @ np.swapaxes(inverse, -1, -2)
-    innovation = np.clip(inverse @ np.swapaxes(observed, -1, -2), -FARTHEST, FARTHEST)
+    innovation = inverse @ np.swapaxes(observed, -1, -2)
+    innovation = innovation * np.minimum(1.0, FARTHEST / np.maximum(np.abs(innovation[:1]), FARTHEST))
     of_deviations = gain @ np.linalg.inv(factor + np.eye(factor.shape[-1]))
     return middle - np.swapaxes(gain @ innovation, -1, -2) + around - shown @ np.swapaxes(of_deviations, -1, -2)
 
@@ -133,25 +137,49 @@ def members_at(
     `noise` is the sensors', in the units of the channels. Where velocities are differences of positions, they are those
     of the positions with noise.
     """
-    states, task = logged.states[np.searchsorted(logged.rows, rows)], simulator.task
-    physical, drawn = slice(0, logged.physical_size), []
-    readings, following = (np.asarray(part, np.float64) for part in _both_readings(dataset))
-    last = np.isin(np.arange(len(dataset)), dataset.episode_ends - 1)
-    for _ in range(count):
-        error = np.zeros((2, *readings.shape))
-        error[..., : len(noise)] = random.standard_normal((*error.shape[:2], len(noise))) * noise
-        here = moved(task.attitudes, readings, error[0])
-        if logged.kind == "exact":
-            drawn.append(states_observed_as(dataset, task, rows, here)[:, physical])
-            continue
-        there = moved(task.attitudes, following, np.where(last[:, None], error[1], np.roll(error[0], -1, axis=0)))
-        noisy = replace(dataset.transitions, observation=here, next_observation=there)
-        other = states_of(replace(dataset, transitions=noisy), simulator)
-        drawn.append(other.states[np.searchsorted(other.rows, rows)][:, physical])
+    assert np.isin(rows, logged.rows).all()
+    states = logged.states[np.searchsorted(logged.rows, rows)]
+    physical = slice(0, logged.physical_size)
+    draw = _rebuilt if logged.kind == "exact" else _rebuilt_from_neighbours
+    drawn = [draw(dataset, simulator, rows, noise, random)[:, physical] for _ in range(count)]
     members = np.repeat(states[:, None], count, axis=1)
     members[..., physical] = np.stack(drawn, axis=1)
     return members
 
 
-def _both_readings(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(dataset.transitions.observation), np.asarray(dataset.transitions.next_observation)
+def _rebuilt(
+    dataset: Dataset,
+    simulator: Simulator,
+    rows: Int[np.ndarray, " windows"],
+    noise: Float[np.ndarray, " channels"],
+    random: np.random.Generator,
+) -> Float[np.ndarray, "windows state"]:
+    """States that readings of a row determine."""
+    readings, rebuild = (
+        np.asarray(dataset.transitions.observation, np.float64)[rows],
+        simulator.task.state_from_observation,
+    )
+    assert rebuild is not None  # else they are not exact
+    error = random.standard_normal(readings.shape) * noise
+    return np.asarray(rebuild(moved(simulator.task.attitudes, readings, error)))
+
+
+def _rebuilt_from_neighbours(
+    dataset: Dataset,
+    simulator: Simulator,
+    rows: Int[np.ndarray, " windows"],
+    noise: Float[np.ndarray, " channels"],
+    random: np.random.Generator,
+) -> Float[np.ndarray, "windows state"]:
+    """States whose velocities are differences of positions in the rows around."""
+    logged, attitudes = dataset.transitions, simulator.task.attitudes
+    here, there = (np.asarray(part, np.float64) for part in (logged.observation, logged.next_observation))
+    error = np.zeros((2, *here.shape))
+    error[..., : len(noise)] = random.standard_normal((*error.shape[:2], len(noise))) * noise
+    last = np.isin(np.arange(len(dataset)), dataset.episode_ends - 1)
+    following = np.where(last[:, None], error[1], np.roll(error[0], -1, axis=0))
+    noisy = replace(
+        logged, observation=moved(attitudes, here, error[0]), next_observation=moved(attitudes, there, following)
+    )
+    states = states_of(replace(dataset, transitions=noisy), simulator)
+    return states.states[np.searchsorted(states.rows, rows)]

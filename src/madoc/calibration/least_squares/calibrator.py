@@ -115,7 +115,7 @@ class LeastSquares:
             length=0,
             best=0,
             filtered=filtered,
-            prediction=None if chosen else predicting.windows_for(problem),
+            prediction=None if chosen or filtered is not None else predicting.windows_for(problem),
             finished=0,
         )
 

@@ -30,21 +30,21 @@ from madoc.identification.information import Uncertainty, sandwich
 from madoc.identification.linearisation import LEAST_CURVATURE
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
 from madoc.identification.replay import Readings
-from madoc.identification.settling import window_costs
-from madoc.identification.windows import disjoint_windows
+from madoc.identification.settling import FAILED_WINDOW, window_costs
+from madoc.identification.windows import disjoint_windows, rows_that_fit
 from madoc.types import Epoch, generator
 
 STRIDES = 20
 """Length of a window in strides: after a few of them the filter knows the state as well as it ever does."""
 LONGEST_WINDOW = 30
 """Largest length of a window in control steps, as each is a step of the filter, however little moves in it."""
-MOST, EARLY = 40, 16
+MOST, EARLY = 32, 16
 """Largest number of windows, and in the first epochs, in which steps are large."""
 EARLY_EPOCHS = 4
 """Number of the first epochs."""
-MEMBERS = 16
-"""Number of states in an ensemble."""
-WIDTH, WIDTHS = 0.1, (0.05, 0.4)
+MEMBERS, EARLY_MEMBERS = 32, 16
+"""Number of states in an ensemble, and in the first epochs; with half as many estimates are off by a standard error."""
+WIDTH, WIDTHS = 0.1, (0.005, 0.4)
 """Width of a difference in [-1, 1] at first, and its smallest and largest."""
 ALIKE = (0.3, 0.8)
 """Share in [0, 1] of a column's squares that both ensembles agree on, below which its difference is made twice as wide,
@@ -63,7 +63,7 @@ AGREEING = 1e-3
 """Smallest eigenvalue of the products of both ensembles' derivatives, relative to those of each with itself."""
 LARGEST_SHARE = 0.1
 """Share in [0, 1] of the sum of squares of all windows' derivatives above which a window counts less."""
-NEAR, LIKE_CHANCE = 4.0, 1.5
+NEAR, LIKE_CHANCE = 2.5, 1.0
 """Steps in standard errors, below which epochs are averaged, and below which the mean is at its end."""
 AVERAGED = 1
 """Smallest number of epochs whose mean with the one before them may be the end."""
@@ -71,7 +71,7 @@ USUAL_EPOCHS = 8
 """Number of epochs that most searches take, for the time that is told to be left."""
 NOISE_CHANGE = (0.1, 4.0)
 """Smallest and largest factor of a channel's noise variance from an epoch to the next."""
-NOISE_SETTLED = 0.5
+NOISE_SETTLED = 0.3
 """Relative change of a noise variance, below which it is as good as known."""
 OF_CLIPPED = 0.9950
 """Mean square of a normal value of variance 1, clipped at nine."""
@@ -79,6 +79,10 @@ LEAST_NOISE = 1e-3
 """Smallest noise of a channel in its typical changes at the start, and relative to the noisiest one's later."""
 MOSTLY = 0.5
 """Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts."""
+SPOILT = 3
+"""Number of the first steps whose errors say little where velocities are differences, which hold the next position."""
+MOST_LEVERAGE = 0.75
+"""Largest share in [0, 1) of what all windows tell that the scatter of a window's gradient is corrected for."""
 ROUNDS = 10
 """Number of times that windows of too large a share are weighted less."""
 _SMALLEST = 1e-100
@@ -117,7 +121,7 @@ class FilterState:
         gradients: Each window's gradient of the cost, the mean of the epochs that are averaged.
         products: Of both ensembles' derivatives, the curvature of the cost, as a mean as well.
         squares: Of each ensemble's with itself, which chance makes larger.
-        meat: Scatter of the gradients before the last step.
+        meat: Scatter of the gradients before the last step, which counts as an error.
         moved: The largest component of the last step in its standard errors.
         damping: λ of the next step.
         cost: Mean loss of a whitened prediction error before it, in squared standard deviations.
@@ -180,11 +184,14 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
     derived = states.measured < problem.simulator.task.observation_size
     if not states.starts_known or states.placed.any() or (states.kind == "exact" and derived):
         return None
-    rows = disjoint_windows(problem.dataset, states.rows, horizon_of(problem))
+    horizon = horizon_of(problem)
+    if not len(rows_that_fit(problem.dataset, states.rows, horizon)):
+        return None
+    rows = states.rows[disjoint_windows(problem.dataset, states.rows, horizon)]
     if len(rows) < FEWEST + count:
         return None
-    rows = generator(key).permutation(rows)[:MOST]
-    if touched(problem, *states.guesses(), rows, horizon_of(problem)).mean() < MOSTLY:
+    rows = generator(key).permutation(rows)[: max(MOST, 2 * (FEWEST + count))]
+    if touched(problem, *states.guesses(), rows, horizon).mean() < MOSTLY:
         return None
     by_differences = (problem.noise_by_differences / problem.typical_change)[: states.measured]
     return FilterState(
@@ -210,8 +217,9 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
 
 def epoch_steps(problem: CalibrationProblem, windows: int) -> int:
     """Control steps of an epoch on so many windows."""
-    systems = 2 * (1 + len(problem.simulator.parameters)) + len(TRIALS)
-    return systems * windows * MEMBERS * horizon_of(problem)
+    systems = 2 * (1 + len(problem.simulator.parameters)) + 1 + len(TRIALS)
+    members = MEMBERS if windows > EARLY else EARLY_MEMBERS
+    return systems * windows * members * horizon_of(problem)
 
 
 def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
@@ -228,11 +236,11 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     """
     rows = state.rows if state.epochs >= EARLY_EPOCHS else state.rows[:EARLY]
     readings = Readings.at(problem.dataset, problem.states, rows, horizon_of(problem), problem.typical_change)
-    sides = [_Side.of(problem, state, readings, rows, sign) for sign in (1, -1)]
-    whole = sides[0].found.whole & sides[1].found.whole
-    pulls, products, squares = _products(sides[0], sides[1], whole, loss)
-    gradients = np.zeros_like(state.gradients)
-    gradients[np.flatnonzero(whole)] = pulls
+    sides = [_Side.of(problem, state, readings, rows, number) for number in (0, 1)]
+    whole = np.asarray(sides[0].found.whole.all(0) & sides[1].found.whole.all(0))
+    pulls, products, squares, shares = _products(sides[0], sides[1], whole, loss)
+    gradients, told = np.zeros_like(state.gradients), np.zeros(len(state.rows))
+    gradients[np.flatnonzero(whole)], told[np.flatnonzero(whole)] = pulls, shares
     averaged = state.averaged + 1 if state.near else 0
     if averaged:
         gradients, products, squares = (
@@ -248,25 +256,29 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     target = np.linalg.solve(factor.T, gradients.sum(0))
     undamped = damped_step(factor, target, state.point, 0.0)
     taken, damping = _taken(problem, state, readings, sides[0], factor, target, loss)
-    meat = gradients.T @ gradients * len(rows) / max(1, len(rows) - len(state.point))
+    scores = gradients / (1.0 - np.minimum(told, MOST_LEVERAGE))[:, None]
+    meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
     error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), _SMALLEST))
     ratio = np.mean([each.noise_ratio() for each in sides], axis=0)
     noise = state.noise * np.sqrt(np.clip(ratio, *NOISE_CHANGE))
     rounding = (problem.rounding / problem.typical_change)[: len(noise)]
+    noise = np.maximum(noise, np.maximum(rounding, LEAST_NOISE * noise.max()))
+    moved, pull = float((np.abs(undamped) / error).max()), bread @ undamped
+    refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))
     following = replace(
         state,
         point=state.point + taken,
         damping=damping,
         widths=np.clip(state.widths * _wider(products, squares), *WIDTHS),
-        noise=np.maximum(noise, np.maximum(rounding, LEAST_NOISE * noise.max())),
-        gradients=gradients + bread @ taken / len(rows),
+        noise=noise,
+        gradients=gradients + told[:, None] * (bread @ taken),
         products=products,
         squares=squares,
-        meat=meat,
-        moved=float((np.abs(undamped) / error).max()),
+        meat=meat + np.outer(pull, pull),
+        moved=max(moved, LIKE_CHANCE) if refused else moved,
         cost=float(np.mean([window_costs(each.errors(), loss)[whole] for each in sides])) if whole.any() else 0.0,
         explained=int(whole.sum()),
-        quiet=int((np.abs(ratio - 1.0) < NOISE_SETTLED).all()),
+        quiet=int((np.abs((noise / state.noise) ** 2 - 1.0) < NOISE_SETTLED).all()),
         averaged=averaged,
         epochs=state.epochs + 1,
         failures=state.failures + int((~whole).sum()),
@@ -293,12 +305,14 @@ def _taken(
     damping[0] *= not state.near
     steps = [damped_step(factor, target, state.point, each) for each in damping.tolist()]
     tried = np.clip(steps, -LONGEST, LONGEST)
-    after = innovations(problem.simulator, readings, state.point + tried, side.members, state.noise)
-    change = after.surprise(loss) - side.found.surprise(loss)[0]
-    best = int(np.argmin(change.mean(1)))
-    if state.near and change[0].mean() <= WORSE * change[0].std() / np.sqrt(len(change[0])):
+    points = np.concatenate([state.point[None], state.point + tried])
+    surprise = innovations(problem.simulator, readings, points, side.members, state.noise).surprise(loss)
+    change = surprise[1:] - surprise[0]
+    fails = ((surprise[1:] == FAILED_WINDOW) & (surprise[0] < FAILED_WINDOW)).any(1)
+    best = int(np.argmin(np.where(fails, np.inf, change.mean(1))))
+    if state.near and not fails[0] and change[0].mean() <= WORSE * change[0].std() / np.sqrt(len(change[0])):
         best = 0
-    elif not change[best].mean() < 0.0:
+    elif fails[best] or not change[best].mean() < 0.0:
         return np.zeros_like(target), min(state.damping * DAMPED, DAMPING[1])
     return tried[best], float(np.clip(damping[best], *DAMPING))
 
@@ -311,11 +325,13 @@ class _Side:
         members: Its states at the first readings.
         found: Prediction errors at the point and at its neighbours.
         apart: How far each neighbour is from the point in its parameter.
+        first: The first step whose errors count.
     """
 
     members: Float[np.ndarray, "windows members state"]
     found: Innovations
     apart: Float[np.ndarray, " d"]
+    first: int
 
     @classmethod
     def of(
@@ -324,24 +340,26 @@ class _Side:
         state: FilterState,
         readings: Readings,
         rows: Int[np.ndarray, " windows"],
-        sign: int,
+        number: int,
     ) -> "_Side":
-        """The ensemble whose differences lead upwards, or downwards, but never out of a range."""
-        random = np.random.default_rng([state.seed, state.epochs, 1 + sign])
+        """One ensemble; differences of both lead upwards in one epoch and downwards in the next, not out of a range."""
+        random, sign = np.random.default_rng([state.seed, state.epochs, number]), 1 - 2 * (state.epochs % 2)
         noise = state.noise * readings.scale
-        members = members_at(problem.dataset, problem.states, problem.simulator, rows, noise, MEMBERS, random)
+        count = MEMBERS if state.epochs >= EARLY_EPOCHS else EARLY_MEMBERS
+        members = members_at(problem.dataset, problem.states, problem.simulator, rows, noise, count, random)
         apart = np.where(np.abs(state.point + sign * state.widths) <= 1.0, sign, -sign) * state.widths
         points = np.concatenate([state.point[None], state.point + np.diag(apart)])
-        return cls(members, innovations(problem.simulator, readings, points, members, state.noise), apart)
+        found = innovations(problem.simulator, readings, points, members, state.noise)
+        return cls(members, found, apart, 0 if problem.states.kind == "exact" else SPOILT)
 
     def errors(self) -> Float[np.ndarray, "windows values"]:
         """Whitened prediction errors at the point, of all channels but those that never differ."""
-        errors = self.found.whitened()[0]
+        errors = self.found.whitened()[0, :, self.first :]
         return errors[..., (errors != 0.0).any((0, 1))].reshape(len(errors), -1)
 
     def slopes(self) -> Float[np.ndarray, "windows values d"]:
         """The derivatives of these by the parameters."""
-        errors = self.found.whitened()
+        errors = self.found.whitened()[:, :, self.first :]
         kept = (errors[0] != 0.0).any((0, 1))
         change = (errors[1:] - errors[0])[..., kept].reshape(len(self.apart), errors.shape[1], -1)
         return np.moveaxis(change / self.apart[:, None, None], 0, -1)
@@ -351,7 +369,7 @@ class _Side:
 
         This is Huber's (1964) second proposal for a scale, with a cut at three standard deviations.
         """
-        relative = (self.found.mean[0] ** 2 / self.found.variances())[self.found.whole].reshape(
+        relative = (self.found.mean[0] ** 2 / self.found.variances())[self.found.whole[0], self.first :].reshape(
             -1, self.found.mean.shape[-1]
         )
         clipped = np.minimum(relative, 9.0).mean(0) / OF_CLIPPED if len(relative) else np.zeros(relative.shape[-1])
@@ -360,27 +378,37 @@ class _Side:
 
 def _products(
     first: _Side, second: _Side, whole: Bool[np.ndarray, " windows"], loss: Loss
-) -> tuple[Float[np.ndarray, "windows d"], Float[np.ndarray, "d d"], Float[np.ndarray, " d"]]:
-    """The gradient of each window's cost, and products of both ensembles' derivatives and squares of each's own.
+) -> tuple[
+    Float[np.ndarray, "windows d"], Float[np.ndarray, "d d"], Float[np.ndarray, " d"], Float[np.ndarray, " windows"]
+]:
+    """The gradient of each window's cost, products of both ensembles' derivatives and squares of each's own.
 
-    A window in which derivatives are chance alone has much larger ones than the others, so none has more than
-    `LARGEST_SHARE` of the squares of a column.
+    Last the share of each window in the squares of all. An ensemble's errors are weighted by their own size alone, so
+    that the other's derivatives share no chance with them. A window in which derivatives are chance alone has much
+    larger ones than the others, so none has more than `LARGEST_SHARE` of the squares of a column, or twice its share
+    if few windows tell of it.
     """
     errors, slopes = (first.errors()[whole], second.errors()[whole]), (first.slopes()[whole], second.slopes()[whole])
-    z = ((errors[0] + errors[1]) / 2.0 / TUNING[loss]) ** 2
-    weights = loss_slope(z, loss)
-    squares = sum(np.einsum("wv,wvd->wd", weights, each**2) for each in slopes) / 2.0
+    z = [(each / TUNING[loss]) ** 2 for each in errors]
+    weights = [loss_slope(each, loss) for each in z]
+    both = np.sqrt(weights[0] * weights[1])
+    squares = sum(np.einsum("wv,wvd->wd", both, each**2) for each in slopes) / 2.0
+    most = np.maximum(LARGEST_SHARE, 2.0 / np.maximum((squares > 0.0).sum(0), 1))
     counted = np.ones(len(squares))
     for _ in range(ROUNDS):
         share = counted[:, None] * squares / np.maximum((counted[:, None] * squares).sum(0), _SMALLEST)
-        counted = counted / np.maximum(1.0, share.max(1, initial=0.0) / LARGEST_SHARE)
-    weights = weights * counted[:, None]
-    pulls = (
-        np.einsum("wv,wvd->wd", weights * mine, other) for mine, other in zip(errors, reversed(slopes), strict=True)
+        counted = counted / np.maximum(1.0, (share / most).max(1, initial=0.0))
+    pulls = sum(
+        np.einsum("wv,wvd->wd", weight * mine, other)
+        for weight, mine, other in zip(weights, errors, reversed(slopes), strict=True)
     )
-    both = np.einsum("wv,wvd,wve->de", weights, *slopes)
-    curvature = max(curvature_share(z, loss), LEAST_CURVATURE)
-    return sum(pulls) / 2.0, curvature * (both + both.T) / 2.0, curvature * (counted[:, None] * squares).sum(0)
+    products = np.einsum("w,wv,wvd,wve->de", counted, both, *slopes)
+    squares = counted[:, None] * squares
+    share = (squares / np.maximum(squares.sum(0), _SMALLEST)).mean(1) if len(squares) else np.zeros(0)
+    share = share / max(float(share.sum()), _SMALLEST)
+    curvature = max(curvature_share(np.stack(z), loss), LEAST_CURVATURE)
+    gradients = counted[:, None] * pulls / 2.0
+    return gradients, curvature * (products + products.T) / 2.0, curvature * squares.sum(0), share
 
 
 def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:

@@ -19,9 +19,7 @@ TAILS = "residuals have longer tails than noise has: the intervals are too narro
 NOT_SETTLED = (
     "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"
 )
-STILL_LENGTHENING = (
-    "longer windows, or more of them, were under way when it ended: a larger budget may narrow the intervals"
-)
+STILL_LENGTHENING = "longer windows were under way when it ended: a larger budget may narrow the intervals"
 PREDICTS = (
     "the model leaves more than noise, so the estimate is the one that predicts motion best over a second; its "
     "distance from the estimate that fits short windows best counts as an error"

@@ -23,7 +23,7 @@ BY_CHANCE = 3.0
 _LARGEST = 3.0
 """Standard deviations of the noise at which residuals are clipped before they are correlated."""
 WIDE = 0.4
-"""Width in [-1, 1] of the differences by which windows are compared: wide enough to show beside the jumps of contacts."""
+"""Width in [-1, 1] of the differences by which windows are compared: these show beside the jumps of contacts."""
 COMPARED = 6
 """Number of windows that are compared for each that is drawn; comparing all of a long log would take too long."""
 _SMALLEST = 1e-12
@@ -216,7 +216,8 @@ def _shares(
 ) -> Float[np.ndarray, " windows"]:
     """How much of all that the windows tell of the parameters each of them does, as the sum over all directions.
 
-    This is the leverage of a linear regression on differences from mid-range. It takes windows · (1 + d) · horizon control steps.
+    This is the leverage of a linear regression on differences from mid-range. It takes windows · (1 + d) · horizon
+    control steps.
     """
     readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
     guesses = problem.states.states[np.searchsorted(problem.states.rows, rows)]
