@@ -8,7 +8,6 @@ from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
 from madoc.calibration.least_squares import filtering, predicting, sentences
-from madoc.calibration.least_squares.filtering import Found
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.lengthening import (
     LENGTHS,
@@ -30,7 +29,7 @@ from madoc.calibration.least_squares.lengthening import (
     tells_more,
     with_search,
 )
-from madoc.calibration.least_squares.plan import FEWEST
+from madoc.calibration.least_squares.plan import FEWEST, Found
 from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.statistics import alternation, consecutive_residuals, noisy_rows
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
@@ -62,11 +61,10 @@ class LeastSquares:
     its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
     has settled, windows become nine times as long, by way of three times where the longest show contacts or fail, while
     that narrows the intervals and residuals remain noise: where motion is smooth, long windows hold more information,
-    and they show model errors. Where most windows show contacts and states are measured, an ensemble filter takes the
-    place of initial states (`filtering`). By
-    default states are estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of
-    consecutive rows alternate as noise makes them: a reading that is too high makes the step to it look too long and
-    the step from it too short.
+    and they show model errors. By default states are estimated where they cannot be rebuilt, where the data is declared
+    noisy, and where residuals of consecutive rows alternate as noise makes them: a reading that is too high makes the
+    step to it look too long and the step from it too short. Where most windows show contacts and positions are
+    measured, an ensemble filter on windows of its own takes the place of estimated ones (`filtering`).
 
     Attributes:
         initial_states: `logged`, `estimated`, or None to choose by the data.

@@ -4,14 +4,13 @@ Every reading of a window is predicted from those before it (`identification.ens
 is unknown, and each prediction error depends on no later noise: at the right parameters errors are uncorrelated with
 anything known before them (prediction error method, Ljung 1999, chapter 7).
 
-Derivatives are differences as wide as they must be to show beside the chance of contacts, which a finite ensemble does
-not average out. That chance would bias a least-squares step, whose residuals and derivatives share it, and shorten it.
-So two independent ensembles a and b are simulated, whose chance is not the same: the derivatives of each are
-instruments for the other (Reiersol 1941). A step p solves
+Derivatives are differences, in which a finite ensemble leaves chance. A least-squares step would be biased by it, as
+residuals and derivatives share it, and too short. So two independent ensembles a and b are simulated: the derivatives
+of each are instruments for the other (Reiersol 1941). A step p solves
 
-    (Jaᵀ W Jb + Jbᵀ W Ja) p = -(Jbᵀ W ra + Jaᵀ W rb),
+    (Jaᵀ W Jb + Jbᵀ W Ja) p = -(Jbᵀ ψ(ra) + Jaᵀ ψ(rb)),
 
-with W the weights of the robust loss, and the same products, by windows, give its covariance.
+with ψ the slope of the robust loss and W its weights, and the same products, by windows, give its covariance.
 """
 
 from dataclasses import dataclass, replace
@@ -21,12 +20,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.plan import FEWEST
+from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
 from madoc.identification.ensembles import Innovations, innovations, members_at
 from madoc.identification.gauss_newton import damped_step
-from madoc.identification.information import Uncertainty, sandwich
+from madoc.identification.information import sandwich
 from madoc.identification.linearisation import LEAST_CURVATURE
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
 from madoc.identification.replay import Readings
@@ -37,7 +36,7 @@ from madoc.types import Epoch, generator
 STRIDES = 20
 """Length of a window in strides: after a few of them the filter knows the state as well as it ever does."""
 LONGEST_WINDOW = 30
-"""Largest length of a window in control steps, as each is a step of the filter, however little moves in it."""
+"""Largest length of a window in control steps, each of which is a step of the filter, however little moves in it."""
 MOST, EARLY = 32, 16
 """Largest number of windows, and in the first epochs, in which steps are large."""
 EARLY_EPOCHS = 4
@@ -47,26 +46,22 @@ MEMBERS, EARLY_MEMBERS = 32, 16
 WIDTH, WIDTHS = 0.1, (0.005, 0.4)
 """Width of a difference in [-1, 1] at first, and its smallest and largest."""
 ALIKE = (0.3, 0.8)
-"""Share in [0, 1] of a column's squares that both ensembles agree on, below which its difference is made twice as wide,
-as it shows more of chance than of a slope, and above which half as wide."""
+"""Shares in [0, 1] of a column's squares that both ensembles agree on: with less its difference becomes twice as wide,
+with more half as wide."""
 LONGEST = 0.5
 """Largest change of a parameter in an epoch, in [-1, 1]."""
-TRIALS = (1e-2, 1.0, 1e2)
-"""Factors of the last damping that helped, tried at once."""
 DAMPED = 10.0
 """Factor of the damping where none helps."""
 WORSE = 2.0
 """Mean change of the windows' surprise in its standard errors; above it a step certainly makes it worse."""
-FIRST_DAMPING, DAMPING = 1e-2, (1e-4, 1e2)
-"""Damping of the first step relative to the columns' squared lengths, and its smallest and largest."""
+DAMPING = (1e-4, 1e2)
+"""Smallest and largest damping of a step, relative to the columns' squared lengths."""
 AGREEING = 1e-3
 """Smallest eigenvalue of the products of both ensembles' derivatives, relative to those of each with itself."""
 LARGEST_SHARE = 0.1
 """Share in [0, 1] of the sum of squares of all windows' derivatives above which a window counts less."""
 NEAR, LIKE_CHANCE = 2.5, 1.0
 """Steps in standard errors, below which epochs are averaged, and below which the mean is at its end."""
-AVERAGED = 1
-"""Smallest number of epochs whose mean with the one before them may be the end."""
 USUAL_EPOCHS = 8
 """Number of epochs that most searches take, for the time that is told to be left."""
 NOISE_CHANGE = (0.1, 4.0)
@@ -80,31 +75,11 @@ LEAST_NOISE = 1e-3
 MOSTLY = 0.5
 """Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts."""
 SPOILT = 3
-"""Number of the first steps whose errors say little where velocities are differences, which hold the next position."""
+"""Number of first steps whose errors do not count where velocities are differences, which hold the next position."""
 MOST_LEVERAGE = 0.75
 """Largest share in [0, 1) of what all windows tell that the scatter of a window's gradient is corrected for."""
-ROUNDS = 10
-"""Number of times that windows of too large a share are weighted less."""
+ROUNDS = 10  # of weighting windows of too large a share less
 _SMALLEST = 1e-100
-
-
-@dataclass(frozen=True)
-class Found:
-    """What a search has found.
-
-    Attributes:
-        point: The parameters, in [-1, 1].
-        uncertainty: That of the point.
-        windows: Number of independent windows that tell it.
-        settled: Whether the search has come to its end.
-        long_tails: Whether residuals have longer tails than noise has.
-    """
-
-    point: Float[np.ndarray, " d"]
-    uncertainty: Uncertainty
-    windows: int
-    settled: bool
-    long_tails: bool
 
 
 @jax.tree_util.register_dataclass
@@ -151,10 +126,17 @@ class FilterState:
     failures: int
 
     @property
+    def in_use(self) -> tuple[Int[np.ndarray, " some"], int]:
+        """First rows of the windows of the next epoch, and the number of states in its ensembles."""
+        if self.epochs < EARLY_EPOCHS:
+            return self.rows[:EARLY], EARLY_MEMBERS
+        return self.rows, MEMBERS
+
+    @property
     def settled(self) -> bool:
         """Whether the last step, on all windows and in known noise, may be chance."""
         enough = self.explained >= FEWEST + len(self.point)
-        return enough and self.averaged >= AVERAGED and bool(self.quiet) and self.moved < LIKE_CHANCE
+        return enough and bool(self.averaged and self.quiet) and self.moved < LIKE_CHANCE
 
     @property
     def near(self) -> bool:
@@ -215,17 +197,16 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
     )
 
 
-def epoch_steps(problem: CalibrationProblem, windows: int) -> int:
-    """Control steps of an epoch on so many windows."""
-    systems = 2 * (1 + len(problem.simulator.parameters)) + 1 + len(TRIALS)
-    members = MEMBERS if windows > EARLY else EARLY_MEMBERS
-    return systems * windows * members * horizon_of(problem)
+def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
+    """Control steps of the next epoch."""
+    (rows, members), systems = state.in_use, 3 + 2 * len(problem.simulator.parameters) + len(TRIALS)
+    return systems * len(rows) * members * horizon_of(problem)
 
 
 def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
     """About how many control steps a whole search takes."""
-    later = USUAL_EPOCHS - EARLY_EPOCHS
-    return EARLY_EPOCHS * epoch_steps(problem, EARLY) + later * epoch_steps(problem, len(state.rows))
+    early, later = (epoch_steps(problem, replace(state, epochs=epochs)) for epochs in (0, EARLY_EPOCHS))
+    return EARLY_EPOCHS * early + (USUAL_EPOCHS - EARLY_EPOCHS) * later
 
 
 def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[FilterState, Epoch]:
@@ -234,29 +215,25 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     Once the noise is known and the end is near it is by the mean of all epochs since, so that the chance of ensembles
     averages out.
     """
-    rows = state.rows if state.epochs >= EARLY_EPOCHS else state.rows[:EARLY]
+    rows = state.in_use[0]
     readings = Readings.at(problem.dataset, problem.states, rows, horizon_of(problem), problem.typical_change)
-    sides = [_Side.of(problem, state, readings, rows, number) for number in (0, 1)]
+    sides = [_Side.of(problem, state, readings, number) for number in (0, 1)]
     whole = np.asarray(sides[0].found.whole.all(0) & sides[1].found.whole.all(0))
     pulls, products, squares, shares = _products(sides[0], sides[1], whole, loss)
     gradients, told = np.zeros_like(state.gradients), np.zeros(len(state.rows))
     gradients[np.flatnonzero(whole)], told[np.flatnonzero(whole)] = pulls, shares
     averaged = state.averaged + 1 if state.near else 0
     if averaged:
-        gradients, products, squares = (
-            old + (new - old) / (averaged + 1)
-            for old, new in (
-                (state.gradients, gradients),
-                (state.products, products),
-                (state.squares, squares),
-            )
-        )
+        share = 1.0 / (averaged + 1)
+        gradients = state.gradients + share * (gradients - state.gradients)
+        products = state.products + share * (products - state.products)
+        squares = state.squares + share * (squares - state.squares)
     bread = agreed(products, squares)
     factor = np.linalg.cholesky(bread).T
     target = np.linalg.solve(factor.T, gradients.sum(0))
     undamped = damped_step(factor, target, state.point, 0.0)
     taken, damping = _taken(problem, state, readings, sides[0], factor, target, loss)
-    scores = gradients / (1.0 - np.minimum(told, MOST_LEVERAGE))[:, None]
+    scores = gradients / (1.0 - np.minimum(told, MOST_LEVERAGE))[:, None]  # as if the window were left out
     meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
     error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), _SMALLEST))
     ratio = np.mean([each.noise_ratio() for each in sides], axis=0)
@@ -284,7 +261,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         failures=state.failures + int((~whole).sum()),
     )
     metrics = {"residual": float(np.sqrt(following.cost)), "moved": following.moved, "noise": float(np.median(noise))}
-    return following, Epoch(metrics, epoch_steps(problem, len(rows)), stage="calibrating")
+    return following, Epoch(metrics, epoch_steps(problem, state), stage="calibrating")
 
 
 def _taken(
@@ -339,13 +316,12 @@ class _Side:
         problem: CalibrationProblem,
         state: FilterState,
         readings: Readings,
-        rows: Int[np.ndarray, " windows"],
         number: int,
     ) -> "_Side":
         """One ensemble; differences of both lead upwards in one epoch and downwards in the next, not out of a range."""
         random, sign = np.random.default_rng([state.seed, state.epochs, number]), 1 - 2 * (state.epochs % 2)
         noise = state.noise * readings.scale
-        count = MEMBERS if state.epochs >= EARLY_EPOCHS else EARLY_MEMBERS
+        rows, count = state.in_use
         members = members_at(problem.dataset, problem.states, problem.simulator, rows, noise, count, random)
         apart = np.where(np.abs(state.point + sign * state.widths) <= 1.0, sign, -sign) * state.widths
         points = np.concatenate([state.point[None], state.point + np.diag(apart)])

@@ -1,10 +1,11 @@
-"""What a search computes before and after a step, in the same form for known and unknown initial states."""
+"""What a search computes before and after a step, and what it has found, in the same form for all searches."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from madoc.identification.information import Uncertainty
 from madoc.identification.losses import ALL_FAILED
 
 TRIALS = (1e-2, 1.0, 1e2)
@@ -59,6 +60,25 @@ class Plan:
     def comparable(self, cost: float) -> float:
         """A cost in typical changes, by which searches are compared; a window left out adds a whole change."""
         return ALL_FAILED if self.left_out == 1.0 else cost * float(self.deviation[0]) ** 2 + self.left_out
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search has found.
+
+    Attributes:
+        point: The parameters, in [-1, 1].
+        uncertainty: That of the point.
+        windows: Number of independent windows that tell it.
+        settled: Whether the search has come to its end.
+        long_tails: Whether residuals have longer tails than noise has.
+    """
+
+    point: Float[np.ndarray, " d"]
+    uncertainty: Uncertainty
+    windows: int
+    settled: bool
+    long_tails: bool
 
 
 @dataclass(frozen=True)
