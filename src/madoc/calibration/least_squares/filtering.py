@@ -39,8 +39,8 @@ LONGEST_WINDOW = 30
 """Largest length of a window in control steps, each of which is a step of the filter, however little moves in it."""
 MOST, EARLY = 32, 16
 """Largest number of windows, and in the first epochs, in which steps are large."""
-EARLY_EPOCHS = 4
-"""Number of the first epochs."""
+EARLY_EPOCHS = 10
+"""Largest number of the first epochs, which end once the noise is known and steps are below `NEAR`."""
 MEMBERS, EARLY_MEMBERS = 32, 16
 """Number of states in an ensemble, and in the first epochs; with half as many estimates are off by a standard error."""
 WIDTH, WIDTHS = 0.1, (0.005, 0.4)
@@ -51,7 +51,7 @@ with more half as wide."""
 LONGEST = 0.5
 """Largest change of a parameter in an epoch, in [-1, 1]."""
 DAMPED = 10.0
-"""Factor of the damping where none helps."""
+"""Factor of the damping where no step helps."""
 WORSE = 2.0
 """Mean change of the windows' surprise in its standard errors; above it a step certainly makes it worse."""
 DAMPING = (1e-4, 1e2)
@@ -62,8 +62,8 @@ LARGEST_SHARE = 0.1
 """Share in [0, 1] of the sum of squares of all windows' derivatives above which a window counts less."""
 NEAR, LIKE_CHANCE = 2.5, 1.0
 """Steps in standard errors, below which epochs are averaged, and below which the mean is at its end."""
-USUAL_EPOCHS = 8
-"""Number of epochs that most searches take, for the time that is told to be left."""
+USUAL_EPOCHS = (5, 4)
+"""Numbers of first and later epochs that most searches take, for the time that is told to be left."""
 NOISE_CHANGE = (0.1, 4.0)
 """Smallest and largest factor of a channel's noise variance from an epoch to the next."""
 NOISE_SETTLED = 0.3
@@ -76,8 +76,6 @@ MOSTLY = 0.5
 """Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts."""
 SPOILT = 3
 """Number of first steps whose errors do not count where velocities are differences, which hold the next position."""
-MOST_LEVERAGE = 0.75
-"""Largest share in [0, 1) of what all windows tell that the scatter of a window's gradient is corrected for."""
 ROUNDS = 10  # of weighting windows of too large a share less
 _SMALLEST = 1e-100
 
@@ -101,6 +99,7 @@ class FilterState:
         damping: λ of the next step.
         cost: Mean loss of a whitened prediction error before it, in squared standard deviations.
         explained: Number of windows in which no simulation failed.
+        wide: 0 in the first epochs, then 1 and the number of epochs on all windows.
         quiet: 1 once no noise has changed much from one epoch to the next.
         averaged: Number of epochs whose mean with the one before them the last step was by.
         epochs: Number of epochs.
@@ -120,6 +119,7 @@ class FilterState:
     damping: float
     cost: float
     explained: int
+    wide: int
     quiet: int
     averaged: int
     epochs: int
@@ -128,9 +128,7 @@ class FilterState:
     @property
     def in_use(self) -> tuple[Int[np.ndarray, " some"], int]:
         """First rows of the windows of the next epoch, and the number of states in its ensembles."""
-        if self.epochs < EARLY_EPOCHS:
-            return self.rows[:EARLY], EARLY_MEMBERS
-        return self.rows, MEMBERS
+        return (self.rows, MEMBERS) if self.wide else (self.rows[:EARLY], EARLY_MEMBERS)
 
     @property
     def settled(self) -> bool:
@@ -141,7 +139,7 @@ class FilterState:
     @property
     def near(self) -> bool:
         """Whether the next step is to be by the mean of this epoch and those that follow."""
-        return self.epochs > EARLY_EPOCHS and bool(self.quiet) and self.moved < NEAR
+        return self.wide > 1 and bool(self.quiet) and self.moved < NEAR
 
     @property
     def found(self) -> Found:
@@ -190,6 +188,7 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
         damping=FIRST_DAMPING,
         cost=0.0,
         explained=0,
+        wide=0,
         quiet=0,
         averaged=0,
         epochs=0,
@@ -205,8 +204,7 @@ def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
 
 def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
     """About how many control steps a whole search takes."""
-    early, later = (epoch_steps(problem, replace(state, epochs=epochs)) for epochs in (0, EARLY_EPOCHS))
-    return EARLY_EPOCHS * early + (USUAL_EPOCHS - EARLY_EPOCHS) * later
+    return sum(USUAL_EPOCHS[wide] * epoch_steps(problem, replace(state, wide=wide)) for wide in (0, 1))
 
 
 def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[FilterState, Epoch]:
@@ -233,7 +231,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     target = np.linalg.solve(factor.T, gradients.sum(0))
     undamped = damped_step(factor, target, state.point, 0.0)
     taken, damping = _taken(problem, state, readings, sides[0], factor, target, loss)
-    scores = gradients / (1.0 - np.minimum(told, MOST_LEVERAGE))[:, None]  # as if the window were left out
+    scores = gradients / (1.0 - np.minimum(told, 0.75))[:, None]  # about what leaving the window out would change
     meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
     error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), _SMALLEST))
     ratio = np.mean([each.noise_ratio() for each in sides], axis=0)
@@ -241,6 +239,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     rounding = (problem.rounding / problem.typical_change)[: len(noise)]
     noise = np.maximum(noise, np.maximum(rounding, LEAST_NOISE * noise.max()))
     moved, pull = float((np.abs(undamped) / error).max()), bread @ undamped
+    quiet = bool((np.abs((noise / state.noise) ** 2 - 1.0) < NOISE_SETTLED).all())
     refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))
     following = replace(
         state,
@@ -255,12 +254,13 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         moved=max(moved, LIKE_CHANCE) if refused else moved,
         cost=float(np.mean([window_costs(each.errors(), loss)[whole] for each in sides])) if whole.any() else 0.0,
         explained=int(whole.sum()),
-        quiet=int((np.abs((noise / state.noise) ** 2 - 1.0) < NOISE_SETTLED).all()),
+        wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < NEAR)),
+        quiet=int(quiet),
         averaged=averaged,
         epochs=state.epochs + 1,
         failures=state.failures + int((~whole).sum()),
     )
-    metrics = {"residual": float(np.sqrt(following.cost)), "moved": following.moved, "noise": float(np.median(noise))}
+    metrics = {"residual": following.cost**0.5, "moved": following.moved, "noise": float(np.median(noise))}
     return following, Epoch(metrics, epoch_steps(problem, state), stage="calibrating")
 
 
