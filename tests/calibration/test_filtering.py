@@ -10,9 +10,9 @@ from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares import filtering
 from madoc.calibration.least_squares.calibrator import LeastSquares
-from madoc.calibration.least_squares.filtering import _products, _Side, agreed, of_contacts
+from madoc.calibration.least_squares.filtering import _products, _Side, of_contacts
 from madoc.data import Disturbance, disturb
-from madoc.identification.ensembles import FARTHEST, Innovations, followed, innovations, members_at
+from madoc.identification.ensembles import AGREEING, FARTHEST, Innovations, agreed, followed, innovations, members_at
 from madoc.identification.replay import Readings
 from madoc.runs.checkpoint import load, save
 from own_robots import write_robot
@@ -132,7 +132,7 @@ def test_chance_biases_no_product_of_two_ensembles():
     assert products[0, 0] / windows == pytest.approx(1.0, abs=0.15)
     assert squares[0] / windows == pytest.approx(5.0, rel=0.1)
     assert gradients.mean() == pytest.approx(0.3, abs=0.05)  # with its own slopes an ensemble's would be 0.7
-    np.testing.assert_allclose(agreed(np.array([[-1.0]]), np.array([4.0])), [[4.0 * filtering.AGREEING]])
+    np.testing.assert_allclose(agreed(np.array([[-1.0]]), np.array([4.0])), [[4.0 * AGREEING]])
 
 
 def test_a_window_of_chance_alone_does_not_decide():

@@ -22,6 +22,10 @@ from madoc.simulation.base import Simulator
 FARTHEST = 4.0
 """Standard deviations of an innovation, beyond which the states follow it no farther: a false reading says nothing."""
 
+AGREEING = 1e-3
+"""Smallest eigenvalue of the products of both ensembles' derivatives, relative to those of each with itself."""
+_SMALLEST = 1e-100
+
 
 @dataclass(frozen=True)
 class Innovations:
@@ -183,3 +187,10 @@ def _rebuilt_from_neighbours(
     )
     states = states_of(replace(dataset, transitions=noisy), simulator)
     return states.states[np.searchsorted(states.rows, rows)]
+
+
+def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
+    """The products, with the eigenvalues of correlations at least `AGREEING`: by chance they may be negative."""
+    lengths = np.sqrt(np.maximum(squares, _SMALLEST))
+    values, vectors = np.linalg.eigh(products / np.outer(lengths, lengths))
+    return (vectors * np.maximum(values, AGREEING)) @ vectors.T * np.outer(lengths, lengths)

@@ -23,7 +23,7 @@ from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification.ensembles import Innovations, innovations, members_at
+from madoc.identification.ensembles import Innovations, agreed, innovations, members_at
 from madoc.identification.gauss_newton import damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.linearisation import LEAST_CURVATURE
@@ -56,8 +56,6 @@ WORSE = 2.0
 """Mean change of the windows' surprise in its standard errors; above it a step certainly makes it worse."""
 DAMPING = (1e-4, 1e2)
 """Smallest and largest damping of a step, relative to the columns' squared lengths."""
-AGREEING = 1e-3
-"""Smallest eigenvalue of the products of both ensembles' derivatives, relative to those of each with itself."""
 LARGEST_SHARE = 0.1
 """Share in [0, 1] of the sum of squares of all windows' derivatives above which a window counts less."""
 NEAR, LIKE_CHANCE = 2.5, 1.0
@@ -101,6 +99,7 @@ class FilterState:
         explained: Number of windows in which no simulation failed.
         wide: 0 in the first epochs, then 1 and the number of epochs on all windows.
         quiet: 1 once no noise has changed much from one epoch to the next.
+        halved: 1 once half as many states have told the error of finite ensembles.
         averaged: Number of epochs whose mean with the one before them the last step was by.
         epochs: Number of epochs.
         failures: Number of windows whose simulation failed.
@@ -121,6 +120,7 @@ class FilterState:
     explained: int
     wide: int
     quiet: int
+    halved: int
     averaged: int
     epochs: int
     failures: int
@@ -128,13 +128,19 @@ class FilterState:
     @property
     def in_use(self) -> tuple[Int[np.ndarray, " some"], int]:
         """First rows of the windows of the next epoch, and the number of states in its ensembles."""
-        return (self.rows, MEMBERS) if self.wide else (self.rows[:EARLY], EARLY_MEMBERS)
+        rows = self.rows if self.wide else self.rows[:EARLY]
+        return rows, MEMBERS if self.wide and not self.at_rest else EARLY_MEMBERS
 
     @property
-    def settled(self) -> bool:
+    def at_rest(self) -> bool:
         """Whether the last step, on all windows and in known noise, may be chance."""
         enough = self.explained >= FEWEST + len(self.point)
         return enough and bool(self.averaged and self.quiet) and self.moved < LIKE_CHANCE
+
+    @property
+    def settled(self) -> bool:
+        """Whether the search is at its end, and the error of finite ensembles is known."""
+        return self.at_rest and bool(self.halved)
 
     @property
     def near(self) -> bool:
@@ -190,6 +196,7 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
         explained=0,
         wide=0,
         quiet=0,
+        halved=0,
         averaged=0,
         epochs=0,
         failures=0,
@@ -218,6 +225,10 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     sides = [_Side.of(problem, state, readings, number) for number in (0, 1)]
     whole = np.asarray(sides[0].found.whole.all(0) & sides[1].found.whole.all(0))
     pulls, products, squares, shares = _products(sides[0], sides[1], whole, loss)
+    if state.at_rest:
+        pull = pulls.sum(0)  # errors of ensembles are in inverse proportion to their size: half errs by as much again
+        following = replace(state, meat=state.meat + np.outer(pull, pull), halved=1, epochs=state.epochs + 1)
+        return following, Epoch({"moved": state.moved}, epoch_steps(problem, state))
     gradients, told = np.zeros_like(state.gradients), np.zeros(len(state.rows))
     gradients[np.flatnonzero(whole)], told[np.flatnonzero(whole)] = pulls, shares
     averaged = state.averaged + 1 if state.near else 0
@@ -235,9 +246,8 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
     error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), _SMALLEST))
     ratio = np.mean([each.noise_ratio() for each in sides], axis=0)
-    noise = state.noise * np.sqrt(np.clip(ratio, *NOISE_CHANGE))
-    rounding = (problem.rounding / problem.typical_change)[: len(noise)]
-    noise = np.maximum(noise, np.maximum(rounding, LEAST_NOISE * noise.max()))
+    noise, rounding = state.noise * np.sqrt(np.clip(ratio, *NOISE_CHANGE)), problem.rounding / problem.typical_change
+    noise = np.maximum(noise, np.maximum(rounding[: len(noise)], LEAST_NOISE * noise.max()))
     moved, pull = float((np.abs(undamped) / error).max()), bread @ undamped
     quiet = bool((np.abs((noise / state.noise) ** 2 - 1.0) < NOISE_SETTLED).all())
     refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))
@@ -261,7 +271,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         failures=state.failures + int((~whole).sum()),
     )
     metrics = {"residual": following.cost**0.5, "moved": following.moved, "noise": float(np.median(noise))}
-    return following, Epoch(metrics, epoch_steps(problem, state), stage="calibrating")
+    return following, Epoch(metrics, epoch_steps(problem, state))
 
 
 def _taken(
@@ -278,10 +288,8 @@ def _taken(
     Near the end chance decides which that is, so the whole step is taken there unless it certainly makes it worse.
     There is none, and the next is damped more, where none helps.
     """
-    damping = state.damping * np.array(TRIALS)
-    damping[0] *= not state.near
-    steps = [damped_step(factor, target, state.point, each) for each in damping.tolist()]
-    tried = np.clip(steps, -LONGEST, LONGEST)
+    damping = state.damping * np.array(TRIALS) * [not state.near, True, True]
+    tried = np.clip([damped_step(factor, target, state.point, each) for each in damping], -LONGEST, LONGEST)
     points = np.concatenate([state.point[None], state.point + tried])
     surprise = innovations(problem.simulator, readings, points, side.members, state.noise).surprise(loss)
     change = surprise[1:] - surprise[0]
@@ -385,13 +393,6 @@ def _products(
     curvature = max(curvature_share(np.stack(z), loss), LEAST_CURVATURE)
     gradients = counted[:, None] * pulls / 2.0
     return gradients, curvature * (products + products.T) / 2.0, curvature * squares.sum(0), share
-
-
-def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
-    """The products, with the eigenvalues of correlations at least `AGREEING`: by chance they may be negative."""
-    lengths = np.sqrt(np.maximum(squares, _SMALLEST))
-    values, vectors = np.linalg.eigh(products / np.outer(lengths, lengths))
-    return (vectors * np.maximum(values, AGREEING)) @ vectors.T * np.outer(lengths, lengths)
 
 
 def _wider(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
