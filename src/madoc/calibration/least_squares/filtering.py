@@ -162,10 +162,7 @@ def horizon_of(problem: CalibrationProblem) -> int:
 
 
 def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState | None:
-    """The search before it has begun; None where few windows show contacts, or the log does not tell states.
-
-    It does where sensors show all positions, and velocities as well unless those are differences of positions.
-    """
+    """The search before it has begun; None where few windows show contacts, or sensors do not show all positions."""
     states, count = problem.states, len(problem.simulator.parameters)
     derived = states.measured < problem.simulator.task.observation_size
     if not states.starts_known or states.placed.any() or (states.kind == "exact" and derived):
