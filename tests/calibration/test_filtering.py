@@ -111,7 +111,7 @@ def test_prediction_errors_of_the_right_model_are_white_and_of_variance_one():
     np.testing.assert_allclose(around.std((0, 1)), noise * readings.scale, rtol=0.05)
     truth = task.parameters.to_unit(task.parameters.vector(SPRING_TRUTH))
     found = innovations(problem.simulator, readings, np.stack([truth, -truth]), members, noise)
-    errors = found.whitened()[0]
+    errors = found.whitened[0]
     assert found.whole.all()
     assert errors.var() == pytest.approx(1.0, rel=0.1)
     assert abs((errors[:, 1:] * errors[:, :-1]).mean()) < 0.1
@@ -202,5 +202,34 @@ def test_logs_without_contacts_or_with_a_horizon_of_the_users_fit_initial_states
     log = recorded(task, SPRING_TRUTH, 600, jax.random.key(0))
     assert of_contacts(CalibrationProblem(log, simulation.make(task, threads=1)), jax.random.key(0)) is None
     problem = problem_of_foot(tmp_path)
-    assert LeastSquares(horizon=5).init(problem, jax.random.key(0)).filtered is None
+    for own in ({"horizon": 5}, {"windows": 20}, {"initial_states": "estimated"}):
+        assert LeastSquares(**own).init(problem, jax.random.key(0)).filtered is None
     assert of_contacts(problem, jax.random.key(0)) is not None
+
+
+def test_both_ensembles_differ_upwards_in_one_epoch_and_downwards_in_the_next_never_out_of_a_range(tmp_path):
+    """A kink, as of a delay of whole steps, would else make the slopes of the two differ as chance does."""
+    problem = problem_of_foot(tmp_path, rows=300)
+    search = of_contacts(problem, jax.random.key(0))
+    search = replace(search, point=np.array([0.0, 1.0]))
+    steps, change = filtering.horizon_of(problem), problem.typical_change
+    readings = Readings.at(problem.dataset, problem.states, search.in_use[0], steps, change)
+    for epochs, first in ((0, filtering.WIDTH), (1, -filtering.WIDTH)):
+        sides = [_Side.of(problem, replace(search, epochs=epochs), readings, number) for number in (0, 1)]
+        for side in sides:
+            np.testing.assert_allclose(side.apart, [first, -filtering.WIDTH])
+        assert (sides[0].members != sides[1].members).any()
+
+
+def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tmp_path):
+    problem = problem_of_foot(tmp_path, rows=300)
+    search = of_contacts(problem, jax.random.key(0))
+    rest = replace(search, point=np.array([0.0, 0.0]), wide=3, quiet=1, averaged=1, explained=len(search.rows))
+    assert rest.at_rest and not rest.settled and rest.in_use[1] == filtering.EARLY_MEMBERS
+    after, epoch = filtering.step(problem, rest, "cauchy")
+    assert after.settled
+    np.testing.assert_array_equal(after.point, rest.point)
+    assert np.linalg.matrix_rank(after.meat) == 1  # one gradient alone, as there was no scatter before
+    systems = 2 * (1 + len(problem.simulator.parameters))
+    rows = len(search.rows)
+    assert epoch.control_steps == systems * rows * filtering.EARLY_MEMBERS * filtering.horizon_of(problem)

@@ -338,6 +338,21 @@ def test_a_gain_that_noise_hides_within_a_few_rows_counts_over_a_longer_time(goo
 
 
 @EITHER
+def test_a_gain_that_few_windows_do_not_show_for_certain_counts_where_predictions_are_much_better(good):
+    uncertain = changed(good, {"relative": 0.86, "nearby_relative": 0.86, "relative_interval": (0.7, 1.01)})
+    much = predicted_over(1.0, 0.8, (0.7, 0.9))
+    assert judge(uncertain).word == "NO_IMPROVEMENT"
+    assert judge(replace(uncertain, open_loop=(much,))).word == "CALIBRATED"
+    for less in (
+        (predicted_over(1.0, 0.85, (0.8, 0.9)),),
+        (predicted_over(1.0, 0.8, (0.6, 1.0)),),
+        (replace(much, windows=4),),
+        (much, predicted_over(0.1, 1.3, (1.1, 1.5))),
+    ):
+        assert judge(replace(uncertain, open_loop=less)).word == "NO_IMPROVEMENT"
+
+
+@EITHER
 def test_a_sentence_names_three_other_terms_at_most(good):
     terms = tuple(
         MissingTerm("Coulomb friction", f"dof_frictionloss.j{joint}", 0.1, 0.01, "N·m", 0.3, 9.0, {"mass": 2.0})

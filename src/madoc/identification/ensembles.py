@@ -7,6 +7,7 @@ smooth in the parameters, and what contacts forget of the first state it forgets
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,7 +22,6 @@ from madoc.simulation.base import Simulator
 
 FARTHEST = 4.0
 """Standard deviations of an innovation, beyond which the states follow it no farther: a false reading says nothing."""
-
 AGREEING = 1e-3
 """Smallest eigenvalue of the products of both ensembles' derivatives, relative to those of each with itself."""
 _SMALLEST = 1e-100
@@ -41,6 +41,7 @@ class Innovations:
     factor: Float[np.ndarray, "systems windows steps channels channels"]
     whole: Bool[np.ndarray, "systems windows"]
 
+    @cached_property
     def whitened(self) -> Float[np.ndarray, "systems windows steps channels"]:
         """L⁻¹ (prediction - reading), all with the L of the first system: of variance 1 there if the model is right."""
         return np.linalg.solve(self.factor[0], self.mean[..., None])[..., 0]
@@ -159,10 +160,8 @@ def _rebuilt(
     random: np.random.Generator,
 ) -> Float[np.ndarray, "windows state"]:
     """States that readings of a row determine."""
-    readings, rebuild = (
-        np.asarray(dataset.transitions.observation, np.float64)[rows],
-        simulator.task.state_from_observation,
-    )
+    readings = np.asarray(dataset.transitions.observation, np.float64)[rows]
+    rebuild = simulator.task.state_from_observation
     assert rebuild is not None  # else they are not exact
     error = random.standard_normal(readings.shape) * noise
     return np.asarray(rebuild(moved(simulator.task.attitudes, readings, error)))

@@ -85,9 +85,8 @@ def _usable(holdout: HoldOut, lacks: Verdict) -> Verdict | None:
     It is none where it predicts certainly worse over another time, nor at an end of its range: a wider range would give
     another one.
     """
-    enough = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
-    better = [each for each in enough if each.relative <= MUCH_BETTER and each.relative_interval[1] < 1.0]
-    if holdout.at_end or not better or any(each.relative_interval[0] > 1.0 for each in enough):
+    better = _much_better(holdout)
+    if holdout.at_end or not better:
         return None
     found = max(better, key=lambda each: (not each.whole, each.seconds))  # whole runs are often few
     return Verdict(
@@ -96,6 +95,14 @@ def _usable(holdout: HoldOut, lacks: Verdict) -> Verdict | None:
         f"own values, as {lacks.sentence}",
         lacks.parameters,
     )
+
+
+def _much_better(holdout: HoldOut) -> list[OpenLoop]:
+    """Predictions that are much and certainly better than those of the model as given; none if others are worse."""
+    enough = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
+    if any(each.relative_interval[0] > 1.0 for each in enough):
+        return []
+    return [each for each in enough if each.relative <= MUCH_BETTER and each.relative_interval[1] < 1.0]
 
 
 def _beside_given(found: OpenLoop) -> str:
@@ -214,18 +221,11 @@ def _improved_later(holdout: Predicted | Fitted) -> bool:
     return any(np.mean(ratios) <= 1.0 - GAINED for ratios in moving if ratios)
 
 
-def _certainly_later(holdout: Predicted | Fitted) -> bool:
-    """Whether predictions over some time are certainly better than those of the model as given, and over none worse."""
-    enough = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
-    worse = any(each.relative_interval[0] > 1.0 for each in enough)
-    return not worse and any(each.relative_interval[1] < 1.0 for each in enough)
-
-
 def _no_better_errors(holdout: Predicted | Fitted) -> str:
     """Why an estimate is no improvement by its prediction errors; empty if it is one.
 
     A small gain is one as well if it is significant and leaves noise alone, which then is most of any error; and one
-    that is not significant, if it leaves noise alone and predictions over longer times are certainly better.
+    that is not significant, if it leaves noise alone and predictions over some time are much better than as given.
     """
     errors, only_noise = holdout.errors, beats_mid_range(holdout) and explains_all(holdout)
     if errors.nearby_relative > 1.0 - WORTH_GAINING and not only_noise:
@@ -234,7 +234,7 @@ def _no_better_errors(holdout: Predicted | Fitted) -> str:
             f"hold-out ({change_of(errors)})"
         )
     gained = (1.0 - errors.relative) / (1.0 - errors.nearby_relative)
-    certain = errors.relative_interval[1] < 1.0 or (explains_all(holdout) and _certainly_later(holdout))
+    certain = errors.relative_interval[1] < 1.0 or (explains_all(holdout) and bool(_much_better(holdout)))
     if certain and gained >= GAINED:
         return ""
     return (

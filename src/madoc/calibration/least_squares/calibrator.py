@@ -64,7 +64,7 @@ class LeastSquares:
     and they show model errors. By default states are estimated where they cannot be rebuilt, where the data is declared
     noisy, and where residuals of consecutive rows alternate as noise makes them: a reading that is too high makes the
     step to it look too long and the step from it too short. Where most windows show contacts and positions are
-    measured, an ensemble filter on windows of its own takes the place of estimated ones (`filtering`).
+    measured, an ensemble filter takes the place of estimated ones (`filtering`), unless a horizon or windows are given.
 
     Attributes:
         initial_states: `logged`, `estimated`, or None to choose by the data.
@@ -102,7 +102,8 @@ class LeastSquares:
         problem.require_pairs()
         stage = self._first_stage(problem)
         chosen = self.horizon is not None or self.initial_states is not None
-        filtered = None if chosen else filtering.of_contacts(problem, named_key(key, "ensembles"))
+        filters = not chosen and self.windows is None
+        filtered = filtering.of_contacts(problem, named_key(key, "ensembles")) if filters else None
         if stage == "estimated" and filtered is not None:
             stage = "filtering"
         fits_starts = stage != "logged" and filtered is None

@@ -201,9 +201,9 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
 
 
 def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
-    """Control steps of the next epoch."""
-    (rows, members), systems = state.in_use, 3 + 2 * len(problem.simulator.parameters) + len(TRIALS)
-    return systems * len(rows) * members * horizon_of(problem)
+    """Control steps of the next epoch; where the search is at rest no step is tried."""
+    (rows, members), tried = state.in_use, 0 if state.at_rest else 1 + len(TRIALS)
+    return (2 * (1 + len(problem.simulator.parameters)) + tried) * len(rows) * members * horizon_of(problem)
 
 
 def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
@@ -335,12 +335,12 @@ class _Side:
 
     def errors(self) -> Float[np.ndarray, "windows values"]:
         """Whitened prediction errors at the point, of all channels but those that never differ."""
-        errors = self.found.whitened()[0, :, self.first :]
+        errors = self.found.whitened[0, :, self.first :]
         return errors[..., (errors != 0.0).any((0, 1))].reshape(len(errors), -1)
 
     def slopes(self) -> Float[np.ndarray, "windows values d"]:
         """The derivatives of these by the parameters."""
-        errors = self.found.whitened()[:, :, self.first :]
+        errors = self.found.whitened[:, :, self.first :]
         kept = (errors[0] != 0.0).any((0, 1))
         change = (errors[1:] - errors[0])[..., kept].reshape(len(self.apart), errors.shape[1], -1)
         return np.moveaxis(change / self.apart[:, None, None], 0, -1)
