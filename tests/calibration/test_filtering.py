@@ -12,8 +12,21 @@ from madoc.calibration.least_squares import filtering
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.least_squares.filtering import _products, _Side, of_contacts
 from madoc.data import Disturbance, disturb
-from madoc.identification.ensembles import AGREEING, FARTHEST, Innovations, agreed, followed, innovations, members_at
+from madoc.identification.ensembles import (
+    AGREEING,
+    BEFORE,
+    DRAWN,
+    FARTHEST,
+    NOISE_ROUNDS,
+    Innovations,
+    agreed,
+    followed,
+    innovations,
+    members_at,
+    with_contacts_settled,
+)
 from madoc.identification.replay import Readings
+from madoc.identification.settling import RESETTLING, settled
 from madoc.runs.checkpoint import load, save
 from own_robots import write_robot
 from robots import SPRING_TRUTH, recorded, spring
@@ -66,7 +79,7 @@ class Given(_Side):
 
 def given(errors, slopes):
     nothing = np.zeros((1, len(errors), 1, 1))
-    found = Innovations(nothing, nothing[..., None], np.ones((1, len(errors)), bool))
+    found = Innovations(nothing, nothing[..., None], np.ones((1, len(errors)), bool), nothing)
     return Given(np.zeros((len(errors), 1, 1)), found, np.zeros(slopes.shape[-1]), 0, (errors, slopes))
 
 
@@ -117,6 +130,29 @@ def test_prediction_errors_of_the_right_model_are_white_and_of_variance_one():
     assert abs((errors[:, 1:] * errors[:, :-1]).mean()) < 0.1
     surprise = found.surprise("linear").mean(1)
     assert surprise[0] < surprise[1]
+
+
+def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_path):
+    problem, steps = problem_of_foot(tmp_path), 20
+    simulator, logged = problem.simulator, problem.states
+    point = simulator.parameters.to_unit(simulator.parameters.vector(FOOT_TRUTH))
+    rows = np.array([row for row in range(0, 880, steps + 1) if row % 100 + steps < 100])
+    readings = Readings.at(problem.dataset, logged, rows, steps, problem.typical_change)
+    given = problem.dataset, logged, simulator, readings, rows, point
+    guesses = logged.states[rows]
+    states, spent = with_contacts_settled(*given, guesses)
+    narrow = settled(simulator, readings, point, guesses, (0.0, *RESETTLING), 0)
+    found = settled(simulator, readings, point, states, (0.0,), 0)
+    size = readings.observed[0].size
+    assert found.unexplained(size, "cauchy").mean() < 0.5 * narrow.unexplained(size, "cauchy").mean()
+    assert (found.deviation[2:] < 0.9 * narrow.deviation[2:]).all()  # of speeds, which contacts decide
+    begun = sum(row % 100 >= BEFORE for row in rows)
+    drawn = NOISE_ROUNDS * begun * DRAWN * BEFORE + len(rows) * (DRAWN + 1) * steps
+    step = len(rows) * (1 + 4 + 3) * steps
+    assert (spent - drawn) / step in (1, 2, 3, 4)
+    aloft = np.add(guesses, [0.0, 1.0, 0.0, 0.0])
+    untouched, nothing = with_contacts_settled(*given, aloft)
+    assert nothing == 0 and untouched is aloft  # without contacts derivatives at the guesses serve
 
 
 def test_chance_biases_no_product_of_two_ensembles():

@@ -8,7 +8,7 @@ from jaxtyping import Float, PRNGKeyArray
 from madoc.data import Dataset, stride, typical_change
 from madoc.data.findings import Finding
 from madoc.identification.excitation import expected_half_widths
-from madoc.identification.fitted_windows import fit_windows, noise_of, windows_of
+from madoc.identification.fitted_windows import fit_log, noise_of, windows_of
 from madoc.identification.gauss_newton import descend
 from madoc.identification.information import (
     Uncertainty,
@@ -149,7 +149,7 @@ def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates,
     spent = len(points) * len(windows) * windows.steps
     if intervals and logged.kind == "approximate":
         fitted = windows_of(dataset, logged, scale, fewest=FEWEST + len(space), most=FEWEST + len(space))
-        fit = fit_windows(simulator, fitted.readings, fitted.states, middle)
+        fit = fit_log(dataset, logged, simulator, fitted, middle)
         if fit.counted.any():
             noise = noise_of(fit, fitted.readings)
             left = scale[: len(noise)] * noise

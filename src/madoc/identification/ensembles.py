@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float, Int
 
 from madoc.data.dataset import Dataset
 from madoc.identification.losses import Loss
+from madoc.identification.noise import difference_noise
 from madoc.identification.replay import Readings
-from madoc.identification.settling import FAILED_WINDOW, window_costs
+from madoc.identification.settling import FAILED_WINDOW, RESETTLING, settled, window_costs, with_bases_settled
 from madoc.identification.states import LoggedStates, states_of
 from madoc.simulation.attitudes import differences, moved
 from madoc.simulation.base import Simulator
@@ -24,6 +25,18 @@ FARTHEST = 4.0
 """Standard deviations of an innovation, beyond which the states follow it no farther: a false reading says nothing."""
 AGREEING = 1e-3
 """Smallest eigenvalue of the products of both ensembles' derivatives, relative to those of each with itself."""
+NOISE_CHANGE = (0.1, 4.0)
+"""Smallest and largest factor of a channel's noise variance from a run of the filter to the next."""
+OF_CLIPPED = 0.9950
+"""Mean square of a normal value of variance 1, clipped at nine."""
+BEFORE = 8
+"""Number of control steps before a window, by whose readings a filter finds states at its first row."""
+DRAWN = 32
+"""Number of states that are tried at the first row of a window."""
+NOISE_ROUNDS = 2
+"""Number of runs of a filter before a window; each tells the sensors' noise better."""
+LEAST_NOISE = 1e-6
+"""Smallest noise of a channel, in its typical changes: rounding in log and simulator is more."""
 _SMALLEST = 1e-100
 
 
@@ -35,11 +48,13 @@ class Innovations:
         mean: Predicted mean minus the reading, in standard deviations of the sensors' noise.
         factor: Lower triangular L with L Lᵀ the covariance of that, the sensors' noise included.
         whole: Windows in which no simulation failed, by system.
+        members: The ensembles' states after the last reading.
     """
 
     mean: Float[np.ndarray, "systems windows steps channels"]
     factor: Float[np.ndarray, "systems windows steps channels channels"]
     whole: Bool[np.ndarray, "systems windows"]
+    members: Float[np.ndarray, "systems windows members state"]
 
     @cached_property
     def whitened(self) -> Float[np.ndarray, "systems windows steps channels"]:
@@ -59,6 +74,16 @@ class Innovations:
     def variances(self) -> Float[np.ndarray, "windows steps channels"]:
         """Variance of each reading's prediction under the first system, in those of the sensors' noise, at least 1."""
         return np.asarray((self.factor[0] ** 2).sum(-1))
+
+    def noise_ratio(self, first: int = 0) -> Float[np.ndarray, " channels"]:
+        """Mean square of each channel's prediction errors over their variance, outliers clipped; 1 if they are all 0.
+
+        It is that of the first system, from the step `first` on: Huber's (1964) second proposal for a scale, with a cut
+        at three standard deviations.
+        """
+        relative = (self.mean[0] ** 2 / self.variances())[self.whole[0], first:].reshape(-1, self.mean.shape[-1])
+        clipped = np.minimum(relative, 9.0).mean(0) / OF_CLIPPED if len(relative) else np.zeros(relative.shape[-1])
+        return np.where(clipped == 0.0, 1.0, clipped)
 
 
 def innovations(
@@ -96,7 +121,7 @@ def innovations(
         mean[:, :, step], factor[:, :, step] = apart.mean(2), _covariance_factor(apart)
         grouped[..., :physical] = followed(grouped[..., :physical], apart, factor[:, :, step])
         states = np.where(whole[..., None, None], grouped, members).reshape(every)
-    return Innovations(mean, factor, whole)
+    return Innovations(mean, factor, whole, states.reshape(*shape[:2], count, size))
 
 
 def _covariance_factor(
@@ -193,3 +218,63 @@ def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, " d"])
     lengths = np.sqrt(np.maximum(squares, _SMALLEST))
     values, vectors = np.linalg.eigh(products / np.outer(lengths, lengths))
     return (vectors * np.maximum(values, AGREEING)) @ vectors.T * np.outer(lengths, lengths)
+
+
+def with_contacts_settled(
+    dataset: Dataset,
+    logged: LoggedStates,
+    simulator: Simulator,
+    readings: Readings,
+    rows: Int[np.ndarray, " windows"],
+    point: Float[np.ndarray, " d"],
+    guesses: Float[np.ndarray, "windows state"],
+) -> tuple[Float[np.ndarray, "windows state"], int]:
+    """Initial states from near which those of single windows can be fitted, and the control steps that it took.
+
+    Where windows begin in contact, the best of many states that are as likely as the readings before each window is
+    taken, and settles: what states in wrong minima leave would pass for what the model lacks.
+    """
+    if readings.placed.any():
+        states, simulations = with_bases_settled(simulator, readings, point, guesses)
+        return states, simulations * readings.steps
+    known = guesses[np.isfinite(guesses).all(-1)]
+    if not len(known) or not simulator.contacts(known, simulator.parameters.to_physical(point.clip(-1.0, 1.0))).any():
+        return guesses, 0
+    spent = 0
+    if logged.starts_known and (logged.kind == "approximate" or logged.measured == simulator.task.observation_size):
+        guesses, spent = _likeliest(dataset, logged, simulator, readings, rows, point, guesses)
+    after = settled(simulator, readings, point, guesses, (0.0, *RESETTLING), 0, until_noise=True)
+    return after.states, spent + after.simulations * readings.steps
+
+
+def _likeliest(
+    dataset: Dataset,
+    logged: LoggedStates,
+    simulator: Simulator,
+    readings: Readings,
+    rows: Int[np.ndarray, " windows"],
+    point: Float[np.ndarray, " d"],
+    guesses: Float[np.ndarray, "windows state"],
+) -> tuple[Float[np.ndarray, "windows state"], int]:
+    """Of an ensemble's states at each window's first row that which fits the window best, or the guess.
+
+    The ensemble has followed the readings before the window, where its episode has as many. Also the control steps.
+    """
+    random, first, least = np.random.default_rng(0), rows - BEFORE, np.full(logged.measured, LEAST_NOISE)
+    noise = np.maximum(difference_noise(dataset)[: logged.measured] / readings.scale, least)
+    tried = np.repeat(guesses[:, None], DRAWN + 1, axis=1)
+    tried[:, :DRAWN] = members_at(dataset, logged, simulator, rows, noise * readings.scale, DRAWN, random)
+    begun = np.flatnonzero(np.isin(first, logged.rows) & (dataset.episode_starts[dataset.episode_of(rows)] <= first))
+    if len(begun):
+        before = Readings.at(dataset, logged, first[begun], BEFORE, readings.scale)
+        for _ in range(NOISE_ROUNDS):
+            members = members_at(dataset, logged, simulator, first[begun], noise * readings.scale, DRAWN, random)
+            found = innovations(simulator, before, point[None], members, noise)
+            noise = np.maximum(noise * np.sqrt(np.clip(found.noise_ratio(), *NOISE_CHANGE)), least)
+        physical, whole = slice(0, logged.physical_size), found.whole[0]
+        tried[begun[whole], :DRAWN, physical] = found.members[0, whole][..., physical]
+    starts = np.swapaxes(tried, 0, 1).reshape(1, -1, guesses.shape[1])
+    residuals = readings.residuals(simulator, point[None], starts)[0] / np.tile(noise, readings.steps + 1)
+    best = window_costs(residuals, "cauchy").argmin(0)
+    spent = NOISE_ROUNDS * len(begun) * DRAWN * BEFORE + len(rows) * (DRAWN + 1) * readings.steps
+    return tried[np.arange(len(rows)), best], spent

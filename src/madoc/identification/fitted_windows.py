@@ -8,13 +8,13 @@ from jaxtyping import Bool, Float, Int
 
 from madoc.data.dataset import Dataset
 from madoc.data.timescale import stride
+from madoc.identification.ensembles import with_contacts_settled
 from madoc.identification.gauss_newton import Eliminated, damped_step, eliminate, states_basis, triangular_factors
 from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.losses import TUNING, loss_slope, loss_value, scale_of
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.score_tests import Products
-from madoc.identification.settling import with_contacts_settled
 from madoc.identification.states import LoggedStates
 from madoc.identification.windows import disjoint_windows, evenly, longest_fit
 from madoc.simulation.base import Simulator
@@ -149,6 +149,16 @@ class Fit:
         return self.unexplained < (1.0 - GAIN) * other.unexplained
 
 
+def fit_log(
+    dataset: Dataset, logged: LoggedStates, simulator: Simulator, windows: LoggedWindows, point: Float[np.ndarray, " d"]
+) -> Fit:
+    """`fit_windows` from what the log tells of initial states, of which those in contact settle first."""
+    readings = windows.readings
+    states, spent = with_contacts_settled(dataset, logged, simulator, readings, windows.rows, point, windows.states)
+    fit = fit_windows(simulator, readings, states, point)
+    return replace(fit, control_steps=spent + fit.control_steps)
+
+
 def fit_windows(
     simulator: Simulator,
     readings: Readings,
@@ -163,9 +173,7 @@ def fit_windows(
     more at the parameters found, so that outlying readings count little.
     """
     unknown = np.zeros((len(readings), readings.observed[0].size, len(point)))
-    states, simulations = with_contacts_settled(simulator, readings, point, states)
-    spent = simulations * readings.steps
-    fit = _settled(simulator, readings, _sloped(simulator, readings, states, point, spent, by_parameters=unknown))
+    fit = _settled(simulator, readings, _sloped(simulator, readings, states, point, 0, by_parameters=unknown))
     fit = _sloped_by_parameters(simulator, readings, fit)
     for _ in range(LINEARISATIONS):
         moved = _descended(simulator, readings, fit)

@@ -14,17 +14,18 @@ from jaxtyping import Float
 from madoc import simulation
 from madoc.data.dataset import Dataset
 from madoc.identification.candidate_effects import effects
-from madoc.identification.candidate_terms import (
-    BELOW_MINIMUM,
-    EARLY,
-    INTEGRATION,
-    Candidate,
-    candidates,
-    is_late,
-)
+from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, INTEGRATION, Candidate, candidates, is_late
 from madoc.identification.concentration import Concentration, alike, concentration
 from madoc.identification.drifts import drifts_of
-from madoc.identification.fitted_windows import Fit, LoggedWindows, fit_windows, negligible, products_of, windows_of
+from madoc.identification.fitted_windows import (
+    Fit,
+    LoggedWindows,
+    fit_log,
+    fit_windows,
+    negligible,
+    products_of,
+    windows_of,
+)
 from madoc.identification.information import NORMAL_95
 from madoc.identification.joint_forces import force_effects, is_joint_force
 from madoc.identification.replay import Readings
@@ -116,8 +117,7 @@ def suspicions(
     readings, runs = windows.readings, windows.runs
     if len(readings) < FEWEST + len(point):
         return Suspicions(tested=False)
-    fit = fit_windows(simulator, readings, windows.states, point)
-    led = fit.point
+    led = (fit := fit_log(dataset, logged, simulator, windows, point)).point
     responses = responses_of(simulator, readings, fit.point, fit.states, fit.slopes.whole)
     tried, by_terms, simulated = _effects(logged, simulator, windows, fit, scale, responses)
     spent = fit.control_steps + (1 + simulated) * len(readings) * readings.steps + responses.control_steps

@@ -28,7 +28,7 @@ PLACED_ALONE = 3
 RESTARTS = 5
 """Number of times that windows whose residuals are more than noise begin anew, near the guess of their state."""
 ANEW = 2
-"""The same for windows that the model is tested by, of which a few may stay where they are."""
+"""The same in the fit for prediction, of whose windows a few may stay where they are."""
 FARTHEST = 30.0
 """Largest error of a guess in standard errors of the state: that of a velocity that jumps between two positions."""
 BEYOND = 3.0
@@ -211,26 +211,6 @@ def with_bases_settled(
     if not readings.placed.any():
         return guesses, 0
     after = settled(simulator, readings, point, guesses, (0.0,), 1)
-    return after.states, after.simulations
-
-
-def with_contacts_settled(
-    simulator: Simulator,
-    readings: Readings,
-    point: Float[np.ndarray, " d"],
-    guesses: Float[np.ndarray, "windows state"],
-) -> tuple[Float[np.ndarray, "windows state"], int]:
-    """Initial states from near which those of single windows can be fitted, and the simulations that it took.
-
-    Where windows begin in contact they settle by differences of all `WIDTHS`, until residuals of nearly all are noise,
-    and then begin anew where they are not: what states in wrong minima leave would pass for what the model lacks.
-    """
-    if readings.placed.any():
-        return with_bases_settled(simulator, readings, point, guesses)
-    known = guesses[np.isfinite(guesses).all(-1)]
-    if not len(known) or not simulator.contacts(known, simulator.parameters.to_physical(point.clip(-1.0, 1.0))).any():
-        return guesses, 0
-    after = settled(simulator, readings, point, guesses, WIDTHS, ANEW, until_noise=True)
     return after.states, after.simulations
 
 

@@ -23,7 +23,7 @@ from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification.ensembles import Innovations, agreed, innovations, members_at
+from madoc.identification.ensembles import NOISE_CHANGE, Innovations, agreed, innovations, members_at
 from madoc.identification.gauss_newton import damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.linearisation import LEAST_CURVATURE
@@ -62,12 +62,8 @@ NEAR, LIKE_CHANCE = 2.5, 1.0
 """Steps in standard errors, below which epochs are averaged, and below which the mean is at its end."""
 USUAL_EPOCHS = (5, 4)
 """Numbers of first and later epochs that most searches take, for the time that is told to be left."""
-NOISE_CHANGE = (0.1, 4.0)
-"""Smallest and largest factor of a channel's noise variance from an epoch to the next."""
 NOISE_SETTLED = 0.3
 """Relative change of a noise variance, below which it is as good as known."""
-OF_CLIPPED = 0.9950
-"""Mean square of a normal value of variance 1, clipped at nine."""
 LEAST_NOISE = 1e-3
 """Smallest noise of a channel in its typical changes at the start, and relative to the noisiest one's later."""
 MOSTLY = 0.5
@@ -242,7 +238,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     scores = gradients / (1.0 - np.minimum(told, 0.75))[:, None]  # about what leaving the window out would change
     meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
     error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), _SMALLEST))
-    ratio = np.mean([each.noise_ratio() for each in sides], axis=0)
+    ratio = np.mean([each.found.noise_ratio(each.first) for each in sides], axis=0)
     noise, rounding = state.noise * np.sqrt(np.clip(ratio, *NOISE_CHANGE)), problem.rounding / problem.typical_change
     noise = np.maximum(noise, np.maximum(rounding[: len(noise)], LEAST_NOISE * noise.max()))
     moved, pull = float((np.abs(undamped) / error).max()), bread @ undamped
@@ -344,17 +340,6 @@ class _Side:
         kept = (errors[0] != 0.0).any((0, 1))
         change = (errors[1:] - errors[0])[..., kept].reshape(len(self.apart), errors.shape[1], -1)
         return np.moveaxis(change / self.apart[:, None, None], 0, -1)
-
-    def noise_ratio(self) -> Float[np.ndarray, " channels"]:
-        """Mean square of each channel's prediction errors over their variance, outliers clipped; 1 if they are all 0.
-
-        This is Huber's (1964) second proposal for a scale, with a cut at three standard deviations.
-        """
-        relative = (self.found.mean[0] ** 2 / self.found.variances())[self.found.whole[0], self.first :].reshape(
-            -1, self.found.mean.shape[-1]
-        )
-        clipped = np.minimum(relative, 9.0).mean(0) / OF_CLIPPED if len(relative) else np.zeros(relative.shape[-1])
-        return np.where(clipped == 0.0, 1.0, clipped)
 
 
 def _products(
