@@ -27,6 +27,7 @@ from madoc.identification.ensembles import (
 )
 from madoc.identification.replay import Readings
 from madoc.identification.settling import RESETTLING, settled
+from madoc.identification.windows import disjoint_windows
 from madoc.runs.checkpoint import load, save
 from own_robots import write_robot
 from robots import SPRING_TRUTH, recorded, spring
@@ -136,7 +137,7 @@ def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_
     problem, steps = problem_of_foot(tmp_path), 20
     simulator, logged = problem.simulator, problem.states
     point = simulator.parameters.to_unit(simulator.parameters.vector(FOOT_TRUTH))
-    rows = np.array([row for row in range(0, 880, steps + 1) if row % 100 + steps < 100])
+    rows = logged.rows[disjoint_windows(problem.dataset, logged.rows, steps)]
     readings = Readings.at(problem.dataset, logged, rows, steps, problem.typical_change)
     given = problem.dataset, logged, simulator, readings, rows, point
     guesses = logged.states[rows]
@@ -146,7 +147,7 @@ def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_
     size = readings.observed[0].size
     assert found.unexplained(size, "cauchy").mean() < 0.5 * narrow.unexplained(size, "cauchy").mean()
     assert (found.deviation[2:] < 0.9 * narrow.deviation[2:]).all()  # of speeds, which contacts decide
-    begun = sum(row % 100 >= BEFORE for row in rows)
+    begun = int((rows - problem.dataset.episode_starts[problem.dataset.episode_of(rows)] >= BEFORE).sum())
     drawn = NOISE_ROUNDS * begun * DRAWN * BEFORE + len(rows) * (DRAWN + 1) * steps
     step = len(rows) * (1 + 4 + 3) * steps
     assert (spent - drawn) / step in (1, 2, 3, 4)
