@@ -10,7 +10,7 @@ from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares import filtering
 from madoc.calibration.least_squares.calibrator import LeastSquares
-from madoc.calibration.least_squares.filtering import _products, _Side, of_contacts
+from madoc.calibration.least_squares.filtering import _axes, _products, _Side, of_contacts
 from madoc.data import Disturbance, disturb
 from madoc.identification.ensembles import (
     AGREEING,
@@ -81,7 +81,8 @@ class Given(_Side):
 def given(errors, slopes):
     nothing = np.zeros((1, len(errors), 1, 1))
     found = Innovations(nothing, nothing[..., None], np.ones((1, len(errors)), bool), nothing)
-    return Given(np.zeros((len(errors), 1, 1)), found, np.zeros(slopes.shape[-1]), 0, (errors, slopes))
+    nowhere = np.zeros(slopes.shape[-1])
+    return Given(np.zeros((len(errors), 1, 1)), found, np.diag(nowhere), nowhere, 0, (errors, slopes))
 
 
 def problem_of_foot(folder, rows=900, spec=FOOT_SPEC):
@@ -167,9 +168,18 @@ def test_chance_biases_no_product_of_two_ensembles():
 
     gradients, products, squares, _ = _products(side(), side(), np.ones(windows, bool), "linear")
     assert products[0, 0] / windows == pytest.approx(1.0, abs=0.15)
-    assert squares[0] / windows == pytest.approx(5.0, rel=0.1)
+    assert squares[0, 0] / windows == pytest.approx(5.0, rel=0.1)
     assert gradients.mean() == pytest.approx(0.3, abs=0.05)  # with its own slopes an ensemble's would be 0.7
-    np.testing.assert_allclose(agreed(np.array([[-1.0]]), np.array([4.0])), [[4.0 * AGREEING]])
+    np.testing.assert_allclose(agreed(np.array([[-1.0]]), np.array([[4.0]])), [[4.0 * AGREEING]])
+
+
+def test_what_both_ensembles_agree_on_is_kept_along_a_weak_direction_too():
+    """Two parameters that act alike but for a thousandth, and a third of which there is chance alone."""
+    alike = np.array([[1.0, 1.0, 0.0], [1.0, 1.000001, 0.0], [0.0, 0.0, -0.5]])
+    squares = alike + np.diag([0.0, 0.0, 2.5])
+    expected = alike.copy()
+    expected[2, 2] = 2.0 * AGREEING
+    np.testing.assert_allclose(agreed(alike, squares), expected, atol=1e-9)
 
 
 def test_a_window_of_chance_alone_does_not_decide():
@@ -178,9 +188,9 @@ def test_a_window_of_chance_alone_does_not_decide():
     slopes[0] = 1000.0
     side = given(np.ones((11, 1)), slopes)
     gradients, _, squares, shares = _products(side, side, np.ones(11, bool), "linear")
-    assert squares[0] < 1.3 * 10.0
+    assert squares[0, 0] < 1.3 * 10.0
     assert gradients[0, 0] < gradients[1, 0]
-    assert shares[0] < 0.2 and shares.sum() == pytest.approx(1.0)
+    assert shares[0] < 0.2 and shares.sum() == pytest.approx(filtering.MOST_TOLD)
 
 
 def test_a_foot_that_slides_under_noise(tmp_path):
@@ -244,18 +254,35 @@ def test_logs_without_contacts_or_with_a_horizon_of_the_users_fit_initial_states
     assert of_contacts(problem, jax.random.key(0)) is not None
 
 
-def test_both_ensembles_differ_upwards_in_one_epoch_and_downwards_in_the_next_never_out_of_a_range(tmp_path):
-    """A kink, as of a delay of whole steps, would else make the slopes of the two differ as chance does."""
+def test_differences_lead_along_the_axes_of_the_covariance_and_not_out_of_a_range(tmp_path):
     problem = problem_of_foot(tmp_path, rows=300)
     search = of_contacts(problem, jax.random.key(0))
-    search = replace(search, point=np.array([0.0, 1.0]))
+    np.testing.assert_allclose(search.spread, filtering.WIDTH * np.eye(2))
+    axes = _axes(
+        np.array([[5e-4, 3e-4], [3e-4, 5e-4]])
+    )  # standard errors of sqrt(8e-4) along (1, 1), sqrt(2e-4) across
+    expected = np.sqrt([[2e-4, 8e-4], [2e-4, 8e-4]]) * filtering.SPREAD / np.sqrt(2.0)
+    np.testing.assert_allclose(np.abs(axes), expected)
+    np.testing.assert_allclose(np.linalg.norm(_axes(np.diag([0.0, 9.0])), axis=0), filtering.WIDTHS)
     steps, change = filtering.horizon_of(problem), problem.typical_change
     readings = Readings.at(problem.dataset, problem.states, search.in_use[0], steps, change)
-    for epochs, first in ((0, filtering.WIDTH), (1, -filtering.WIDTH)):
-        sides = [_Side.of(problem, replace(search, epochs=epochs), readings, number) for number in (0, 1)]
-        for side in sides:
-            np.testing.assert_allclose(side.apart, [first, -filtering.WIDTH])
-        assert (sides[0].members != sides[1].members).any()
+    search = replace(search, point=np.array([0.0, 1.0]), spread=np.array([[0.1, -0.1], [0.2, 0.1]]))
+    sides = [_Side.of(problem, search, readings, number) for number in (0, 1)]
+    for side in sides:
+        np.testing.assert_allclose(side.apart, [[0.2, 0.2], [-0.2, 0.1]])  # both ends of 1 +- 0.2 and of 1 +- 0.1
+        np.testing.assert_allclose(side.aside, [0.0, -0.075])
+    assert (sides[0].members != sides[1].members).any()
+
+
+def test_errors_and_slopes_of_a_linear_model_lead_back_to_the_point():
+    """By hand: errors 2 + 3 p, at ends 0.1 above the point and 0.3 below it."""
+    ends = 2.0 + 3.0 * np.array([0.0, 0.1, -0.3])
+    factor = np.ones((3, 1, 1, 1, 1))
+    found = Innovations(ends.reshape(3, 1, 1, 1), factor, np.ones((3, 1), bool), np.zeros((3, 1, 1, 1)))
+    side = _Side(np.zeros((1, 1, 1)), found, np.array([[0.4]]), np.array([-0.1]), 0)
+    np.testing.assert_allclose(side.slopes(), [[[3.0]]])
+    np.testing.assert_allclose(side.errors(), [[2.0]])
+    np.testing.assert_allclose(side.at_point(), [[2.0]])
 
 
 def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tmp_path):
@@ -267,6 +294,6 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     assert after.settled
     np.testing.assert_array_equal(after.point, rest.point)
     assert np.linalg.matrix_rank(after.meat) == 1  # one gradient alone, as there was no scatter before
-    systems = 2 * (1 + len(problem.simulator.parameters))
+    systems = 2 * (1 + 2 * len(problem.simulator.parameters))
     rows = len(search.rows)
     assert epoch.control_steps == systems * rows * filtering.EARLY_MEMBERS * filtering.horizon_of(problem)

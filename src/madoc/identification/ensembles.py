@@ -24,7 +24,7 @@ from madoc.simulation.base import Simulator
 FARTHEST = 4.0
 """Standard deviations of an innovation, beyond which the states follow it no farther: a false reading says nothing."""
 AGREEING = 1e-3
-"""Smallest eigenvalue of the products of both ensembles' derivatives, relative to those of each with itself."""
+"""Smallest share in [0, 1] of the squares of an ensemble's derivatives that the other counts as agreeing on."""
 NOISE_CHANGE = (0.1, 4.0)
 """Smallest and largest factor of a channel's noise variance from a run of the filter to the next."""
 OF_CLIPPED = 0.9950
@@ -37,7 +37,7 @@ NOISE_ROUNDS = 2
 """Number of runs of a filter before a window; each tells the sensors' noise better."""
 LEAST_NOISE = 1e-6
 """Smallest noise of a channel, in its typical changes: rounding in log and simulator is more."""
-_SMALLEST = 1e-100
+_SMALLEST, _ROUNDING = 1e-100, 1e-12
 
 
 @dataclass(frozen=True)
@@ -213,11 +213,16 @@ def _rebuilt_from_neighbours(
     return states.states[np.searchsorted(states.rows, rows)]
 
 
-def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
-    """The products, with the eigenvalues of correlations at least `AGREEING`: by chance they may be negative."""
-    lengths = np.sqrt(np.maximum(squares, _SMALLEST))
-    values, vectors = np.linalg.eigh(products / np.outer(lengths, lengths))
-    return (vectors * np.maximum(values, AGREEING)) @ vectors.T * np.outer(lengths, lengths)
+def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
+    """The products, in no direction less than `AGREEING` of the squares: by chance they may be negative."""
+    size = np.sqrt(np.maximum(np.diag(squares), _SMALLEST))
+    relative = [each / np.outer(size, size) for each in (products, squares)]
+    values, vectors = np.linalg.eigh(relative[1])
+    root = vectors * np.sqrt(np.maximum(values, _ROUNDING * values[-1]))
+    inverse = np.linalg.inv(root)
+    shares, axes = np.linalg.eigh(inverse @ relative[0] @ inverse.T)
+    whole = size[:, None] * (root @ axes * np.sqrt(np.maximum(shares, AGREEING)))
+    return whole @ whole.T
 
 
 def with_contacts_settled(

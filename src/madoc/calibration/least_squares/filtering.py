@@ -4,9 +4,14 @@ Every reading of a window is predicted from those before it (`identification.ens
 is unknown, and each prediction error depends on no later noise: at the right parameters errors are uncorrelated with
 anything known before them (prediction error method, Ljung 1999, chapter 7).
 
-Derivatives are differences, in which a finite ensemble leaves chance. A least-squares step would be biased by it, as
-residuals and derivatives share it, and too short. So two independent ensembles a and b are simulated: the derivatives
-of each are instruments for the other (Reiersol 1941). A step p solves
+Where bodies strike each other the cost is rough: within a small part of a standard error it goes up and down with what
+strikes a step sooner, and there a derivative says nothing of where the minimum is. So errors and derivatives are those
+of a statistical linearisation (Gelb 1974, section 6.2): means and differences over points as far apart as parameters
+are uncertain, along the axes of their covariance (as sigma points, Julier and Uhlmann 2004).
+
+A finite ensemble leaves chance in them. A least-squares step would be biased by it, as residuals and derivatives share
+it, and too short. So two independent ensembles a and b are simulated: the derivatives of each are instruments for the
+other (Reiersol 1941). A step p solves
 
     (Jaᵀ W Jb + Jbᵀ W Ja) p = -(Jbᵀ ψ(ra) + Jaᵀ ψ(rb)),
 
@@ -44,10 +49,9 @@ EARLY_EPOCHS = 10
 MEMBERS, EARLY_MEMBERS = 32, 16
 """Number of states in an ensemble, and in the first epochs; with half as many estimates are off by a standard error."""
 WIDTH, WIDTHS = 0.1, (0.005, 0.4)
-"""Width of a difference in [-1, 1] at first, and its smallest and largest."""
-ALIKE = (0.3, 0.8)
-"""Shares in [0, 1] of a column's squares that both ensembles agree on: with less its difference becomes twice as wide,
-with more half as wide."""
+"""Width of a difference in [-1, 1] to either side at first, and its smallest and largest."""
+SPREAD = 3.0
+"""Its width in between, in standard errors of the parameters along each axis of their covariance."""
 LONGEST = 0.5
 """Largest change of a parameter in an epoch, in [-1, 1]."""
 DAMPED = 10.0
@@ -70,6 +74,8 @@ MOSTLY = 0.5
 """Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts."""
 SPOILT = 3
 """Number of first steps whose errors do not count where velocities are differences, which hold the next position."""
+MOST_TOLD = 0.9
+"""Share in (0, 1) that counts of what a window tells where no other one tells of a direction."""
 ROUNDS = 10  # of weighting windows of too large a share less
 _SMALLEST = 1e-100
 
@@ -82,12 +88,12 @@ class FilterState:
     Attributes:
         point: The parameters, in [-1, 1].
         rows: First rows of the windows, in random order.
-        widths: Width of each parameter's difference in [-1, 1].
+        spread: Differences along each axis of the parameters' covariance, in [-1, 1], in columns.
         noise: Noise of each channel in its typical changes.
         seed: Seed of the ensembles' random numbers.
         gradients: Each window's gradient of the cost, the mean of the epochs that are averaged.
         products: Of both ensembles' derivatives, the curvature of the cost, as a mean as well.
-        squares: Of each ensemble's with itself, which chance makes larger.
+        squares: Of each ensemble's own, which chance makes larger.
         meat: Scatter of the gradients before the last step, which counts as an error.
         moved: The largest component of the last step in its standard errors.
         damping: λ of the next step.
@@ -103,12 +109,12 @@ class FilterState:
 
     point: Float[np.ndarray, " d"]
     rows: Int[np.ndarray, " windows"]
-    widths: Float[np.ndarray, " d"]
+    spread: Float[np.ndarray, "d d"]
     noise: Float[np.ndarray, " channels"]
     seed: int
     gradients: Float[np.ndarray, "windows d"]
     products: Float[np.ndarray, "d d"]
-    squares: Float[np.ndarray, " d"]
+    squares: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
     moved: float
     damping: float
@@ -176,12 +182,12 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
     return FilterState(
         point=np.zeros(count),
         rows=rows,
-        widths=np.full(count, WIDTH),
+        spread=WIDTH * np.eye(count),
         noise=np.maximum(by_differences, LEAST_NOISE),
         seed=int(np.asarray(jax.random.key_data(key))[-1]),
         gradients=np.zeros((len(rows), count)),
         products=np.zeros((count, count)),
-        squares=np.zeros(count),
+        squares=np.zeros((count, count)),
         meat=np.zeros((count, count)),
         moved=0.0,
         damping=FIRST_DAMPING,
@@ -199,7 +205,7 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
 def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
     """Control steps of the next epoch; where the search is at rest no step is tried."""
     (rows, members), tried = state.in_use, 0 if state.at_rest else 1 + len(TRIALS)
-    return (2 * (1 + len(problem.simulator.parameters)) + tried) * len(rows) * members * horizon_of(problem)
+    return (2 * (1 + 2 * len(problem.simulator.parameters)) + tried) * len(rows) * members * horizon_of(problem)
 
 
 def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
@@ -222,7 +228,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         pull = pulls.sum(0)  # errors of ensembles are in inverse proportion to their size: half errs by as much again
         following = replace(state, meat=state.meat + np.outer(pull, pull), halved=1, epochs=state.epochs + 1)
         return following, Epoch({"moved": state.moved}, epoch_steps(problem, state))
-    gradients, told = np.zeros_like(state.gradients), np.zeros(len(state.rows))
+    gradients, told = np.zeros_like(state.gradients), np.zeros((len(state.rows), *products.shape))
     gradients[np.flatnonzero(whole)], told[np.flatnonzero(whole)] = pulls, shares
     averaged = state.averaged + 1 if state.near else 0
     if averaged:
@@ -235,7 +241,8 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     target = np.linalg.solve(factor.T, gradients.sum(0))
     undamped = damped_step(factor, target, state.point, 0.0)
     taken, damping = _taken(problem, state, readings, sides[0], factor, target, loss)
-    scores = gradients / (1.0 - np.minimum(told, 0.75))[:, None]  # about what leaving the window out would change
+    left_out = np.linalg.inv(np.eye(len(bread)) - told)
+    scores = (left_out @ gradients[..., None])[..., 0]  # about what leaving the window out would change
     meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
     error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), _SMALLEST))
     ratio = np.mean([each.found.noise_ratio(each.first) for each in sides], axis=0)
@@ -248,14 +255,14 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         state,
         point=state.point + taken,
         damping=damping,
-        widths=np.clip(state.widths * _wider(products, squares), *WIDTHS),
+        spread=_axes(sandwich(bread, meat).covariance),
         noise=noise,
-        gradients=gradients + told[:, None] * (bread @ taken),
+        gradients=gradients + told @ (bread @ taken),
         products=products,
         squares=squares,
         meat=meat + np.outer(pull, pull),
         moved=max(moved, LIKE_CHANCE) if refused else moved,
-        cost=float(np.mean([window_costs(each.errors(), loss)[whole] for each in sides])) if whole.any() else 0.0,
+        cost=float(np.mean([window_costs(each.at_point(), loss)[whole] for each in sides])) if whole.any() else 0.0,
         explained=int(whole.sum()),
         wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < NEAR)),
         quiet=int(quiet),
@@ -302,13 +309,15 @@ class _Side:
     Attributes:
         members: Its states at the first readings.
         found: Prediction errors at the point and at its neighbours.
-        apart: How far each neighbour is from the point in its parameter.
+        apart: The parameters' change in each difference, in rows.
+        aside: How far the mean of its ends is from the point.
         first: The first step whose errors count.
     """
 
     members: Float[np.ndarray, "windows members state"]
     found: Innovations
-    apart: Float[np.ndarray, " d"]
+    apart: Float[np.ndarray, "d d"]
+    aside: Float[np.ndarray, " d"]
     first: int
 
     @classmethod
@@ -319,65 +328,78 @@ class _Side:
         readings: Readings,
         number: int,
     ) -> "_Side":
-        """One ensemble; differences of both lead upwards in one epoch and downwards in the next, not out of a range."""
-        random, sign = np.random.default_rng([state.seed, state.epochs, number]), 1 - 2 * (state.epochs % 2)
+        """One ensemble, and differences to either side of the point, not out of a range."""
+        random = np.random.default_rng([state.seed, state.epochs, number])
         noise = state.noise * readings.scale
         rows, count = state.in_use
         members = members_at(problem.dataset, problem.states, problem.simulator, rows, noise, count, random)
-        apart = np.where(np.abs(state.point + sign * state.widths) <= 1.0, sign, -sign) * state.widths
-        points = np.concatenate([state.point[None], state.point + np.diag(apart)])
+        above, below = (np.clip(state.point + sign * state.spread.T, -1.0, 1.0) for sign in (1, -1))
+        points, aside = np.concatenate([state.point[None], above, below]), (above + below).mean(0) / 2.0 - state.point
         found = innovations(problem.simulator, readings, points, members, state.noise)
-        return cls(members, found, apart, 0 if problem.states.kind == "exact" else SPOILT)
+        return cls(members, found, above - below, aside, 0 if problem.states.kind == "exact" else SPOILT)
 
     def errors(self) -> Float[np.ndarray, "windows values"]:
-        """Whitened prediction errors at the point, of all channels but those that never differ."""
-        errors = self.found.whitened[0, :, self.first :]
-        return errors[..., (errors != 0.0).any((0, 1))].reshape(len(errors), -1)
+        """Whitened prediction errors at the point, by their mean over the differences' ends.
+
+        Where these are not on either side of the point, as at the end of a range, the derivatives lead back to it.
+        """
+        return self._told(self.found.whitened[1:].mean(0)) - self.slopes() @ self.aside
+
+    def at_point(self) -> Float[np.ndarray, "windows values"]:
+        """Whitened prediction errors simulated at the point itself."""
+        return self._told(self.found.whitened[0])
 
     def slopes(self) -> Float[np.ndarray, "windows values d"]:
         """The derivatives of these by the parameters."""
-        errors = self.found.whitened[:, :, self.first :]
-        kept = (errors[0] != 0.0).any((0, 1))
-        change = (errors[1:] - errors[0])[..., kept].reshape(len(self.apart), errors.shape[1], -1)
-        return np.moveaxis(change / self.apart[:, None, None], 0, -1)
+        above, below = np.split(self.found.whitened[1:], 2)
+        change = np.stack([self._told(each) for each in above - below])
+        return np.moveaxis(np.linalg.solve(self.apart, change.reshape(len(change), -1)).reshape(change.shape), 0, -1)
+
+    def _told(self, errors: Float[np.ndarray, "windows steps channels"]) -> Float[np.ndarray, "windows values"]:
+        """The errors that count, of all channels but those that never differ."""
+        kept = (self.found.whitened[0, :, self.first :] != 0.0).any((0, 1))
+        return errors[:, self.first :, kept].reshape(len(errors), -1)
 
 
 def _products(
     first: _Side, second: _Side, whole: Bool[np.ndarray, " windows"], loss: Loss
 ) -> tuple[
-    Float[np.ndarray, "windows d"], Float[np.ndarray, "d d"], Float[np.ndarray, " d"], Float[np.ndarray, " windows"]
+    Float[np.ndarray, "windows d"],
+    Float[np.ndarray, "d d"],
+    Float[np.ndarray, "d d"],
+    Float[np.ndarray, "windows d d"],
 ]:
     """The gradient of each window's cost, products of both ensembles' derivatives and squares of each's own.
 
-    Last the share of each window in the squares of all. An ensemble's errors are weighted by their own size alone, so
+    Last each window's own squares over those of all. An ensemble's errors are weighted by their own size alone, so
     that the other's derivatives share no chance with them. A window in which derivatives are chance alone has much
-    larger ones than the others, so none has more than `LARGEST_SHARE` of the squares of a column, or twice its share
-    if few windows tell of it.
+    larger ones than the others, so none has more than `LARGEST_SHARE` of the squares in all directions.
     """
     errors, slopes = (first.errors()[whole], second.errors()[whole]), (first.slopes()[whole], second.slopes()[whole])
     z = [(each / TUNING[loss]) ** 2 for each in errors]
     weights = [loss_slope(each, loss) for each in z]
     both = np.sqrt(weights[0] * weights[1])
-    squares = sum(np.einsum("wv,wvd->wd", both, each**2) for each in slopes) / 2.0
-    most = np.maximum(LARGEST_SHARE, 2.0 / np.maximum((squares > 0.0).sum(0), 1))
-    counted = np.ones(len(squares))
+    own = sum(np.einsum("wv,wvd,wve->wde", both, each, each) for each in slopes) / 2.0
+    count = own.shape[-1]
+    counted, shares = np.ones(len(own)), np.zeros_like(own)
     for _ in range(ROUNDS):
-        share = counted[:, None] * squares / np.maximum((counted[:, None] * squares).sum(0), _SMALLEST)
-        counted = counted / np.maximum(1.0, (share / most).max(1, initial=0.0))
+        squares = (counted[:, None, None] * own).sum(0)
+        inverse = np.linalg.inv(squares + np.diag(1e-9 * np.diag(squares) + _SMALLEST))
+        shares = counted[:, None, None] * own @ inverse
+        leverage = np.trace(shares, axis1=1, axis2=2) / count
+        counted = counted / np.maximum(1.0, leverage / LARGEST_SHARE)
     pulls = sum(
         np.einsum("wv,wvd->wd", weight * mine, other)
         for weight, mine, other in zip(weights, errors, reversed(slopes), strict=True)
     )
     products = np.einsum("w,wv,wvd,wve->de", counted, both, *slopes)
-    squares = counted[:, None] * squares
-    share = (squares / np.maximum(squares.sum(0), _SMALLEST)).mean(1) if len(squares) else np.zeros(0)
-    share = share / max(float(share.sum()), _SMALLEST)
+    squares = (counted[:, None, None] * own).sum(0)
     curvature = max(curvature_share(np.stack(z), loss), LEAST_CURVATURE)
     gradients = counted[:, None] * pulls / 2.0
-    return gradients, curvature * (products + products.T) / 2.0, curvature * squares.sum(0), share
+    return gradients, curvature * (products + products.T) / 2.0, curvature * squares, MOST_TOLD * shares
 
 
-def _wider(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
-    """Factors of the widths of the differences, by how much of a column both ensembles agree on."""
-    alike = np.diag(products) / np.maximum(squares, _SMALLEST)
-    return np.select([alike < ALIKE[0], alike > ALIKE[1]], [2.0, 0.5], 1.0)
+def _axes(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
+    """Standard errors along each axis of a covariance, none below or above those of `WIDTHS`, in columns."""
+    variances, axes = np.linalg.eigh(covariance)
+    return axes * np.clip(SPREAD * np.sqrt(np.maximum(variances, 0.0)), *WIDTHS)
