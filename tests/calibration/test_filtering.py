@@ -190,7 +190,7 @@ def test_a_window_of_chance_alone_does_not_decide():
     gradients, _, squares, shares = _products(side, side, np.ones(11, bool), "linear")
     assert squares[0, 0] < 1.3 * 10.0
     assert gradients[0, 0] < gradients[1, 0]
-    assert shares[0] < 0.2 and shares.sum() == pytest.approx(filtering.MOST_TOLD)
+    assert shares[0] < 0.2 and shares.sum() == pytest.approx(1.0)
 
 
 def test_a_foot_that_slides_under_noise(tmp_path):
@@ -289,11 +289,11 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     problem = problem_of_foot(tmp_path, rows=300)
     search = of_contacts(problem, jax.random.key(0))
     rest = replace(search, point=np.array([0.0, 0.0]), wide=3, quiet=1, averaged=1, explained=len(search.rows))
-    assert rest.at_rest and not rest.settled and rest.in_use[1] == filtering.EARLY_MEMBERS
+    assert rest.at_rest and not rest.settled and rest.in_use[1] == filtering.MEMBERS // 2
     after, epoch = filtering.step(problem, rest, "cauchy")
     assert after.settled
     np.testing.assert_array_equal(after.point, rest.point)
     assert np.linalg.matrix_rank(after.meat) == 1  # one gradient alone, as there was no scatter before
     systems = 2 * (1 + 2 * len(problem.simulator.parameters))
     rows = len(search.rows)
-    assert epoch.control_steps == systems * rows * filtering.EARLY_MEMBERS * filtering.horizon_of(problem)
+    assert epoch.control_steps == systems * rows * filtering.MEMBERS // 2 * filtering.horizon_of(problem)

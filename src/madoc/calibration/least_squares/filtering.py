@@ -4,18 +4,16 @@ Every reading of a window is predicted from those before it (`identification.ens
 is unknown, and each prediction error depends on no later noise: at the right parameters errors are uncorrelated with
 anything known before them (prediction error method, Ljung 1999, chapter 7).
 
-Where bodies strike each other the cost is rough: within a small part of a standard error it goes up and down with what
-strikes a step sooner, and there a derivative says nothing of where the minimum is. So errors and derivatives are those
-of a statistical linearisation (Gelb 1974, section 6.2): means and differences over points as far apart as parameters
-are uncertain, along the axes of their covariance (as sigma points, Julier and Uhlmann 2004).
+Where bodies strike each other the cost is rough: it goes up and down with what strikes a step sooner, within a small
+part of a standard error, and there a derivative does not tell where the minimum is. So errors and derivatives are means
+and differences over points as far apart as parameters are uncertain (statistical linearisation, Gelb 1974, 6.2).
 
-A finite ensemble leaves chance in them. A least-squares step would be biased by it, as residuals and derivatives share
-it, and too short. So two independent ensembles a and b are simulated: the derivatives of each are instruments for the
-other (Reiersol 1941). A step p solves
+A finite ensemble leaves chance in them, by which a least-squares step would be biased and too short, as both share it.
+So there are two independent ensembles a and b, whose derivatives are instruments for the other (Reiersol 1941):
 
     (Jaᵀ W Jb + Jbᵀ W Ja) p = -(Jbᵀ ψ(ra) + Jaᵀ ψ(rb)),
 
-with ψ the slope of the robust loss and W its weights, and the same products, by windows, give its covariance.
+gives the step p, with ψ the slope of the robust loss and W its weights, and the same products give its covariance.
 """
 
 from dataclasses import dataclass, replace
@@ -46,8 +44,8 @@ MOST, EARLY = 32, 16
 """Largest number of windows, and in the first epochs, in which steps are large."""
 EARLY_EPOCHS = 10
 """Largest number of the first epochs, which end once the noise is known and steps are below `NEAR`."""
-MEMBERS, EARLY_MEMBERS = 32, 16
-"""Number of states in an ensemble, and in the first epochs; with half as many estimates are off by a standard error."""
+MEMBERS = 16
+"""Number of states in an ensemble; the last epoch, with half as many, tells what a finite one errs."""
 WIDTH, WIDTHS = 0.1, (0.005, 0.4)
 """Width of a difference in [-1, 1] to either side at first, and its smallest and largest."""
 SPREAD = 3.0
@@ -64,7 +62,7 @@ LARGEST_SHARE = 0.1
 """Share in [0, 1] of the sum of squares of all windows' derivatives above which a window counts less."""
 NEAR, LIKE_CHANCE = 2.5, 1.0
 """Steps in standard errors, below which epochs are averaged, and below which the mean is at its end."""
-USUAL_EPOCHS = (5, 4)
+USUAL_EPOCHS = (8, 3)
 """Numbers of first and later epochs that most searches take, for the time that is told to be left."""
 NOISE_SETTLED = 0.3
 """Relative change of a noise variance, below which it is as good as known."""
@@ -131,7 +129,7 @@ class FilterState:
     def in_use(self) -> tuple[Int[np.ndarray, " some"], int]:
         """First rows of the windows of the next epoch, and the number of states in its ensembles."""
         rows = self.rows if self.wide else self.rows[:EARLY]
-        return rows, MEMBERS if self.wide and not self.at_rest else EARLY_MEMBERS
+        return rows, MEMBERS // 2 if self.at_rest else MEMBERS
 
     @property
     def at_rest(self) -> bool:
@@ -241,7 +239,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     target = np.linalg.solve(factor.T, gradients.sum(0))
     undamped = damped_step(factor, target, state.point, 0.0)
     taken, damping = _taken(problem, state, readings, sides[0], factor, target, loss)
-    left_out = np.linalg.inv(np.eye(len(bread)) - told)
+    left_out = np.linalg.inv(np.eye(len(bread)) - MOST_TOLD * told)
     scores = (left_out @ gradients[..., None])[..., 0]  # about what leaving the window out would change
     meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
     error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), _SMALLEST))
@@ -339,10 +337,7 @@ class _Side:
         return cls(members, found, above - below, aside, 0 if problem.states.kind == "exact" else SPOILT)
 
     def errors(self) -> Float[np.ndarray, "windows values"]:
-        """Whitened prediction errors at the point, by their mean over the differences' ends.
-
-        Where these are not on either side of the point, as at the end of a range, the derivatives lead back to it.
-        """
+        """Whitened prediction errors at the point: the mean over the differences' ends, led back from theirs to it."""
         return self._told(self.found.whitened[1:].mean(0)) - self.slopes() @ self.aside
 
     def at_point(self) -> Float[np.ndarray, "windows values"]:
@@ -371,9 +366,9 @@ def _products(
 ]:
     """The gradient of each window's cost, products of both ensembles' derivatives and squares of each's own.
 
-    Last each window's own squares over those of all. An ensemble's errors are weighted by their own size alone, so
-    that the other's derivatives share no chance with them. A window in which derivatives are chance alone has much
-    larger ones than the others, so none has more than `LARGEST_SHARE` of the squares in all directions.
+    Last each window's squares over those of all. An ensemble's errors are weighted by their own size alone, so that the
+    other's derivatives share no chance with them. A window in which derivatives are chance alone has much larger ones
+    than the others, so none has more than `LARGEST_SHARE` of the squares in all directions.
     """
     errors, slopes = (first.errors()[whole], second.errors()[whole]), (first.slopes()[whole], second.slopes()[whole])
     z = [(each / TUNING[loss]) ** 2 for each in errors]
@@ -396,7 +391,7 @@ def _products(
     squares = (counted[:, None, None] * own).sum(0)
     curvature = max(curvature_share(np.stack(z), loss), LEAST_CURVATURE)
     gradients = counted[:, None] * pulls / 2.0
-    return gradients, curvature * (products + products.T) / 2.0, curvature * squares, MOST_TOLD * shares
+    return gradients, curvature * (products + products.T) / 2.0, curvature * squares, shares
 
 
 def _axes(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
