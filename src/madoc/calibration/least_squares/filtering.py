@@ -64,7 +64,7 @@ NEAR, LIKE_CHANCE = 2.5, 1.0
 """Steps in standard errors, below which epochs are averaged, and below which the mean is at its end."""
 USUAL_EPOCHS = (8, 3)
 """Numbers of first and later epochs that most searches take, for the time that is told to be left."""
-NOISE_SETTLED = 0.3
+NOISE_SETTLED = 0.4
 """Relative change of a noise variance, below which it is as good as known."""
 LEAST_NOISE = 1e-3
 """Smallest noise of a channel in its typical changes at the start, and relative to the noisiest one's later."""
