@@ -25,6 +25,7 @@ from madoc.identification.ensembles import (
     members_at,
     with_contacts_settled,
 )
+from madoc.identification.information import BOX_VARIANCE
 from madoc.identification.replay import Readings
 from madoc.identification.settling import RESETTLING, settled
 from madoc.identification.windows import disjoint_windows
@@ -147,7 +148,7 @@ def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_
     found = settled(simulator, readings, point, states, (0.0,), 0)
     size = readings.observed[0].size
     assert found.unexplained(size, "cauchy").mean() < 0.5 * narrow.unexplained(size, "cauchy").mean()
-    assert (found.deviation[2:] < 0.9 * narrow.deviation[2:]).all()  # of speeds, which contacts decide
+    assert (found.deviation[2:] < 0.95 * narrow.deviation[2:]).all()  # of speeds, which contacts decide
     begun = int((rows - problem.dataset.episode_starts[problem.dataset.episode_of(rows)] >= BEFORE).sum())
     drawn = NOISE_ROUNDS * begun * DRAWN * BEFORE + len(rows) * (DRAWN + 1) * steps
     step = len(rows) * (1 + 4 + 3) * steps
@@ -183,14 +184,26 @@ def test_what_both_ensembles_agree_on_is_kept_along_a_weak_direction_too():
 
 
 def test_a_window_of_chance_alone_does_not_decide():
-    """Of eleven windows one has slopes a thousand times as large as the others'."""
-    slopes = np.ones((11, 1, 1))
-    slopes[0] = 1000.0
-    side = given(np.ones((11, 1)), slopes)
-    gradients, _, squares, shares = _products(side, side, np.ones(11, bool), "linear")
-    assert squares[0, 0] < 1.3 * 10.0
-    assert gradients[0, 0] < gradients[1, 0]
-    assert shares[0] < 0.2 and shares.sum() == pytest.approx(1.0)
+    """Of thirty windows one has slopes a thousand times as large as the others'."""
+    slopes = np.random.default_rng(0).standard_normal((30, 8, 2))
+    slopes[0] *= 1000.0
+    side = given(np.ones((30, 8)), slopes)
+    gradients, products, squares, shares = _products(side, side, np.ones(30, bool), "linear")
+    np.testing.assert_allclose(shares.sum(0), np.eye(2), atol=1e-6)
+    np.testing.assert_allclose(products, squares)  # one ensemble agrees with itself
+    told = np.trace(shares, axis1=1, axis2=2) / 2.0
+    assert told[0] == told.max() <= 1.05 * filtering.LARGEST_SHARE
+    less = gradients[0] / slopes[0].sum(0)
+    assert less[0] == pytest.approx(less[1]) and less[0] < 1e-4
+    np.testing.assert_allclose(gradients[1:], slopes[1:].sum(1))
+
+
+def test_a_parameter_that_changes_nothing_stays_unknown(tmp_path):
+    assert (agreed(np.zeros((2, 2)), np.zeros((2, 2))) < 1e-90).all()
+    search = of_contacts(problem_of_foot(tmp_path, rows=300), jax.random.key(0))
+    one = np.diag([4.0, 0.0])
+    found = replace(search, products=one, squares=one, meat=one, epochs=3).found
+    np.testing.assert_allclose(np.diag(found.uncertainty.covariance), [0.25, BOX_VARIANCE])
 
 
 def test_a_foot_that_slides_under_noise(tmp_path):
@@ -207,7 +220,7 @@ def test_a_foot_that_slides_under_noise(tmp_path):
     assert state.stage == "filtering" and epoch.converged
     estimate, truth = method.estimate(problem, state), space.vector(FOOT_TRUTH)
     assert ((estimate.interval[:, 0] <= truth) & (truth <= estimate.interval[:, 1])).all()
-    assert (np.diff(estimate.interval, axis=1)[:, 0] < 0.05 * (space.high - space.low)).all()
+    assert (np.diff(estimate.interval, axis=1)[:, 0] < 0.1 * (space.high - space.low)).all()
     assert estimate.settled and not estimate.long_tails
     found = state.filtered.noise * problem.typical_change
     np.testing.assert_allclose(found, [*NOISE.values()], rtol=0.4)
@@ -261,7 +274,7 @@ def test_differences_lead_along_the_axes_of_the_covariance_and_not_out_of_a_rang
     axes = _axes(
         np.array([[5e-4, 3e-4], [3e-4, 5e-4]])
     )  # standard errors of sqrt(8e-4) along (1, 1), sqrt(2e-4) across
-    expected = np.sqrt([[2e-4, 8e-4], [2e-4, 8e-4]]) * filtering.SPREAD / np.sqrt(2.0)
+    expected = np.sqrt([[2e-4, 8e-4], [2e-4, 8e-4]])  # two of them, in each component 1 / sqrt(2) of the length
     np.testing.assert_allclose(np.abs(axes), expected)
     np.testing.assert_allclose(np.linalg.norm(_axes(np.diag([0.0, 9.0])), axis=0), filtering.WIDTHS)
     steps, change = filtering.horizon_of(problem), problem.typical_change
@@ -274,14 +287,17 @@ def test_differences_lead_along_the_axes_of_the_covariance_and_not_out_of_a_rang
     assert (sides[0].members != sides[1].members).any()
 
 
-def test_errors_and_slopes_of_a_linear_model_lead_back_to_the_point():
-    """By hand: errors 2 + 3 p, at ends 0.1 above the point and 0.3 below it."""
-    ends = 2.0 + 3.0 * np.array([0.0, 0.1, -0.3])
-    factor = np.ones((3, 1, 1, 1, 1))
-    found = Innovations(ends.reshape(3, 1, 1, 1), factor, np.ones((3, 1), bool), np.zeros((3, 1, 1, 1)))
-    side = _Side(np.zeros((1, 1, 1)), found, np.array([[0.4]]), np.array([-0.1]), 0)
-    np.testing.assert_allclose(side.slopes(), [[[3.0]]])
-    np.testing.assert_allclose(side.errors(), [[2.0]])
+@pytest.mark.parametrize(("above", "below", "mean"), [(0.1, -0.1, 2.01), (0.1, -0.3, 2.03)])
+def test_errors_are_the_mean_over_both_ends_and_lead_back_to_the_point(above, below, mean):
+    """By hand: errors 2 + 3 p + p², whose mean at a standard error of 0.1 is 2 + 0.1².
+
+    A line through both ends of a parabola passes the point too high by their product."""
+    p = np.array([0.0, above, below])
+    errors, nothing = (2.0 + 3.0 * p + p**2).reshape(3, 1, 1, 1), np.zeros((3, 1, 1, 1))
+    found = Innovations(errors, np.ones((3, 1, 1, 1, 1)), np.ones((3, 1), bool), nothing)
+    side = _Side(np.zeros((1, 1, 1)), found, np.array([[above - below]]), np.array([(above + below) / 2.0]), 0)
+    np.testing.assert_allclose(side.slopes(), [[[3.0 + above + below]]])
+    np.testing.assert_allclose(side.errors(), [[mean]])
     np.testing.assert_allclose(side.at_point(), [[2.0]])
 
 

@@ -7,16 +7,25 @@ smooth in the parameters, and what contacts forget of the first state it forgets
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.data.dataset import Dataset
+from madoc.data.timescale import stride
 from madoc.identification.losses import Loss
 from madoc.identification.noise import difference_noise
 from madoc.identification.replay import Readings
-from madoc.identification.settling import FAILED_WINDOW, RESETTLING, settled, window_costs, with_bases_settled
+from madoc.identification.settling import (
+    ANEW,
+    FAILED_WINDOW,
+    RESETTLING,
+    WIDTHS,
+    settled,
+    window_costs,
+    with_bases_settled,
+)
 from madoc.identification.states import LoggedStates, states_of
 from madoc.simulation.attitudes import differences, moved
 from madoc.simulation.base import Simulator
@@ -29,14 +38,16 @@ NOISE_CHANGE = (0.1, 4.0)
 """Smallest and largest factor of a channel's noise variance from a run of the filter to the next."""
 OF_CLIPPED = 0.9950
 """Mean square of a normal value of variance 1, clipped at nine."""
-BEFORE = 8
-"""Number of control steps before a window, by whose readings a filter finds states at its first row."""
+BEFORE, MOST_BEFORE = 8, 30
+"""Number of strides before a window, by whose readings a filter finds states at its first row; so many rows at most."""
 DRAWN = 32
 """Number of states that are tried at the first row of a window."""
 NOISE_ROUNDS = 2
 """Number of runs of a filter before a window; each tells the sensors' noise better."""
-LEAST_NOISE = 1e-6
-"""Smallest noise of a channel, in its typical changes: rounding in log and simulator is more."""
+LEAST_NOISE = 1e-3
+"""Smallest noise of a channel in its typical changes at the start: differences of rows may hide it."""
+SPOILT = 3
+"""Number of first steps whose errors do not count where velocities are differences, which hold the next position."""
 _SMALLEST, _ROUNDING = 1e-100, 1e-12
 
 
@@ -218,7 +229,7 @@ def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, "d d"]
     size = np.sqrt(np.maximum(np.diag(squares), _SMALLEST))
     relative = [each / np.outer(size, size) for each in (products, squares)]
     values, vectors = np.linalg.eigh(relative[1])
-    root = vectors * np.sqrt(np.maximum(values, _ROUNDING * values[-1]))
+    root = vectors * np.sqrt(np.maximum(values, _ROUNDING))
     inverse = np.linalg.inv(root)
     shares, axes = np.linalg.eigh(inverse @ relative[0] @ inverse.T)
     whole = size[:, None] * (root @ axes * np.sqrt(np.maximum(shares, AGREEING)))
@@ -246,10 +257,17 @@ def with_contacts_settled(
     if not len(known) or not simulator.contacts(known, simulator.parameters.to_physical(point.clip(-1.0, 1.0))).any():
         return guesses, 0
     spent = 0
-    if logged.starts_known and (logged.kind == "approximate" or logged.measured == simulator.task.observation_size):
+    likely = logged.starts_known and can_be_drawn(logged, simulator)
+    if likely:
         guesses, spent = _likeliest(dataset, logged, simulator, readings, rows, point, guesses)
-    after = settled(simulator, readings, point, guesses, (0.0, *RESETTLING), 0, until_noise=True)
+    widths, anew = ((0.0, *RESETTLING), 0) if likely else (WIDTHS, ANEW)
+    after = settled(simulator, readings, point, guesses, widths, anew, until_noise=True)
     return after.states, spent + after.simulations * readings.steps
+
+
+def can_be_drawn(logged: LoggedStates, simulator: Simulator) -> bool:
+    """Whether `members_at` can draw states: not where a log has derived velocities that states are rebuilt from."""
+    return simulator.task.state_from_observation is None or logged.measured == simulator.task.observation_size
 
 
 def _likeliest(
@@ -261,25 +279,31 @@ def _likeliest(
     point: Float[np.ndarray, " d"],
     guesses: Float[np.ndarray, "windows state"],
 ) -> tuple[Float[np.ndarray, "windows state"], int]:
-    """Of an ensemble's states at each window's first row that which fits the window best, or the guess.
+    """The guess of each window's first state, or that of an ensemble's states there which fits the window better.
 
     The ensemble has followed the readings before the window, where its episode has as many. Also the control steps.
     """
-    random, first, least = np.random.default_rng(0), rows - BEFORE, np.full(logged.measured, LEAST_NOISE)
+    before = min(BEFORE * stride(dataset), MOST_BEFORE)
+    random, first, least = np.random.default_rng(0), rows - before, np.full(logged.measured, LEAST_NOISE)
     noise = np.maximum(difference_noise(dataset)[: logged.measured] / readings.scale, least)
-    tried = np.repeat(guesses[:, None], DRAWN + 1, axis=1)
-    tried[:, :DRAWN] = members_at(dataset, logged, simulator, rows, noise * readings.scale, DRAWN, random)
-    begun = np.flatnonzero(np.isin(first, logged.rows) & (dataset.episode_starts[dataset.episode_of(rows)] <= first))
+    tried, physical = np.repeat(guesses[:, None], 1 + DRAWN, axis=1), slice(0, logged.physical_size)
+    follows = np.isin(first, logged.rows) & (dataset.episode_starts[dataset.episode_of(rows)] <= first)
+    begun, others = np.flatnonzero(follows), np.flatnonzero(~follows)
+    draw = partial(members_at, dataset, logged, simulator, count=DRAWN, random=random)
     if len(begun):
-        before = Readings.at(dataset, logged, first[begun], BEFORE, readings.scale)
+        earlier = Readings.at(dataset, logged, first[begun], before, readings.scale)
         for _ in range(NOISE_ROUNDS):
-            members = members_at(dataset, logged, simulator, first[begun], noise * readings.scale, DRAWN, random)
-            found = innovations(simulator, before, point[None], members, noise)
-            noise = np.maximum(noise * np.sqrt(np.clip(found.noise_ratio(), *NOISE_CHANGE)), least)
-        physical, whole = slice(0, logged.physical_size), found.whole[0]
-        tried[begun[whole], :DRAWN, physical] = found.members[0, whole][..., physical]
+            members = draw(rows=first[begun], noise=noise * readings.scale)
+            found = innovations(simulator, earlier, point[None], members, noise)
+            ratio = found.noise_ratio(0 if logged.kind == "exact" else SPOILT)
+            noise = np.maximum(noise * np.sqrt(np.clip(ratio, *NOISE_CHANGE)), least)
+        whole = found.whole[0]
+        tried[begun[whole], 1:, physical] = found.members[0, whole][..., physical]
+    if len(others):
+        system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
+        tried[others, 1:] = system.unbiased(draw(rows=rows[others], noise=noise * readings.scale))
     starts = np.swapaxes(tried, 0, 1).reshape(1, -1, guesses.shape[1])
     residuals = readings.residuals(simulator, point[None], starts)[0] / np.tile(noise, readings.steps + 1)
     best = window_costs(residuals, "cauchy").argmin(0)
-    spent = NOISE_ROUNDS * len(begun) * DRAWN * BEFORE + len(rows) * (DRAWN + 1) * readings.steps
+    spent = NOISE_ROUNDS * len(begun) * DRAWN * before + len(rows) * (1 + DRAWN) * readings.steps
     return tried[np.arange(len(rows)), best], spent

@@ -26,7 +26,16 @@ from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification.ensembles import NOISE_CHANGE, Innovations, agreed, innovations, members_at
+from madoc.identification.ensembles import (
+    LEAST_NOISE,
+    NOISE_CHANGE,
+    SPOILT,
+    Innovations,
+    agreed,
+    can_be_drawn,
+    innovations,
+    members_at,
+)
 from madoc.identification.gauss_newton import damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.linearisation import LEAST_CURVATURE
@@ -47,9 +56,7 @@ EARLY_EPOCHS = 10
 MEMBERS = 16
 """Number of states in an ensemble; the last epoch, with half as many, tells what a finite one errs."""
 WIDTH, WIDTHS = 0.1, (0.005, 0.4)
-"""Width of a difference in [-1, 1] to either side at first, and its smallest and largest."""
-SPREAD = 3.0
-"""Its width in between, in standard errors of the parameters along each axis of their covariance."""
+"""Width of a difference in [-1, 1] to either side at first, and its smallest and largest later, see `_axes`."""
 LONGEST = 0.5
 """Largest change of a parameter in an epoch, in [-1, 1]."""
 DAMPED = 10.0
@@ -59,23 +66,18 @@ WORSE = 2.0
 DAMPING = (1e-4, 1e2)
 """Smallest and largest damping of a step, relative to the columns' squared lengths."""
 LARGEST_SHARE = 0.1
-"""Share in [0, 1] of the sum of squares of all windows' derivatives above which a window counts less."""
+"""Largest share in [0, 1] of the squares of all windows, mean over all directions, that a window counts with."""
 NEAR, LIKE_CHANCE = 2.5, 1.0
 """Steps in standard errors, below which epochs are averaged, and below which the mean is at its end."""
 USUAL_EPOCHS = (8, 3)
 """Numbers of first and later epochs that most searches take, for the time that is told to be left."""
 NOISE_SETTLED = 0.4
 """Relative change of a noise variance, below which it is as good as known."""
-LEAST_NOISE = 1e-3
-"""Smallest noise of a channel in its typical changes at the start, and relative to the noisiest one's later."""
 MOSTLY = 0.5
 """Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts."""
-SPOILT = 3
-"""Number of first steps whose errors do not count where velocities are differences, which hold the next position."""
 MOST_TOLD = 0.9
 """Share in (0, 1) that counts of what a window tells where no other one tells of a direction."""
 ROUNDS = 10  # of weighting windows of too large a share less
-_SMALLEST = 1e-100
 
 
 @jax.tree_util.register_dataclass
@@ -150,7 +152,8 @@ class FilterState:
     @property
     def found(self) -> Found:
         """The point, with its uncertainty by the last epoch."""
-        bread = agreed(self.products, self.squares) if self.epochs else self.products
+        told = np.diag(self.squares) > 0.0
+        bread = agreed(self.products, self.squares) * np.outer(told, told)
         long_tails = self.settled and self.cost > LONG_TAILS
         return Found(self.point, sandwich(bread, self.meat), self.explained, self.settled, long_tails)
 
@@ -164,8 +167,7 @@ def horizon_of(problem: CalibrationProblem) -> int:
 def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState | None:
     """The search before it has begun; None where few windows show contacts, or sensors do not show all positions."""
     states, count = problem.states, len(problem.simulator.parameters)
-    derived = states.measured < problem.simulator.task.observation_size
-    if not states.starts_known or states.placed.any() or (states.kind == "exact" and derived):
+    if not states.starts_known or states.placed.any() or not can_be_drawn(states, problem.simulator):
         return None
     horizon = horizon_of(problem)
     if not len(rows_that_fit(problem.dataset, states.rows, horizon)):
@@ -242,7 +244,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     left_out = np.linalg.inv(np.eye(len(bread)) - MOST_TOLD * told)
     scores = (left_out @ gradients[..., None])[..., 0]  # about what leaving the window out would change
     meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
-    error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), _SMALLEST))
+    error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), np.finfo(float).tiny))
     ratio = np.mean([each.found.noise_ratio(each.first) for each in sides], axis=0)
     noise, rounding = state.noise * np.sqrt(np.clip(ratio, *NOISE_CHANGE)), problem.rounding / problem.typical_change
     noise = np.maximum(noise, np.maximum(rounding[: len(noise)], LEAST_NOISE * noise.max()))
@@ -367,34 +369,32 @@ def _products(
     """The gradient of each window's cost, products of both ensembles' derivatives and squares of each's own.
 
     Last each window's squares over those of all. An ensemble's errors are weighted by their own size alone, so that the
-    other's derivatives share no chance with them. A window in which derivatives are chance alone has much larger ones
-    than the others, so none has more than `LARGEST_SHARE` of the squares in all directions.
+    other's derivatives share no chance with them.
     """
     errors, slopes = (first.errors()[whole], second.errors()[whole]), (first.slopes()[whole], second.slopes()[whole])
     z = [(each / TUNING[loss]) ** 2 for each in errors]
     weights = [loss_slope(each, loss) for each in z]
-    both = np.sqrt(weights[0] * weights[1])
+    both, counted = np.sqrt(weights[0] * weights[1]), np.ones(len(errors[0]))
     own = sum(np.einsum("wv,wvd,wve->wde", both, each, each) for each in slopes) / 2.0
-    count = own.shape[-1]
-    counted, shares = np.ones(len(own)), np.zeros_like(own)
+    most = max(LARGEST_SHARE, 2.0 / max(1, len(own)))
     for _ in range(ROUNDS):
-        squares = (counted[:, None, None] * own).sum(0)
-        inverse = np.linalg.inv(squares + np.diag(1e-9 * np.diag(squares) + _SMALLEST))
-        shares = counted[:, None, None] * own @ inverse
-        leverage = np.trace(shares, axis1=1, axis2=2) / count
-        counted = counted / np.maximum(1.0, leverage / LARGEST_SHARE)
+        squares = own.sum(0)
+        shares = own @ np.linalg.inv(squares + np.diag(1e-9 * np.diag(squares) + np.finfo(float).tiny))
+        less = 1.0 / np.maximum(1.0, np.trace(shares, axis1=1, axis2=2) / len(squares) / most)
+        counted, own = counted * less, own * less[:, None, None]
     pulls = sum(
         np.einsum("wv,wvd->wd", weight * mine, other)
         for weight, mine, other in zip(weights, errors, reversed(slopes), strict=True)
     )
     products = np.einsum("w,wv,wvd,wve->de", counted, both, *slopes)
-    squares = (counted[:, None, None] * own).sum(0)
     curvature = max(curvature_share(np.stack(z), loss), LEAST_CURVATURE)
-    gradients = counted[:, None] * pulls / 2.0
-    return gradients, curvature * (products + products.T) / 2.0, curvature * squares, shares
+    return counted[:, None] * pulls / 2.0, curvature * (products + products.T) / 2.0, curvature * own.sum(0), shares
 
 
 def _axes(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
-    """Standard errors along each axis of a covariance, none below or above those of `WIDTHS`, in columns."""
+    """√d standard errors along each axis of a covariance of d parameters, within `WIDTHS`, in columns.
+
+    Means over the ends are those of cubic functions over its normal distribution (Arasaratnam and Haykin 2009).
+    """
     variances, axes = np.linalg.eigh(covariance)
-    return axes * np.clip(SPREAD * np.sqrt(np.maximum(variances, 0.0)), *WIDTHS)
+    return axes * np.clip(np.sqrt(len(axes) * np.maximum(variances, 0.0)), *WIDTHS)
