@@ -1,3 +1,4 @@
+import mujoco
 import numpy as np
 
 from madoc import tasks
@@ -17,6 +18,15 @@ def test_a_quaternions_velocity_is_how_far_it_turned():
     np.testing.assert_allclose(found[:, 5] * seconds, 0.2)
     np.testing.assert_allclose(found[:, 0] * seconds, 0.3)
     assert not found[:, 6:].any()
+    random = np.random.default_rng(0)
+    before[:, 3:7], after[:, 3:7] = random.standard_normal((2, 2, 4))
+    for each in (before, after):
+        each[:, 3:7] /= np.linalg.norm(each[:, 3:7], axis=1, keepdims=True)
+    found = velocities_between(task, before, after, np.array([1.0, 2.0]))
+    for row, time in enumerate(seconds):
+        expected = np.zeros(model.nv)
+        mujoco.mj_differentiatePos(model, expected, time, *(each[row, : model.nq] for each in (before, after)))
+        np.testing.assert_allclose(found[row], expected, atol=1e-9)
 
 
 def test_velocities_go_where_there_are_none():

@@ -1,10 +1,10 @@
 """Velocities from positions: the change of a joint's position, or of its quaternion, over time."""
 
-import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.errors import MadocError
+from madoc.simulation.attitudes import Tangent, differences
 from madoc.tasks.base import Task
 
 
@@ -20,10 +20,12 @@ def velocities_between(
     start, end = before[:, : model.nq], after[:, : model.nq]
     if model.nq == model.nv:
         return (end - start) / seconds[:, None]
-    velocities = np.zeros((len(start), model.nv))
-    for velocity, *row in zip(velocities, seconds, start, end, strict=True):
-        mujoco.mj_differentiatePos(model, velocity, *row)
-    return velocities
+    tangent = Tangent.of(model)
+    apart = differences(tangent.attitudes, end, start)
+    for _, *turn in tangent.attitudes:  # n sin(θ/2), for n θ/2
+        size = np.linalg.norm(apart[:, turn], axis=1, keepdims=True)
+        apart[:, turn] *= np.arcsin(np.minimum(size, 1.0)) / np.where(size > 0.0, size, 1.0)
+    return tangent.halves * apart[:, tangent.places] / seconds[:, None]
 
 
 def with_velocities(
