@@ -221,10 +221,13 @@ def test_a_foot_that_slides_under_noise(tmp_path):
     estimate, truth = method.estimate(problem, state), space.vector(FOOT_TRUTH)
     assert ((estimate.interval[:, 0] <= truth) & (truth <= estimate.interval[:, 1])).all()
     assert (np.diff(estimate.interval, axis=1)[:, 0] < 0.1 * (space.high - space.low)).all()
-    assert estimate.settled and not estimate.long_tails
+    assert estimate.settled and not estimate.unlike_noise
     found = state.filtered.noise * problem.typical_change
     np.testing.assert_allclose(found, [*NOISE.values()], rtol=0.4)
     assert any("predicted by an ensemble filter" in warning for warning in estimate.warnings)
+    wrong = replace(state, filtered=replace(state.filtered, alike=0.3))
+    doubtful = method.estimate(problem, wrong)
+    assert doubtful.unlike_noise and any("(correlation 0.30)" in warning for warning in doubtful.warnings)
     resumed, _ = load(tmp_path / "checkpoint.npz", method.init(problem, jax.random.key(0)))
     again, _ = method.step(problem, resumed)
     for kept, other in zip(jax.tree.leaves(second), jax.tree.leaves(again), strict=True):
@@ -285,6 +288,19 @@ def test_differences_lead_along_the_axes_of_the_covariance_and_not_out_of_a_rang
         np.testing.assert_allclose(side.apart, [[0.2, 0.2], [-0.2, 0.1]])  # both ends of 1 +- 0.2 and of 1 +- 0.1
         np.testing.assert_allclose(side.aside, [0.0, -0.075])
     assert (sides[0].members != sides[1].members).any()
+
+
+def test_predictions_leave_errors_alike_only_where_windows_agree():
+    """Errors of one channel that are noise, of a second that lasts, and of a third that lasts in one window."""
+    random = np.random.default_rng(0)
+    errors = random.standard_normal((1, 40, 30, 3))
+    errors[..., 1] += 1.5 * random.standard_normal((1, 40, 1))
+    found = Innovations(errors, np.broadcast_to(np.eye(3), (*errors.shape, 3)), np.ones((1, 40), bool), errors)
+    clipped = np.clip(errors[0, ..., 1], -3.0, 3.0)
+    assert found.alike() == pytest.approx((clipped[:, 1:] * clipped[:, :-1]).mean() / (clipped**2).mean())
+    assert 0.5 < found.alike() < 0.75
+    errors[..., 1], errors[0, 0, :, 2] = errors[..., 0], 2.9
+    assert replace(found).alike() < 0.1  # the third has a correlation of 0.2 that one window makes
 
 
 @pytest.mark.parametrize(("above", "below", "mean"), [(0.1, -0.1, 2.01), (0.1, -0.3, 2.03)])

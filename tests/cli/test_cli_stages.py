@@ -15,7 +15,7 @@ from madoc.numpy_policy import NumpyPolicy
 
 RESULT = {
     *("method", "task", "status", "sentence", "control_steps", "seconds", "seed", "groups", "parameters", "settled"),
-    *("warnings", "error", "long_tails"),
+    *("warnings", "error", "unlike_noise"),
 }
 
 

@@ -283,9 +283,9 @@ def test_what_could_not_be_tested_or_stands_at_an_end_is_not_calibrated(good):
 
 @EITHER
 def test_residuals_with_long_tails_are_a_mismatch(good):
-    verdict = judge(good, long_tails=True)
+    verdict = judge(good, unlike_noise=True)
     assert verdict.word == "MODEL_MISMATCH"
-    assert verdict.sentence.startswith("residuals have longer tails than noise has")
+    assert verdict.sentence.startswith("residuals are unlike noise")
 
 
 @EITHER
@@ -377,7 +377,7 @@ def test_an_estimate_beats_mid_range_beyond_chance():
 
 
 @pytest.mark.parametrize(
-    ("holdout", "long_tails"),
+    ("holdout", "unlike_noise"),
     [
         (changed(PREDICTED, LEFT_OVER, explained=0.4), False),
         (replace(PREDICTED, at_end=("mass",)), False),
@@ -386,9 +386,9 @@ def test_an_estimate_beats_mid_range_beyond_chance():
     ],
     ids=["systematic", "at an end", "contradicted", "long tails"],
 )
-def test_a_mismatch_of_a_model_with_too_long_a_timestep_says_so(holdout, long_tails):
+def test_a_mismatch_of_a_model_with_too_long_a_timestep_says_so(holdout, unlike_noise):
     for coarseness in (0.2, 0.4):
-        verdict = judge(replace(holdout, coarseness=coarseness), long_tails=long_tails)
+        verdict = judge(replace(holdout, coarseness=coarseness), unlike_noise=unlike_noise)
         assert verdict.word == "MODEL_MISMATCH"
         assert ("the timestep of the model is too long" in verdict.sentence) == (coarseness > 0.25)
     assert "of half of the signals change by 0.4 typical changes or more" in verdict.sentence

@@ -125,8 +125,8 @@ class Estimate:
         quantile: Standard errors in half of such an interval, before an end of the range cuts it off.
         settled: False where the method can tell that its search is not at its end, so that a larger budget would change
             the estimate: least squares until its steps are small, Madoc until its discriminators can have settled.
-        long_tails: Whether residuals have longer tails than noise has: the model does not explain some stretches of the
-            log, and the intervals do not count that. False where the method does not estimate the noise.
+        unlike_noise: Whether residuals have longer tails than noise has, or each is like the next: the model does not
+            explain the log, and the intervals do not count that. False where the method does not estimate the noise.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
@@ -141,7 +141,7 @@ class Estimate:
     interval: Float[np.ndarray, "d 2"] | None = None
     quantile: float = NORMAL_95
     settled: bool = True
-    long_tails: bool = False
+    unlike_noise: bool = False
     effective: bool = False
     group_stability: float | None = None
 

@@ -82,7 +82,7 @@ def calibrate(
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
         combinations=[] if told is None else list(combinations(space, estimate.mean, told, estimate.quantile)),
         settled=estimate.settled,
-        long_tails=estimate.long_tails,
+        unlike_noise=estimate.unlike_noise,
         effective=estimate.effective,
         group_stability=estimate.group_stability,
         problem=problem,

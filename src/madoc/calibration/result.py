@@ -65,7 +65,7 @@ class CalibrationResult:
         covariance: Covariance of the estimates in physical units, in the task's order; None where it is unknown.
         combinations: Sums and products of parameters that the log tells though it leaves each of them open.
         settled: False where the method can tell that its search is not at its end; its intervals mean nothing before.
-        long_tails: Whether residuals have longer tails than noise has, which intervals do not count.
+        unlike_noise: Whether residuals have longer tails than noise has, or each is like the next.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
             groups, 0 for chance; None where the method did not find groups.
@@ -91,7 +91,7 @@ class CalibrationResult:
     covariance: list[list[float]] | None = None
     combinations: list[Combination] = field(default_factory=list)
     settled: bool = True
-    long_tails: bool = False
+    unlike_noise: bool = False
     effective: bool = False
     group_stability: float | None = None
     chosen: str | None = None

@@ -36,8 +36,8 @@ AGREEING = 1e-3
 """Smallest share in [0, 1] of the squares of an ensemble's derivatives that the other counts as agreeing on."""
 NOISE_CHANGE = (0.1, 4.0)
 """Smallest and largest factor of a channel's noise variance from a run of the filter to the next."""
-OF_CLIPPED = 0.9950
-"""Mean square of a normal value of variance 1, clipped at nine."""
+CLIP, OF_CLIPPED = 3.0, 0.9950
+"""Standard deviations at which errors are clipped, and the mean square of a normal value that is."""
 BEFORE, MOST_BEFORE = 8, 30
 """Number of strides before a window, by whose readings a filter finds states at its first row; so many rows at most."""
 DRAWN = 32
@@ -86,6 +86,19 @@ class Innovations:
         """Variance of each reading's prediction under the first system, in those of the sensors' noise, at least 1."""
         return np.asarray((self.factor[0] ** 2).sum(-1))
 
+    def alike(self, first: int = 0) -> float:
+        """The largest certain correlation of a channel's whitened errors with the next ones, outliers clipped.
+
+        It is that of the first system, from the step `first` on; 0 for right predictions, as these use every reading.
+        A correlation is certain where windows agree on it, by two standard errors.
+        """
+        errors = np.clip(self.whitened[0, self.whole[0], first:], -CLIP, CLIP)
+        if len(errors) < 2:
+            return 0.0
+        pairs, squares = (errors[:, 1:] * errors[:, :-1]).mean(1), (errors**2).mean((0, 1))
+        certain = pairs.mean(0) > 2.0 * pairs.std(0, ddof=1) / np.sqrt(len(pairs))
+        return float((certain * pairs.mean(0) / np.maximum(squares, _SMALLEST)).max(initial=0.0))
+
     def noise_ratio(self, first: int = 0) -> Float[np.ndarray, " channels"]:
         """Mean square of each channel's prediction errors over their variance, outliers clipped; 1 if they are all 0.
 
@@ -93,7 +106,7 @@ class Innovations:
         at three standard deviations.
         """
         relative = (self.mean[0] ** 2 / self.variances())[self.whole[0], first:].reshape(-1, self.mean.shape[-1])
-        clipped = np.minimum(relative, 9.0).mean(0) / OF_CLIPPED if len(relative) else np.zeros(relative.shape[-1])
+        clipped = np.minimum(relative, CLIP**2).mean(0) / OF_CLIPPED if len(relative) else np.zeros(relative.shape[-1])
         return np.where(clipped == 0.0, 1.0, clipped)
 
 

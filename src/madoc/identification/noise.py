@@ -19,6 +19,8 @@ from madoc.identification.states import states_observed_as
 from madoc.simulation.attitudes import differences, moved
 from madoc.simulation.base import Simulator
 
+WHITE = 0.2
+"""Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
 OUTLIER = 5.0
 """Robust standard deviations to which residuals are clipped, as contacts turn small noise into large ones; of normal
 values one in two million is larger."""

@@ -81,7 +81,7 @@ def assess(
     verdict = judge(
         holdout,
         settled=result.settled,
-        long_tails=result.long_tails,
+        unlike_noise=result.unlike_noise,
         effective=result.effective,
         combinations=widened.combinations,
     )

@@ -40,7 +40,7 @@ def judge(
     holdout: HoldOut,
     *,
     settled: bool = True,
-    long_tails: bool = False,
+    unlike_noise: bool = False,
     effective: bool = False,
     combinations: Sequence[Combination] = (),
 ) -> Verdict:
@@ -53,14 +53,14 @@ def judge(
     Args:
         holdout: What the hold-out says of the estimate.
         settled: Whether the search that led to it came to its end.
-        long_tails: Whether its residuals have longer tails than noise has.
+        unlike_noise: Whether its residuals have longer tails than noise has, or each is like the next.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         combinations: What the log tells of parameters that it leaves open.
     """
     refused = _rejected(holdout) or contradicted(holdout)
     if refused:
         return refused
-    lacks = lacking(holdout, settled=settled, long_tails=long_tails)
+    lacks = lacking(holdout, settled=settled, unlike_noise=unlike_noise)
     if lacks:
         return (_usable(holdout, lacks) if settled else None) or lacks
     return (

@@ -7,14 +7,13 @@ import numpy as np
 from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, PredictionErrors, ToldApart, Verdict
 from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
+from madoc.identification.noise import WHITE
 from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import about_timestep, as_likely, far_beyond_noise, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
 from madoc.verdict.systematic import EXPLAINED
 
-WHITE = 0.2
-"""Autocorrelation in [-1, 1]; above it residuals are not white. It is four standard errors of 400 independent rows."""
 PERSISTENT = 0.1
 """Correlation in [-1, 1] of residuals with those a few rows later, above which a force is missing that lasts."""
 BEYOND_RANDOM = 1.3
@@ -27,17 +26,17 @@ SEPARABLE = 0.65
 true simulator have about 0.55."""
 
 
-def lacking(holdout: HoldOut, *, settled: bool, long_tails: bool) -> Verdict | None:
+def lacking(holdout: HoldOut, *, settled: bool, unlike_noise: bool) -> Verdict | None:
     """The first of the ways in which a model lacks something; None where there is none.
 
-    An end of a range at which a search stands that has not settled says nothing. `long_tails` tells that residuals
-    have longer tails than noise has.
+    An end of a range at which a search stands that has not settled says nothing. `unlike_noise` tells that residuals
+    have longer tails than noise has, or that each is like the next.
     """
     found = _missing(holdout, missing_term(holdout)) or _mismatch(holdout)
     if far_beyond_noise(holdout) and numerical(holdout) is None:
         found = found or _missing(holdout, missing_term(holdout, least=0.0))
     found = found or (_outside(holdout) if settled else None)
-    return found or (_unlike_noise(holdout) if long_tails else None)
+    return found or (_unlike_noise(holdout) if unlike_noise else None)
 
 
 def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
@@ -146,14 +145,15 @@ def _outside(holdout: HoldOut) -> Verdict | None:
 
 
 def _unlike_noise(holdout: HoldOut) -> Verdict | None:
-    """Residuals with long tails, where the error of the integration step does not explain them."""
+    """Residuals unlike noise, where the error of the integration step does not explain them."""
     if numerical(holdout) is not None:
         return None
     return Verdict(
         "MODEL_MISMATCH",
-        "residuals have longer tails than noise has: the model does not explain some stretches of the log, and "
-        f"intervals do not count that{_where(holdout)}; look for a force that acts at times only, at contacts or in "
-        f"fast motion, for wrong or missing readings and for values that differ between runs{about_timestep(holdout)}",
+        "residuals are unlike noise, with some far larger or each like the next: the model does not explain the whole "
+        f"log, and intervals do not count that{_where(holdout)}; look for a force that acts at times only, at contacts "
+        "or in fast motion, for wrong or missing readings and for values that differ between runs"
+        f"{about_timestep(holdout)}",
     )
 
 

@@ -16,12 +16,12 @@ from madoc.data import Dataset
 from madoc.identification.candidate_terms import INTEGRATION
 from madoc.identification.coarseness import FINER
 from madoc.identification.missing_terms import suspicions
+from madoc.identification.noise import WHITE
 from madoc.identification.states import LoggedStates, states_of
 from madoc.identification.term_tests import LIKELY_FORCE, MissingTerm, named
 from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.simulation.delay import pending_actions
-from madoc.verdict.mismatch import WHITE
 from madoc.verdict.remedies import line_of
 
 

@@ -186,7 +186,7 @@ class LeastSquares:
             uncertainty=sandwich(spread.bread, spread.meat),
             windows=windows,
             settled=settled,
-            long_tails=settled and state.estimates_starts and sentences.have_long_tails(problem, best),
+            unlike_noise=settled and state.estimates_starts and sentences.have_long_tails(problem, best),
         )
 
     def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:
@@ -220,7 +220,7 @@ class LeastSquares:
             interval=interval,
             quantile=errors,
             settled=found.settled,
-            long_tails=found.long_tails,
+            unlike_noise=found.unlike_noise,
             effective=progress == "better",
         )
 

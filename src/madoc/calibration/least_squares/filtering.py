@@ -26,20 +26,13 @@ from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification.ensembles import (
-    LEAST_NOISE,
-    NOISE_CHANGE,
-    SPOILT,
-    Innovations,
-    agreed,
-    can_be_drawn,
-    innovations,
-    members_at,
-)
+from madoc.identification import ensembles
+from madoc.identification.ensembles import Innovations, agreed, innovations, members_at
 from madoc.identification.gauss_newton import damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.linearisation import LEAST_CURVATURE
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
+from madoc.identification.noise import WHITE
 from madoc.identification.replay import Readings
 from madoc.identification.settling import FAILED_WINDOW, window_costs
 from madoc.identification.windows import disjoint_windows, rows_that_fit
@@ -98,6 +91,7 @@ class FilterState:
         moved: The largest component of the last step in its standard errors.
         damping: λ of the next step.
         cost: Mean loss of a whitened prediction error before it, in squared standard deviations.
+        alike: The largest correlation of a channel's whitened error with that of the next reading, as noise has none.
         explained: Number of windows in which no simulation failed.
         wide: 0 in the first epochs, then 1 and the number of epochs on all windows.
         quiet: 1 once no noise has changed much from one epoch to the next.
@@ -119,6 +113,7 @@ class FilterState:
     moved: float
     damping: float
     cost: float
+    alike: float
     explained: int
     wide: int
     quiet: int
@@ -154,8 +149,8 @@ class FilterState:
         """The point, with its uncertainty by the last epoch."""
         told = np.diag(self.squares) > 0.0
         bread = agreed(self.products, self.squares) * np.outer(told, told)
-        long_tails = self.settled and self.cost > LONG_TAILS
-        return Found(self.point, sandwich(bread, self.meat), self.explained, self.settled, long_tails)
+        unlike_noise = self.settled and (self.cost > LONG_TAILS or self.alike > WHITE)
+        return Found(self.point, sandwich(bread, self.meat), self.explained, self.settled, unlike_noise)
 
 
 def horizon_of(problem: CalibrationProblem) -> int:
@@ -167,7 +162,7 @@ def horizon_of(problem: CalibrationProblem) -> int:
 def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState | None:
     """The search before it has begun; None where few windows show contacts, or sensors do not show all positions."""
     states, count = problem.states, len(problem.simulator.parameters)
-    if not states.starts_known or states.placed.any() or not can_be_drawn(states, problem.simulator):
+    if not states.starts_known or states.placed.any() or not ensembles.can_be_drawn(states, problem.simulator):
         return None
     horizon = horizon_of(problem)
     if not len(rows_that_fit(problem.dataset, states.rows, horizon)):
@@ -183,7 +178,7 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
         point=np.zeros(count),
         rows=rows,
         spread=WIDTH * np.eye(count),
-        noise=np.maximum(by_differences, LEAST_NOISE),
+        noise=np.maximum(by_differences, ensembles.LEAST_NOISE),
         seed=int(np.asarray(jax.random.key_data(key))[-1]),
         gradients=np.zeros((len(rows), count)),
         products=np.zeros((count, count)),
@@ -192,6 +187,7 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
         moved=0.0,
         damping=FIRST_DAMPING,
         cost=0.0,
+        alike=0.0,
         explained=0,
         wide=0,
         quiet=0,
@@ -246,8 +242,9 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
     error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), np.finfo(float).tiny))
     ratio = np.mean([each.found.noise_ratio(each.first) for each in sides], axis=0)
-    noise, rounding = state.noise * np.sqrt(np.clip(ratio, *NOISE_CHANGE)), problem.rounding / problem.typical_change
-    noise = np.maximum(noise, np.maximum(rounding[: len(noise)], LEAST_NOISE * noise.max()))
+    noise = state.noise * np.sqrt(np.clip(ratio, *ensembles.NOISE_CHANGE))
+    rounding = (problem.rounding / problem.typical_change)[: len(noise)]
+    noise = np.maximum(noise, np.maximum(rounding, ensembles.LEAST_NOISE * noise.max()))
     moved, pull = float((np.abs(undamped) / error).max()), bread @ undamped
     quiet = bool((np.abs((noise / state.noise) ** 2 - 1.0) < NOISE_SETTLED).all())
     refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))
@@ -263,6 +260,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         meat=meat + np.outer(pull, pull),
         moved=max(moved, LIKE_CHANCE) if refused else moved,
         cost=float(np.mean([window_costs(each.at_point(), loss)[whole] for each in sides])) if whole.any() else 0.0,
+        alike=float(np.mean([each.found.alike(each.first) for each in sides])),
         explained=int(whole.sum()),
         wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < NEAR)),
         quiet=int(quiet),
@@ -336,7 +334,7 @@ class _Side:
         above, below = (np.clip(state.point + sign * state.spread.T, -1.0, 1.0) for sign in (1, -1))
         points, aside = np.concatenate([state.point[None], above, below]), (above + below).mean(0) / 2.0 - state.point
         found = innovations(problem.simulator, readings, points, members, state.noise)
-        return cls(members, found, above - below, aside, 0 if problem.states.kind == "exact" else SPOILT)
+        return cls(members, found, above - below, aside, 0 if problem.states.kind == "exact" else ensembles.SPOILT)
 
     def errors(self) -> Float[np.ndarray, "windows values"]:
         """Whitened prediction errors at the point: the mean over the differences' ends, led back from theirs to it."""

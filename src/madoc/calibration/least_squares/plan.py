@@ -71,14 +71,14 @@ class Found:
         uncertainty: That of the point.
         windows: Number of independent windows that tell it.
         settled: Whether the search has come to its end.
-        long_tails: Whether residuals have longer tails than noise has.
+        unlike_noise: Whether residuals have longer tails than noise has, or each is like the next.
     """
 
     point: Float[np.ndarray, " d"]
     uncertainty: Uncertainty
     windows: int
     settled: bool
-    long_tails: bool
+    unlike_noise: bool
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from madoc.calibration.least_squares.filtering import FilterState, horizon_of
 from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.statistics import LONG_TAILS
 from madoc.data import stride
+from madoc.identification.noise import WHITE
 
 MOST_LEFT_OUT = 0.05
 """Share in [0, 1] of windows that no initial state explains; without contacts, noise alone leaves out fewer."""
@@ -16,6 +17,10 @@ FEWEST_LEFT_OUT = 3
 EXACT = 1e-6
 """Residual in typical changes of a stride; smaller ones mean that states were logged without noise."""
 TAILS = "residuals have longer tails than noise has: the intervals are too narrow"
+ALIKE = (
+    "what the model leaves of a reading is like what it leaves of the next (correlation {:.2f}), as noise is not: the "
+    "intervals are too narrow"
+)
 NOT_SETTLED = (
     "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"
 )
@@ -49,8 +54,9 @@ def about_filtered_states(problem: CalibrationProblem, search: FilterState) -> t
     )
     if not search.epochs:
         return (sentence,)
-    tails = (TAILS,) if search.found.long_tails else ()
-    return (f"{sentence}; {_how_large(problem, search.noise)}, and the intervals allow for it", *tails)
+    unlike = [TAILS] * (search.cost > LONG_TAILS) + [ALIKE.format(search.alike)] * (search.alike > WHITE)
+    left = unlike if search.found.unlike_noise else []
+    return (f"{sentence}; {_how_large(problem, search.noise)}, and the intervals allow for it", *left)
 
 
 def _why_states_are_not_known(problem: CalibrationProblem) -> str:
