@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,6 +7,7 @@ from test_holdout import REPORTS
 
 from madoc.calibration import CalibrationResult, ParameterEstimate
 from madoc.errors import MadocError
+from madoc.identification.concentration import Concentration
 
 
 def result(**changes):
@@ -48,8 +50,9 @@ def test_intervals_have_a_column_of_their_own():
 
 @pytest.mark.parametrize("report", REPORTS)
 def test_the_record_of_the_hold_out_comes_back_as_it_was(report):
-    stored = json.loads(json.dumps(result(holdout=report).to_json()))
-    assert CalibrationResult.from_json(stored).holdout == report
+    for told in (report, replace(report, concentration=Concentration(0.0, "", "speed"))):
+        stored = json.loads(json.dumps(result(holdout=told).to_json()))
+        assert CalibrationResult.from_json(stored).holdout == told
 
 
 def test_why_auto_took_a_method_is_kept_and_told():

@@ -66,7 +66,7 @@ def test_times_in_pieces_of_a_run_are_not_told():
 def test_a_signal_is_told_where_it_has_most():
     errors = alike()
     errors[..., 1] *= 3.0
-    assert found(errors) == Concentration(0.0, "", None, "speed")
+    assert found(errors) == Concentration(0.0, "", "speed")
 
 
 def test_what_is_left_is_alike_in_a_row_where_it_is_not_noise():

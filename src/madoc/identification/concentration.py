@@ -27,14 +27,14 @@ class Concentration:
     Attributes:
         share: Share in [0, 1] of the squared residuals that the stretch holds; 0 where no place stands out.
         run: The run that it is in.
-        seconds: Where it begins and ends, in s from the start of the run; None for the whole run.
         signal: The signal, of three or more; empty where none has so much.
+        seconds: Where it begins and ends, in s from the start of the run; None for the whole run.
     """
 
     share: float
     run: str
-    seconds: tuple[float, float] | None
     signal: str
+    seconds: tuple[float, float] | None = None
 
 
 def concentration(
@@ -66,10 +66,10 @@ def concentration(
         begin = dataset.episode_starts[run]
         ends = rows[first] - begin, rows[last - 1] + windows.readings.steps - begin
         seconds = float(control_step * ends[0]), float(control_step * ends[1])
-        return Concentration(float(by_window[first:last].sum()), name, seconds, signal)
+        return Concentration(float(by_window[first:last].sum()), name, signal, seconds)
     if in_run > MOST and (runs == run).mean() <= MOST * MOST:
-        return Concentration(in_run, name, None, signal)
-    return Concentration(0.0, "", None, signal) if signal else None
+        return Concentration(in_run, name, signal)
+    return Concentration(0.0, "", signal) if signal else None
 
 
 def alike(fit: Fit, readings: Readings) -> float:
