@@ -47,8 +47,9 @@ def judge(
     """The first verdict that applies: rejected data, a model that lacks something, open parameters, no improvement.
 
     What the model lacks makes an estimate `USABLE` where it predicts much better than the model as given, and else a
-    mismatch; one of a search that had not settled is `USABLE` there too, and else no improvement. A log that is too
-    short to tell whether the model lacks a term, or tells no states, leaves its parameters open.
+    mismatch; one of a search that had not settled is `USABLE` there too, and else no improvement: what its log leaves
+    open is not known before. A log that is too short to tell whether the model lacks a term, or tells no states, leaves
+    its parameters open.
 
     Args:
         holdout: What the hold-out says of the estimate.
@@ -63,10 +64,11 @@ def judge(
     lacks = lacking(holdout, settled=settled, unlike_noise=unlike_noise)
     if lacks:
         return (_usable(holdout, lacks) if settled else None) or lacks
+    if not settled:
+        return _no_improvement(holdout) or _unsettled(holdout)
     return (
         _open(holdout, combinations)
         or _no_improvement(holdout)
-        or (None if settled else _unsettled(holdout))
         or _untested(holdout)
         or _with_an_assumed_base(holdout)
         or (_not_certain(holdout, EFFECTIVE) if effective and numerical(holdout) is None else None)
