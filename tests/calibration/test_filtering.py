@@ -19,6 +19,7 @@ from madoc.identification.ensembles import (
     FARTHEST,
     NOISE_ROUNDS,
     Innovations,
+    _likeliest,
     agreed,
     followed,
     innovations,
@@ -27,7 +28,7 @@ from madoc.identification.ensembles import (
 )
 from madoc.identification.information import BOX_VARIANCE
 from madoc.identification.replay import Readings
-from madoc.identification.settling import RESETTLING, settled
+from madoc.identification.settling import ANEW, RESETTLING, WIDTHS, settled
 from madoc.identification.windows import disjoint_windows
 from madoc.runs.checkpoint import load, save
 from own_robots import write_robot
@@ -151,8 +152,9 @@ def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_
     assert (found.deviation[2:] < 0.95 * narrow.deviation[2:]).all()  # of speeds, which contacts decide
     begun = int((rows - problem.dataset.episode_starts[problem.dataset.episode_of(rows)] >= BEFORE).sum())
     drawn = NOISE_ROUNDS * begun * DRAWN * BEFORE + len(rows) * (DRAWN + 1) * steps
-    step = len(rows) * (1 + 4 + 3) * steps
-    assert (spent - drawn) / step in (1, 2, 3, 4)
+    likely, of_draws = _likeliest(*given, guesses)
+    after = settled(simulator, readings, point, likely, WIDTHS, ANEW, until_noise=True)
+    assert of_draws == drawn and spent == drawn + after.simulations * steps
     aloft = np.add(guesses, [0.0, 1.0, 0.0, 0.0])
     untouched, nothing = with_contacts_settled(*given, aloft)
     assert nothing == 0 and untouched is aloft  # without contacts derivatives at the guesses serve
@@ -220,7 +222,8 @@ def test_a_foot_that_slides_under_noise(tmp_path):
     assert state.stage == "filtering" and epoch.converged
     estimate, truth = method.estimate(problem, state), space.vector(FOOT_TRUTH)
     assert ((estimate.interval[:, 0] <= truth) & (truth <= estimate.interval[:, 1])).all()
-    assert (np.diff(estimate.interval, axis=1)[:, 0] < 0.1 * (space.high - space.low)).all()
+    for found, most in ((method.estimate(problem, before), 0.05), (estimate, 0.1)):  # half ensembles may err by chance
+        assert (np.diff(found.interval, axis=1)[:, 0] < most * (space.high - space.low)).all()
     assert estimate.settled and not estimate.unlike_noise
     found = state.filtered.noise * problem.typical_change
     np.testing.assert_allclose(found, [*NOISE.values()], rtol=0.4)
@@ -274,9 +277,8 @@ def test_differences_lead_along_the_axes_of_the_covariance_and_not_out_of_a_rang
     problem = problem_of_foot(tmp_path, rows=300)
     search = of_contacts(problem, jax.random.key(0))
     np.testing.assert_allclose(search.spread, filtering.WIDTH * np.eye(2))
-    axes = _axes(
-        np.array([[5e-4, 3e-4], [3e-4, 5e-4]])
-    )  # standard errors of sqrt(8e-4) along (1, 1), sqrt(2e-4) across
+    # Standard errors of sqrt(8e-4) along (1, 1), and of sqrt(2e-4) across it.
+    axes = _axes(np.array([[5e-4, 3e-4], [3e-4, 5e-4]]))
     expected = np.sqrt([[2e-4, 8e-4], [2e-4, 8e-4]])  # two of them, in each component 1 / sqrt(2) of the length
     np.testing.assert_allclose(np.abs(axes), expected)
     np.testing.assert_allclose(np.linalg.norm(_axes(np.diag([0.0, 9.0])), axis=0), filtering.WIDTHS)
@@ -307,7 +309,8 @@ def test_predictions_leave_errors_alike_only_where_windows_agree():
 def test_errors_are_the_mean_over_both_ends_and_lead_back_to_the_point(above, below, mean):
     """By hand: errors 2 + 3 p + p², whose mean at a standard error of 0.1 is 2 + 0.1².
 
-    A line through both ends of a parabola passes the point too high by their product."""
+    A line through both ends of a parabola passes the point too high by their product.
+    """
     p = np.array([0.0, above, below])
     errors, nothing = (2.0 + 3.0 * p + p**2).reshape(3, 1, 1, 1), np.zeros((3, 1, 1, 1))
     found = Innovations(errors, np.ones((3, 1, 1, 1, 1)), np.ones((3, 1), bool), nothing)

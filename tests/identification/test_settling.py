@@ -10,6 +10,7 @@ from madoc import robots, simulation, tasks
 from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb
 from madoc.identification import settling
+from madoc.identification.ensembles import with_contacts_settled
 from madoc.identification.replay import Readings
 from madoc.identification.settling import (
     FAILED_WINDOW,
@@ -26,6 +27,12 @@ from robots import SPRING_TRUTH, recorded, spring
 
 def windows(task, truth, steps, noise):
     """Readings of windows, and their initial states as read with noise."""
+    simulator, readings, guesses, _ = logged_windows(task, truth, steps, noise)
+    return simulator, readings, guesses
+
+
+def logged_windows(task, truth, steps, noise):
+    """The same, with the problem and the rows that windows begin at."""
     log = recorded(task, truth, 600, jax.random.key(0))
     noisy = replace(disturb(log, Disturbance(noise=noise), task, jax.random.key(1)), disturbance=Disturbance())
     problem = CalibrationProblem(noisy, simulation.make(task, threads=1))
@@ -33,7 +40,7 @@ def windows(task, truth, steps, noise):
     rows = rows[rows % task.max_episode_steps + steps < task.max_episode_steps]
     readings = Readings.at(noisy, problem.states, rows, steps, problem.typical_change)
     guesses = problem.states.states[np.searchsorted(problem.states.rows, rows)]
-    return problem.simulator, readings, guesses
+    return problem.simulator, readings, guesses, (problem, rows)
 
 
 def descended(simulator, readings, guesses, point, widths):
@@ -73,7 +80,7 @@ def test_states_of_a_smooth_robot_settle_in_two_steps_at_any_width():
 def test_wide_differences_and_restarts_find_states_at_contacts():
     task = tasks.make("halfcheetah", "legacy")
     truth = dict(zip(task.parameters.names, task.parameters.middle.tolist(), strict=True))
-    simulator, readings, guesses = windows(task, truth, 5, 0.1)
+    simulator, readings, guesses, (problem, rows) = logged_windows(task, truth, 5, 0.1)
     point, values = np.zeros(len(truth)), readings.observed[0].size
     narrow = descended(simulator, readings, guesses, point, np.zeros(len(settling.WIDTHS)))
     wide = descended(simulator, readings, guesses, point, settling.WIDTHS)
@@ -82,6 +89,12 @@ def test_wide_differences_and_restarts_find_states_at_contacts():
     assert missed[0] > 1.5 * missed[1] > 0  # of 100 windows 22 and 7; with MuJoCo 3.8 19 and 11
     assert missed[2] < missed[1]
     assert (again.costs <= wide.costs).all()
+    given = problem.dataset, problem.states, simulator, readings, rows, point, guesses
+    states, spent = with_contacts_settled(*given)
+    residuals = readings.residuals(simulator, point[None], states[None])[0, 0] / np.tile(wide.deviation, 6)
+    drawn = replace(wide, costs=window_costs(residuals, "cauchy"))
+    assert drawn.unexplained(values, "cauchy").sum() <= missed[1]
+    assert spent > len(readings) * readings.steps
 
 
 def test_contacts_of_a_window_are_those_of_its_simulated_states():

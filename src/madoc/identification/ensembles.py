@@ -20,7 +20,6 @@ from madoc.identification.replay import Readings
 from madoc.identification.settling import (
     ANEW,
     FAILED_WINDOW,
-    RESETTLING,
     WIDTHS,
     settled,
     window_costs,
@@ -261,7 +260,8 @@ def with_contacts_settled(
     """Initial states from near which those of single windows can be fitted, and the control steps that it took.
 
     Where windows begin in contact, the best of many states that are as likely as the readings before each window is
-    taken, and settles: what states in wrong minima leave would pass for what the model lacks.
+    taken, and settles by differences of all `WIDTHS` until residuals of nearly all are noise, and anew where they are
+    not: what states in wrong minima leave would pass for what the model lacks.
     """
     if readings.placed.any():
         states, simulations = with_bases_settled(simulator, readings, point, guesses)
@@ -270,11 +270,9 @@ def with_contacts_settled(
     if not len(known) or not simulator.contacts(known, simulator.parameters.to_physical(point.clip(-1.0, 1.0))).any():
         return guesses, 0
     spent = 0
-    likely = logged.starts_known and can_be_drawn(logged, simulator)
-    if likely:
+    if logged.starts_known and can_be_drawn(logged, simulator):
         guesses, spent = _likeliest(dataset, logged, simulator, readings, rows, point, guesses)
-    widths, anew = ((0.0, *RESETTLING), 0) if likely else (WIDTHS, ANEW)
-    after = settled(simulator, readings, point, guesses, widths, anew, until_noise=True)
+    after = settled(simulator, readings, point, guesses, WIDTHS, ANEW, until_noise=True)
     return after.states, spent + after.simulations * readings.steps
 
 

@@ -28,7 +28,7 @@ PLACED_ALONE = 3
 RESTARTS = 5
 """Number of times that windows whose residuals are more than noise begin anew, near the guess of their state."""
 ANEW = 2
-"""The same in the fit for prediction, of whose windows a few may stay where they are."""
+"""The same in the fit for prediction and in tests of a model, of whose windows a few may stay where they are."""
 FARTHEST = 30.0
 """Largest error of a guess in standard errors of the state: that of a velocity that jumps between two positions."""
 BEYOND = 3.0

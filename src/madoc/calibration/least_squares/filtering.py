@@ -240,7 +240,8 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     left_out = np.linalg.inv(np.eye(len(bread)) - MOST_TOLD * told)
     scores = (left_out @ gradients[..., None])[..., 0]  # about what leaving the window out would change
     meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
-    error = np.sqrt(np.maximum(np.diag(sandwich(bread, meat).covariance), np.finfo(float).tiny))
+    covariance = sandwich(bread, meat).covariance
+    error = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
     ratio = np.mean([each.found.noise_ratio(each.first) for each in sides], axis=0)
     noise = state.noise * np.sqrt(np.clip(ratio, *ensembles.NOISE_CHANGE))
     rounding = (problem.rounding / problem.typical_change)[: len(noise)]
@@ -252,7 +253,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         state,
         point=state.point + taken,
         damping=damping,
-        spread=_axes(sandwich(bread, meat).covariance),
+        spread=_axes(covariance),
         noise=noise,
         gradients=gradients + told @ (bread @ taken),
         products=products,
