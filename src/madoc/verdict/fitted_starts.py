@@ -32,7 +32,7 @@ GAIN = 1e-3
 STEPS_OF_BASES = 2
 """The same where the place of a base, which no sensor shows, has settled with the state before."""
 FEW = 0.01
-"""Share in [0, 1] of the windows, up to which no further step is taken for those that are not fitted."""
+"""Share in [0, 1] of the windows, up to which no further step is taken for those that a step gained on."""
 _SHARES = np.array([1.0, 0.3, 0.1])
 """Shares in (0, 1] of a step, of which every window takes the one that fits it best; none where none does."""
 _POINTS, _NEARBY_STEPS = 6, 6
@@ -82,25 +82,30 @@ class FittedReplays:
     def starts(self, points: Float[np.ndarray, "systems d"]) -> tuple[Float[np.ndarray, "systems windows state"], int]:
         """The initial states from which each system comes nearest to the observations of the fitted steps.
 
-        Also the control steps that were simulated. Steps end once they gain little in nearly all windows.
+        Also the control steps that were simulated. Each step moves the windows that the one before gained on, under any
+        system.
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
         settled = [with_bases_settled(self.simulator, first, point, self.near) for point in points]
-        states = np.stack([each for each, _ in settled])
-        damping, spent = np.full(len(first), _DAMPING), first.steps * sum(simulations for _, simulations in settled)
+        states, spent = np.stack([each for each, _ in settled]), first.steps * sum(count for _, count in settled)
+        gaining = np.arange(len(first))
         for _ in range(STEPS_OF_BASES if first.placed.any() else FIT_STEPS):
-            around = slopes_at(self.simulator, first, points, states, parameters=False)
-            fits = [eliminate(slopes, np.ones_like(slopes.residuals), damping) for slopes in around]
+            part, around = first.of(gaining), states[:, gaining]
+            slopes = slopes_at(self.simulator, part, points, around, parameters=False)
+            damping = np.full(len(part), _DAMPING)
+            fits = [eliminate(each, np.ones_like(each.residuals), damping) for each in slopes]
             step = first.in_state_units(np.stack([fit.states_step(np.zeros(0)) for fit in fits]), states.shape[2])
-            tried = states[:, None] + _SHARES[:, None, None] * step[:, None]
-            residuals = first.residuals(self.simulator, points, tried.reshape(len(points), -1, states.shape[2]))
-            spent += len(points) * len(first) * first.steps * (1 + len(first.spread) + len(_SHARES))
-            before = np.stack([np.where(each.whole, (each.residuals**2).sum(-1), np.inf) for each in around])
+            tried = around[:, None] + _SHARES[:, None, None] * step[:, None]
+            residuals = part.residuals(self.simulator, points, tried.reshape(len(points), -1, states.shape[2]))
+            spent += len(points) * len(part) * first.steps * (1 + len(first.spread) + len(_SHARES))
+            before = np.stack([np.where(each.whole, (each.residuals**2).sum(-1), np.inf) for each in slopes])
             costs = np.concatenate([_squares(residuals), before[:, None]], axis=1)
             best = costs.argmin(1)[:, None, :, None]
-            states = np.take_along_axis(np.concatenate([tried, states[:, None]], axis=1), best, axis=1)[:, 0]
-            if _unfitted(before, costs.min(1)) <= FEW:
+            every = np.concatenate([tried, around[:, None]], axis=1)
+            states[:, gaining] = np.take_along_axis(every, best, axis=1)[:, 0]
+            gaining = gaining[(costs.min(1) < (1.0 - GAIN) * before).any(0)]
+            if len(gaining) <= FEW * len(first):
                 break
         return states, spent
 
@@ -117,11 +122,6 @@ def _squares(residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarra
     with np.errstate(over="ignore", invalid="ignore"):
         cost = (residuals**2).sum(-1)
     return np.where(np.isfinite(cost), cost, np.inf)
-
-
-def _unfitted(before: Float[np.ndarray, "systems windows"], after: Float[np.ndarray, "systems windows"]) -> float:
-    """The largest share over systems of the windows in which a step saved more than `GAIN`, or that simulate now."""
-    return float((after < (1.0 - GAIN) * before).mean(1).max())
 
 
 def fitted_replays_of(
