@@ -63,8 +63,8 @@ def check(
         simulator: The model and the ranges of its parameters.
         robot: The user's own robot, if it is one: its spec gives units and reasons.
         seed: Seed of the windows that are replayed and of the parameters that are tried.
-        intervals: Whether expected intervals are wanted where initial states have to be fitted for them, which takes
-            as long as the rest; a calibration that follows has its own.
+        intervals: Whether expected intervals are wanted as narrow as they can be, which takes as long as the rest, and
+            where initial states have to be fitted for them; a calibration that follows has its own.
     """
     started = time.monotonic()
     of_rows, of_box, of_actions, of_windows = jax.random.split(jax.random.key(seed), 4)
@@ -94,7 +94,7 @@ def check(
             acting, steps = action_findings(dataset, simulator, logged, explanation, told=told, key=of_actions)
             findings += acting
             start = explanation.draws[explanation.best]
-            excitation = excite(dataset, simulator, logged, start=start, key=of_windows)
+            excitation = excite(dataset, simulator, logged, start=start, key=of_windows, intervals=intervals)
             spent += explanation.control_steps + steps
         else:
             findings.append(_inexact_states_finding(logged, robot))
