@@ -10,25 +10,37 @@ from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares import filtering
 from madoc.calibration.least_squares.calibrator import LeastSquares
-from madoc.calibration.least_squares.filtering import _axes, _products, _Side, of_contacts
-from madoc.data import Disturbance, disturb
-from madoc.identification.ensembles import (
+from madoc.calibration.least_squares.filtering import of_contacts
+from madoc.calibration.least_squares.instruments import (
     AGREEING,
+    FEWER,
+    LARGEST_SHARE,
+    WIDTHS,
+    Side,
+    agreed,
+    axes_of,
+    products_of,
+    shares_of,
+)
+from madoc.data import Disturbance, disturb
+from madoc.identification import settling
+from madoc.identification.ensembles import (
     BEFORE,
     DRAWN,
     FARTHEST,
     NOISE_ROUNDS,
+    Correction,
     Innovations,
     _likeliest,
-    agreed,
-    followed,
+    few_of,
     innovations,
     members_at,
+    next_noise,
     with_contacts_settled,
 )
 from madoc.identification.information import BOX_VARIANCE
 from madoc.identification.replay import Readings
-from madoc.identification.settling import ANEW, RESETTLING, WIDTHS, settled
+from madoc.identification.settling import ANEW, RESETTLING, settled
 from madoc.identification.windows import disjoint_windows
 from madoc.runs.checkpoint import load, save
 from own_robots import write_robot
@@ -68,7 +80,7 @@ NOISE = {"along": 5e-4, "up": 5e-4, "along_speed": 5e-3, "up_speed": 5e-3}
 
 
 @dataclass(frozen=True)
-class Given(_Side):
+class Given(Side):
     """An ensemble whose errors and slopes are given."""
 
     by_hand: tuple[np.ndarray, np.ndarray]
@@ -80,11 +92,17 @@ class Given(_Side):
         return self.by_hand[1]
 
 
+def known(errors):
+    """Innovations with these whitened errors, as the covariance of predictions is 1."""
+    rows, channels = errors.shape[1:-1], errors.shape[-1]
+    one, none = np.broadcast_to(np.eye(channels), (*rows, channels, channels)), np.zeros((*rows, 1, channels))
+    correction = Correction(one, one, none, none, np.ones((*rows, channels)))
+    return Innovations(errors, correction, np.ones(errors.shape[:2], bool), errors, 0)
+
+
 def given(errors, slopes):
-    nothing = np.zeros((1, len(errors), 1, 1))
-    found = Innovations(nothing, nothing[..., None], np.ones((1, len(errors)), bool), nothing)
-    nowhere = np.zeros(slopes.shape[-1])
-    return Given(np.zeros((len(errors), 1, 1)), found, np.diag(nowhere), nowhere, 0, (errors, slopes))
+    nothing, nowhere = known(np.zeros((1, len(errors), 1, 1))), np.zeros(slopes.shape[-1])
+    return Given(nothing.members, nothing, nothing, np.diag(nowhere), nowhere, (errors, slopes))
 
 
 def problem_of_foot(folder, rows=900, spec=FOOT_SPEC):
@@ -103,16 +121,31 @@ def problem_of_foot(folder, rows=900, spec=FOOT_SPEC):
 def test_states_follow_a_reading_by_kalmans_gain():
     """By hand: two states with a variance of 2 and a reading of noise 1 that is 2 below them: K = 2/3, P = 2/3."""
     states, apart = np.array([4.0, 2.0]).reshape(1, 1, 2, 1), np.array([3.0, 1.0]).reshape(1, 1, 2, 1)
-    factor = np.full((1, 1, 1, 1), np.sqrt(3.0))
-    after = followed(states, apart, factor)
+    correction = Correction.of(states[0], apart[0])
+    assert correction.factor == pytest.approx(np.sqrt(3.0))
+    after = correction.follow(states, apart)
     assert after.mean() == pytest.approx(3.0 - 2.0 * 2.0 / 3.0)
     assert after.var(ddof=1) == pytest.approx(2.0 / 3.0)
-    false = followed(states, apart + 1000.0, factor)
+    far = Correction.of(states[0], apart[0] + 1000.0)
+    false = far.follow(states, apart + 1000.0)
     assert false.mean() == pytest.approx(3.0 - FARTHEST * 2.0 / np.sqrt(3.0))
-    both = followed(
-        *(np.concatenate(pair) for pair in ((states, states), (apart + 1000.0, apart + 500.0), (factor, factor)))
-    )
+    both = far.follow(np.concatenate([states, states]), np.concatenate([apart + 1000.0, apart + 500.0]))
     assert 3.0 - both[1].mean() == pytest.approx(0.5 * (3.0 - both[0].mean()), rel=0.01)  # the first system decides
+    one = correction.follow(states[..., :1, :], apart[..., :1, :])  # a single state follows by the ensemble's gain
+    assert one.item() == pytest.approx(4.0 - 3.0 * 2.0 / 3.0)
+
+
+def test_few_states_have_the_mean_of_all_and_noise_follows_the_size_of_errors():
+    members = np.arange(8.0).reshape(1, 4, 2) ** 2
+    few = few_of(members, 2, 1)
+    np.testing.assert_allclose(few[..., 0].mean(), members[..., 0].mean())
+    np.testing.assert_allclose(few[0, 1, 0] - few[0, 0, 0], 4.0 * np.sqrt(0.75 * 2.0))
+    many = np.random.default_rng(0).standard_normal((4000, 16, 1))
+    assert few_of(many, 4, 1).var() == pytest.approx(1.0, rel=0.05)
+    np.testing.assert_array_equal(few[..., 1], members[:, :2, 1])  # an action that is pending
+    noise, rounding = np.array([0.1, 0.1, 0.1, 1.0]), np.array([0.0, 0.04, 0.0, 0.0])
+    ratio = np.array([4.0, 0.09, 1e-9, 1.0])
+    np.testing.assert_allclose(next_noise(noise, ratio, rounding), [0.2, 0.04, 0.01, 1.0])
 
 
 def test_prediction_errors_of_the_right_model_are_white_and_of_variance_one():
@@ -134,6 +167,9 @@ def test_prediction_errors_of_the_right_model_are_white_and_of_variance_one():
     assert abs((errors[:, 1:] * errors[:, :-1]).mean()) < 0.1
     surprise = found.surprise("linear").mean(1)
     assert surprise[0] < surprise[1]
+    few = few_of(members, 50, problem.states.physical_size)
+    again = innovations(problem.simulator, readings, truth[None], few, noise, like=found)
+    np.testing.assert_allclose(again.mean[0], found.mean[0], atol=1e-6)  # where motion is linear few say the same
 
 
 def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_path):
@@ -153,7 +189,7 @@ def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_
     begun = int((rows - problem.dataset.episode_starts[problem.dataset.episode_of(rows)] >= BEFORE).sum())
     drawn = NOISE_ROUNDS * begun * DRAWN * BEFORE + len(rows) * (DRAWN + 1) * steps
     likely, of_draws = _likeliest(*given, guesses)
-    after = settled(simulator, readings, point, likely, WIDTHS, ANEW, until_noise=True)
+    after = settled(simulator, readings, point, likely, settling.WIDTHS, ANEW, until_noise=True)
     assert of_draws == drawn and spent == drawn + after.simulations * steps
     aloft = np.add(guesses, [0.0, 1.0, 0.0, 0.0])
     untouched, nothing = with_contacts_settled(*given, aloft)
@@ -169,9 +205,9 @@ def test_chance_biases_no_product_of_two_ensembles():
         chance = 2.0 * random.standard_normal((windows, 1, 1))
         return given(errors + 0.1 * chance[..., 0], 1.0 + chance)
 
-    gradients, products, squares, _ = _products(side(), side(), np.ones(windows, bool), "linear")
-    assert products[0, 0] / windows == pytest.approx(1.0, abs=0.15)
-    assert squares[0, 0] / windows == pytest.approx(5.0, rel=0.1)
+    gradients, products, squares = products_of(side(), side(), np.ones(windows, bool), "linear")
+    assert products.mean() == pytest.approx(1.0, abs=0.15)
+    assert squares.mean() == pytest.approx(5.0, rel=0.1)
     assert gradients.mean() == pytest.approx(0.3, abs=0.05)  # with its own slopes an ensemble's would be 0.7
     np.testing.assert_allclose(agreed(np.array([[-1.0]]), np.array([[4.0]])), [[4.0 * AGREEING]])
 
@@ -190,11 +226,12 @@ def test_a_window_of_chance_alone_does_not_decide():
     slopes = np.random.default_rng(0).standard_normal((30, 8, 2))
     slopes[0] *= 1000.0
     side = given(np.ones((30, 8)), slopes)
-    gradients, products, squares, shares = _products(side, side, np.ones(30, bool), "linear")
+    gradients, products, squares = products_of(side, side, np.ones(30, bool), "linear")
+    shares = shares_of(squares)
     np.testing.assert_allclose(shares.sum(0), np.eye(2), atol=1e-6)
     np.testing.assert_allclose(products, squares)  # one ensemble agrees with itself
     told = np.trace(shares, axis1=1, axis2=2) / 2.0
-    assert told[0] == told.max() <= 1.05 * filtering.LARGEST_SHARE
+    assert told[0] == told.max() <= 1.05 * LARGEST_SHARE
     less = gradients[0] / slopes[0].sum(0)
     assert less[0] == pytest.approx(less[1]) and less[0] < 1e-4
     np.testing.assert_allclose(gradients[1:], slopes[1:].sum(1))
@@ -203,8 +240,9 @@ def test_a_window_of_chance_alone_does_not_decide():
 def test_a_parameter_that_changes_nothing_stays_unknown(tmp_path):
     assert (agreed(np.zeros((2, 2)), np.zeros((2, 2))) < 1e-90).all()
     search = of_contacts(problem_of_foot(tmp_path, rows=300), jax.random.key(0))
-    one = np.diag([4.0, 0.0])
-    found = replace(search, products=one, squares=one, meat=one, epochs=3).found
+    one, windows = np.diag([4.0, 0.0]), len(search.rows)
+    each = np.broadcast_to(one / windows, (windows, 2, 2))
+    found = replace(search, products=each, squares=each, meat=one, epochs=3).found
     np.testing.assert_allclose(np.diag(found.uncertainty.covariance), [0.25, BOX_VARIANCE])
 
 
@@ -247,7 +285,7 @@ def test_the_gradient_at_the_truth_is_none_though_chance_is_shared(loss):
         here, there = 0.5 * random.standard_normal((2, *shape))
         return given(noise + here, (3.0 + (there - here) / 0.1)[..., None])
 
-    gradients, *_ = _products(side(), side(), np.ones(len(noise), bool), loss)
+    gradients, *_ = products_of(side(), side(), np.ones(len(noise), bool), loss)
     assert abs(gradients.mean()) < 3.0 * gradients.std() / np.sqrt(len(gradients))
 
 
@@ -278,18 +316,19 @@ def test_differences_lead_along_the_axes_of_the_covariance_and_not_out_of_a_rang
     search = of_contacts(problem, jax.random.key(0))
     np.testing.assert_allclose(search.spread, filtering.WIDTH * np.eye(2))
     # Standard errors of sqrt(8e-4) along (1, 1), and of sqrt(2e-4) across it.
-    axes = _axes(np.array([[5e-4, 3e-4], [3e-4, 5e-4]]))
+    axes = axes_of(np.array([[5e-4, 3e-4], [3e-4, 5e-4]]))
     expected = np.sqrt([[2e-4, 8e-4], [2e-4, 8e-4]])  # two of them, in each component 1 / sqrt(2) of the length
     np.testing.assert_allclose(np.abs(axes), expected)
-    np.testing.assert_allclose(np.linalg.norm(_axes(np.diag([0.0, 9.0])), axis=0), filtering.WIDTHS)
+    np.testing.assert_allclose(np.linalg.norm(axes_of(np.diag([0.0, 9.0])), axis=0), WIDTHS)
     steps, change = filtering.horizon_of(problem), problem.typical_change
-    readings = Readings.at(problem.dataset, problem.states, search.in_use[0], steps, change)
-    search = replace(search, point=np.array([0.0, 1.0]), spread=np.array([[0.1, -0.1], [0.2, 0.1]]))
-    sides = [_Side.of(problem, search, readings, number) for number in (0, 1)]
+    rows, point, spread = search.rows[search.block], np.array([0.0, 1.0]), np.array([[0.1, -0.1], [0.2, 0.1]])
+    log = problem, Readings.at(problem.dataset, problem.states, rows, steps, change), rows
+    sides = [Side.of(*log, point, spread, search.noise, 16, np.random.default_rng(number)) for number in (0, 1)]
     for side in sides:
         np.testing.assert_allclose(side.apart, [[0.2, 0.2], [-0.2, 0.1]])  # both ends of 1 +- 0.2 and of 1 +- 0.1
         np.testing.assert_allclose(side.aside, [0.0, -0.075])
-    assert (sides[0].members != sides[1].members).any()
+        assert side.few.shape[1] == 16 // FEWER
+    assert (sides[0].few != sides[1].few).any()
 
 
 def test_predictions_leave_errors_alike_only_where_windows_agree():
@@ -297,7 +336,7 @@ def test_predictions_leave_errors_alike_only_where_windows_agree():
     random = np.random.default_rng(0)
     errors = random.standard_normal((1, 40, 30, 3))
     errors[..., 1] += 1.5 * random.standard_normal((1, 40, 1))
-    found = Innovations(errors, np.broadcast_to(np.eye(3), (*errors.shape, 3)), np.ones((1, 40), bool), errors)
+    found = known(errors)
     clipped = np.clip(errors[0, ..., 1], -3.0, 3.0)
     assert found.alike() == pytest.approx((clipped[:, 1:] * clipped[:, :-1]).mean() / (clipped**2).mean())
     assert 0.5 < found.alike() < 0.75
@@ -311,24 +350,46 @@ def test_errors_are_the_mean_over_both_ends_and_lead_back_to_the_point(above, be
 
     A line through both ends of a parabola passes the point too high by their product.
     """
-    p = np.array([0.0, above, below])
-    errors, nothing = (2.0 + 3.0 * p + p**2).reshape(3, 1, 1, 1), np.zeros((3, 1, 1, 1))
-    found = Innovations(errors, np.ones((3, 1, 1, 1, 1)), np.ones((3, 1), bool), nothing)
-    side = _Side(np.zeros((1, 1, 1)), found, np.array([[above - below]]), np.array([(above + below) / 2.0]), 0)
+    point, *ends = (known(np.array(2.0 + 3.0 * p + p**2).reshape(1, 1, 1, 1)) for p in (0.0, above, below))
+    errors = np.concatenate([each.mean for each in ends])
+    both = replace(point, mean=errors, whole=np.ones((2, 1), bool), members=errors)
+    apart, aside = np.array([[above - below]]), np.array([(above + below) / 2.0])
+    side = Side(np.zeros((1, 1, 1)), point, both, apart, aside)
     np.testing.assert_allclose(side.slopes(), [[[3.0 + above + below]]])
     np.testing.assert_allclose(side.errors(), [[mean]])
-    np.testing.assert_allclose(side.at_point(), [[2.0]])
+    np.testing.assert_allclose(side.found.counted(side.found.whitened[0]), [[2.0]])
 
 
 def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tmp_path):
-    problem = problem_of_foot(tmp_path, rows=300)
+    problem = problem_of_foot(tmp_path)
     search = of_contacts(problem, jax.random.key(0))
-    rest = replace(search, point=np.array([0.0, 0.0]), wide=3, quiet=1, averaged=1, explained=len(search.rows))
-    assert rest.at_rest and not rest.settled and rest.in_use[1] == filtering.MEMBERS // 2
+    assert (search.blocks, len(search.rows)) == (1, 42)
+    told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
+    rest = replace(search, point=np.array([0.0, 0.0]), wide=3, quiet=1, together=filtering.TOGETHER, squares=told)
+    assert rest.at_rest and not rest.settled and rest.members == filtering.MEMBERS // 2
     after, epoch = filtering.step(problem, rest, "cauchy")
     assert after.settled
     np.testing.assert_array_equal(after.point, rest.point)
-    assert np.linalg.matrix_rank(after.meat) == 1  # one gradient alone, as there was no scatter before
-    systems = 2 * (1 + 2 * len(problem.simulator.parameters))
-    rows = len(search.rows)
-    assert epoch.control_steps == systems * rows * filtering.MEMBERS // 2 * filtering.horizon_of(problem)
+    assert not rest.apart.any() and after.apart.all()
+    known_well = replace(after, apart=np.array([1.0, 2.0]), products=1e3 * told, squares=1e3 * told)
+    covariance = known_well.found.uncertainty.covariance  # of one gradient alone, as there was no scatter before
+    np.testing.assert_allclose(covariance, np.array([[1.0, 2.0], [2.0, 4.0]]) / (1e3 * len(told)) ** 2)
+    few = 2 * 2 * len(problem.simulator.parameters) // FEWER
+    systems = (2 + few) * filtering.MEMBERS // 2 + filtering.LARGE_ROUNDS * filtering.LARGE
+    assert epoch.control_steps == systems * len(search.rows) * filtering.horizon_of(problem)
+
+
+def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):
+    problem = problem_of_foot(tmp_path, rows=2400)
+    search = of_contacts(problem, jax.random.key(0))
+    assert search.blocks == 3 and search.block == slice(0, filtering.BLOCK // 2)
+    near = replace(search, wide=2, quiet=1, together=1, moved=0.5)
+    assert near.block == slice(32, 64)
+    near, _ = filtering.step(problem, near, "cauchy")
+    assert near.together == 2 and near.explained == 32 and not near.gradients[:32].any()
+    assert replace(near, quiet=1, moved=0.5).block == slice(64, None)
+    kept, fresh = np.arange(6.0), np.array([9.0, 9.0])
+    np.testing.assert_allclose(filtering._counted(kept, fresh, slice(2, 4), 2), [0.0, 1.0, 5.5, 6.0, 4.0, 5.0])
+    far = replace(near, quiet=1, moved=filtering.NEAR)
+    fresh_start, _ = filtering.step(problem, far, "cauchy")
+    assert fresh_start.together == 0 and not fresh_start.gradients[32:].any()

@@ -7,7 +7,8 @@ smooth in the parameters, and what contacts forget of the first state it forgets
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -31,10 +32,8 @@ from madoc.simulation.base import Simulator
 
 FARTHEST = 4.0
 """Standard deviations of an innovation, beyond which the states follow it no farther: a false reading says nothing."""
-AGREEING = 1e-3
-"""Smallest share in [0, 1] of the squares of an ensemble's derivatives that the other counts as agreeing on."""
-NOISE_CHANGE = (0.1, 4.0)
-"""Smallest and largest factor of a channel's noise variance from a run of the filter to the next."""
+LEAST_CHANGE = 0.01
+"""Smallest factor of a channel's noise variance from a run of the filter to the next."""
 CLIP, OF_CLIPPED = 3.0, 0.9950
 """Standard deviations at which errors are clipped, and the mean square of a normal value that is."""
 BEFORE, MOST_BEFORE = 8, 30
@@ -43,11 +42,57 @@ DRAWN = 32
 """Number of states that are tried at the first row of a window."""
 NOISE_ROUNDS = 2
 """Number of runs of a filter before a window; each tells the sensors' noise better."""
-LEAST_NOISE = 1e-3
+FIRST_NOISE = 0.1
 """Smallest noise of a channel in its typical changes at the start: differences of rows may hide it."""
+LEAST_NOISE = 1e-3
+"""Smallest noise of a channel before windows, in its typical changes, and later relative to that of any channel."""
 SPOILT = 3
 """Number of first steps whose errors do not count where velocities are differences, which hold the next position."""
-_SMALLEST, _ROUNDING = 1e-100, 1e-12
+_SMALLEST = 1e-100
+
+
+class Correction(NamedTuple):
+    """How an ensemble's states follow the readings of a step, with L Lᵀ = S the covariance of their predictions.
+
+    Attributes:
+        factor: Lower triangular L, in standard deviations of the sensors' noise, that noise included.
+        inverse: L⁻¹.
+        gain: P Hᵀ L⁻ᵀ, by which the mean moves: Kalman's gain is K = P Hᵀ S⁻¹.
+        shrinking: P Hᵀ L⁻ᵀ (L + 1)⁻¹, by which deviations do: they then have the covariance (1 - K H) P (Andrews 1968).
+        share: Share in [0, 1] of L⁻¹ (prediction - reading) that is followed: not what is farther than `FARTHEST`.
+    """
+
+    factor: Float[np.ndarray, "*rows channels channels"]
+    inverse: Float[np.ndarray, "*rows channels channels"]
+    gain: Float[np.ndarray, "*rows physical channels"]
+    shrinking: Float[np.ndarray, "*rows physical channels"]
+    share: Float[np.ndarray, "*rows channels"]
+
+    @classmethod
+    def of(
+        cls,
+        states: Float[np.ndarray, "*rows members physical"],
+        apart: Float[np.ndarray, "*rows members channels"],
+    ) -> "Correction":
+        """That of an ensemble which is so far `apart` from a reading, in standard deviations of its noise."""
+        around, observed = states - states.mean(-2, keepdims=True), apart.mean(-2, keepdims=True)
+        shown, freedom, one = apart - observed, states.shape[-2] - 1, np.eye(apart.shape[-1])
+        factor = np.linalg.cholesky(np.swapaxes(shown, -1, -2) @ shown / freedom + one)
+        inverse = np.linalg.inv(factor)
+        gain = np.swapaxes(around, -1, -2) @ shown / freedom @ np.swapaxes(inverse, -1, -2)
+        far = np.abs(observed @ np.swapaxes(inverse, -1, -2))[..., 0, :]
+        return cls(factor, inverse, gain, gain @ np.linalg.inv(factor + one), FARTHEST / np.maximum(far, FARTHEST))
+
+    def follow(
+        self,
+        states: Float[np.ndarray, "*systems_and_rows members physical"],
+        apart: Float[np.ndarray, "*systems_and_rows members channels"],
+    ) -> Float[np.ndarray, "*systems_and_rows members physical"]:
+        """The states after the reading from which they are so far `apart`."""
+        observed = apart.mean(-2, keepdims=True)
+        innovation = observed @ np.swapaxes(self.inverse, -1, -2) * self.share[..., None, :]
+        middle = innovation @ np.swapaxes(self.gain, -1, -2)
+        return states - middle - (apart - observed) @ np.swapaxes(self.shrinking, -1, -2)
 
 
 @dataclass(frozen=True)
@@ -56,55 +101,57 @@ class Innovations:
 
     Attributes:
         mean: Predicted mean minus the reading, in standard deviations of the sensors' noise.
-        factor: Lower triangular L with L Lᵀ the covariance of that, the sensors' noise included.
+        corrections: How the states of all systems followed each reading.
         whole: Windows in which no simulation failed, by system.
         members: The ensembles' states after the last reading.
+        first: The first step whose errors count.
     """
 
     mean: Float[np.ndarray, "systems windows steps channels"]
-    factor: Float[np.ndarray, "systems windows steps channels channels"]
+    corrections: Correction
     whole: Bool[np.ndarray, "systems windows"]
     members: Float[np.ndarray, "systems windows members state"]
+    first: int
 
     @cached_property
     def whitened(self) -> Float[np.ndarray, "systems windows steps channels"]:
-        """L⁻¹ (prediction - reading), all with the L of the first system: of variance 1 there if the model is right."""
-        return np.linalg.solve(self.factor[0], self.mean[..., None])[..., 0]
+        """L⁻¹ (prediction - reading): of variance 1 if the model is right."""
+        return (self.corrections.inverse @ self.mean[..., None])[..., 0]
 
     def surprise(self, loss: Loss) -> Float[np.ndarray, "systems windows"]:
-        """Mean of the loss of each window's values, each system whitening its own, and of log det S per value.
-
-        For squares it is -2 log p of the readings, but for a constant and a factor; `FAILED_WINDOW` where one failed.
-        """
-        own = np.linalg.solve(self.factor, self.mean[..., None])[..., 0]
-        sizes = np.log(np.diagonal(self.factor, axis1=-2, axis2=-1)).mean((-1, -2))
-        costs = window_costs(own.reshape(*own.shape[:2], -1), loss) + 2.0 * sizes
+        """Mean of the loss of each window's whitened values; `FAILED_WINDOW` where a simulation failed."""
+        costs = window_costs(self.whitened.reshape(*self.whole.shape, -1), loss)
         return np.where(self.whole, costs, FAILED_WINDOW)
 
     def variances(self) -> Float[np.ndarray, "windows steps channels"]:
-        """Variance of each reading's prediction under the first system, in those of the sensors' noise, at least 1."""
-        return np.asarray((self.factor[0] ** 2).sum(-1))
+        """Variance of each reading's prediction, in those of the sensors' noise, at least 1."""
+        return np.asarray((self.corrections.factor**2).sum(-1))
 
-    def alike(self, first: int = 0) -> float:
+    def counted(self, errors: Float[np.ndarray, "windows steps channels"]) -> Float[np.ndarray, "windows values"]:
+        """The errors that count, of all channels but those in which the first system's never differ from 0."""
+        kept = (self.whitened[0, :, self.first :] != 0.0).any((0, 1))
+        return errors[:, self.first :, kept].reshape(len(errors), -1)
+
+    def alike(self) -> float:
         """The largest certain correlation of a channel's whitened errors with the next ones, outliers clipped.
 
-        It is that of the first system, from the step `first` on; 0 for right predictions, as these use every reading.
+        It is that of the first system; 0 for right predictions, as these use every reading before them.
         A correlation is certain where windows agree on it, by two standard errors.
         """
-        errors = np.clip(self.whitened[0, self.whole[0], first:], -CLIP, CLIP)
+        errors = np.clip(self.whitened[0, self.whole[0], self.first :], -CLIP, CLIP)
         if len(errors) < 2:
             return 0.0
         pairs, squares = (errors[:, 1:] * errors[:, :-1]).mean(1), (errors**2).mean((0, 1))
         certain = pairs.mean(0) > 2.0 * pairs.std(0, ddof=1) / np.sqrt(len(pairs))
         return float((certain * pairs.mean(0) / np.maximum(squares, _SMALLEST)).max(initial=0.0))
 
-    def noise_ratio(self, first: int = 0) -> Float[np.ndarray, " channels"]:
+    def noise_ratio(self) -> Float[np.ndarray, " channels"]:
         """Mean square of each channel's prediction errors over their variance, outliers clipped; 1 if they are all 0.
 
-        It is that of the first system, from the step `first` on: Huber's (1964) second proposal for a scale, with a cut
-        at three standard deviations.
+        It is that of the first system: Huber's (1964) second proposal for a scale, with a cut at three standard
+        deviations.
         """
-        relative = (self.mean[0] ** 2 / self.variances())[self.whole[0], first:].reshape(-1, self.mean.shape[-1])
+        relative = (self.mean[0] ** 2 / self.variances())[self.whole[0], self.first :].reshape(-1, self.mean.shape[-1])
         clipped = np.minimum(relative, CLIP**2).mean(0) / OF_CLIPPED if len(relative) else np.zeros(relative.shape[-1])
         return np.where(clipped == 0.0, 1.0, clipped)
 
@@ -115,21 +162,27 @@ def innovations(
     points: Float[np.ndarray, "systems d"],
     members: Float[np.ndarray, "windows members state"],
     noise: Float[np.ndarray, " channels"],
+    *,
+    first: int = 0,
+    like: Innovations | None = None,
 ) -> Innovations:
     """Predict each reading after the first at every point, and move the members by it before the next one.
 
-    What is too far from the first point's prediction to be followed is followed as little at the others, so that they
-    differ from it in their parameters alone.
+    All systems follow readings as the first one's ensemble does, or as those of other innovations did, so that they
+    differ in their parameters alone, and few members may do where a larger ensemble is at hand. An error of the gain
+    hardly changes an estimate, as right predictions leave errors that are uncorrelated with all readings before.
 
-    The members are states as likely as the first reading; `noise` is that of the sensors in typical changes. Spends
-    systems · windows · members · steps control steps.
+    The members are states as likely as the first reading; `noise` is that of the sensors in typical changes. Errors
+    count from the step `first` on. Spends systems · windows · members · steps control steps.
     """
     (windows, count, size), physical = members.shape, len(readings.spread)
     system = simulator.bind(simulator.parameters.to_physical(np.clip(points, -1.0, 1.0)))
     every = (len(points), windows * count, size)
     states = system.unbiased(np.broadcast_to(members.reshape(every[1:]), every).copy())
-    shape, channels = (len(points), windows, readings.steps, len(noise)), len(noise)
-    mean, factor, whole = np.zeros(shape), np.zeros((*shape, channels)), np.ones(shape[:2], bool)
+    shape, channels, corrections = (len(points), windows, readings.steps, len(noise)), len(noise), []
+    mean, whole = np.zeros(shape), np.ones(shape[:2], bool)
+    if like is not None:
+        whole &= like.whole[0]
     for step in range(readings.steps):
         actions = np.repeat(readings.actions[:, step], count, axis=0)
         after = system.step(states, np.broadcast_to(actions, (*every[:2], actions.shape[-1])))
@@ -141,39 +194,67 @@ def innovations(
         whole &= finite.reshape(*shape[:2], count).all(2) & np.isfinite(apart).all((2, 3))
         grouped = np.where(whole[..., None, None], after.reshape(*shape[:2], count, size), 0.0)
         apart = np.where(whole[..., None, None], apart, 0.0)
-        mean[:, :, step], factor[:, :, step] = apart.mean(2), _covariance_factor(apart)
-        grouped[..., :physical] = followed(grouped[..., :physical], apart, factor[:, :, step])
+        mean[:, :, step], moving = apart.mean(2), grouped[..., :physical]
+        if like is None:
+            correction = Correction.of(moving[0], apart[0])
+        else:
+            correction = Correction(*(each[:, step] for each in like.corrections))
+        corrections.append(correction)
+        grouped[..., :physical] = correction.follow(moving, apart)
         states = np.where(whole[..., None, None], grouped, members).reshape(every)
-    return Innovations(mean, factor, whole, states.reshape(*shape[:2], count, size))
+    every_step = (np.stack(each, axis=1) for each in zip(*corrections, strict=True))
+    stacked = Correction(*every_step) if like is None else like.corrections
+    return Innovations(mean, stacked, whole, states.reshape(*shape[:2], count, size), first)
 
 
-def _covariance_factor(
-    apart: Float[np.ndarray, "*rows members channels"],
-) -> Float[np.ndarray, "*rows channels channels"]:
-    """L of the members' covariance and that of the noise, which is 1."""
-    around = apart - apart.mean(-2, keepdims=True)
-    covariance = np.swapaxes(around, -1, -2) @ around / (apart.shape[-2] - 1)
-    return np.asarray(np.linalg.cholesky(covariance + np.eye(apart.shape[-1])))
+def next_noise(
+    noise: Float[np.ndarray, " channels"],
+    ratio: Float[np.ndarray, " channels"],
+    rounding: Float[np.ndarray, " channels"],
+) -> Float[np.ndarray, " channels"]:
+    """The sensors' noise by `Innovations.noise_ratio`, at least that of rounding, all in typical changes."""
+    changed = noise * np.sqrt(np.maximum(ratio, LEAST_CHANGE))
+    return np.maximum(changed, np.maximum(rounding, LEAST_NOISE * changed.max()))
 
 
-def followed(
-    states: Float[np.ndarray, "systems windows members physical"],
-    apart: Float[np.ndarray, "systems windows members channels"],
-    factor: Float[np.ndarray, "systems windows channels channels"],
-) -> Float[np.ndarray, "systems windows members physical"]:
-    """The states after a reading, from which theirs are so far `apart` in standard deviations of its noise.
+def with_noise(
+    dataset: Dataset,
+    logged: LoggedStates,
+    simulator: Simulator,
+    readings: Readings,
+    rows: Int[np.ndarray, " windows"],
+    point: Float[np.ndarray, " d"],
+    noise: Float[np.ndarray, " channels"],
+    rounding: Float[np.ndarray, " channels"],
+    count: int,
+    rounds: int,
+    random: np.random.Generator,
+) -> tuple[Innovations, Float[np.ndarray, " channels"]]:
+    """Innovations of so many members at one point, and the sensors' noise, estimated by them in several rounds.
 
-    The mean moves by Kalman's gain K = P Hᵀ S⁻¹, the deviations from it by P Hᵀ L⁻ᵀ (L + 1)⁻¹, S = L Lᵀ, after which
-    they have the covariance (1 - K H) P without further random numbers (Andrews 1968).
+    It begins at a given one, in typical changes. Spends rounds · windows · members · steps control steps.
     """
-    middle, observed = states.mean(-2, keepdims=True), apart.mean(-2, keepdims=True)
-    around, shown = states - middle, apart - observed
-    inverse = np.linalg.inv(factor)
-    gain = np.swapaxes(around, -1, -2) @ shown / (states.shape[-2] - 1) @ np.swapaxes(inverse, -1, -2)
-    innovation = inverse @ np.swapaxes(observed, -1, -2)
-    innovation = innovation * np.minimum(1.0, FARTHEST / np.maximum(np.abs(innovation[:1]), FARTHEST))
-    of_deviations = gain @ np.linalg.inv(factor + np.eye(factor.shape[-1]))
-    return middle - np.swapaxes(gain @ innovation, -1, -2) + around - shown @ np.swapaxes(of_deviations, -1, -2)
+    for _ in range(rounds):
+        members = members_at(dataset, logged, simulator, rows, noise * readings.scale, count, random)
+        found = innovations(simulator, readings, point[None], members, noise, first=first_counted(logged))
+        noise = next_noise(noise, found.noise_ratio(), rounding)
+    return found, noise
+
+
+def first_counted(logged: LoggedStates) -> int:
+    """The first step whose errors count."""
+    return 0 if logged.kind == "exact" else SPOILT
+
+
+def few_of(
+    members: Float[np.ndarray, "windows members state"], count: int, physical: int
+) -> Float[np.ndarray, "windows few state"]:
+    """The first so many members, their physical values with the mean of all and, as expected, their variance."""
+    few, total = members[:, :count].copy(), members.shape[1]
+    middle = members.mean(1, keepdims=True)[..., :physical]
+    around = few[..., :physical] - few.mean(1, keepdims=True)[..., :physical]
+    few[..., :physical] = middle + around * np.sqrt((1.0 - 1.0 / total) * count / max(1, count - 1))
+    return few
 
 
 def members_at(
@@ -236,18 +317,6 @@ def _rebuilt_from_neighbours(
     return states.states[np.searchsorted(states.rows, rows)]
 
 
-def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
-    """The products, in no direction less than `AGREEING` of the squares: by chance they may be negative."""
-    size = np.sqrt(np.maximum(np.diag(squares), _SMALLEST))
-    relative = [each / np.outer(size, size) for each in (products, squares)]
-    values, vectors = np.linalg.eigh(relative[1])
-    root = vectors * np.sqrt(np.maximum(values, _ROUNDING))
-    inverse = np.linalg.inv(root)
-    shares, axes = np.linalg.eigh(inverse @ relative[0] @ inverse.T)
-    whole = size[:, None] * (root @ axes * np.sqrt(np.maximum(shares, AGREEING)))
-    return whole @ whole.T
-
-
 def with_contacts_settled(
     dataset: Dataset,
     logged: LoggedStates,
@@ -295,24 +364,21 @@ def _likeliest(
     The ensemble has followed the readings before the window, where its episode has as many. Also the control steps.
     """
     before = min(BEFORE * stride(dataset), MOST_BEFORE)
-    random, first, least = np.random.default_rng(0), rows - before, np.full(logged.measured, LEAST_NOISE)
-    noise = np.maximum(difference_noise(dataset)[: logged.measured] / readings.scale, least)
+    random, first = np.random.default_rng(0), rows - before
+    noise = np.maximum(difference_noise(dataset)[: logged.measured] / readings.scale, LEAST_NOISE)
     tried, physical = np.repeat(guesses[:, None], 1 + DRAWN, axis=1), slice(0, logged.physical_size)
     follows = np.isin(first, logged.rows) & (dataset.episode_starts[dataset.episode_of(rows)] <= first)
     begun, others = np.flatnonzero(follows), np.flatnonzero(~follows)
-    draw = partial(members_at, dataset, logged, simulator, count=DRAWN, random=random)
     if len(begun):
         earlier = Readings.at(dataset, logged, first[begun], before, readings.scale)
-        for _ in range(NOISE_ROUNDS):
-            members = draw(rows=first[begun], noise=noise * readings.scale)
-            found = innovations(simulator, earlier, point[None], members, noise)
-            ratio = found.noise_ratio(0 if logged.kind == "exact" else SPOILT)
-            noise = np.maximum(noise * np.sqrt(np.clip(ratio, *NOISE_CHANGE)), least)
+        how = np.zeros_like(noise), DRAWN, NOISE_ROUNDS, random
+        found, noise = with_noise(dataset, logged, simulator, earlier, first[begun], point, noise, *how)
         whole = found.whole[0]
         tried[begun[whole], 1:, physical] = found.members[0, whole][..., physical]
     if len(others):
         system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
-        tried[others, 1:] = system.unbiased(draw(rows=rows[others], noise=noise * readings.scale))
+        drawn = members_at(dataset, logged, simulator, rows[others], noise * readings.scale, DRAWN, random)
+        tried[others, 1:] = system.unbiased(drawn)
     starts = np.swapaxes(tried, 0, 1).reshape(1, -1, guesses.shape[1])
     residuals = readings.residuals(simulator, point[None], starts)[0] / np.tile(noise, readings.steps + 1)
     best = window_costs(residuals, "cauchy").argmin(0)

@@ -4,34 +4,24 @@ Every reading of a window is predicted from those before it (`identification.ens
 is unknown, and each prediction error depends on no later noise: at the right parameters errors are uncorrelated with
 anything known before them (prediction error method, Ljung 1999, chapter 7).
 
-Where bodies strike each other the cost is rough: it goes up and down with what strikes a step sooner, within a small
-part of a standard error, and there a derivative does not tell where the minimum is. So errors and derivatives are means
-and differences over points as far apart as parameters are uncertain (statistical linearisation, Gelb 1974, 6.2).
-
-A finite ensemble leaves chance in them, by which a least-squares step would be biased and too short, as both share it.
-So there are two independent ensembles a and b, whose derivatives are instruments for the other (Reiersol 1941):
-
-    (Jaᵀ W Jb + Jbᵀ W Ja) p = -(Jbᵀ ψ(ra) + Jaᵀ ψ(rb)),
-
-gives the step p, with ψ the slope of the robust loss and W its weights, and the same products give its covariance.
+Errors and derivatives are those of two ensembles (`instruments`).
 """
 
 from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.least_squares.instruments import FEWER, Side, agreed, axes_of, products_of, shares_of
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification import ensembles
-from madoc.identification.ensembles import Innovations, agreed, innovations, members_at
+from madoc.identification.ensembles import FIRST_NOISE, Innovations, can_be_drawn, innovations, next_noise, with_noise
 from madoc.identification.gauss_newton import damped_step
 from madoc.identification.information import sandwich
-from madoc.identification.linearisation import LEAST_CURVATURE
-from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
+from madoc.identification.losses import Loss
 from madoc.identification.noise import WHITE
 from madoc.identification.replay import Readings
 from madoc.identification.settling import FAILED_WINDOW, window_costs
@@ -42,14 +32,18 @@ STRIDES = 20
 """Length of a window in strides: after a few of them the filter knows the state as well as it ever does."""
 LONGEST_WINDOW = 30
 """Largest length of a window in control steps, each of which is a step of the filter, however little moves in it."""
-MOST, EARLY = 32, 16
-"""Largest number of windows, and in the first epochs, in which steps are large."""
-EARLY_EPOCHS = 10
-"""Largest number of the first epochs, which end once the noise is known and steps are below `NEAR`."""
+BLOCK, MOST_BLOCKS = 32, 8
+"""Least number of windows of an epoch, of which the first ones, where steps are large, take half, and largest number of
+such blocks."""
+EARLY_EPOCHS = 8
+"""Largest number of the first epochs, which end once the noise is known and steps are below `SMALL`."""
+WIDTH = 0.1
+"""Width of a difference in [-1, 1] to either side at first; later it is by what is known of parameters, `axes_of`."""
 MEMBERS = 16
-"""Number of states in an ensemble; the last epoch, with half as many, tells what a finite one errs."""
-WIDTH, WIDTHS = 0.1, (0.005, 0.4)
-"""Width of a difference in [-1, 1] to either side at first, and its smallest and largest later, see `_axes`."""
+"""Number of states in an ensemble; the last epochs, with half as many, tell what a finite one errs."""
+LARGE, LARGE_ROUNDS = 64, 2
+"""Number of states that tell at the end whether what is left is noise, as few leave errors that are alike, and how
+often the noise is estimated by them."""
 LONGEST = 0.5
 """Largest change of a parameter in an epoch, in [-1, 1]."""
 DAMPED = 10.0
@@ -58,19 +52,23 @@ WORSE = 2.0
 """Mean change of the windows' surprise in its standard errors; above it a step certainly makes it worse."""
 DAMPING = (1e-4, 1e2)
 """Smallest and largest damping of a step, relative to the columns' squared lengths."""
-LARGEST_SHARE = 0.1
-"""Largest share in [0, 1] of the squares of all windows, mean over all directions, that a window counts with."""
-NEAR, LIKE_CHANCE = 2.5, 1.0
-"""Steps in standard errors, below which epochs are averaged, and below which the mean is at its end."""
-USUAL_EPOCHS = (8, 3)
+NEAR, SMALL, LIKE_CHANCE = 2.5, 1.5, 1.0
+"""Steps in standard errors, below which epochs count together, below which the first epochs end, and below which the
+search does."""
+AGREES = 3.0
+"""What an epoch's windows alone ask for, in standard errors of their own, up to which they agree with those before."""
+TOGETHER = 3
+"""Least number of epochs that count together in the end."""
+USUAL_EPOCHS = (5, 4)
 """Numbers of first and later epochs that most searches take, for the time that is told to be left."""
 NOISE_SETTLED = 0.4
-"""Relative change of a noise variance, below which it is as good as known."""
+"""Relative change of noise variances, root of the mean square, below which they are as good as known."""
+NOISE_ROUNDS = 3
+"""Number of runs of half an ensemble before each of the first epochs, which tell the noise better at little cost."""
 MOSTLY = 0.5
 """Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts."""
 MOST_TOLD = 0.9
 """Share in (0, 1) that counts of what a window tells where no other one tells of a direction."""
-ROUNDS = 10  # of weighting windows of too large a share less
 
 
 @jax.tree_util.register_dataclass
@@ -84,19 +82,20 @@ class FilterState:
         spread: Differences along each axis of the parameters' covariance, in [-1, 1], in columns.
         noise: Noise of each channel in its typical changes.
         seed: Seed of the ensembles' random numbers.
-        gradients: Each window's gradient of the cost, the mean of the epochs that are averaged.
-        products: Of both ensembles' derivatives, the curvature of the cost, as a mean as well.
+        gradients: Each window's gradient of the cost, 0 until an epoch has had it; the mean where several have.
+        products: Of both ensembles' derivatives in each window, the curvature of the cost, likewise.
         squares: Of each ensemble's own, which chance makes larger.
         meat: Scatter of the gradients before the last step, which counts as an error.
+        apart: What gradients of half as many states differ from these, sum of the windows compared so far.
         moved: The largest component of the last step in its standard errors.
         damping: λ of the next step.
         cost: Mean loss of a whitened prediction error before it, in squared standard deviations.
-        alike: The largest correlation of a channel's whitened error with that of the next reading, as noise has none.
-        explained: Number of windows in which no simulation failed.
-        wide: 0 in the first epochs, then 1 and the number of epochs on all windows.
-        quiet: 1 once no noise has changed much from one epoch to the next.
-        halved: 1 once half as many states have told the error of finite ensembles.
-        averaged: Number of epochs whose mean with the one before them the last step was by.
+        alike: The largest correlation of a channel's whitened error with that of the next reading, as noise has none;
+            0 until the end.
+        wide: 0 in the first epochs, then 1 and the number of epochs since.
+        quiet: 1 once noise has not changed much from one epoch to the next.
+        halved: Number of blocks of windows compared with what half as many states tell.
+        together: Number of epochs near the end that the last step was by, 0 before these.
         epochs: Number of epochs.
         failures: Number of windows whose simulation failed.
     """
@@ -107,50 +106,90 @@ class FilterState:
     noise: Float[np.ndarray, " channels"]
     seed: int
     gradients: Float[np.ndarray, "windows d"]
-    products: Float[np.ndarray, "d d"]
-    squares: Float[np.ndarray, "d d"]
+    products: Float[np.ndarray, "windows d d"]
+    squares: Float[np.ndarray, "windows d d"]
     meat: Float[np.ndarray, "d d"]
+    apart: Float[np.ndarray, " d"]
     moved: float
     damping: float
     cost: float
     alike: float
-    explained: int
     wide: int
     quiet: int
     halved: int
-    averaged: int
+    together: int
     epochs: int
     failures: int
 
     @property
-    def in_use(self) -> tuple[Int[np.ndarray, " some"], int]:
-        """First rows of the windows of the next epoch, and the number of states in its ensembles."""
-        rows = self.rows if self.wide else self.rows[:EARLY]
-        return rows, MEMBERS // 2 if self.at_rest else MEMBERS
+    def blocks(self) -> int:
+        """Number of blocks of windows, of which every epoch has one."""
+        return max(1, len(self.rows) // _block(len(self.point)))
+
+    @property
+    def block(self) -> slice:
+        """The windows of the next epoch."""
+        size = _block(len(self.point))
+        if not self.wide:
+            return slice(0, size // 2)
+        number = (self.halved if self.at_rest else self.together if self.near else 0) % self.blocks
+        return slice(number * size, (number + 1) * size if number + 1 < self.blocks else None)
+
+    @property
+    def members(self) -> int:
+        """Number of states in an ensemble of the next epoch."""
+        return MEMBERS // 2 if self.at_rest else MEMBERS
+
+    @property
+    def explained(self) -> int:
+        """Number of windows that count."""
+        return int(self.squares.any((1, 2)).sum())
 
     @property
     def at_rest(self) -> bool:
-        """Whether the last step, on all windows and in known noise, may be chance."""
+        """Whether the last step, by several epochs in known noise, may be chance."""
         enough = self.explained >= FEWEST + len(self.point)
-        return enough and bool(self.averaged and self.quiet) and self.moved < LIKE_CHANCE
+        return enough and self.together >= TOGETHER and bool(self.quiet) and self.moved < LIKE_CHANCE
+
+    @property
+    def to_compare(self) -> int:
+        """Number of blocks still to be compared with what half as many states tell, once at rest."""
+        return min(self.together, self.blocks) - self.halved
 
     @property
     def settled(self) -> bool:
         """Whether the search is at its end, and the error of finite ensembles is known."""
-        return self.at_rest and bool(self.halved)
+        return self.at_rest and self.to_compare <= 0
 
     @property
     def near(self) -> bool:
-        """Whether the next step is to be by the mean of this epoch and those that follow."""
-        return self.wide > 1 and bool(self.quiet) and self.moved < NEAR
+        """Whether the next step is to be by the next epoch and those before it that count together.
+
+        Not after one whose own windows disagree with those before it: of a step that they alone ask for, one part in
+        `together` is taken, and their own standard error is larger by its root.
+        """
+        agrees = self.moved * self.together**0.5 < AGREES
+        return self.wide > 1 and bool(self.quiet) and self.moved < NEAR and agrees
 
     @property
     def found(self) -> Found:
-        """The point, with its uncertainty by the last epoch."""
-        told = np.diag(self.squares) > 0.0
-        bread = agreed(self.products, self.squares) * np.outer(told, told)
+        """The point, with its uncertainty by the epochs that count together."""
+        products, squares = self.products.sum(0), self.squares.sum(0)
+        told = np.diag(squares) > 0.0
+        bread = agreed(products, squares) * np.outer(told, told)
         unlike_noise = self.settled and (self.cost > LONG_TAILS or self.alike > WHITE)
-        return Found(self.point, sandwich(bread, self.meat), self.explained, self.settled, unlike_noise)
+        return Found(
+            self.point,
+            sandwich(bread, self.meat + np.outer(self.apart, self.apart)),
+            self.explained,
+            self.settled,
+            unlike_noise,
+        )
+
+
+def _block(parameters: int) -> int:
+    """Number of windows of an epoch."""
+    return max(BLOCK, 2 * (FEWEST + parameters))
 
 
 def horizon_of(problem: CalibrationProblem) -> int:
@@ -162,7 +201,7 @@ def horizon_of(problem: CalibrationProblem) -> int:
 def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState | None:
     """The search before it has begun; None where few windows show contacts, or sensors do not show all positions."""
     states, count = problem.states, len(problem.simulator.parameters)
-    if not states.starts_known or states.placed.any() or not ensembles.can_be_drawn(states, problem.simulator):
+    if not states.starts_known or states.placed.any() or not can_be_drawn(states, problem.simulator):
         return None
     horizon = horizon_of(problem)
     if not len(rows_that_fit(problem.dataset, states.rows, horizon)):
@@ -170,29 +209,29 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
     rows = states.rows[disjoint_windows(problem.dataset, states.rows, horizon)]
     if len(rows) < FEWEST + count:
         return None
-    rows = generator(key).permutation(rows)[: max(MOST, 2 * (FEWEST + count))]
-    if touched(problem, *states.guesses(), rows, horizon).mean() < MOSTLY:
+    rows = generator(key).permutation(rows)[: _block(count) * MOST_BLOCKS]
+    if touched(problem, *states.guesses(), rows[: _block(count)], horizon).mean() < MOSTLY:
         return None
     by_differences = (problem.noise_by_differences / problem.typical_change)[: states.measured]
     return FilterState(
         point=np.zeros(count),
         rows=rows,
         spread=WIDTH * np.eye(count),
-        noise=np.maximum(by_differences, ensembles.LEAST_NOISE),
+        noise=np.maximum(by_differences, FIRST_NOISE),
         seed=int(np.asarray(jax.random.key_data(key))[-1]),
         gradients=np.zeros((len(rows), count)),
-        products=np.zeros((count, count)),
-        squares=np.zeros((count, count)),
+        products=np.zeros((len(rows), count, count)),
+        squares=np.zeros((len(rows), count, count)),
         meat=np.zeros((count, count)),
+        apart=np.zeros(count),
         moved=0.0,
         damping=FIRST_DAMPING,
         cost=0.0,
         alike=0.0,
-        explained=0,
         wide=0,
         quiet=0,
         halved=0,
-        averaged=0,
+        together=0,
         epochs=0,
         failures=0,
     )
@@ -200,8 +239,12 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
 
 def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
     """Control steps of the next epoch; where the search is at rest no step is tried."""
-    (rows, members), tried = state.in_use, 0 if state.at_rest else 1 + len(TRIALS)
-    return (2 * (1 + 2 * len(problem.simulator.parameters)) + tried) * len(rows) * members * horizon_of(problem)
+    members, tried = state.members, 0 if state.at_rest else 1 + len(TRIALS)
+    few = (2 * 2 * len(problem.simulator.parameters) + tried) * (members // FEWER)
+    alone = 0 if state.wide else NOISE_ROUNDS * (members // 2)
+    if state.at_rest and state.to_compare == 1:
+        alone += LARGE_ROUNDS * LARGE
+    return (alone + 2 * members + few) * len(state.rows[state.block]) * horizon_of(problem)
 
 
 def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
@@ -212,60 +255,68 @@ def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
 def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[FilterState, Epoch]:
     """One step of the parameters, and the noise of every channel by how large its prediction errors were.
 
-    Once the noise is known and the end is near it is by the mean of all epochs since, so that the chance of ensembles
-    averages out.
+    Once the noise is known and the end is near it is by all epochs since, each of which has other windows, or the same
+    ones once more where the log has no others, so that the chance of windows and of ensembles averages out. Gradients
+    of earlier windows follow the parameters by what those tell of them.
     """
-    rows = state.in_use[0]
+    block, count = state.block, state.members
+    rows = state.rows[block]
     readings = Readings.at(problem.dataset, problem.states, rows, horizon_of(problem), problem.typical_change)
-    sides = [_Side.of(problem, state, readings, number) for number in (0, 1)]
-    whole = np.asarray(sides[0].found.whole.all(0) & sides[1].found.whole.all(0))
-    pulls, products, squares, shares = _products(sides[0], sides[1], whole, loss)
+    rounding = (problem.rounding / problem.typical_change)[: len(state.noise)]
+    random = [np.random.default_rng([state.seed, state.epochs, number]) for number in range(3)]
+    log = problem.dataset, problem.states, problem.simulator, readings, rows
+    if not state.wide:
+        how = rounding, count // 2, NOISE_ROUNDS, random[2]
+        state = replace(state, noise=with_noise(*log, state.point, state.noise, *how)[1])
+    given = problem, readings, rows, state.point, state.spread, state.noise, count
+    sides = [Side.of(*given, each) for each in random[:2]]
+    whole = np.logical_and(*(each.found.whole[0] & each.ends.whole.all(0) for each in sides))
+    fresh = products_of(sides[0], sides[1], whole, loss)
     if state.at_rest:
-        pull = pulls.sum(0)  # errors of ensembles are in inverse proportion to their size: half errs by as much again
-        following = replace(state, meat=state.meat + np.outer(pull, pull), halved=1, epochs=state.epochs + 1)
+        # Errors of ensembles are in inverse proportion to their size: half errs by as much again.
+        both = whole & state.squares[block].any((1, 2))
+        apart = state.apart + (fresh[0] - state.gradients[block])[both].sum(0)
+        following = replace(state, apart=apart, halved=state.halved + 1, epochs=state.epochs + 1)
+        if following.settled:
+            found, noise = with_noise(*log, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random[2])
+            following = replace(following, noise=noise, cost=_cost(found, loss), alike=found.alike())
         return following, Epoch({"moved": state.moved}, epoch_steps(problem, state))
-    gradients, told = np.zeros_like(state.gradients), np.zeros((len(state.rows), *products.shape))
-    gradients[np.flatnonzero(whole)], told[np.flatnonzero(whole)] = pulls, shares
-    averaged = state.averaged + 1 if state.near else 0
-    if averaged:
-        share = 1.0 / (averaged + 1)
-        gradients = state.gradients + share * (gradients - state.gradients)
-        products = state.products + share * (products - state.products)
-        squares = state.squares + share * (squares - state.squares)
-    bread = agreed(products, squares)
+    together = state.together + 1 if state.near else 0
+    gradients, products, squares = (
+        _counted(kept if together > 1 else np.zeros_like(kept), each, block, 1 + max(0, together - 1) // state.blocks)
+        for kept, each in zip((state.gradients, state.products, state.squares), fresh, strict=True)
+    )
+    bread = agreed(products.sum(0), squares.sum(0))
     factor = np.linalg.cholesky(bread).T
     target = np.linalg.solve(factor.T, gradients.sum(0))
     undamped = damped_step(factor, target, state.point, 0.0)
     taken, damping = _taken(problem, state, readings, sides[0], factor, target, loss)
+    told, seen = shares_of(squares), int(squares.any((1, 2)).sum())
     left_out = np.linalg.inv(np.eye(len(bread)) - MOST_TOLD * told)
     scores = (left_out @ gradients[..., None])[..., 0]  # about what leaving the window out would change
-    meat = scores.T @ scores * len(rows) / max(1, len(rows) - len(state.point))
+    meat = scores.T @ scores * seen / max(1, seen - len(state.point))
     covariance = sandwich(bread, meat).covariance
     error = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-    ratio = np.mean([each.found.noise_ratio(each.first) for each in sides], axis=0)
-    noise = state.noise * np.sqrt(np.clip(ratio, *ensembles.NOISE_CHANGE))
-    rounding = (problem.rounding / problem.typical_change)[: len(noise)]
-    noise = np.maximum(noise, np.maximum(rounding, ensembles.LEAST_NOISE * noise.max()))
+    ratio = np.mean([each.found.noise_ratio() for each in sides], axis=0)
+    noise = next_noise(state.noise, ratio, rounding)
     moved, pull = float((np.abs(undamped) / error).max()), bread @ undamped
-    quiet = bool((np.abs((noise / state.noise) ** 2 - 1.0) < NOISE_SETTLED).all())
+    quiet = bool((((noise / state.noise) ** 2 - 1.0) ** 2).mean() < NOISE_SETTLED**2)
     refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))
     following = replace(
         state,
         point=state.point + taken,
         damping=damping,
-        spread=_axes(covariance),
+        spread=axes_of(covariance),
         noise=noise,
         gradients=gradients + told @ (bread @ taken),
         products=products,
         squares=squares,
         meat=meat + np.outer(pull, pull),
         moved=max(moved, LIKE_CHANCE) if refused else moved,
-        cost=float(np.mean([window_costs(each.at_point(), loss)[whole] for each in sides])) if whole.any() else 0.0,
-        alike=float(np.mean([each.found.alike(each.first) for each in sides])),
-        explained=int(whole.sum()),
-        wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < NEAR)),
+        cost=float(np.mean([_cost(each.found, loss) for each in sides])),
+        wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < SMALL)),
         quiet=int(quiet),
-        averaged=averaged,
+        together=together,
         epochs=state.epochs + 1,
         failures=state.failures + int((~whole).sum()),
     )
@@ -273,11 +324,26 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     return following, Epoch(metrics, epoch_steps(problem, state))
 
 
+def _cost(found: Innovations, loss: Loss) -> float:
+    """Mean loss of a whitened prediction error in the windows in which no simulation failed; 0 if there are none."""
+    costs = window_costs(found.counted(found.whitened[0]), loss)[found.whole[0]]
+    return float(costs.mean()) if len(costs) else 0.0
+
+
+def _counted(
+    kept: Float[np.ndarray, "*windows"], fresh: Float[np.ndarray, "*some"], block: slice, times: int
+) -> Float[np.ndarray, "*windows"]:
+    """The windows' values with those of a block, which is counted for so many times: the mean of all of them."""
+    counted = kept.copy()
+    counted[block] += (fresh - kept[block]) / times
+    return counted
+
+
 def _taken(
     problem: CalibrationProblem,
     state: FilterState,
     readings: Readings,
-    side: "_Side",
+    side: Side,
     factor: Float[np.ndarray, "d d"],
     target: Float[np.ndarray, " d"],
     loss: Loss,
@@ -290,7 +356,7 @@ def _taken(
     damping = state.damping * np.array(TRIALS) * [not state.near, True, True]
     tried = np.clip([damped_step(factor, target, state.point, each) for each in damping], -LONGEST, LONGEST)
     points = np.concatenate([state.point[None], state.point + tried])
-    surprise = innovations(problem.simulator, readings, points, side.members, state.noise).surprise(loss)
+    surprise = innovations(problem.simulator, readings, points, side.few, state.noise, like=side.found).surprise(loss)
     change = surprise[1:] - surprise[0]
     fails = ((surprise[1:] == FAILED_WINDOW) & (surprise[0] < FAILED_WINDOW)).any(1)
     best = int(np.argmin(np.where(fails, np.inf, change.mean(1))))
@@ -299,101 +365,3 @@ def _taken(
     elif fails[best] or not change[best].mean() < 0.0:
         return np.zeros_like(target), min(state.damping * DAMPED, DAMPING[1])
     return tried[best], float(np.clip(damping[best], *DAMPING))
-
-
-@dataclass(frozen=True)
-class _Side:
-    """What one of the two ensembles says.
-
-    Attributes:
-        members: Its states at the first readings.
-        found: Prediction errors at the point and at its neighbours.
-        apart: The parameters' change in each difference, in rows.
-        aside: How far the mean of its ends is from the point.
-        first: The first step whose errors count.
-    """
-
-    members: Float[np.ndarray, "windows members state"]
-    found: Innovations
-    apart: Float[np.ndarray, "d d"]
-    aside: Float[np.ndarray, " d"]
-    first: int
-
-    @classmethod
-    def of(
-        cls,
-        problem: CalibrationProblem,
-        state: FilterState,
-        readings: Readings,
-        number: int,
-    ) -> "_Side":
-        """One ensemble, and differences to either side of the point, not out of a range."""
-        random = np.random.default_rng([state.seed, state.epochs, number])
-        noise = state.noise * readings.scale
-        rows, count = state.in_use
-        members = members_at(problem.dataset, problem.states, problem.simulator, rows, noise, count, random)
-        above, below = (np.clip(state.point + sign * state.spread.T, -1.0, 1.0) for sign in (1, -1))
-        points, aside = np.concatenate([state.point[None], above, below]), (above + below).mean(0) / 2.0 - state.point
-        found = innovations(problem.simulator, readings, points, members, state.noise)
-        return cls(members, found, above - below, aside, 0 if problem.states.kind == "exact" else ensembles.SPOILT)
-
-    def errors(self) -> Float[np.ndarray, "windows values"]:
-        """Whitened prediction errors at the point: the mean over the differences' ends, led back from theirs to it."""
-        return self._told(self.found.whitened[1:].mean(0)) - self.slopes() @ self.aside
-
-    def at_point(self) -> Float[np.ndarray, "windows values"]:
-        """Whitened prediction errors simulated at the point itself."""
-        return self._told(self.found.whitened[0])
-
-    def slopes(self) -> Float[np.ndarray, "windows values d"]:
-        """The derivatives of these by the parameters."""
-        above, below = np.split(self.found.whitened[1:], 2)
-        change = np.stack([self._told(each) for each in above - below])
-        return np.moveaxis(np.linalg.solve(self.apart, change.reshape(len(change), -1)).reshape(change.shape), 0, -1)
-
-    def _told(self, errors: Float[np.ndarray, "windows steps channels"]) -> Float[np.ndarray, "windows values"]:
-        """The errors that count, of all channels but those that never differ."""
-        kept = (self.found.whitened[0, :, self.first :] != 0.0).any((0, 1))
-        return errors[:, self.first :, kept].reshape(len(errors), -1)
-
-
-def _products(
-    first: _Side, second: _Side, whole: Bool[np.ndarray, " windows"], loss: Loss
-) -> tuple[
-    Float[np.ndarray, "windows d"],
-    Float[np.ndarray, "d d"],
-    Float[np.ndarray, "d d"],
-    Float[np.ndarray, "windows d d"],
-]:
-    """The gradient of each window's cost, products of both ensembles' derivatives and squares of each's own.
-
-    Last each window's squares over those of all. An ensemble's errors are weighted by their own size alone, so that the
-    other's derivatives share no chance with them.
-    """
-    errors, slopes = (first.errors()[whole], second.errors()[whole]), (first.slopes()[whole], second.slopes()[whole])
-    z = [(each / TUNING[loss]) ** 2 for each in errors]
-    weights = [loss_slope(each, loss) for each in z]
-    both, counted = np.sqrt(weights[0] * weights[1]), np.ones(len(errors[0]))
-    own = sum(np.einsum("wv,wvd,wve->wde", both, each, each) for each in slopes) / 2.0
-    most = max(LARGEST_SHARE, 2.0 / max(1, len(own)))
-    for _ in range(ROUNDS):
-        squares = own.sum(0)
-        shares = own @ np.linalg.inv(squares + np.diag(1e-9 * np.diag(squares) + np.finfo(float).tiny))
-        less = 1.0 / np.maximum(1.0, np.trace(shares, axis1=1, axis2=2) / len(squares) / most)
-        counted, own = counted * less, own * less[:, None, None]
-    pulls = sum(
-        np.einsum("wv,wvd->wd", weight * mine, other)
-        for weight, mine, other in zip(weights, errors, reversed(slopes), strict=True)
-    )
-    products = np.einsum("w,wv,wvd,wve->de", counted, both, *slopes)
-    curvature = max(curvature_share(np.stack(z), loss), LEAST_CURVATURE)
-    return counted[:, None] * pulls / 2.0, curvature * (products + products.T) / 2.0, curvature * own.sum(0), shares
-
-
-def _axes(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
-    """√d standard errors along each axis of a covariance of d parameters, within `WIDTHS`, in columns.
-
-    Means over the ends are those of cubic functions over its normal distribution (Arasaratnam and Haykin 2009).
-    """
-    variances, axes = np.linalg.eigh(covariance)
-    return axes * np.clip(np.sqrt(len(axes) * np.maximum(variances, 0.0)), *WIDTHS)

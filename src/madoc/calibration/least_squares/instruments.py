@@ -1,0 +1,149 @@
+"""Errors and derivatives of a filter's predictions by two independent ensembles, each an instrument for the other.
+
+Where bodies strike each other the cost is rough: it goes up and down with what strikes a step sooner, within a small
+part of a standard error, and there a derivative does not tell where the minimum is. So errors and derivatives are means
+and differences over points as far apart as parameters are uncertain (statistical linearisation, Gelb 1974, 6.2).
+
+A finite ensemble leaves chance in them, by which a least-squares step would be biased and too short, as both share it.
+So there are two independent ensembles a and b, whose derivatives are instruments for the other (Reiersol 1941):
+
+    (Jaᵀ W Jb + Jbᵀ W Ja) p = -(Jbᵀ ψ(ra) + Jaᵀ ψ(rb)),
+
+gives the step p, with ψ the slope of the robust loss and W its weights, and the same products give its covariance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from madoc.calibration.base import CalibrationProblem
+from madoc.identification.ensembles import Innovations, few_of, first_counted, innovations, members_at
+from madoc.identification.linearisation import LEAST_CURVATURE
+from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
+from madoc.identification.replay import Readings
+
+FEWER = 4
+"""Ratio of an ensemble to the number of states at the ends of differences and after steps that are tried."""
+WIDTHS = (0.005, 0.4)
+"""Smallest and largest width of a difference in [-1, 1] to either side."""
+LARGEST_SHARE = 0.1
+"""Largest share in [0, 1] of the squares of all windows, mean over all directions, that a window counts with."""
+ROUNDS = 10  # of weighting windows of too large a share less
+AGREEING = 1e-3
+"""Smallest share in [0, 1] of the squares of an ensemble's derivatives that the other counts as agreeing on."""
+_SMALLEST, _ROUNDING = 1e-100, 1e-12
+
+
+@dataclass(frozen=True)
+class Side:
+    """What one of the two ensembles says.
+
+    Attributes:
+        few: Some of its states at the first readings, with the mean of all.
+        found: Prediction errors at the point.
+        ends: Those of few states at the ends of differences to either side of it.
+        apart: The parameters' change in each difference, in rows.
+        aside: How far the mean of its ends is from the point.
+    """
+
+    few: Float[np.ndarray, "windows few state"]
+    found: Innovations
+    ends: Innovations
+    apart: Float[np.ndarray, "d d"]
+    aside: Float[np.ndarray, " d"]
+
+    @classmethod
+    def of(
+        cls,
+        problem: CalibrationProblem,
+        readings: Readings,
+        rows: Int[np.ndarray, " windows"],
+        point: Float[np.ndarray, " d"],
+        spread: Float[np.ndarray, "d d"],
+        noise: Float[np.ndarray, " channels"],
+        count: int,
+        random: np.random.Generator,
+    ) -> "Side":
+        """An ensemble of so many states, and differences to either side of the point, not out of a range.
+
+        `spread` are the differences in columns, in [-1, 1], and `noise` is in typical changes.
+        """
+        states, simulator = problem.states, problem.simulator
+        members = members_at(problem.dataset, states, simulator, rows, noise * readings.scale, count, random)
+        few = few_of(members, count // FEWER, states.physical_size)
+        above, below = (np.clip(point + sign * spread.T, -1.0, 1.0) for sign in (1, -1))
+        found = innovations(simulator, readings, point[None], members, noise, first=first_counted(states))
+        ends = innovations(simulator, readings, np.concatenate([above, below]), few, noise, like=found)
+        return cls(few, found, ends, above - below, (above + below).mean(0) / 2.0 - point)
+
+    def errors(self) -> Float[np.ndarray, "windows values"]:
+        """Whitened prediction errors at the point: the mean over the differences' ends, led back from theirs to it."""
+        return self.found.counted(self.ends.whitened.mean(0)) - self.slopes() @ self.aside
+
+    def slopes(self) -> Float[np.ndarray, "windows values d"]:
+        """The derivatives of these by the parameters."""
+        above, below = np.split(self.ends.whitened, 2)
+        change = np.stack([self.found.counted(each) for each in above - below])
+        return np.moveaxis(np.linalg.solve(self.apart, change.reshape(len(change), -1)).reshape(change.shape), 0, -1)
+
+
+def products_of(
+    first: Side, second: Side, whole: Bool[np.ndarray, " windows"], loss: Loss
+) -> tuple[
+    Float[np.ndarray, "windows d"],
+    Float[np.ndarray, "windows d d"],
+    Float[np.ndarray, "windows d d"],
+]:
+    """Each window's gradient of the cost, products of both ensembles' derivatives, and squares of each's own.
+
+    They are 0 in a window in which a simulation failed. An ensemble's errors are weighted by their own size alone, so
+    that the other's derivatives share no chance with them.
+    """
+    errors, slopes = (first.errors()[whole], second.errors()[whole]), (first.slopes()[whole], second.slopes()[whole])
+    z = [(each / TUNING[loss]) ** 2 for each in errors]
+    weights = [loss_slope(each, loss) for each in z]
+    both, counted = np.sqrt(weights[0] * weights[1]), np.ones(len(errors[0]))
+    own = sum(np.einsum("wv,wvd,wve->wde", both, each, each) for each in slopes) / 2.0
+    most = max(LARGEST_SHARE, 2.0 / max(1, len(own)))
+    for _ in range(ROUNDS):
+        shares = np.trace(shares_of(counted[:, None, None] * own), axis1=1, axis2=2) / own.shape[-1]
+        counted = counted / np.maximum(1.0, shares / most)
+    pulls = sum(
+        np.einsum("wv,wvd->wd", weight * mine, other)
+        for weight, mine, other in zip(weights, errors, reversed(slopes), strict=True)
+    )
+    products = np.einsum("wv,wvd,wve->wde", both, *slopes)
+    curvature = max(curvature_share(np.stack(z), loss), LEAST_CURVATURE)
+    gradients, all_products, squares = (np.zeros((len(whole), *each.shape[1:])) for each in (pulls, products, own))
+    gradients[whole] = counted[:, None] * pulls / 2.0
+    all_products[whole] = counted[:, None, None] * curvature * (products + np.swapaxes(products, 1, 2)) / 2.0
+    squares[whole] = counted[:, None, None] * curvature * own
+    return gradients, all_products, squares
+
+
+def shares_of(squares: Float[np.ndarray, "windows d d"]) -> Float[np.ndarray, "windows d d"]:
+    """Each window's squares over those of all."""
+    total = squares.sum(0)
+    return np.asarray(squares @ np.linalg.inv(total + np.diag(1e-9 * np.diag(total) + np.finfo(float).tiny)))
+
+
+def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
+    """The products, in no direction less than `AGREEING` of the squares: by chance they may be negative."""
+    size = np.sqrt(np.maximum(np.diag(squares), _SMALLEST))
+    relative = [each / np.outer(size, size) for each in (products, squares)]
+    values, vectors = np.linalg.eigh(relative[1])
+    root = vectors * np.sqrt(np.maximum(values, _ROUNDING))
+    inverse = np.linalg.inv(root)
+    shares, axes = np.linalg.eigh(inverse @ relative[0] @ inverse.T)
+    whole = size[:, None] * (root @ axes * np.sqrt(np.maximum(shares, AGREEING)))
+    return whole @ whole.T
+
+
+def axes_of(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
+    """√d standard errors along each axis of a covariance of d parameters, within `WIDTHS`, in columns.
+
+    Means over the ends are those of cubic functions over its normal distribution (Arasaratnam and Haykin 2009).
+    """
+    variances, axes = np.linalg.eigh(covariance)
+    return axes * np.clip(np.sqrt(len(axes) * np.maximum(variances, 0.0)), *WIDTHS)
