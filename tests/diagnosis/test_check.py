@@ -56,6 +56,15 @@ def test_a_good_log_has_nothing_to_warn_of(robot, columns, checked):
     assert (found.excitation.half_width < 0.01).all()
 
 
+def test_without_intervals_a_check_finds_the_same_in_fewer_steps(robot, columns, checked, tmp_path):
+    whole, _ = checked(robot, columns)
+    dataset = logs.read(write_csv(tmp_path / "again.csv", columns), robot)
+    short = check(dataset, simulation.make(robot.task, threads=1), robot=robot, intervals=False)
+    assert short.findings == whole.findings
+    assert short.excitation.control_steps < 0.8 * whole.excitation.control_steps
+    assert short.control_steps < whole.control_steps
+
+
 def test_a_dead_signal_and_a_dead_action(robot, columns, checked):
     still = columns | {"elbow": np.full(ROWS, 0.3), "elbow_torque": np.full(ROWS, 0.1)}
     _, findings = checked(robot, still)
