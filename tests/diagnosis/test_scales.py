@@ -7,11 +7,10 @@ import pytest
 from logged_arm import SPEC, arm_of, write_csv
 from mujoco_log import recorded
 
-from madoc import identification, robots, simulation
+from madoc import robots, simulation
 from madoc.data import logs, stride
-from madoc.diagnosis import check
-from madoc.diagnosis.scales import range_findings
-from madoc.identification.coarseness import COARSE, coarseness
+from madoc.diagnosis import check, scales
+from madoc.diagnosis.scales import COARSE, coarseness, range_findings
 from madoc.identification.states import states_of
 from own_robots import BOUNCER, BOUNCER_SPEC, CART, CART_SPEC, task_of
 from robots import recorded as planted
@@ -128,7 +127,7 @@ def test_a_timestep_that_diverges_counts_as_too_long(box, monkeypatch):
     robot, dataset = box
     simulator = simulation.make(robot.task, threads=1)
     both = iter([np.full((1, 64, 4), np.nan), np.zeros((1, 64, 4))])
-    monkeypatch.setattr(identification.coarseness, "window_residuals", lambda *_: next(both))
+    monkeypatch.setattr(scales, "window_residuals", lambda *_: next(both))
     assert coarseness(dataset, states_of(dataset, simulator), simulator, np.zeros(1), np.ones(4)) == (1.0, 2 * 64)
 
 

@@ -3,11 +3,13 @@
 import numpy as np
 from jaxtyping import Float
 
-from madoc.data import Dataset, typical_change
+from madoc import simulation
+from madoc.data import Dataset, stride, typical_change
 from madoc.data.findings import Finding
 from madoc.errors import listed
-from madoc.identification.coarseness import COARSE, FINER, coarseness
-from madoc.identification.states import LoggedStates, probing_rows
+from madoc.identification.candidate_effects import FINER
+from madoc.identification.replay import window_residuals
+from madoc.identification.states import LoggedStates, probing_rows, probing_windows
 from madoc.identification.windows import evenly
 from madoc.simulation.base import Simulator
 from madoc.simulation.response import hidden_scales, mass_like
@@ -17,6 +19,12 @@ _ROWS = 16
 _PLACES = ("payload_x", "payload_y", "payload_z")
 FARTHEST = 10.0
 """Distance of a payload from its body in sizes of the whole model, beyond which it is hardly in m."""
+_WINDOWS = 64
+"""Largest number of windows that a finer timestep is tried on."""
+COARSE = 0.25
+"""Change of predictions in typical changes of a signal, above which the integration step is too long for its robot."""
+_DIVERGED = 1.0
+"""Typical changes that a window counts for where only the model's own integration step diverges."""
 
 
 def scale_findings(
@@ -112,3 +120,40 @@ def timestep_findings(
     )
     remedy = f"give timestep: {timestep / FINER:.12g} in the spec, unless the log is of a simulation with this timestep"
     return [Finding("warning", what, "the model", remedy)], spent
+
+
+def coarseness(
+    dataset: Dataset,
+    logged: LoggedStates,
+    simulator: Simulator,
+    point: Float[np.ndarray, " d"],
+    scale: Float[np.ndarray, " observation"],
+) -> tuple[float, int]:
+    """By how much predictions one stride ahead change with integration steps of a quarter of the length.
+
+    Smooth motion hardly changes. Where contacts begin or end it may, and then parameters fitted to a machine, whose
+    motion has no integration step, are not the machine's.
+
+    Args:
+        dataset: The log.
+        logged: What it says of states.
+        simulator: The model.
+        point: The parameters in [-1, 1].
+        scale: Typical change of each signal in a stride, of which the result is a multiple.
+
+    Returns:
+        The median over signals of the root mean square over windows of the log, as a signal that hardly moves may
+        change by much of its little. A window whose finer simulation fails is left out; 0 where none is left. Then the
+        control steps simulated.
+    """
+    windows = probing_windows(logged, dataset, simulator, steps=stride(dataset), count=_WINDOWS)
+    finer = simulation.make(simulator.task.with_time_step(1.0 / FINER, substeps=FINER))
+    coarse, fine = (
+        window_residuals(each, windows, point[None], scale)[0].reshape(len(windows), windows.steps, -1)[:, -1]
+        for each in (simulator, finer)
+    )
+    counted = np.isfinite(fine).all(-1)
+    change = np.abs(fine - coarse)[counted]
+    change = np.where(np.isfinite(change), change, _DIVERGED)
+    spent = 2 * len(windows) * windows.steps
+    return (float(np.median(np.sqrt((change**2).mean(0)))) if len(change) else 0.0), spent

@@ -18,7 +18,6 @@ from madoc.identification.candidate_terms import (
     TILTS,
     Candidate,
 )
-from madoc.identification.coarseness import FINER
 from madoc.identification.replay import Readings
 from madoc.parameters import FIELDS, Parameter
 from madoc.simulation.base import Simulator
@@ -29,6 +28,8 @@ _SATURATED = 0.3
 """Share of the largest logged action by which actions are cut off, to compute the effect of a drive that saturates."""
 _LATER = 0.1
 """Delay in control steps with which the effect of a delay is computed."""
+FINER = 4
+"""Number of integration steps that take the place of one."""
 
 
 def effects(

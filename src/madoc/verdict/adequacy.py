@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from madoc.calibration.holdout import HoldOut, Judged, JudgedByErrors
 from madoc.calibration.result import CalibrationResult
+from madoc.diagnosis.scales import COARSE
 from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, UNLISTED, is_late
-from madoc.identification.coarseness import COARSE
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.information import NORMAL_95

@@ -14,8 +14,9 @@ from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
 from madoc.data import stride
 from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
+from madoc.diagnosis.scales import coarseness
+from madoc.identification.candidate_effects import FINER
 from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
-from madoc.identification.coarseness import FINER, coarseness
 from madoc.identification.excitation import expected_half_widths
 from madoc.identification.fitted_windows import SHORTER, STRIDES, WINDOWS
 from madoc.identification.information import OPEN
