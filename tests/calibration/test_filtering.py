@@ -143,9 +143,9 @@ def test_few_states_have_the_mean_of_all_and_noise_follows_the_size_of_errors():
     many = np.random.default_rng(0).standard_normal((4000, 16, 1))
     assert few_of(many, 4, 1).var() == pytest.approx(1.0, rel=0.05)
     np.testing.assert_array_equal(few[..., 1], members[:, :2, 1])  # an action that is pending
-    noise, rounding = np.array([0.1, 0.1, 0.1, 1.0]), np.array([0.0, 0.04, 0.0, 0.0])
-    ratio = np.array([4.0, 0.09, 1e-9, 1.0])
-    np.testing.assert_allclose(next_noise(noise, ratio, rounding), [0.2, 0.04, 0.01, 1.0])
+    noise, rounding = np.array([0.1, 0.1, 0.1, 1e-3, 1.0]), np.array([0.0, 0.04, 0.0, 0.0, 0.0])
+    ratio = np.array([9.0, 0.09, 1e-9, 0.5, 1.0])  # at most twice as large, at least the root of a tenth
+    np.testing.assert_allclose(next_noise(noise, ratio, rounding), [0.2, 0.04, 0.1 * np.sqrt(0.1), 1e-3, 1.0])
 
 
 def test_prediction_errors_of_the_right_model_are_white_and_of_variance_one():

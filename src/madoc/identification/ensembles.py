@@ -32,8 +32,8 @@ from madoc.simulation.base import Simulator
 
 FARTHEST = 4.0
 """Standard deviations of an innovation, beyond which the states follow it no farther: a false reading says nothing."""
-LEAST_CHANGE = 0.01
-"""Smallest factor of a channel's noise variance from a run of the filter to the next."""
+NOISE_CHANGE = (0.1, 4.0)
+"""Smallest and largest factor of a channel's noise variance from a run of the filter to the next."""
 CLIP, OF_CLIPPED = 3.0, 0.9950
 """Standard deviations at which errors are clipped, and the mean square of a normal value that is."""
 BEFORE, MOST_BEFORE = 8, 30
@@ -213,7 +213,7 @@ def next_noise(
     rounding: Float[np.ndarray, " channels"],
 ) -> Float[np.ndarray, " channels"]:
     """The sensors' noise by `Innovations.noise_ratio`, at least that of rounding, all in typical changes."""
-    changed = noise * np.sqrt(np.maximum(ratio, LEAST_CHANGE))
+    changed = noise * np.sqrt(np.clip(ratio, *NOISE_CHANGE))
     return np.maximum(changed, np.maximum(rounding, LEAST_NOISE * changed.max()))
 
 
