@@ -42,8 +42,6 @@ DRAWN = 32
 """Number of states that are tried at the first row of a window."""
 NOISE_ROUNDS = 2
 """Number of runs of a filter before a window; each tells the sensors' noise better."""
-FIRST_NOISE = 0.1
-"""Smallest noise of a channel in its typical changes at the start: differences of rows may hide it."""
 LEAST_NOISE = 1e-3
 """Smallest noise of a channel before windows, in its typical changes, and later relative to that of any channel."""
 SPOILT = 3
@@ -197,14 +195,14 @@ def innovations(
         mean[:, :, step], moving = apart.mean(2), grouped[..., :physical]
         if like is None:
             correction = Correction.of(moving[0], apart[0])
+            corrections.append(correction)
         else:
             correction = Correction(*(each[:, step] for each in like.corrections))
-        corrections.append(correction)
         grouped[..., :physical] = correction.follow(moving, apart)
         states = np.where(whole[..., None, None], grouped, members).reshape(every)
     every_step = (np.stack(each, axis=1) for each in zip(*corrections, strict=True))
-    stacked = Correction(*every_step) if like is None else like.corrections
-    return Innovations(mean, stacked, whole, states.reshape(*shape[:2], count, size), first)
+    followed = Correction(*every_step) if like is None else like.corrections
+    return Innovations(mean, followed, whole, states.reshape(*shape[:2], count, size), first)
 
 
 def next_noise(

@@ -18,7 +18,7 @@ from madoc.calibration.least_squares.instruments import FEWER, Side, agreed, axe
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification.ensembles import FIRST_NOISE, Innovations, can_be_drawn, innovations, next_noise, with_noise
+from madoc.identification.ensembles import Innovations, can_be_drawn, innovations, next_noise, with_noise
 from madoc.identification.gauss_newton import damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.losses import Loss
@@ -59,8 +59,11 @@ AGREES = 3.0
 """What an epoch's windows alone ask for, in standard errors of their own, up to which they agree with those before."""
 TOGETHER = 3
 """Least number of epochs that count together in the end."""
-USUAL_EPOCHS = (5, 4)
-"""Numbers of first and later epochs that most searches take, for the time that is told to be left."""
+USUAL_EPOCHS = (6, 6)
+"""Numbers of first and later epochs that most searches take, for the time that is told to be left; ensembles of half
+the size take about half an epoch."""
+FIRST_NOISE = 0.1
+"""Smallest noise of a channel in its typical changes at the start: differences of rows may hide it."""
 NOISE_SETTLED = 0.4
 """Relative change of noise variances, root of the mean square, below which they are as good as known."""
 NOISE_ROUNDS = 3
@@ -276,7 +279,8 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         # Errors of ensembles are in inverse proportion to their size: half errs by as much again.
         both = whole & state.squares[block].any((1, 2))
         apart = state.apart + (fresh[0] - state.gradients[block])[both].sum(0)
-        following = replace(state, apart=apart, halved=state.halved + 1, epochs=state.epochs + 1)
+        failures = state.failures + int((~whole).sum())
+        following = replace(state, apart=apart, halved=state.halved + 1, epochs=state.epochs + 1, failures=failures)
         if following.settled:
             found, noise = with_noise(*log, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random[2])
             following = replace(following, noise=noise, cost=_cost(found, loss), alike=found.alike())

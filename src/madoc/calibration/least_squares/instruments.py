@@ -40,7 +40,7 @@ class Side:
     """What one of the two ensembles says.
 
     Attributes:
-        few: Some of its states at the first readings, with the mean of all.
+        few: Some of its states at the first readings, with the mean and variance of all.
         found: Prediction errors at the point.
         ends: Those of few states at the ends of differences to either side of it.
         apart: The parameters' change in each difference, in rows.
