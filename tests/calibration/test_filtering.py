@@ -31,9 +31,9 @@ from madoc.identification.ensembles import (
     NOISE_ROUNDS,
     Correction,
     Innovations,
-    _likeliest,
     few_of,
     innovations,
+    likely_states,
     members_at,
     next_noise,
     with_contacts_settled,
@@ -188,7 +188,7 @@ def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_
     assert (found.deviation[2:] < 0.95 * narrow.deviation[2:]).all()  # of speeds, which contacts decide
     begun = int((rows - problem.dataset.episode_starts[problem.dataset.episode_of(rows)] >= BEFORE).sum())
     drawn = NOISE_ROUNDS * begun * DRAWN * BEFORE + len(rows) * (DRAWN + 1) * steps
-    likely, of_draws = _likeliest(*given, guesses)
+    likely, of_draws = likely_states(*given, guesses)
     after = settled(simulator, readings, point, likely, settling.WIDTHS, ANEW, until_noise=True)
     assert of_draws == drawn and spent == drawn + after.simulations * steps
     aloft = np.add(guesses, [0.0, 1.0, 0.0, 0.0])

@@ -333,14 +333,18 @@ def with_contacts_settled(
     if readings.placed.any():
         states, simulations = with_bases_settled(simulator, readings, point, guesses)
         return states, simulations * readings.steps
-    known = guesses[np.isfinite(guesses).all(-1)]
-    if not len(known) or not simulator.contacts(known, simulator.parameters.to_physical(point.clip(-1.0, 1.0))).any():
+    if not _touch(simulator, point, guesses):
         return guesses, 0
-    spent = 0
-    if logged.starts_known and can_be_drawn(logged, simulator):
-        guesses, spent = _likeliest(dataset, logged, simulator, readings, rows, point, guesses)
+    guesses, spent = likely_states(dataset, logged, simulator, readings, rows, point, guesses)
     after = settled(simulator, readings, point, guesses, WIDTHS, ANEW, until_noise=True)
     return after.states, spent + after.simulations * readings.steps
+
+
+def _touch(simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]) -> bool:
+    """Whether bodies touch in any of the states."""
+    known = states[np.isfinite(states).all(-1)]
+    values = simulator.parameters.to_physical(point.clip(-1.0, 1.0))
+    return bool(len(known) and simulator.contacts(known, values).any())
 
 
 def can_be_drawn(logged: LoggedStates, simulator: Simulator) -> bool:
@@ -348,7 +352,7 @@ def can_be_drawn(logged: LoggedStates, simulator: Simulator) -> bool:
     return simulator.task.state_from_observation is None or logged.measured == simulator.task.observation_size
 
 
-def _likeliest(
+def likely_states(
     dataset: Dataset,
     logged: LoggedStates,
     simulator: Simulator,
@@ -359,8 +363,11 @@ def _likeliest(
 ) -> tuple[Float[np.ndarray, "windows state"], int]:
     """The guess of each window's first state, or that of an ensemble's states there which fits the window better.
 
-    The ensemble has followed the readings before the window, where its episode has as many. Also the control steps.
+    The ensemble has followed the readings before the window, where its episode has as many. Guesses are left as they
+    are where nothing touches, and where no states can be drawn. Also the control steps.
     """
+    if not (logged.starts_known and can_be_drawn(logged, simulator) and _touch(simulator, point, guesses)):
+        return guesses, 0
     before = min(BEFORE * stride(dataset), MOST_BEFORE)
     random, first = np.random.default_rng(0), rows - before
     noise = np.maximum(difference_noise(dataset)[: logged.measured] / readings.scale, LEAST_NOISE)

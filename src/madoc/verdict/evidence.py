@@ -114,9 +114,10 @@ def _fitted(
 ) -> Float[np.ndarray, "runs state"]:
     """The states from which a model comes nearest to the first readings of each run."""
     held = bench.held_out
-    readings = Readings.at(held, states_of(held, model), first, steps, bench.change)
-    moving = stride(bench.problem.dataset)
-    return FittedReplays(model, readings, states, first, held.episode_of(first), moving, ()).starts(point[None])[0][0]
+    logged, moving, episodes = states_of(held, model), stride(bench.problem.dataset), held.episode_of(first)
+    readings = Readings.at(held, logged, first, steps, bench.change)
+    replays = FittedReplays(held, logged, model, readings, states, first, episodes, moving, ())
+    return replays.starts(point[None])[0][0]
 
 
 def replay_errors(

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.data import Dataset
+from madoc.identification.ensembles import likely_states
 from madoc.identification.gauss_newton import eliminate
 from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.settling import with_bases_settled
@@ -48,6 +49,8 @@ class FittedReplays:
     `ahead` are the numbers of control steps after the fitted ones at which errors are taken.
     """
 
+    held: Dataset
+    logged: LoggedStates
     simulator: Simulator
     readings: Readings
     near: Float[np.ndarray, "windows state"]
@@ -87,8 +90,8 @@ class FittedReplays:
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
-        settled = [with_bases_settled(self.simulator, first, point, self.near) for point in points]
-        states, spent = np.stack([each for each, _ in settled]), first.steps * sum(count for _, count in settled)
+        begun = [self._begun(first, point) for point in points]
+        states, spent = np.stack([each for each, _ in begun]), sum(count for _, count in begun)
         gaining = np.arange(len(first))
         for _ in range(STEPS_OF_BASES if first.placed.any() else FIT_STEPS):
             part, around = first.of(gaining), states[:, gaining]
@@ -108,6 +111,13 @@ class FittedReplays:
             if len(gaining) <= FEW * len(first):
                 break
         return states, spent
+
+    def _begun(self, first: Readings, point: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, "windows state"], int]:
+        """Initial states from which steps begin at a point, and the control steps that it took."""
+        if not first.placed.any():
+            return likely_states(self.held, self.logged, self.simulator, first, self.rows, point, self.near)
+        states, simulations = with_bases_settled(self.simulator, first, point, self.near)
+        return states, simulations * first.steps
 
 
 def replay_steps(logged: LoggedStates, stride: int, parameters: int) -> int:
@@ -149,4 +159,4 @@ def fitted_replays_of(
     chosen = evenly(possible, most)
     readings = Readings.at(held, logged, rows[chosen], steps, scale)
     episodes = held.episode_of(rows[chosen])
-    return FittedReplays(simulator, readings, near[chosen], rows[chosen], episodes, stride, ahead)
+    return FittedReplays(held, logged, simulator, readings, near[chosen], rows[chosen], episodes, stride, ahead)
