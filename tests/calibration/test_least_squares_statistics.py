@@ -8,7 +8,6 @@ from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares
 from madoc.calibration.least_squares.sentences import LONG_TAILS, about_residuals, have_long_tails
 from madoc.calibration.least_squares.statistics import (
-    alternation,
     autocorrelation,
     clipped_change,
     consecutive_residuals,
@@ -18,6 +17,7 @@ from madoc.calibration.least_squares.statistics import (
 )
 from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE
 from madoc.data import Disturbance, disturb
+from madoc.identification.noise import alternation
 from madoc.identification.settling import cost_of_noise
 from own_robots import BOUNCER, BOUNCER_SPEC, write_robot
 from robots import SPRING_TRUTH, recorded, spring

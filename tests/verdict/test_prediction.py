@@ -10,9 +10,8 @@ from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb
 from madoc.data.dataset import Dataset
 from madoc.identification.windows import HORIZONS
-from madoc.verdict import predicted
 from madoc.verdict.bench import Bench
-from madoc.verdict.predicted import noise_makes_contacts
+from madoc.verdict.predicted import noisy_contacts
 from madoc.verdict.prediction import nearby_best, replays_of
 from own_robots import BOUNCER, BOUNCER_SPEC, write_robot
 from robots import recorded
@@ -78,16 +77,18 @@ def test_random_forces_add_up_with_random_signs_and_a_constant_one_adds_up_to_mo
     assert np.sqrt((floor[:, 4, 1] ** 2).mean()) == pytest.approx(0.01 * np.sqrt(5.0), rel=0.25)
 
 
-@pytest.mark.parametrize(("noise", "makes"), [(0.0, False), (0.05, True)])
-def test_noise_makes_contacts_where_these_begin_and_end_for_a_single_row(tmp_path, monkeypatch, noise, makes):
-    monkeypatch.setattr(predicted, "BY_NOISE", 0.02)  # by chance 0.3 % of rows in the log, with noise 4 %
+@pytest.mark.parametrize(("noise", "noisy"), [(0.0, False), (0.05, True)])
+def test_states_are_noisy_for_contacts_where_residuals_of_single_steps_alternate(tmp_path, noise, noisy):
     task = robots.load(write_robot(tmp_path, BOUNCER_SPEC, bouncer=BOUNCER)).task
     truth = {"body_mass.trunk": 2.0, "body_mass.leg": 0.5, "dof_damping.knee": 5.0}
     log = recorded(task, truth, 1000, jax.random.key(0))
-    noisy = replace(disturb(log, Disturbance(noise=noise), task, jax.random.key(1)), disturbance=Disturbance())
-    train, held = noisy.split(0.3)
+    read = replace(disturb(log, Disturbance(noise=noise), task, jax.random.key(1)), disturbance=Disturbance())
+    train, held = read.split(0.3)
     bench = Bench(CalibrationProblem(train, simulation.make(task, threads=1)), held, jax.random.key(0))
     point = task.parameters.to_unit(task.parameters.vector(truth))
-    assert noise_makes_contacts(bench, point) == makes
+    assert noisy_contacts(bench, point) == noisy
     far = np.array([1.0, 1.0, 1.0])  # no excuse for an estimate that errs by far more than noise
-    assert not noise_makes_contacts(bench, far)
+    assert not noisy_contacts(bench, far)
+    rows = held.transitions
+    raised = {name: getattr(rows, name) + np.array([10.0, 0, 0, 0]) for name in ("observation", "next_observation")}
+    assert not noisy_contacts(replace(bench, held_out=replace(held, transitions=replace(rows, **raised))), point)

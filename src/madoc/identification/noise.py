@@ -28,6 +28,11 @@ STEP = 1e-3
 """Change of an observation, in typical changes of a stride, by which the derivative of a control step is taken."""
 SLOPE_LIMIT = 2.0
 """Largest derivative of a channel by itself over a control step; a contact's is larger, and is clipped to it."""
+NOISY = 0.2
+"""Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5, and random forces
+as large as it half of that."""
+_BY_CHANCE = 3.0
+"""Standard errors of a correlation, by which the most negative one of several channels may be so by chance."""
 _SHORTEST = 5
 """Smallest number of rows of an episode; shorter ones have too few second differences and are left out."""
 _STANDARD_ERRORS = 3.0
@@ -144,6 +149,23 @@ def clipped(residuals: Float[np.ndarray, "rows observation"]) -> Float[np.ndarra
     finite = np.where(np.isfinite(residuals), residuals, 0.0)
     limit = OUTLIER * NORMAL_MAD * np.median(np.abs(finite), axis=0)
     return np.where(limit > 0.0, np.clip(finite, -limit, limit), finite)
+
+
+def alternation(before: Float[np.ndarray, "pairs channels"], after: Float[np.ndarray, "pairs channels"]) -> float:
+    """Minus the correlation of one-step residuals with the next row's, in the channel in which it is most negative.
+
+    With noise e alone a residual is about e' - e, as the reading it starts at is noisy as well as the one it ends at.
+    The next one is e'' - e', so the correlation is -1/2. A model error has the same sign in the next row. A speed that
+    a servo or a contact holds forgets its noise in a row, so one channel is enough. Residuals are clipped at five
+    robust standard deviations. It is 0 without pairs, and where chance may make as much.
+    """
+    if not len(before):
+        return 0.0
+    most = OUTLIER * NORMAL_MAD * np.maximum(np.median(np.abs(before), axis=0), _SMALLEST)
+    first, second = (np.clip(part, -most, most) for part in (before, after))
+    power = np.sqrt((first**2).mean(0) * (second**2).mean(0))
+    largest = float((-(first * second).mean(0) / np.maximum(power, _SMALLEST**2)).max())
+    return largest if largest > _BY_CHANCE / np.sqrt(len(before)) else 0.0
 
 
 def own_slopes(

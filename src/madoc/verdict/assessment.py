@@ -17,7 +17,7 @@ from madoc.verdict.bench import Bench
 from madoc.verdict.fitted import fitted
 from madoc.verdict.judge import beats_mid_range, explains_all, judge
 from madoc.verdict.open_loop import open_loop
-from madoc.verdict.predicted import noise_hides_gain, noise_makes_contacts, predicted
+from madoc.verdict.predicted import noise_hides_gain, noisy_contacts, predicted
 from madoc.verdict.records import judged
 
 NO_BETTER = "the estimate predicts the rows held out no better than mid-range does, so it is not settled"
@@ -97,15 +97,15 @@ def assess(
 def measured(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None = None) -> HoldOut:
     """The hold-out's numbers for an estimate and its 95 % intervals in physical units, by the measure its states allow.
 
-    Where states can be rebuilt, but the sensors' noise in them decides on contacts or hides what parameters do, initial
-    states are fitted too.
+    Where states can be rebuilt, but bodies touch and the sensors' noise is not small for them, or it hides what
+    parameters do, initial states are fitted too.
 
     Raises:
         MadocError: No state of the hold-out can be rebuilt though the robot's observations determine it.
     """
     point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
     bench.tell("predictions of single steps and short windows")
-    noisy = bench.states_known and (noise_makes_contacts(bench, point) or noise_hides_gain(bench))
+    noisy = bench.states_known and (noisy_contacts(bench, point) or noise_hides_gain(bench))
     if bench.states_known and (not noisy or bench.fitted is None):
         return predicted(bench, point, interval)
     if bench.fitted is not None:

@@ -20,7 +20,6 @@ from madoc.verdict.statistics import (
     NEGLIGIBLE,
     beside_random,
     best_of,
-    beyond_noise,
     hides_gain,
     independent_groups,
     prediction_errors,
@@ -35,9 +34,8 @@ _DAMPING = 1e-6
 """Marquardt's damping of a step, relative to the squared lengths of the columns; 0 is none."""
 MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
-BY_NOISE = 0.1
-"""Share in [0, 1] of rows whose contacts are neither those of the row before nor of the row after; with more, noise
-makes them."""
+TOUCHING = 0.1
+"""Share in [0, 1] of held-out rows in which bodies touch; with more, noise of a state is not small for its motion."""
 
 
 def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
@@ -81,22 +79,18 @@ def noise_hides_gain(bench: Bench) -> bool:
     return hides_gain(_replayed(bench, np.zeros(len(bench.simulator.parameters))).errors)
 
 
-def noise_makes_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
-    """Whether contacts begin or end for a single row so often in the hold-out that noise decides on them, not motion.
+def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
+    """Whether bodies touch in the hold-out, and logged states are noisy.
 
-    Replays from logged states then err by what contacts make of noise, least where these are soft. That is no excuse
-    for an estimate whose errors are far larger than noise.
+    Replays from these then err by what contacts make of noise. It shows in residuals of single steps that alternate;
+    those of an estimate whose errors are far larger than noise do not.
     """
     states, rows = logged_states(bench.held_out, bench.simulator.task)
-    counts = bench.simulator.contacts(states[:MOST_ROWS])
-    within = consecutive_rows(bench.held_out, rows)
-    middle = within[1:][np.diff(within) == 1]
-    middle = middle[middle < len(counts) - 1]
-    before, here, after = (counts[middle + shift] for shift in (-1, 0, 1))
-    if not len(middle) or float(((before != here) & (here != after)).mean()) <= BY_NOISE:
+    if float((bench.simulator.contacts(states[:MOST_ROWS]) > 0).mean()) < TOUCHING:
         return False
-    errors = _replayed(bench, point).errors
-    return not beyond_noise(errors.estimate, errors.noise)
+    first = evenly(rows[consecutive_rows(bench.held_out, rows)], MOST_ROWS)
+    pairs = np.stack([_residuals(bench, point, each) for each in (first, first + 1)])
+    return sensors.alternation(*pairs[:, np.isfinite(pairs).all((0, 2))]) > sensors.NOISY
 
 
 class _Replayed(NamedTuple):

@@ -31,11 +31,12 @@ from madoc.calibration.least_squares.lengthening import (
 )
 from madoc.calibration.least_squares.plan import FEWEST, Found
 from madoc.calibration.least_squares.search import Search, SearchState
-from madoc.calibration.least_squares.statistics import alternation, consecutive_residuals, noisy_rows
+from madoc.calibration.least_squares.statistics import consecutive_residuals, noisy_rows
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import stride
 from madoc.identification.information import identifiability, quantile, sandwich
 from madoc.identification.losses import Loss
+from madoc.identification.noise import NOISY, alternation
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters, named_key
 
 InitialStates = Literal["logged", "estimated"]
@@ -47,9 +48,6 @@ SEARCH_WINDOWS: dict[InitialStates, int] = {"logged": 64, "estimated": 24}
 """Largest number of windows while searching."""
 STARTING_STRIDES = 1
 """Length in strides of the rows of windows from logged states where these are noisy and only a start is wanted."""
-NOISY = 0.2
-"""Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5, and random forces
-as large as it half of that."""
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,6 @@ FEWEST_STEADY = 10
 """Smallest number of windows of a kind whose noise is estimated by itself."""
 NOISY_STRIDE = 1e-3
 """Noise of a channel in its typical changes in a stride; above it logged states are noisy where rows are close."""
-BY_CHANCE = 3.0
-"""Standard errors of a correlation, by which the most negative one of several channels may be so by chance."""
 _LARGEST = 3.0
 """Standard deviations of the noise at which residuals are clipped before they are correlated."""
 WIDE = 0.4
@@ -142,23 +140,6 @@ def autocorrelation(residuals: Float[np.ndarray, "windows readings channels"]) -
     clipped = np.clip(residuals, -_LARGEST, _LARGEST)
     power = np.maximum((clipped**2).sum((0, 1)), clipped[..., 0].size)
     return float(((clipped[:, 1:] * clipped[:, :-1]).sum((0, 1)) / power).max())
-
-
-def alternation(before: Residuals, after: Residuals) -> float:
-    """Minus the correlation of one-step residuals with the next row's, in the channel in which it is most negative.
-
-    With noise e alone a residual is about e' - e, as the reading it starts at is noisy as well as the one it ends at.
-    The next one is e'' - e', so the correlation is -1/2. A model error has the same sign in the next row. A speed that
-    a servo or a contact holds forgets its noise in a row, so one channel is enough. Residuals are clipped at five
-    robust standard deviations. It is 0 without pairs, and where chance may make as much.
-    """
-    if not len(before):
-        return 0.0
-    most = OUTLIER * NORMAL_MAD * np.maximum(np.median(np.abs(before), axis=0), _SMALLEST)
-    first, second = (np.clip(part, -most, most) for part in (before, after))
-    power = np.sqrt((first**2).mean(0) * (second**2).mean(0))
-    largest = float((-(first * second).mean(0) / np.maximum(power, _SMALLEST**2)).max())
-    return largest if largest > BY_CHANCE / np.sqrt(len(before)) else 0.0
 
 
 def consecutive_residuals(
