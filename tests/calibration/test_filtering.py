@@ -308,7 +308,12 @@ def test_logs_without_contacts_or_with_a_horizon_of_the_users_fit_initial_states
     problem = problem_of_foot(tmp_path)
     for own in ({"horizon": 5}, {"windows": 20}, {"initial_states": "estimated"}):
         assert LeastSquares(**own).init(problem, jax.random.key(0)).filtered is None
-    assert of_contacts(problem, jax.random.key(0)) is not None
+    assert of_contacts(problem, jax.random.key(0)).size == filtering.BLOCK
+
+
+def test_epochs_have_more_windows_where_few_touch(tmp_path, monkeypatch):
+    monkeypatch.setattr(filtering, "touched", lambda problem, states, known, rows, horizon: np.arange(len(rows)) < 5)
+    assert of_contacts(problem_of_foot(tmp_path), jax.random.key(0)).size == 2 * filtering.BLOCK
 
 
 def test_differences_lead_along_the_axes_of_the_covariance_and_not_out_of_a_range(tmp_path):

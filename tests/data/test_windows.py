@@ -10,6 +10,7 @@ from madoc.identification.windows import (
     drawn,
     evenly,
     first_rows,
+    interleaved,
     longest_fit,
     readings_at,
     rows_that_fit,
@@ -60,6 +61,13 @@ def test_readings_include_the_first(hopper):
     assert found.shape == (2, 3, 11)
     np.testing.assert_array_equal(found[:, 0], dataset.transitions.observation[[0, 4]])
     np.testing.assert_array_equal(found[1, 1:], dataset.transitions.next_observation[4:6])
+
+
+def test_interleaved_windows_have_the_same_share_in_every_stretch():
+    mixed = interleaved(np.arange(4), np.arange(10, 22))
+    assert sorted(mixed) == [*range(4), *range(10, 22)]
+    assert [(mixed[at : at + 4] < 10).sum() for at in (0, 4, 8, 12)] == [1, 1, 1, 1]
+    assert interleaved(np.arange(3), np.arange(0)).tolist() == [0, 1, 2]
 
 
 def test_windows_are_spread_evenly():

@@ -157,3 +157,9 @@ def evenly(positions: Int[np.ndarray, " possible"], count: int) -> Positions:
     if len(positions) <= count:
         return positions
     return positions[np.linspace(0, len(positions) - 1, count).round().astype(np.int64)]
+
+
+def interleaved(first: Int[np.ndarray, " first"], second: Int[np.ndarray, " second"]) -> Int[np.ndarray, " both"]:
+    """Both in one order, in which every stretch has about the same share of each."""
+    place = np.concatenate([(np.arange(len(part)) + 0.5) / max(1, len(part)) for part in (first, second)])
+    return np.concatenate([first, second])[np.argsort(place, kind="stable")]

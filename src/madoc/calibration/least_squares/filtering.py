@@ -25,7 +25,7 @@ from madoc.identification.losses import Loss
 from madoc.identification.noise import WHITE
 from madoc.identification.replay import Readings
 from madoc.identification.settling import FAILED_WINDOW, window_costs
-from madoc.identification.windows import disjoint_windows, rows_that_fit
+from madoc.identification.windows import disjoint_windows, interleaved, rows_that_fit
 from madoc.types import Epoch, generator
 
 STRIDES = 20
@@ -68,8 +68,13 @@ NOISE_SETTLED = 0.4
 """Relative change of noise variances, root of the mean square, below which they are as good as known."""
 NOISE_ROUNDS = 3
 """Number of runs of half an ensemble before each of the first epochs, which tell the noise better at little cost."""
-MOSTLY = 0.5
+TOUCHING = 0.05
 """Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts."""
+FEW_TOUCH = (0.25, 0.5)
+"""Shares in [0, 1] of windows in which bodies touch: below the first, others are left out; below the second, epochs
+have twice as many windows, so that enough of them touch."""
+MOST_SEEN = 2000
+"""Largest number of windows of which it is asked whether bodies touch."""
 MOST_TOLD = 0.9
 """Share in (0, 1) that counts of what a window tells where no other one tells of a direction."""
 
@@ -81,7 +86,8 @@ class FilterState:
 
     Attributes:
         point: The parameters, in [-1, 1].
-        rows: First rows of the windows, in random order.
+        rows: First rows of the windows, in random order, those in which bodies touch in every block of them.
+        size: Number of windows of an epoch, a block of them.
         spread: Differences along each axis of the parameters' covariance, in [-1, 1], in columns.
         noise: Noise of each channel in its typical changes.
         seed: Seed of the ensembles' random numbers.
@@ -105,6 +111,7 @@ class FilterState:
 
     point: Float[np.ndarray, " d"]
     rows: Int[np.ndarray, " windows"]
+    size: int
     spread: Float[np.ndarray, "d d"]
     noise: Float[np.ndarray, " channels"]
     seed: int
@@ -127,16 +134,15 @@ class FilterState:
     @property
     def blocks(self) -> int:
         """Number of blocks of windows, of which every epoch has one."""
-        return max(1, len(self.rows) // _block(len(self.point)))
+        return max(1, len(self.rows) // self.size)
 
     @property
     def block(self) -> slice:
         """The windows of the next epoch."""
-        size = _block(len(self.point))
         if not self.wide:
-            return slice(0, size // 2)
+            return slice(0, self.size // 2)
         number = (self.halved if self.at_rest else self.together if self.near else 0) % self.blocks
-        return slice(number * size, (number + 1) * size if number + 1 < self.blocks else None)
+        return slice(number * self.size, (number + 1) * self.size if number + 1 < self.blocks else None)
 
     @property
     def members(self) -> int:
@@ -190,11 +196,6 @@ class FilterState:
         )
 
 
-def _block(parameters: int) -> int:
-    """Number of windows of an epoch."""
-    return max(BLOCK, 2 * (FEWEST + parameters))
-
-
 def horizon_of(problem: CalibrationProblem) -> int:
     """Length of the windows in control steps, short enough for twice as many of them as are needed."""
     fewest = 2 * (FEWEST + len(problem.simulator.parameters))
@@ -212,13 +213,18 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
     rows = states.rows[disjoint_windows(problem.dataset, states.rows, horizon)]
     if len(rows) < FEWEST + count:
         return None
-    rows = generator(key).permutation(rows)[: _block(count) * MOST_BLOCKS]
-    if touched(problem, *states.guesses(), rows[: _block(count)], horizon).mean() < MOSTLY:
+    rows = generator(key).permutation(rows)[:MOST_SEEN]
+    touching = touched(problem, *states.guesses(), rows, horizon)
+    if touching.mean() < TOUCHING:
         return None
+    size = max(BLOCK, 2 * (FEWEST + count)) * (1 if touching.mean() >= FEW_TOUCH[1] else 2)
+    alone = max(size, int(touching.sum() / FEW_TOUCH[0] - touching.sum()))
+    rows = interleaved(rows[touching], rows[~touching][:alone])[: size * MOST_BLOCKS]
     by_differences = (problem.noise_by_differences / problem.typical_change)[: states.measured]
     return FilterState(
         point=np.zeros(count),
         rows=rows,
+        size=size,
         spread=WIDTH * np.eye(count),
         noise=np.maximum(by_differences, FIRST_NOISE),
         seed=int(np.asarray(jax.random.key_data(key))[-1]),
