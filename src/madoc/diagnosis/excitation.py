@@ -30,6 +30,8 @@ from madoc.simulation.response import mass_like
 WINDOWS = {3: 300, 20: 60}
 """Largest number of windows, by their length in strides (`data.timescale`). Long ones narrow the intervals where
 sensors are noisy, short ones where the robot is chaotic."""
+FEW = 100
+"""Largest number of short windows where no intervals are wanted."""
 FEWEST = 5
 """Windows beyond the number of parameters that are fitted where states are approximate."""
 ROUNDS = 3
@@ -85,8 +87,8 @@ def excite(
     expected intervals take these for noise. Of short and long windows, those with the narrower intervals count; where
     no `intervals` are wanted, short ones alone tell what cannot be determined, in a fraction of the time.
     """
-    lengths = WINDOWS if intervals else [min(WINDOWS)]
-    of_length = [_excited(dataset, simulator, logged, start=start, horizon=horizon, key=key) for horizon in lengths]
+    lengths = WINDOWS if intervals else {min(WINDOWS): FEW}
+    of_length = [_excited(dataset, simulator, logged, start=start, windows=each, key=key) for each in lengths.items()]
     spans = simulator.parameters.high - simulator.parameters.low
     widths = [np.nan_to_num(each.half_width / spans, nan=1.0).mean() for each in of_length]
     return replace(of_length[int(np.argmin(widths))], control_steps=sum(each.control_steps for each in of_length))
@@ -98,19 +100,19 @@ def _excited(
     logged: LoggedStates,
     *,
     start: Float[np.ndarray, " d"],
-    horizon: int,
+    windows: tuple[int, int],
     key: PRNGKeyArray,
 ) -> Excitation:
-    """As `excite`, over windows of one length."""
+    """As `excite`, over windows of one length in strides, so many at most."""
     space, (states, rows) = simulator.parameters, logged.exact()
-    steps = longest_fit(dataset, rows, horizon * stride(dataset))
+    steps = longest_fit(dataset, rows, windows[0] * stride(dataset))
     disjoint = disjoint_windows(dataset, rows, steps, gap=0)
-    chosen, available = drawn(disjoint, WINDOWS[horizon], key), len(disjoint)
-    windows = windows_at(dataset, states[chosen], rows[chosen], steps)
+    chosen, available = drawn(disjoint, windows[1], key), len(disjoint)
+    replayed = windows_at(dataset, states[chosen], rows[chosen], steps)
     first = np.clip(start, -0.9 * INSIDE, 0.9 * INSIDE)
     linearisations, visited, spent = descend(
         simulator,
-        windows,
+        replayed,
         first,
         typical_change(dataset, simulator.task.attitudes),
         steps=ROUNDS,
@@ -120,7 +122,7 @@ def _excited(
     )
     if not linearisations:
         nothing = np.full(len(space), np.nan)
-        sentence = f"the simulation fails in all {len(windows)} stretches tried; look at the ranges and the states"
+        sentence = f"the simulation fails in all {len(replayed)} stretches tried; look at the ranges and the states"
         return Excitation(nothing, nothing, (), (sentence,), False, spent)
     at = int(np.argmin([(each.residuals**2).mean() for each in linearisations]))
     best, point = linearisations[at], (first, *visited)[at]

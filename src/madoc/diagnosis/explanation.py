@@ -16,8 +16,10 @@ from madoc.identification.states import LoggedStates
 from madoc.identification.windows import Windows, drawn, horizons, longest_fit, rows_that_fit, windows_at
 from madoc.simulation.base import Simulator
 
-WINDOWS = 64
-"""Largest number of windows replayed."""
+WINDOWS = (16, 64)
+"""Smallest and largest number of windows replayed."""
+PHYSICS_STEPS = 200_000
+"""Number of physics steps of all replays, beyond which there are fewer windows: a heavy model's take their time."""
 CORNERS, DRAWS = 8, 24
 """Number of corners of the box of parameters that are tried, and of points inside it."""
 HALF = 0.5
@@ -67,7 +69,8 @@ def explain(
     states, rows = logged.exact()
     lengths = horizons(dataset)
     steps = longest_fit(dataset, rows, max(lengths))
-    chosen = drawn(rows_that_fit(dataset, rows, steps), WINDOWS, key)
+    affordable = PHYSICS_STEPS // (len(draws) * steps * simulator.task.frame_skip)
+    chosen = drawn(rows_that_fit(dataset, rows, steps), int(np.clip(affordable, *WINDOWS)), key)
     compared = tuple(length for length in lengths if length <= steps) or (steps,)
     windows = windows_at(dataset, states[chosen], rows[chosen], steps)
     errors = _errors(dataset, simulator, windows, rows[chosen], draws, compared)
@@ -123,7 +126,7 @@ def action_findings(
     task, (states, rows) = simulator.task, logged.exact()
     at = min(1, len(explanation.horizons) - 1)
     horizon = explanation.horizons[at]
-    chosen = drawn(rows_that_fit(dataset, rows, horizon, margin=1), WINDOWS, key)
+    chosen = drawn(rows_that_fit(dataset, rows, horizon, margin=1), WINDOWS[1], key)
     if not len(chosen):
         return [], 0
     windows = windows_at(dataset, states[chosen], rows[chosen], horizon)
