@@ -13,7 +13,7 @@ from madoc.identification.combinations import Combination
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.verdict.adequacy import numerical
-from madoc.verdict.mismatch import SEPARABLE, change_of, contradicted, in_percent, lacking, of_area
+from madoc.verdict.mismatch import SEPARABLE, at_most, change_of, contradicted, in_percent, in_rows, lacking, of_area
 from madoc.verdict.statistics import FEWEST_GROUPS, WORTH_GAINING, beyond_noise
 
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
@@ -78,7 +78,7 @@ def judge(
 
 def _how_sure(holdout: HoldOut) -> str:
     """How wide the widest interval is, as a clause."""
-    return f"no 95 % interval covers more than {in_percent(max(holdout.interval_shares.values()))} of its range"
+    return f"no 95 % interval covers more than {at_most(max(holdout.interval_shares.values()))} of its range"
 
 
 def _usable(holdout: HoldOut, lacks: Verdict) -> Verdict | None:
@@ -265,7 +265,8 @@ def _how_good(holdout: HoldOut) -> str:
         confirmed = ", and mid-range is confirmed: every interval holds it" if _mid_range_was_right(holdout) else ""
         parts = [each for each in holdout.open_loop if not each.whole and each.relative <= 1.0]
         told = _beside_given(parts[-1]) if parts else _how_small(holdout.errors)
-        return f"{told}{', down to the noise' if explains_all(holdout) else ''}{confirmed}"
+        ahead = f", {in_rows(holdout.errors.estimate[-1].steps)} ahead as well as the sensors' noise allows"
+        return f"{told}{ahead if explains_all(holdout) else ''}{confirmed}"
     return (
         "a classifier tells rows of the simulator from those held out with an area of "
         f"{of_area(holdout.area_at_estimate)}, after {of_area(holdout.area_at_mid_range)} at mid-range (0.5 is chance)"

@@ -260,6 +260,12 @@ def in_rows(count: int) -> str:
     return "1 row" if count == 1 else f"{count} rows"
 
 
+def at_most(share: float) -> str:
+    """A share in percent, rounded up to two digits, or up to a whole number from 99.5 on."""
+    digit = 10.0 ** (np.floor(np.log10(max(share, 1e-12))) - 1)
+    return in_percent(float(np.ceil(share / digit - 1e-9) * digit))
+
+
 def in_percent(share: float) -> str:
     """A share in percent, with three digits near 100; a question mark for one that is not finite."""
     return f"{100 * share:.{2 if share < 0.995 else 3}g} %" if np.isfinite(share) else "?"
