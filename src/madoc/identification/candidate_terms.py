@@ -14,6 +14,7 @@ from madoc.identification.score_tests import Score
 from madoc.identification.states import LoggedStates
 from madoc.identification.windows import evenly
 from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
+from madoc.robots.space import element_unit
 from madoc.simulation.base import Simulator
 from madoc.simulation.gears import deflections
 from madoc.simulation.inertials import off_centre
@@ -130,7 +131,8 @@ def candidates(
     wanted += _at_contacts(model, logged, calibrated)
     for field, element, reference in wanted:
         if (field, element) not in calibrated:
-            candidate, parameter = _candidate(partial(nominal_values, model), field, element, reference)
+            unit = element_unit(model, field, element) if isinstance(element, str) else ""
+            candidate, parameter = _candidate(partial(nominal_values, model), field, element, reference, unit)
             yield replace(candidate, plausible=_plausible(model, parameter, reference)), parameter
 
 
@@ -179,10 +181,17 @@ def references_of(logged: LoggedStates, simulator: Simulator, joint: Any) -> dic
 
 
 def _candidate(
-    nominal_of: Callable[[Parameter], tuple[float, ...]], field: str, element: str | tuple[str, ...], reference: float
+    nominal_of: Callable[[Parameter], tuple[float, ...]],
+    field: str,
+    element: str | tuple[str, ...],
+    reference: float,
+    unit: str = "",
 ) -> tuple[Candidate, Parameter]:
-    """A term, and the parameter whose range begins at its value in the model and is `reference` wide."""
-    parameter = Parameter(field, element, 0.0, reference)
+    """A term, and the parameter whose range begins at its value in the model and is `reference` wide.
+
+    It is in the field's unit if none is given.
+    """
+    parameter = Parameter(field, element, 0.0, reference, measured_in=unit)
     nominal = nominal_of(parameter)[0]
     parameter = replace(parameter, low=nominal, high=nominal + reference)
     least, elements = parameter.kind.minimum, parameter.elements

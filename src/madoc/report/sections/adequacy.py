@@ -1,12 +1,12 @@
 """What the log says against the model, and of parameters that it leaves open: missing terms, and combinations."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from madoc.identification.combinations import Combination
 from madoc.identification.term_tests import Alternative, MissingTerm
 from madoc.report.reading import Run
-from madoc.report.words import interval_words, number, parameter_title, percent
-from madoc.verdict.adequacy import is_certain
+from madoc.report.words import interval_words, number, parameter_title, percent, unit_words, with_error
+from madoc.verdict.adequacy import CERTAIN, is_certain
 
 
 def lacks(run: Run) -> dict[str, object] | str:
@@ -17,14 +17,17 @@ def lacks(run: Run) -> dict[str, object] | str:
     if not held.missing_terms and not held.alternatives:
         return "No missing term was found, or the log does not tell the robot's states well enough to look for one."
     largest = max((_largest(term) for term in held.missing_terms), default=0.0)
-    rows = [_row(term, largest) for term in held.missing_terms]
-    return {"rows": rows, "alternatives": [_words(each) for each in held.alternatives]}
+    rows = [_row(term, largest, run.units) for term in held.missing_terms]
+    alternatives = [_words(each) for each in held.alternatives]
+    return {"rows": rows, "alternatives": alternatives, "largest": number(largest, 2), "certain": number(CERTAIN)}
 
 
-def _row(term: MissingTerm, largest: float) -> dict[str, object]:
+def _row(term: MissingTerm, largest: float, units: Mapping[str, str]) -> dict[str, object]:
     """A term as its bar shows it: the largest shift of a parameter, relative to the largest of all terms."""
     name = max(term.shifts, key=lambda each: abs(term.shifts[each]))
-    value = f"{number(term.value, 3)} ± {number(term.standard_error, 1)} {term.unit}".rstrip()
+    field, _, element = term.parameter.partition(".")
+    unit = units.get(element, "") if field == "signal_bias" else unit_words(term.unit)
+    value = f"{with_error(term.value, term.standard_error)} {unit}".rstrip()
     return {
         "cause": term.cause,
         "parameter": term.parameter,
@@ -44,7 +47,7 @@ def _largest(term: MissingTerm) -> float:
 def _words(each: Alternative) -> tuple[str, str]:
     """What an alternative rests on, and how it moves the parameters."""
     moved = sorted(each.shifts, key=lambda name: -abs(each.shifts[name]))[:3]
-    shifts = (f"{parameter_title(n)} {number(each.shifts[n], 2)} ± {number(each.errors[n], 2)}" for n in moved)
+    shifts = (f"{parameter_title(n)} {with_error(each.shifts[n], each.errors[n])}" for n in moved)
     return ", ".join(each.causes), ", ".join(shifts)
 
 
