@@ -11,12 +11,14 @@ from madoc.calibration.registry import CALIBRATORS
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
 from madoc.identification.combinations import combinations
-from madoc.parameters import ParameterSpace
+from madoc.parameters import Parameter, ParameterSpace
 from madoc.runs import loop
 from madoc.runs.budget import Budget
 from madoc.runs.files import replacing
 from madoc.runs.run_folder import RunFolder
 from madoc.simulation.sensitivity import refuse_insensitive
+from madoc.simulation.write import nominal_values
+from madoc.tasks import Task
 from madoc.types import State, entry_of
 
 DIVERGED = "the run diverged: the estimate is that of its last checkpoint, which may be where it began"
@@ -76,7 +78,7 @@ def calibrate(
         seconds=round(finished.seconds, 3),
         seed=int(np.asarray(jax.random.key_data(key))[-1]),
         groups=[[space.names[index] for index in group] for group in estimate.groups or [range(len(space))]],
-        parameters=_parameters(space, estimate),
+        parameters=_parameters(problem.simulator.task, estimate),
         warnings=without_repeats(warnings, problem.doubts),
         error=None if true_values is None else calibration_error(estimate.mean, true_values, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
@@ -103,14 +105,21 @@ def _trace(space: ParameterSpace, estimate: Estimate) -> dict[str, float]:
     return {name: value for row in rows for name, value in row.items() if np.isfinite(value)}
 
 
-def _parameters(space: ParameterSpace, estimate: Estimate) -> dict[str, ParameterEstimate]:
+def _parameters(task: Task, estimate: Estimate) -> dict[str, ParameterEstimate]:
     """The estimate of each parameter, by name."""
+    space = task.parameters
     intervals = [None] * len(space) if estimate.interval is None else estimate.interval.tolist()
     columns = zip(space.parameters, estimate.mean, estimate.std, intervals, strict=True)
     return {
-        row.name: ParameterEstimate(float(mean), float(std), row.low, row.high, row.unit, interval)
+        row.name: ParameterEstimate(float(mean), float(std), row.low, row.high, row.unit, interval, _given(task, row))
         for row, mean, std, interval in columns
     }
+
+
+def _given(task: Task, parameter: Parameter) -> float | None:
+    """The value in the user's own model as it was given; None where its elements differ, or the model is Madoc's."""
+    values = set(nominal_values(task.model, parameter)) if task.source is not None else set()
+    return values.pop() if len(values) == 1 else None
 
 
 def exploded(failures: int, control_steps: int) -> tuple[str, ...]:

@@ -26,7 +26,10 @@ MOST_SIGNALS = 12
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """The estimate of one parameter and its standard deviation, range, unit and, where known, 95 % interval."""
+    """The estimate of one parameter and its standard deviation, range, unit and, where known, 95 % interval.
+
+    `given` is the value in a user's own model as it was given, where all elements of the parameter have the same.
+    """
 
     estimate: float
     std: float
@@ -34,6 +37,7 @@ class ParameterEstimate:
     high: float
     unit: str
     interval: list[float] | None = None
+    given: float | None = None
 
     @property
     def half_width(self) -> float:
@@ -163,6 +167,9 @@ class CalibrationResult:
         group_of = {name: index for index, names in enumerate(self.groups, 1) for name in names}
         table.add_column("parameter", min_width=max(map(len, self.parameters)))
         table.add_column("unit")
+        given = any(row.given is not None for row in self.parameters.values())
+        if given:
+            table.add_column("as given", justify="right")
         intervals = any(row.interval for row in self.parameters.values())
         headings = ["estimate ± std", *(["95 %"] if intervals else []), "range", *(["group"] if self.grouped else [])]
         for heading in headings:
@@ -174,6 +181,7 @@ class CalibrationResult:
             cells = [
                 name,
                 row.unit,
+                *(["" if row.given is None else f"{row.given:.4g}"] if given else []),
                 f"{row.estimate:.4g} ± {row.std:.2g}",
                 *([_span(row.interval)] if intervals else []),
                 f"[{row.low:g}, {row.high:g}]",
