@@ -52,7 +52,7 @@ _ARMATURE = "inertia at the joint, as of a geared rotor"
 FIELDS: dict[str, Field] = {
     "gravity": Field(None, "m/s²", missing="another gravity", maximum=1e4),
     "body_mass": Field("body", "kg", 0.0, words="mass", missing="another mass, as of a payload"),
-    "body_mass_and_inertia": Field("body", "kg", 0.0, words="mass, inertia"),
+    "body_mass_and_inertia": Field("body", "kg", 0.0, words="mass and inertia"),
     "body_inertia": Field("body", "kg·m²", 0.0),
     "body_com": Field("body", "m", 0.0, missing="another centre of mass, as with a payload"),
     "body_distance": Field("body", "m", 0.0, words="distance", missing="another length of the link before a body"),

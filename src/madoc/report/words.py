@@ -60,6 +60,15 @@ def number(value: float | None, digits: int = 4) -> str:
     return f"{value:.{digits}g}".replace("-", "−")
 
 
+def with_error(value: float, error: float) -> str:
+    """A value with its standard error, which has two digits, and as many decimals; without one where the error is 0."""
+    if not error or not math.isfinite(error):
+        return number(value, 3)
+    size = abs(value) or error
+    digits = math.floor(math.log10(size)) - math.floor(math.log10(error)) + 2
+    return f"{number(value, max(2, digits))} ± {number(error, 2)}"
+
+
 def percent(share: float) -> str:
     """A share of 1 in percent."""
     return f"{number(100 * share, 3)} %"

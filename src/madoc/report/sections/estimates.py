@@ -13,7 +13,9 @@ def estimates(run: Run) -> dict[str, object] | str:
     if not run.parameters:
         return "There is no estimate."
     intervals = any(row.interval for row in run.parameters.values())
-    return {"run": run, "spread": "95 % interval" if intervals else "one standard deviation to either side"}
+    given = any(row.given is not None for row in run.parameters.values())
+    spread = "95 % interval" if intervals else "one standard deviation to either side"
+    return {"run": run, "spread": spread, "given": given}
 
 
 def grouping(run: Run) -> dict[str, object] | str:

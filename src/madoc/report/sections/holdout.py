@@ -148,7 +148,9 @@ def residuals(run: Run) -> dict[str, object] | str:
         (evidence.signals[signal], float(before[signal]), float(after[signal]), _factor(before[signal], after[signal]))
         for signal in np.argsort(-before)
     ]
-    return {"rows": rows, "largest": float(max(before.max(), after.max())) or 1.0}
+    stride = 1 if run.holdout is None or isinstance(run.holdout, ToldApart) else run.holdout.errors.stride
+    ahead = "a row" if stride == 1 else f"{stride} rows"
+    return {"rows": rows, "largest": float(max(before.max(), after.max())) or 1.0, "ahead": ahead}
 
 
 def _error(residual: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -102,6 +102,13 @@
     { rootMargin: "600px" },
   );
   charts.forEach((chart) => seen.observe(chart));
+  /* The others as well once the browser is idle: a page that is saved as a picture has all of them. */
+  const idle = window.requestIdleCallback ?? ((next) => setTimeout(next, 50));
+  const rest = () => {
+    const next = charts.find((chart) => !chart.data);
+    if (next) draw(next), idle(rest);
+  };
+  idle(rest);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => charts.filter((chart) => chart.data).forEach(draw));
   addEventListener("beforeprint", () => charts.filter((chart) => !chart.data).forEach(draw));
 })();
