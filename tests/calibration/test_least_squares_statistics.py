@@ -123,7 +123,7 @@ def test_tails_are_long_where_the_cost_is_above_that_of_noise():
     assert not long(costing(1.0))
     assert long(costing(1.2))
     assert about_residuals(problem, costing(1.2)) == (
-        "residuals have longer tails than noise has: the intervals are too narrow",
+        "residuals have longer tails than noise has: the intervals are too narrow, by how much is not known",
     )
     assert not long(costing(1.2, epochs=0))  # not all windows are known yet
     assert not long(costing(1.2, deviation=np.full(2, 1e-9)))  # rounding errors

@@ -27,7 +27,7 @@ RIPPLE = "a drive whose gain depends on where the joint is"
 UNEVEN = "friction that depends on where the joint is"
 PLACED = "a force that depends on where the joint is"
 COUPLED = "a force that another joint's motion exerts"
-BUILT_UP = "friction that builds up over a distance after each reversal, as of belts and seals"
+BUILT_UP = "friction that builds up or falls off over a distance after each reversal, as of belts, seals and brakes"
 FORCES = (CONSTANT, LOADED, SLOW, WEAKENING, DEAD_ZONE, BENT, RIPPLE, UNEVEN, PLACED, COUPLED, BUILT_UP)
 """What each stands for, in words, the most usual first; the joint's name follows in brackets."""
 RESISTING = (LOADED, SLOW)

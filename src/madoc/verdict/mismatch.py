@@ -150,8 +150,8 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
         return None
     return Verdict(
         "MODEL_MISMATCH",
-        "residuals are unlike noise, with some far larger or each like the next: the model does not explain the whole "
-        f"log, and intervals do not count that{_where(holdout)}; look for a force that acts at times only, at contacts "
+        "residuals are unlike noise (a warning says in what): the model does not explain the whole log, and intervals "
+        f"count noise alone{_where(holdout)}; look for a force that acts at times only, at contacts "
         "or in fast motion, for wrong or missing readings and for values that differ between runs"
         f"{about_timestep(holdout)}",
     )

@@ -16,10 +16,10 @@ FEWEST_LEFT_OUT = 3
 """Number of windows; fewer may be left out by chance, however few there are."""
 EXACT = 1e-6
 """Residual in typical changes of a stride; smaller ones mean that states were logged without noise."""
-TAILS = "residuals have longer tails than noise has: the intervals are too narrow"
+TAILS = "residuals have longer tails than noise has: the intervals are too narrow, by how much is not known"
 ALIKE = (
     "what the model leaves of a reading is like what it leaves of the next (correlation {:.2f}), as noise is not: the "
-    "intervals are too narrow"
+    "intervals are too narrow, by how much is not known"
 )
 NOT_SETTLED = (
     "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"
