@@ -90,5 +90,7 @@ def test_states_are_noisy_for_contacts_where_residuals_of_single_steps_alternate
     far = np.array([1.0, 1.0, 1.0])  # no excuse for an estimate that errs by far more than noise
     assert not noisy_contacts(bench, far)
     rows = held.transitions
+    loose = replace(held, episode_starts=np.arange(len(held)))
+    assert not noisy_contacts(replace(bench, held_out=loose), point)  # no row follows another
     raised = {name: getattr(rows, name) + np.array([10.0, 0, 0, 0]) for name in ("observation", "next_observation")}
     assert not noisy_contacts(replace(bench, held_out=replace(held, transitions=replace(rows, **raised))), point)

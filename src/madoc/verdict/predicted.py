@@ -86,9 +86,10 @@ def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     those of an estimate whose errors are far larger than noise do not.
     """
     states, rows = logged_states(bench.held_out, bench.simulator.task)
-    if float((bench.simulator.contacts(states[:MOST_ROWS]) > 0).mean()) < TOUCHING:
-        return False
+    seen = states[evenly(np.arange(len(states)), MOST_ROWS)]
     first = evenly(rows[consecutive_rows(bench.held_out, rows)], MOST_ROWS)
+    if not len(first) or float((bench.simulator.contacts(seen) > 0).mean()) < TOUCHING:
+        return False
     pairs = np.stack([_residuals(bench, point, each) for each in (first, first + 1)])
     return sensors.alternation(*pairs[:, np.isfinite(pairs).all((0, 2))]) > sensors.NOISY
 
