@@ -36,6 +36,14 @@ def test_what_is_not_known_is_left_out():
     assert CalibrationResult.from_json(told).covariance is None
 
 
+def test_values_of_the_model_as_given_have_a_column_where_they_are_known():
+    assert "as given" not in str(result())
+    rows = result().parameters
+    given = result(parameters=rows | {"body_mass.foot": replace(rows["body_mass.foot"], given=4.5)})
+    assert "as given" in str(given) and "4.5" in str(given)
+    assert CalibrationResult.from_json(json.loads(json.dumps(given.to_json()))) == given
+
+
 def test_half_a_width_reaches_to_the_end_that_is_not_cut_off():
     cut_off = ParameterEstimate(0.1, 0.3, 0.0, 2.0, "kg", [0.0, 0.7])
     assert cut_off.half_width == pytest.approx(0.6)

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from madoc.report.words import count, duration, memory, number, parameter_title
+from madoc.report.words import count, duration, memory, number, parameter_title, with_error
 
 
 @pytest.mark.parametrize(
@@ -52,3 +52,16 @@ def test_counts_keep_thousands_apart():
 )
 def test_parameters_are_called_by_element_and_quantity(name, title):
     assert parameter_title(name) == title
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "words"),
+    [
+        (-9.80642, 0.00122, "−9.8064 ± 0.0012"),
+        (8.664, 1.48, "8.7 ± 1.5"),
+        (0.5587, 0.0, "0.559"),
+        (float("nan"), 0.1, "–"),
+    ],
+)
+def test_an_error_has_two_digits_and_its_value_as_many_decimals(value, error, words):
+    assert with_error(value, error) == words

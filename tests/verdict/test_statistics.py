@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from madoc.calibration.holdout import PredictionError, PredictionErrors
+from madoc.verdict.mismatch import at_most
 from madoc.verdict.statistics import better_than_chance, hides_gain, independent_groups, interval_of, resampled
 
 
@@ -85,3 +86,7 @@ def test_noise_hides_the_gain_where_mid_range_errs_by_no_more_than_noise_does():
     assert not hides_gain(replace(hidden, nearby_relative=0.5))
     assert not hides_gain(replace(hidden, mid_range=errors(0.12, 0.5)))
     assert not hides_gain(replace(hidden, noise=errors(0.0, 0.0), mid_range=errors(0.0, 0.0)))
+
+
+def test_at_most_is_rounded_up():
+    assert list(map(at_most, (0.1131, 0.01125, 0.011, 0.0))) == ["12 %", "1.2 %", "1.1 %", "0 %"]

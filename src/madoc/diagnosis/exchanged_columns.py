@@ -22,8 +22,8 @@ WINDOWS = 64
 """Largest number of windows that are replayed."""
 FEWEST_WINDOWS = 8
 """Smallest number of windows with which two columns are exchanged; where so many cost too much, none are."""
-PHYSICS_STEPS = 250_000
-"""Largest number of physics steps that all replays take."""
+MOST_STEPS = 60_000
+"""Largest number of control steps that all replays take."""
 _BEYOND = 1.05
 """Largest action over the largest logged one, or over the range; sensors of current read more than the range."""
 _NEGLIGIBLE = 1e-3
@@ -67,7 +67,7 @@ def exchanged_columns(
         contradicts: Whether the finding is to say that no estimate from this log is to be trusted.
     """
     corrections = _corrections(dataset, simulator, exchanged=True)
-    affordable = PHYSICS_STEPS // (steps * len(points) * simulator.task.frame_skip)
+    affordable = MOST_STEPS // (steps * len(points))
     if affordable < FEWEST_WINDOWS * len(corrections):
         corrections = _corrections(dataset, simulator, exchanged=False)
     count = min(WINDOWS, max(FEWEST_WINDOWS, affordable // max(1, len(corrections))))

@@ -31,6 +31,8 @@ SLOPE_LIMIT = 2.0
 NOISY = 0.2
 """Alternation of residuals in [-1, 1]; above it logged states are noisy. Noise alone has about 0.5, and random forces
 as large as it half of that."""
+NOISY_STRIDE = 1e-3
+"""Noise of a channel in its typical changes in a stride; above it logged states are noisy where rows are close."""
 _BY_CHANCE = 3.0
 """Standard errors of a correlation, by which the most negative one of several channels may be so by chance."""
 _SHORTEST = 5

@@ -76,7 +76,7 @@ class Evidence:
         measured: What was logged.
         before: Simulated in the model as given.
         after: Simulated at the estimate.
-        residual_before: Simulated minus measured after one control step, in the model as given.
+        residual_before: Simulated minus measured after a stride of rows, in the model as given.
         residual_after: The same at the estimate.
     """
 

@@ -62,7 +62,7 @@ def number(value: float | None, digits: int = 4) -> str:
 
 def with_error(value: float, error: float) -> str:
     """A value with its standard error, which has two digits, and as many decimals; without one where the error is 0."""
-    if not error or not math.isfinite(error):
+    if not error or not math.isfinite(error) or not math.isfinite(value):
         return number(value, 3)
     size = abs(value) or error
     digits = math.floor(math.log10(size)) - math.floor(math.log10(error)) + 2

@@ -266,7 +266,8 @@ def _how_good(holdout: HoldOut) -> str:
         parts = [each for each in holdout.open_loop if not each.whole and each.relative <= 1.0]
         told = _beside_given(parts[-1]) if parts else _how_small(holdout.errors)
         ahead = f", {in_rows(holdout.errors.estimate[-1].steps)} ahead as well as the sensors' noise allows"
-        return f"{told}{ahead if explains_all(holdout) else ''}{confirmed}"
+        noise_alone = not beyond_noise(holdout.errors.estimate, holdout.errors.noise)
+        return f"{told}{ahead if noise_alone else ''}{confirmed}"
     return (
         "a classifier tells rows of the simulator from those held out with an area of "
         f"{of_area(holdout.area_at_estimate)}, after {of_area(holdout.area_at_mid_range)} at mid-range (0.5 is chance)"

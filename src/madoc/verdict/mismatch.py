@@ -263,7 +263,7 @@ def in_rows(count: int) -> str:
 def at_most(share: float) -> str:
     """A share in percent, rounded up to two digits, or up to a whole number from 99.5 on."""
     digit = 10.0 ** (np.floor(np.log10(max(share, 1e-12))) - 1)
-    return in_percent(float(np.ceil(share / digit - 1e-9) * digit))
+    return in_percent(float(np.ceil(share / digit - 1e-9) * digit + 0.0))
 
 
 def in_percent(share: float) -> str:

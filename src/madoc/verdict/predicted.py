@@ -82,13 +82,17 @@ def noise_hides_gain(bench: Bench) -> bool:
 def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     """Whether bodies touch in the hold-out, and logged states are noisy.
 
-    Replays from these then err by what contacts make of noise. It shows in residuals of single steps that alternate;
-    those of an estimate whose errors are far larger than noise do not.
+    Replays from these then err by what contacts make of noise. It shows in readings that alternate by more than their
+    rounding, and in residuals of single steps that do; those of an estimate with far larger errors do not.
     """
     states, rows = logged_states(bench.held_out, bench.simulator.task)
     seen = states[evenly(np.arange(len(states)), MOST_ROWS)]
     first = evenly(rows[consecutive_rows(bench.held_out, rows)], MOST_ROWS)
-    if not len(first) or float((bench.simulator.contacts(seen) > 0).mean()) < TOUCHING:
+    loud = bench.problem.noise_by_differences > sensors.NOISY_STRIDE * bench.change
+    if not len(first) or not loud.any():
+        return False
+    contacts = bench.simulator.contacts(seen, bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
+    if float((contacts > 0).mean()) < TOUCHING:
         return False
     pairs = np.stack([_residuals(bench, point, each) for each in (first, first + 1)])
     return sensors.alternation(*pairs[:, np.isfinite(pairs).all((0, 2))]) > sensors.NOISY

@@ -61,7 +61,7 @@ class LeastSquares:
     that narrows the intervals and residuals remain noise: where motion is smooth, long windows hold more information,
     and they show model errors. By default states are estimated where they cannot be rebuilt, where the data is declared
     noisy, and where residuals of consecutive rows alternate as noise makes them: a reading that is too high makes the
-    step to it look too long and the step from it too short. Where most windows show contacts and positions are
+    step to it look too long and the step from it too short. Where windows show contacts and positions are
     measured, an ensemble filter takes the place of estimated ones (`filtering`), unless a horizon or windows are given.
 
     Attributes:
@@ -112,7 +112,7 @@ class LeastSquares:
             length=0,
             best=0,
             filtered=filtered,
-            prediction=None if chosen or filtered is not None else predicting.windows_for(problem),
+            prediction=None if chosen or stage == "filtering" else predicting.windows_for(problem),
             finished=0,
         )
 

@@ -69,12 +69,12 @@ NOISE_SETTLED = 0.4
 NOISE_ROUNDS = 3
 """Number of runs of half an ensemble before each of the first epochs, which tell the noise better at little cost."""
 TOUCHING = 0.05
-"""Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts."""
+"""Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts if they are enough."""
 FEW_TOUCH = (0.25, 0.5)
 """Shares in [0, 1] of windows in which bodies touch: below the first, others are left out; below the second, epochs
 have twice as many windows, so that enough of them touch."""
-MOST_SEEN = 2000
-"""Largest number of windows of which it is asked whether bodies touch."""
+FIRST_SEEN, MOST_SEEN = 64, 512
+"""Number of windows of which it is asked first whether bodies touch in any, and largest number of which it is asked."""
 MOST_TOLD = 0.9
 """Share in (0, 1) that counts of what a window tells where no other one tells of a direction."""
 
@@ -86,7 +86,7 @@ class FilterState:
 
     Attributes:
         point: The parameters, in [-1, 1].
-        rows: First rows of the windows, in random order, those in which bodies touch in every block of them.
+        rows: First rows of the windows, in random order, but that as many touch in every block of them.
         size: Number of windows of an epoch, a block of them.
         spread: Differences along each axis of the parameters' covariance, in [-1, 1], in columns.
         noise: Noise of each channel in its typical changes.
@@ -214,8 +214,10 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
     if len(rows) < FEWEST + count:
         return None
     rows = generator(key).permutation(rows)[:MOST_SEEN]
+    if not touched(problem, *states.guesses(), rows[:FIRST_SEEN], horizon).any():
+        return None
     touching = touched(problem, *states.guesses(), rows, horizon)
-    if touching.mean() < TOUCHING:
+    if touching.sum() < max(TOUCHING * len(rows), FEWEST + count):
         return None
     size = max(BLOCK, 2 * (FEWEST + count)) * (1 if touching.mean() >= FEW_TOUCH[1] else 2)
     alone = max(size, int(touching.sum() / FEW_TOUCH[0] - touching.sum()))

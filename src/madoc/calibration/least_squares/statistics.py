@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Int
 from madoc.calibration.base import CalibrationProblem
 from madoc.data import stride
 from madoc.identification.losses import NORMAL_MAD, Loss
-from madoc.identification.noise import OUTLIER, channel_noise
+from madoc.identification.noise import NOISY_STRIDE, OUTLIER, channel_noise
 from madoc.identification.replay import Readings, window_residuals
 from madoc.identification.settling import window_costs
 from madoc.identification.windows import consecutive_rows, windows_at
@@ -16,8 +16,6 @@ LONG_TAILS = 1.1
 Cauchy's loss and 1 with squares."""
 FEWEST_STEADY = 10
 """Smallest number of windows of a kind whose noise is estimated by itself."""
-NOISY_STRIDE = 1e-3
-"""Noise of a channel in its typical changes in a stride; above it logged states are noisy where rows are close."""
 _LARGEST = 3.0
 """Standard deviations of the noise at which residuals are clipped before they are correlated."""
 WIDE = 0.4

@@ -137,7 +137,7 @@ def _fit(near: Sequence[np.ndarray], far: np.ndarray, most: float) -> tuple[floa
 
 
 def residuals(run: Run) -> dict[str, object] | str:
-    """Residuals of one control step, signal by signal."""
+    """Residuals of single steps of the robot, signal by signal."""
     evidence = run.evidence
     if evidence is None:
         return "Nothing was held out, so there are no residuals."
