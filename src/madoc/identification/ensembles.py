@@ -330,13 +330,10 @@ def with_contacts_settled(
     taken, and settles by differences of all `WIDTHS` until residuals of nearly all are noise, and anew where they are
     not: what states in wrong minima leave would pass for what the model lacks.
     """
-    if readings.placed.any():
-        states, simulations = with_bases_settled(simulator, readings, point, guesses)
-        return states, simulations * readings.steps
-    if not _touch(simulator, point, guesses):
-        return guesses, 0
-    guesses, spent = likely_states(dataset, logged, simulator, readings, rows, point, guesses)
-    after = settled(simulator, readings, point, guesses, WIDTHS, ANEW, until_noise=True)
+    likely, spent = likely_states(dataset, logged, simulator, readings, rows, point, guesses)
+    if readings.placed.any() or not _touch(simulator, point, guesses):
+        return likely, spent
+    after = settled(simulator, readings, point, likely, WIDTHS, ANEW, until_noise=True)
     return after.states, spent + after.simulations * readings.steps
 
 
@@ -363,9 +360,13 @@ def likely_states(
 ) -> tuple[Float[np.ndarray, "windows state"], int]:
     """The guess of each window's first state, or that of an ensemble's states there which fits the window better.
 
-    The ensemble has followed the readings before the window, where its episode has as many. Guesses are left as they
-    are where nothing touches, and where no states can be drawn. Also the control steps.
+    The ensemble has followed the readings before the window, where its episode has as many. Bases that no sensor shows
+    settle instead. Guesses are left as they are where nothing touches, and where no states can be drawn. Also the
+    control steps.
     """
+    if readings.placed.any():
+        states, simulations = with_bases_settled(simulator, readings, point, guesses)
+        return states, simulations * readings.steps
     if not (logged.starts_known and can_be_drawn(logged, simulator) and _touch(simulator, point, guesses)):
         return guesses, 0
     before = min(BEFORE * stride(dataset), MOST_BEFORE)

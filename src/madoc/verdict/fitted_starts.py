@@ -14,7 +14,6 @@ from madoc.data import Dataset
 from madoc.identification.ensembles import likely_states
 from madoc.identification.gauss_newton import eliminate
 from madoc.identification.replay import Readings, slopes_at
-from madoc.identification.settling import with_bases_settled
 from madoc.identification.states import LoggedStates, states_of
 from madoc.identification.windows import evenly, rows_that_fit
 from madoc.simulation.base import Simulator
@@ -90,7 +89,8 @@ class FittedReplays:
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
-        begun = [self._begun(first, point) for point in points]
+        log = self.held, self.logged, self.simulator, first, self.rows
+        begun = [likely_states(*log, point, self.near) for point in points]
         states, spent = np.stack([each for each, _ in begun]), sum(count for _, count in begun)
         gaining = np.arange(len(first))
         for _ in range(STEPS_OF_BASES if first.placed.any() else FIT_STEPS):
@@ -111,13 +111,6 @@ class FittedReplays:
             if len(gaining) <= FEW * len(first):
                 break
         return states, spent
-
-    def _begun(self, first: Readings, point: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, "windows state"], int]:
-        """Initial states from which steps begin at a point, and the control steps that it took."""
-        if not first.placed.any():
-            return likely_states(self.held, self.logged, self.simulator, first, self.rows, point, self.near)
-        states, simulations = with_bases_settled(self.simulator, first, point, self.near)
-        return states, simulations * first.steps
 
 
 def replay_steps(logged: LoggedStates, stride: int, parameters: int) -> int:
