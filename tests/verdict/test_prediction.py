@@ -94,3 +94,5 @@ def test_states_are_noisy_for_contacts_where_residuals_of_single_steps_alternate
     assert not noisy_contacts(replace(bench, held_out=loose), point)  # no row follows another
     raised = {name: getattr(rows, name) + np.array([10.0, 0, 0, 0]) for name in ("observation", "next_observation")}
     assert not noisy_contacts(replace(bench, held_out=replace(held, transitions=replace(rows, **raised))), point)
+    late = replace(rows, action=np.roll(np.asarray(rows.action), -1, axis=0))  # the machine acts a row later
+    assert noisy_contacts(replace(bench, held_out=replace(held, transitions=late)), point) == noisy

@@ -36,6 +36,8 @@ MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
 TOUCHING = 0.1
 """Share in [0, 1] of held-out rows in which bodies touch; with more, noise of a state is not small for its motion."""
+FEWEST_FREE = 100
+"""Number of pairs of rows without a contact, from which on they alone tell whether logged states are noisy."""
 
 
 def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
@@ -83,19 +85,36 @@ def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     """Whether bodies touch in the hold-out, and logged states are noisy.
 
     Replays from these then err by what contacts make of noise. It shows in readings that alternate by more than their
-    rounding, and in residuals of single steps that do; those of an estimate with far larger errors do not.
+    rounding, and in residuals of single steps that do; those of an estimate with far larger errors do not. A wrong
+    model of contacts alternates where bodies touch alone: rows in which none do decide, where there are enough. A delay
+    that the model lacks alternates with the actions: the one before a row says nothing of noise, and what it explains
+    does not count.
     """
     states, rows = logged_states(bench.held_out, bench.simulator.task)
-    seen = states[evenly(np.arange(len(states)), MOST_ROWS)]
-    first = evenly(rows[consecutive_rows(bench.held_out, rows)], MOST_ROWS)
+    follows = consecutive_rows(bench.held_out, rows)
+    first = evenly(follows[np.isin(follows - 1, follows)], MOST_ROWS)
     loud = bench.problem.noise_by_differences > sensors.NOISY_STRIDE * bench.change
     if not len(first) or not loud.any():
         return False
-    contacts = bench.simulator.contacts(seen, bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
-    if float((contacts > 0).mean()) < TOUCHING:
+    both = np.concatenate([states[first], states[first + 1]])
+    contacts = bench.simulator.contacts(both, bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
+    touching = contacts.reshape(2, len(first)) > 0
+    if float(touching.mean()) < TOUCHING:
         return False
-    pairs = np.stack([_residuals(bench, point, each) for each in (first, first + 1)])
-    return sensors.alternation(*pairs[:, np.isfinite(pairs).all((0, 2))]) > sensors.NOISY
+    pairs = np.stack([_residuals(bench, point, each) for each in (rows[first], rows[first] + 1)])
+    whole, free = np.isfinite(pairs).all((0, 2)), ~touching.any(0)
+    kept = whole & free if (whole & free).sum() >= FEWEST_FREE else whole
+    actions = np.asarray(bench.held_out.transitions.action)
+    left = [_without(pairs[each, kept], actions[rows[first[kept]] + each - 1]) for each in (0, 1)]
+    return min(sensors.alternation(*pairs[:, kept]), sensors.alternation(*left)) > sensors.NOISY
+
+
+def _without(
+    residuals: Float[np.ndarray, "rows observation"], actions: Float[np.ndarray, "rows action"]
+) -> Float[np.ndarray, "rows observation"]:
+    """What a linear regression on actions leaves of residuals, clipped as `alternation` clips them."""
+    inputs, values = np.column_stack([np.ones(len(actions)), actions]), sensors.clipped(residuals)
+    return values - inputs @ np.linalg.lstsq(inputs, values, rcond=None)[0]
 
 
 class _Replayed(NamedTuple):
