@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 RUNS := $(VENV)/runs
 SEED ?= 0
 TESTS := $(VENV)/tests
+WORKERS := -n auto --maxprocesses 4  # one for each core
 # The oldest and the newest MuJoCo; 4.x by its core, which has all that Madoc imports of it.
 MUJOCO := mujoco==3.8.0 mujoco-core==4.0.1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
@@ -26,16 +27,16 @@ demo: $(RUNS)  ## the main job on an arm with an unknown load: logs, calibration
 	@echo "The paper's robots:                $(BIN)/madoc run hopper-medium --policy-budget 300s"
 
 test: $(TESTS)  ## every test that takes seconds
-	$(BIN)/python -m pytest -n 2 --dist worksteal -rs
+	$(BIN)/python -m pytest $(WORKERS) --dist worksteal -rs
 
 test-slow: $(TESTS)  ## the others
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+	$(BIN)/python -m pytest $(WORKERS) --dist worksteal -m slow
 
 # A folder with one MuJoCo alone, ahead of the locked packages on the path, so that everything else is as in the lock.
 test-versions: $(TESTS)  ## every test that takes seconds, with the oldest and the newest MuJoCo
 	set -e; for one in $(MUJOCO); do folder=$(abspath $(VENV))/$$one; \
 	  test -d $$folder/mujoco || $(PIP) install --no-deps --target $$folder $$one; \
-	  echo "$$one:"; PYTHONPATH=$$folder$${PYTHONPATH:+:$$PYTHONPATH} $(BIN)/python -m pytest -n 2 --dist worksteal -rs; \
+	  echo "$$one:"; PYTHONPATH=$$folder$${PYTHONPATH:+:$$PYTHONPATH} $(BIN)/python -m pytest $(WORKERS) --dist worksteal -rs; \
 	done
 
 WHEEL := $(VENV)/wheel

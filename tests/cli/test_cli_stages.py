@@ -229,6 +229,7 @@ def test_a_log_without_truth_is_calibrated_and_learnt_from(recorded, tmp_path, c
     assert "the target's parameters are not known" in answer["sentence"]
 
 
+@pytest.mark.slow
 def test_a_policy_learnt_from_a_log_is_evaluated_at_the_truth_that_the_log_carries(recorded, tmp_path, capsys):
     words = ["run", "hopper", "--data", recorded, *WHOLE[2:], "--no-yardsticks", "--out", tmp_path / "run"]
     answer, code = asked_for_json(capsys, words)

@@ -105,6 +105,7 @@ def test_auto_leaves_nothing_where_every_method_refuses(log, tmp_path, capsys, m
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_rejected_data_ends_auto_with_a_code_of_its_own(log, tmp_path, capsys):
     whole = data.load(str(log), make("spring"), format=None, max_transitions=None, key=jax.random.key(0))
     order = np.random.default_rng(0).permutation(len(whole))

@@ -72,17 +72,14 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path, kills):
     moments = random.Random(kills)
     budget = 100 * (20 + 40 * kills)
     run = tmp_path / "run"
-    # What the uninterrupted run compiles is kept for the others, for speed; the command line below compiles anew.
-    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
-    cache |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
-    ended(start([TESTS / "calibrating.py", tmp_path / "whole", budget], **cache))
+    ended(start([TESTS / "calibrating.py", tmp_path / "whole", budget]))
     for kill in range(kills):
-        process = start([TESTS / "calibrating.py", run, budget], **cache)
+        process = start([TESTS / "calibrating.py", run, budget])
         # Some moments fall before the first epoch: into imports, into the making of the folder.
         more = 0 if kill % 7 == 6 else 1
         kill_after(process, folder=run, more=more, seconds=moments.uniform(0.0, 0.3 if more else 5.0))
         assert not (run / "result.json").exists()
-    ended(start([TESTS / "calibrating.py", run, budget], **cache))
+    ended(start([TESTS / "calibrating.py", run, budget]))
     assert told(run) == told(tmp_path / "whole")
     assert {path.name for path in run.iterdir()} == {path.name for path in (tmp_path / "whole").iterdir()}
 
