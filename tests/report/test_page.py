@@ -88,7 +88,7 @@ def test_combinations_are_told_with_their_intervals(whole):
 
 def test_a_hold_out_is_told_by_its_own_measure(whole):
     held = content(whole, "holdout")
-    (area,) = (value for title, value in held["facts"] if "area under its curve" in title)
+    (area,) = (value for title, value in held["facts"] if "how well a classifier tells" in title)
     assert area == "0.9 → 0.52"
     assert [name for _, name in held["legend"]][-1] == "estimate"
     file = whole / "calibration" / "result.json"

@@ -88,7 +88,11 @@ def _channel_table(channels: tuple[Channel, ...]) -> Table:
 def _explanation_table(explanation: Explanation, signals: list[str]) -> Table:
     first, *others = map(str, explanation.horizons)
     ahead, both = ", ".join((first, *others)), (0, explanation.best)
-    numbers = [heading for where in ("mid-range", "best draw") for heading in (f"{where}: {first}", *others)]
+    numbers = [
+        heading
+        for where in ("mid-range", f"best of {len(explanation.draws)} draws")
+        for heading in (f"{where}: {first}", *others)
+    ]
     table = _table(f"prediction errors {ahead} steps ahead, in % of what 'nothing changes' errs", ("signal",), numbers)
     for at, name in enumerate(signals):
         table.add_row(name, *(_percent(value) for draw in both for value in explanation.errors[draw, :, at]))
@@ -97,10 +101,14 @@ def _explanation_table(explanation: Explanation, signals: list[str]) -> Table:
 
 
 def _parameter_table(excitation: Excitation, space: ParameterSpace) -> Table:
-    numbers = ("range", "effect of half of it", "expected 95 %", "of its range")
-    table = _table("how well this log can determine each parameter, at best", ("parameter", "unit"), numbers)
+    numbers = ("range", "effect of half of it", "expected 95 %", "its width, of range")
+    table = _table(
+        "how well single rows of this log determine each parameter (a calibration over windows may do better)",
+        ("parameter", "unit"),
+        numbers,
+    )
     for row, effect, width in zip(space.parameters, excitation.effect, excitation.half_width, strict=True):
-        cells = (f"{effect:.3g} × noise", f"± {width:.2g}", f"{100 * width / (row.high - row.low):.2g} %")
+        cells = (f"{effect:.3g} × noise", f"± {width:.2g}", f"{200 * width / (row.high - row.low):.2g} %")
         cells = cells if math.isfinite(width) else ("?", "?", "?")
         table.add_row(row.name, row.unit, f"[{row.low:g}, {row.high:g}]", *cells)
     return table

@@ -78,7 +78,8 @@ def judge(
 
 def _how_sure(holdout: HoldOut) -> str:
     """How wide the widest interval is, as a clause."""
-    return f"no 95 % interval covers more than {at_most(max(holdout.interval_shares.values()))} of its range"
+    widest = max(holdout.interval_shares, key=holdout.interval_shares.__getitem__)
+    return f"the widest 95 % interval, of {widest}, covers {at_most(holdout.interval_shares[widest])} of its range"
 
 
 def _usable(holdout: HoldOut, lacks: Verdict) -> Verdict | None:
@@ -265,7 +266,7 @@ def _how_good(holdout: HoldOut) -> str:
         confirmed = ", and mid-range is confirmed: every interval holds it" if _mid_range_was_right(holdout) else ""
         parts = [each for each in holdout.open_loop if not each.whole and each.relative <= 1.0]
         told = _beside_given(parts[-1]) if parts else _how_small(holdout.errors)
-        ahead = f", {in_rows(holdout.errors.estimate[-1].steps)} ahead as well as the sensors' noise allows"
+        ahead = f", up to {in_rows(holdout.errors.estimate[-1].steps)} ahead as well as the sensors' noise allows"
         noise_alone = not beyond_noise(holdout.errors.estimate, holdout.errors.noise)
         return f"{told}{ahead if noise_alone else ''}{confirmed}"
     return (

@@ -18,8 +18,14 @@ def lacks(run: Run) -> dict[str, object] | str:
         return "No missing term was found, or the log does not tell the robot's states well enough to look for one."
     largest = max((_largest(term) for term in held.missing_terms), default=0.0)
     rows = [_row(term, largest, run.units) for term in held.missing_terms]
+    causes = [term.cause for term in held.missing_terms]
+    for at, cause in enumerate(causes):
+        if causes.count(cause) > 1:
+            rows[at]["cause"] = f"{cause}, shape {1 + causes[:at].count(cause)}"
     alternatives = [_words(each) for each in held.alternatives]
-    return {"rows": rows, "alternatives": alternatives, "largest": number(largest, 2), "certain": number(CERTAIN)}
+    told = {"largest": number(largest, 2), "certain": number(CERTAIN)}
+    none_certain = not any(map(is_certain, held.missing_terms))
+    return {"rows": rows, "alternatives": alternatives, "none_certain": none_certain} | told
 
 
 def _row(term: MissingTerm, largest: float, units: Mapping[str, str]) -> dict[str, object]:

@@ -25,14 +25,14 @@ def holdout(run: Run) -> dict[str, object] | str:
     facts = [("rows held out", count(held.rows)), ("episodes", count(held.episodes))]
     if not isinstance(held, Fitted):
         areas = (held.area_at_mid_range.area, held.area_at_estimate.area)
-        told = "classifier of simulated and logged motion: area under its curve (0.5: it cannot tell them apart)"
+        told = "how well a classifier tells simulated from logged motion, mid-range → calibrated (0.5: not at all)"
         facts.append((told, " → ".join(number(area, 2) for area in areas)))
     data: dict[str, object] = {"facts": facts, "chart": None, "legend": [], "held": held, "units": run.units}
     if isinstance(held, ToldApart) or len(held.errors.estimate) < 2:
         return data
     errors = held.errors
     lines = [
-        _error_line("mid-range", errors.mid_range, "before"),
+        _error_line("mid-range", errors.mid_range, "g3"),
         _error_line("what noise alone leaves", errors.noise, "chance", dashed=True),
         _error_line("the best parameters nearby", errors.nearby_best, "g2"),
         _error_line("estimate", errors.estimate, "after"),
@@ -45,7 +45,11 @@ def holdout(run: Run) -> dict[str, object] | str:
         log=True,
     )
     unit = "a step" if errors.stride == 1 else f"{errors.stride} steps"
-    return data | {"chart": chart, "legend": [(line.colour, line.name) for line in lines], "unit": unit}
+    return data | {
+        "chart": chart,
+        "legend": [(line.colour, f"{line.name}: {number(line.y[-1], 2)}") for line in lines],
+        "unit": unit,
+    }
 
 
 def _error_line(name: str, errors: Sequence[PredictionError], colour: str, *, dashed: bool = False) -> Line:
@@ -119,7 +123,7 @@ def _replayed(evidence: Evidence, signal: int, every: int, whole: Int[np.ndarray
         "hovermode": "x unified",
         "xaxis": {"title": {"text": "time, s"}, "anchor": "y2", "range": ranges["xaxis"][chosen]},
         "yaxis": {"domain": [0.36, 1.0], "range": ranges["yaxis"][chosen]},
-        "yaxis2": {"domain": [0.0, 0.26], "range": ranges["yaxis2"][chosen], "nticks": 3},
+        "yaxis2": {"domain": [0.0, 0.26], "range": ranges["yaxis2"][chosen], "nticks": 6},
         "meta": ranges,
     }
     return drawn({"data": data, "layout": layout}, f"{evidence.signals[signal]}: measured and simulated")

@@ -95,14 +95,7 @@
 
   if (!charts.length) return;
   await unpack(document.getElementById("plotly").textContent);
-  const seen = new IntersectionObserver(
-    (entries) => {
-      for (const { target } of entries.filter((entry) => entry.isIntersecting && !entry.target.data)) draw(target);
-    },
-    { rootMargin: "600px" },
-  );
-  charts.forEach((chart) => seen.observe(chart));
-  /* The others as well once the browser is idle: a page that is saved as a picture has all of them. */
+  /* From the top, whenever the browser is idle: the page can be read meanwhile. */
   const idle = window.requestIdleCallback ?? ((next) => setTimeout(next, 50));
   const rest = () => {
     const next = charts.find((chart) => !chart.data);
