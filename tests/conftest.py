@@ -35,10 +35,10 @@ def _listen(event: str, duration: float, **_: object) -> None:
 jax.monitoring.register_event_duration_secs_listener(_listen)
 
 
-@pytest.fixture(params=["eager", "jitted"])
-def compiled(request):
-    """Wraps a function under test: as it is, or jitted."""
-    return eqx.filter_jit if request.param == "jitted" else lambda function: function
+@pytest.fixture
+def compiled():
+    """Compiles a function under test."""
+    return eqx.filter_jit
 
 
 @pytest.fixture

@@ -102,9 +102,11 @@ def test_causes_are_known_by_their_begin():
     [
         (lambda q, v, u: 0.02, CONSTANT),
         (lambda q, v, u: -0.08 * abs(u) * np.tanh(v / 0.05), LOADED),
-        (lambda q, v, u: -0.06 * np.tanh(v / 0.05) * np.exp(-((v / 0.4) ** 2)), SLOW),
+        pytest.param(
+            lambda q, v, u: -0.06 * np.tanh(v / 0.05) * np.exp(-((v / 0.4) ** 2)), SLOW, marks=pytest.mark.slow
+        ),
         (lambda q, v, u: 0.1 * u * np.sin(q), RIPPLE),
-        (lambda q, v, u: -np.clip(u, -0.03, 0.03), DEAD_ZONE),
+        pytest.param(lambda q, v, u: -np.clip(u, -0.03, 0.03), DEAD_ZONE, marks=pytest.mark.slow),
         (dahl(0.08, rate=10.0), BUILT_UP),
     ],
     ids=["constant", "loaded", "slow", "ripple", "dead zone", "built up"],

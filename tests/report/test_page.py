@@ -90,7 +90,7 @@ def test_a_hold_out_is_told_by_its_own_measure(whole):
     held = content(whole, "holdout")
     (area,) = (value for title, value in held["facts"] if "how well a classifier tells" in title)
     assert area == "0.9 → 0.52"
-    assert [name for _, name in held["legend"]][-1] == "estimate"
+    assert [name for _, name in held["legend"]][-1] == "estimate: 0.1"
     file = whole / "calibration" / "result.json"
     stored = json.loads(file.read_text())
     of_errors, of_areas = ("errors", "explained"), ("area_at_mid_range", "area_at_estimate")
