@@ -88,7 +88,7 @@ class CalibrationProblem:
             "the estimate will be biased by the difference"
         )
         gaps = () if recorded in ("unknown", simulated) else (gap,)
-        findings = (finding.sentence for finding in self.dataset.findings if finding.level == "warning")
+        findings = (finding.sentence for finding in self.dataset.findings if finding.level == "warning" or finding.kept)
         return (*gaps, *self.dataset.disturbance.sentences(), *findings)
 
     def require_pairs(self) -> None:

@@ -20,6 +20,7 @@ class Finding:
         contradicts: Whether the log contradicts the spec, so that no estimate from the two is to be trusted.
         late: How late actions seem to take effect, s, where that is the finding; tests at an estimate may exclude it.
         rough: Whether it is a size that the log alone tells roughly, so that an estimate may refute it.
+        kept: Whether a note is kept with results as a warning is, as it bears on what estimates mean.
     """
 
     level: Level
@@ -29,6 +30,7 @@ class Finding:
     contradicts: bool = False
     late: float = 0.0
     rough: bool = False
+    kept: bool = False
 
     @property
     def sentence(self) -> str:

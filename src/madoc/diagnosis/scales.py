@@ -57,7 +57,7 @@ def scale_findings(
             "no log can show the scale of positions here: were all of them logged too large, and every gain with them, "
             f"the fit would be as good, and {listed(names)} wrong"
         )
-        findings.append(Finding("note", what, "scale", "check one distance with a ruler"))
+        findings.append(Finding("note", what, "scale", "check one distance with a ruler", kept=True))
     return findings
 
 
@@ -69,10 +69,10 @@ def _scale_of_masses(names: list[str], *, only_ratios: bool) -> Finding:
         )
         return Finding("warning", what, "parameters", "take one of them out of the spec, at a value that was measured")
     what = (
-        f"no log can show a gear and all masses scaled alike: {listed(names)} will be found in proportion to the "
+        f"no log can show a gear and all masses scaled alike: {listed(names)} are found in proportion to the "
         "masses and gains that the model takes as known"
     )
-    return Finding("note", what, "scale", "weigh a part, or measure a torque, and put that into the model")
+    return Finding("note", what, "scale", "weigh a part, or measure a torque, and put that into the model", kept=True)
 
 
 def range_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
