@@ -26,8 +26,11 @@ demo: $(RUNS)  ## the main job on an arm with an unknown load: logs, calibration
 	@echo "Your own robot, from its model:    $(BIN)/madoc init robot.xml, then docs/how-to/own-policy.md"
 	@echo "The paper's robots:                $(BIN)/madoc run hopper-medium --policy-budget 300s"
 
+# Whole runs call what the other tests call: annotated shapes, a quarter of their time, are checked in these alone.
+WHOLE := tests/cli tests/conformance tests/faults tests/recovery tests/suites
 test: $(TESTS)  ## every test that takes seconds
-	$(BIN)/python -m pytest $(WORKERS) --dist worksteal -rs
+	SHAPES=0 $(BIN)/python -m pytest $(WORKERS) --dist worksteal -rs $(WHOLE)
+	$(BIN)/python -m pytest $(WORKERS) --dist worksteal -rs $(addprefix --ignore=,$(WHOLE))
 
 test-slow: $(TESTS)  ## the others
 	$(BIN)/python -m pytest $(WORKERS) --dist worksteal -m slow

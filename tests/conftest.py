@@ -1,5 +1,6 @@
 """Strictness for the whole suite, and what tests of equations share."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -21,7 +22,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # of each worker: there is one fo
 os.environ["MUJOCO_GL"] = "disable"  # only tests of pictures draw any
 os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"  # for the processes that tests start
 jax.config.update("jax_numpy_rank_promotion", "raise")
-shapes.check("madoc")  # annotated shapes and types
+if os.environ.get("SHAPES", "1") != "0":
+    shapes.check("madoc")  # annotated shapes and types
+gc.set_threshold(100_000, 20, 100)  # tracing makes very many objects, nearly all of which stay
 
 _TRACE_EVENT = "/jax/core/compile/jaxpr_trace_duration"
 _traces: list[str] = []
