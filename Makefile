@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 RUNS := $(VENV)/runs
 SEED ?= 0
 TESTS := $(VENV)/tests
-WORKERS := -n auto --maxprocesses 4  # one for each core
+WORKERS := -n auto --maxprocesses 4  # one for each core, 4 at most
 # The oldest and the newest MuJoCo; 4.x by its core, which has all that Madoc imports of it.
 MUJOCO := mujoco==3.8.0 mujoco-core==4.0.1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet

@@ -26,11 +26,11 @@ SMALL = [
 VERDICTS = tuple(EXIT_CODES.values())
 
 
-def start(words, **environment):
+def start(words):
     folders = [str(TESTS), str(TESTS.parent / "src")]
     return subprocess.Popen(
         [sys.executable, *map(str, words)],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(folders), "JAX_PLATFORMS": "cpu"} | environment,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(folders), "JAX_PLATFORMS": "cpu"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

@@ -13,7 +13,7 @@ class Finding:
     """One finding about a log.
 
     Attributes:
-        level: `fatal` stops a calibration, `warning` is kept with its result, `note` is printed once.
+        level: `fatal` stops a calibration, `warning` is kept with its result, `note` is printed once, unless `kept`.
         what: The finding, as a clause.
         where: A file, a row, a signal or a parameter; empty where it concerns the whole log.
         do: What to do about it; empty where nothing is to be done.

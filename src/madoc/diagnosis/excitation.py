@@ -200,8 +200,8 @@ def excitation_findings(excitation: Excitation, simulator: Simulator) -> list[Fi
         scaled = excitation.only_ratios and mass_like(parameter)  # that is a finding of its own
         if share > WIDE and parameter.name not in named and not scaled:
             what = (
-                f"the log hardly determines it: expect ± {width:.2g} {parameter.unit} (95 %), {100 * share:.0f} % of "
-                "its range"
+                f"the log hardly determines it: expect ± {width:.2g} {parameter.unit} (95 %), which is "
+                f"{min(200 * share, 100):.0f} % of its range"
             )
             remedy = "excite it more, record longer, or leave it out"
             findings.append(Finding("warning", what, parameter.name, remedy))

@@ -102,13 +102,10 @@ def _explanation_table(explanation: Explanation, signals: list[str]) -> Table:
 
 def _parameter_table(excitation: Excitation, space: ParameterSpace) -> Table:
     numbers = ("range", "effect of half of it", "expected 95 %", "its width, of range")
-    table = _table(
-        "how well single rows of this log determine each parameter (a calibration over windows may do better)",
-        ("parameter", "unit"),
-        numbers,
-    )
+    title = "how well this log determines each parameter, by windows of at most 20 steps (longer ones may do better)"
+    table = _table(title, ("parameter", "unit"), numbers)
     for row, effect, width in zip(space.parameters, excitation.effect, excitation.half_width, strict=True):
-        cells = (f"{effect:.3g} × noise", f"± {width:.2g}", f"{200 * width / (row.high - row.low):.2g} %")
+        cells = (f"{effect:.3g} × noise", f"± {width:.2g}", f"{min(200 * width / (row.high - row.low), 100):.3g} %")
         cells = cells if math.isfinite(width) else ("?", "?", "?")
         table.add_row(row.name, row.unit, f"[{row.low:g}, {row.high:g}]", *cells)
     return table

@@ -36,8 +36,9 @@ MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
 TOUCHING = 0.1
 """Share in [0, 1] of held-out rows in which bodies touch; with more, noise of a state is not small for its motion."""
-FEWEST_FREE = 100
-"""Number of pairs of rows without a contact, from which on they alone tell whether logged states are noisy."""
+FEWEST_FREE = 225
+"""Number of pairs of rows without a contact, from which on they alone tell whether logged states are noisy: of so
+many chance makes an alternation of no more than `noise.NOISY`."""
 
 
 def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
@@ -92,18 +93,20 @@ def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     """
     states, rows = logged_states(bench.held_out, bench.simulator.task)
     follows = consecutive_rows(bench.held_out, rows)
-    first = evenly(follows[np.isin(follows - 1, follows)], MOST_ROWS)
+    first = evenly(follows[np.isin(follows - 1, follows) & np.isin(follows + 1, follows)], MOST_ROWS)
     loud = bench.problem.noise_by_differences > sensors.NOISY_STRIDE * bench.change
     if not len(first) or not loud.any():
         return False
-    both = np.concatenate([states[first], states[first + 1]])
-    contacts = bench.simulator.contacts(both, bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
-    touching = contacts.reshape(2, len(first)) > 0
+    visited = np.concatenate([states[first + later] for later in range(3)])  # by the two steps of a pair
+    contacts = bench.simulator.contacts(visited, bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
+    touching = contacts.reshape(3, len(first)) > 0
     if float(touching.mean()) < TOUCHING:
         return False
     pairs = np.stack([_residuals(bench, point, each) for each in (rows[first], rows[first] + 1)])
     whole, free = np.isfinite(pairs).all((0, 2)), ~touching.any(0)
     kept = whole & free if (whole & free).sum() >= FEWEST_FREE else whole
+    if not kept.any():
+        return False
     actions = np.asarray(bench.held_out.transitions.action)
     left = [_without(pairs[each, kept], actions[rows[first[kept]] + each - 1]) for each in (0, 1)]
     return min(sensors.alternation(*pairs[:, kept]), sensors.alternation(*left)) > sensors.NOISY

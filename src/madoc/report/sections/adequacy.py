@@ -6,7 +6,7 @@ from madoc.identification.combinations import Combination
 from madoc.identification.term_tests import Alternative, MissingTerm
 from madoc.report.reading import Run
 from madoc.report.words import interval_words, number, parameter_title, percent, unit_words, with_error
-from madoc.verdict.adequacy import CERTAIN, is_certain
+from madoc.verdict.adequacy import CERTAIN, is_certain, numerical
 
 
 def lacks(run: Run) -> dict[str, object] | str:
@@ -24,7 +24,7 @@ def lacks(run: Run) -> dict[str, object] | str:
             rows[at]["cause"] = f"{cause}, shape {1 + causes[:at].count(cause)}"
     alternatives = [_words(each) for each in held.alternatives]
     told = {"largest": number(largest, 2), "certain": number(CERTAIN)}
-    none_certain = not any(map(is_certain, held.missing_terms))
+    none_certain = bool(rows) and numerical(held) is None and not any(map(is_certain, held.missing_terms))
     return {"rows": rows, "alternatives": alternatives, "none_certain": none_certain} | told
 
 

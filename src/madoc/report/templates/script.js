@@ -97,9 +97,12 @@
   await unpack(document.getElementById("plotly").textContent);
   /* From the top, whenever the browser is idle: the page can be read meanwhile. */
   const idle = window.requestIdleCallback ?? ((next) => setTimeout(next, 50));
+  const left = [...charts];
   const rest = () => {
-    const next = charts.find((chart) => !chart.data);
-    if (next) draw(next), idle(rest);
+    const next = left.shift();
+    if (!next) return;
+    idle(rest); /* before the drawing: a chart that fails leaves the others */
+    if (!next.data) draw(next);
   };
   idle(rest);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => charts.filter((chart) => chart.data).forEach(draw));
