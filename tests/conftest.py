@@ -38,10 +38,10 @@ def _listen(event: str, duration: float, **_: object) -> None:
 jax.monitoring.register_event_duration_secs_listener(_listen)
 
 
-@pytest.fixture
-def compiled():
-    """Compiles a function under test."""
-    return eqx.filter_jit
+@pytest.fixture(params=["jitted", pytest.param("eager", marks=pytest.mark.slow)])
+def compiled(request):
+    """Wraps a function under test: jitted, or as it is."""
+    return eqx.filter_jit if request.param == "jitted" else lambda function: function
 
 
 @pytest.fixture

@@ -93,7 +93,13 @@ def test_velocities_that_are_differences_of_noisy_positions_are_not_taken_for_st
     assert said.word == "CALIBRATED", said.sentence
 
 
-@pytest.mark.parametrize(("robot", "how"), [("spring", "next"), ("arm", "rows")])
+@pytest.mark.parametrize(
+    ("robot", "how"),
+    [
+        *(("spring", "next"), ("arm", "rows")),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in (("spring", "rows"), ("arm", "next"))),
+    ],
+)
 def test_shuffled_next_observations_are_rejected_whatever_the_estimate(robot, how):
     task, truth = ROBOTS[robot]
     judged = bench(shuffled(log_of(robot), how), task)

@@ -36,9 +36,6 @@ MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
 TOUCHING = 0.1
 """Share in [0, 1] of held-out rows in which bodies touch; with more, noise of a state is not small for its motion."""
-FEWEST_FREE = 225
-"""Number of pairs of rows without a contact, from which on they alone tell whether logged states are noisy: of so
-many chance makes an alternation of no more than `noise.NOISY`."""
 
 
 def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
@@ -86,30 +83,26 @@ def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     """Whether bodies touch in the hold-out, and logged states are noisy.
 
     Replays from these then err by what contacts make of noise. It shows in readings that alternate by more than their
-    rounding, and in residuals of single steps that do; those of an estimate with far larger errors do not. A wrong
-    model of contacts alternates where bodies touch alone: rows in which none do decide, where there are enough. A delay
-    that the model lacks alternates with the actions: the one before a row says nothing of noise, and what it explains
-    does not count.
+    rounding, and in residuals of single steps that do; those of an estimate with far larger errors do not. A delay that
+    the model lacks alternates with the actions: the one before a row says nothing of noise, and what it explains does
+    not count.
     """
     states, rows = logged_states(bench.held_out, bench.simulator.task)
+    seen = states[evenly(np.arange(len(states)), MOST_ROWS)]
     follows = consecutive_rows(bench.held_out, rows)
-    first = evenly(follows[np.isin(follows - 1, follows) & np.isin(follows + 1, follows)], MOST_ROWS)
+    first = rows[evenly(follows[np.isin(follows - 1, follows)], MOST_ROWS)]
     loud = bench.problem.noise_by_differences > sensors.NOISY_STRIDE * bench.change
     if not len(first) or not loud.any():
         return False
-    visited = np.concatenate([states[first + later] for later in range(3)])  # by the two steps of a pair
-    contacts = bench.simulator.contacts(visited, bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
-    touching = contacts.reshape(3, len(first)) > 0
-    if float(touching.mean()) < TOUCHING:
+    contacts = bench.simulator.contacts(seen, bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
+    if float((contacts > 0).mean()) < TOUCHING:
         return False
-    pairs = np.stack([_residuals(bench, point, each) for each in (rows[first], rows[first] + 1)])
-    whole, free = np.isfinite(pairs).all((0, 2)), ~touching.any(0)
-    kept = whole & free if (whole & free).sum() >= FEWEST_FREE else whole
-    if not kept.any():
+    pairs = np.stack([_residuals(bench, point, each) for each in (first, first + 1)])
+    whole, actions = np.isfinite(pairs).all((0, 2)), np.asarray(bench.held_out.transitions.action)
+    if not whole.any():
         return False
-    actions = np.asarray(bench.held_out.transitions.action)
-    left = [_without(pairs[each, kept], actions[rows[first[kept]] + each - 1]) for each in (0, 1)]
-    return min(sensors.alternation(*pairs[:, kept]), sensors.alternation(*left)) > sensors.NOISY
+    left = [_without(pairs[each, whole], actions[first[whole] + each - 1]) for each in (0, 1)]
+    return min(sensors.alternation(*pairs[:, whole]), sensors.alternation(*left)) > sensors.NOISY
 
 
 def _without(
