@@ -66,5 +66,6 @@ def start(words, **options):
 def without_seconds(value):
     """JSON without what differs between two runs of the same thing: seconds and the folder."""
     if isinstance(value, dict):
-        return {name: without_seconds(child) for name, child in value.items() if name not in ("seconds", "folder")}
+        differing = ("seconds", "judging_seconds", "folder")
+        return {name: without_seconds(child) for name, child in value.items() if name not in differing}
     return [without_seconds(child) for child in value] if isinstance(value, list) else value

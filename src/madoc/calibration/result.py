@@ -60,7 +60,8 @@ class CalibrationResult:
         status: `finished` (the budget is spent), `converged`, `interrupted` or `diverged`.
         sentence: The status in words.
         control_steps: Simulated control steps of any kind.
-        seconds: Wall-clock time.
+        seconds: Wall-clock time of the search.
+        judging_seconds: Wall-clock time of judging it on held-out rows; 0 where none were.
         seed: Seed of the random key.
         groups: Names of the parameters that were calibrated together.
         parameters: Estimates by name.
@@ -97,6 +98,7 @@ class CalibrationResult:
     settled: bool = True
     unlike_noise: bool = False
     effective: bool = False
+    judging_seconds: float = 0.0
     group_stability: float | None = None
     chosen: str | None = None
     verdict: Verdict | None = None
@@ -211,9 +213,10 @@ class CalibrationResult:
 
     def summary(self) -> str:
         """Status, cost, error and warnings, one line each."""
+        judging = f" and {self.judging_seconds:.0f} s of judging" if self.judging_seconds else ""
         lines = [
             f"{self.status}: {self.sentence}",
-            f"{self.control_steps:,} control steps, {self.seconds:.0f} s, seed {self.seed}",
+            f"{self.control_steps:,} control steps in {self.seconds:.0f} s{judging}, seed {self.seed}",
         ]
         if self.error:
             lines.append(

@@ -13,6 +13,11 @@ from madoc.simulation.mjcf import Change
 
 OF_PATCH = "What a calibration changed in the model, and how sure it is."
 """The first line of a patch."""
+OF_RANGES = (
+    "Ranges to randomize in; each is a normal distribution cut off at low and high, whose std is that of its 95 % "
+    "interval."
+)
+"""The first line of a file of ranges; an interval is wider than a patch's std says where the model may lack a term."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ def save_randomization(
         content["drawn_independently"] = independent
     if covariance is not None:
         content["covariance"] = {"order": [each.parameter.name for each in exported], "rows": covariance}
-    _write(path, "Ranges to randomize in; each is a normal distribution cut off at low and high.", content)
+    _write(path, OF_RANGES, content)
 
 
 def save_sysid_parameters(path: Path, exported: Sequence[Exported]) -> None:
@@ -132,7 +137,7 @@ def _distribution(exported: Exported) -> dict[str, object]:
         "low": float(min(max(low, row.low), row.estimate)),
         "high": float(max(min(high, row.high), row.estimate)),
         "mean": row.estimate,
-        "std": row.std,
+        "std": row.half_width / NORMAL_95,
         "unit": row.unit,
         "from": "95 % interval" if row.interval else "1.96 standard deviations",
     }

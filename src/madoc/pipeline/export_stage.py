@@ -82,10 +82,8 @@ def export_run(
     own = [nominal_values(model, parameter) for parameter in simulator.parameters.parameters]
     lost = losses(_evidence(calibrated), simulator, result.mean, own, draws)
     exported = [
-        Exported(parameter, replace(result.parameters[parameter.name], std=std), values, left_out)
-        for parameter, std, values, left_out in zip(
-            simulator.parameters.parameters, np.sqrt(np.diag(covariance)).tolist(), own, lost.left_out, strict=True
-        )
+        Exported(parameter, result.parameters[parameter.name], values, left_out)
+        for parameter, values, left_out in zip(simulator.parameters.parameters, own, lost.left_out, strict=True)
     ]
     files = {
         "model": folder / "model.xml",

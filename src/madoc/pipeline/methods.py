@@ -95,7 +95,9 @@ def choose(
         except MadocError as error:
             refusals.append(f"{name} refuses: {error}")
             continue
-        why = "; ".join(refusals) or "the robot's states can be had from the log or fitted to it"
+        had = problem.states.kind == "exact"
+        states = "the log has the robot's states" if had else "the robot's states can be fitted to the log"
+        why = "; ".join(refusals) or states
         return name, f"auto took {name}: {why}"
     raise MadocError("; ".join(refusals))
 

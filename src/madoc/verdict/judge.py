@@ -34,6 +34,8 @@ GAINED = 0.75
 MUCH_BETTER = 0.8
 """Error of open-loop predictions over that of the model as given, at or below which an estimate is of use though the
 model lacks something."""
+WORSE_SIGNAL = 1.1
+"""Error of one signal over that of the model as given, above which the sentence names the signal."""
 
 
 def judge(
@@ -109,11 +111,13 @@ def _much_better(holdout: HoldOut) -> list[OpenLoop]:
 
 
 def _beside_given(found: OpenLoop) -> str:
-    """How small open-loop errors are beside those of the model as given."""
+    """How small open-loop errors are beside those of the model as given, and of which signals they are larger."""
     low, high = map(in_percent, found.relative_interval)
+    worse = [name for name, error in found.estimate.items() if error > WORSE_SIGNAL * found.as_given[name]]
+    but = f", but {', '.join(worse)} with more" if worse else ""
     return (
         f"over {found.seconds:.3g} s held-out motion is predicted with {in_percent(found.relative)} of the error of "
-        f"the model as given (95 % interval {low} to {high})"
+        f"the model as given (95 % interval {low} to {high}){but}"
     )
 
 

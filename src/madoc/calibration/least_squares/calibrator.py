@@ -137,9 +137,7 @@ class LeastSquares:
             state, epoch = self._then_predicting(problem, state, epoch)
         if not state.finished:
             return state, epoch
-        steps = state.filtered.epochs if state.filtered and state.stage == "filtering" else self._fitted(state).epochs
-        converged = f"after {steps} iterations another one would hardly change any estimate"
-        return state, replace(epoch, converged=converged)
+        return state, replace(epoch, converged="another iteration would hardly change any estimate")
 
     def _then_predicting(
         self, problem: CalibrationProblem, state: LeastSquaresState, epoch: Epoch

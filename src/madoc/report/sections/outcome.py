@@ -7,7 +7,7 @@ from madoc.report.words import count, duration, memory
 
 POLICIES = {
     "calibrated": ("calibrated", "after"),
-    "midrange": ("mid-range, uncalibrated", "before"),
+    "midrange": ("mid-range, uncalibrated", "g3"),
     "truth": ("truth, a yardstick", "truth"),
     "distribution": ("over the calibrated distribution", "after"),
 }
@@ -28,32 +28,32 @@ def cost(run: Run) -> dict[str, object] | str:
     """What the calibration took."""
     if run.result is not None:
         steps, seconds = float(run.result.control_steps), run.result.seconds
+        judging = run.result.judging_seconds
     elif run.log is not None:
-        steps, seconds = float(run.log.spent[-1]), float(run.log.seconds[-1])
+        steps, seconds, judging = float(run.log.spent[-1]), float(run.log.seconds[-1]), 0.0
     else:
         return "The run has not ended, and kept no log."
-    facts = [("control steps simulated", count(steps)), ("wall-clock time", duration(seconds))]
+    facts = [("control steps simulated", count(steps)), ("time of the search", duration(seconds))]
+    if judging:
+        facts.append(("time of judging on held-out rows", duration(judging)))
     if seconds > 0 and steps:
         facts.append(("control steps a second, all in", count(steps / seconds)))
     if run.log is not None:
         facts.append(("epochs", count(len(run.log))))
     if run.result is not None:
         facts.append(("most memory held", "not known" if run.peak_memory is None else memory(run.peak_memory)))
-    return {"facts": facts, "stages": [] if run.log is None else _stages(run.log)}
+    return {"facts": facts, "stages": [] if run.log is None else _stages(run.log, judging)}
 
 
-def _stages(log: MetricLog) -> list[dict[str, object]]:
-    """Seconds and steps of each stage."""
+def _stages(log: MetricLog, judging: float) -> list[dict[str, object]]:
+    """Seconds and steps of each stage, and the seconds of judging."""
     costs = log.by_stage()
-    total = sum(cost.seconds for cost in costs.values()) or 1.0
-    return [
-        {
-            "name": name,
-            "share": cost.seconds / total,
-            "words": f"{duration(cost.seconds)}, {count(cost.spent)} {log.unit}",
-        }
-        for name, cost in costs.items()
-    ]
+    words = {name: f"{duration(cost.seconds)}, {count(cost.spent)} {log.unit}" for name, cost in costs.items()}
+    seconds = {name: cost.seconds for name, cost in costs.items()}
+    if judging:
+        words["judging"], seconds["judging"] = duration(judging), judging
+    total = sum(seconds.values()) or 1.0
+    return [{"name": name, "share": seconds[name] / total, "words": words[name]} for name in words]
 
 
 def asked(run: Run) -> dict[str, object] | str:
