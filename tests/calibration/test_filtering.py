@@ -265,7 +265,7 @@ def test_a_foot_that_slides_under_noise(tmp_path):
     assert estimate.settled and not estimate.unlike_noise
     found = state.filtered.noise * problem.typical_change
     np.testing.assert_allclose(found, [*NOISE.values()], rtol=0.4)
-    assert any("predicted by an ensemble filter" in warning for warning in estimate.warnings)
+    assert any("predicted by an ensemble filter" in note for note in estimate.notes)
     wrong = replace(state, filtered=replace(state.filtered, alike=0.3))
     doubtful = method.estimate(problem, wrong)
     assert doubtful.unlike_noise and any("(correlation 0.30)" in warning for warning in doubtful.warnings)

@@ -56,7 +56,7 @@ def test_least_squares_is_exact_on_exact_encoders(arm):
     said = (
         r"the initial state of each window of \d+ control steps was estimated with the parameters, as states cannot be"
     )
-    assert re.match(said + " rebuilt from the data", result.warnings[0])
+    assert re.match(said + " rebuilt from the data", result.notes[0])
 
 
 DELAYED = """\

@@ -120,6 +120,7 @@ class Estimate:
         groups: Indices of the parameters that were calibrated together; empty means one group of all.
         failures: Number of simulated rows that diverged and were left out.
         warnings: Reasons to doubt the estimate, one sentence each.
+        notes: How the data was taken and why, one sentence each, of which nothing follows for the user.
         covariance: Covariance of the estimates, with `std` squared on its diagonal; None where it is unknown.
         interval: 95 % confidence intervals, columns low and high; None where they are unknown.
         quantile: Standard errors in half of such an interval, before an end of the range cuts it off.
@@ -137,6 +138,7 @@ class Estimate:
     groups: tuple[tuple[int, ...], ...] = ()
     failures: int = 0
     warnings: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = field(default=())
     covariance: Float[np.ndarray, "d d"] | None = None
     interval: Float[np.ndarray, "d 2"] | None = None
     quantile: float = NORMAL_95

@@ -66,6 +66,7 @@ class CalibrationResult:
         groups: Names of the parameters that were calibrated together.
         parameters: Estimates by name.
         warnings: Reasons to doubt the estimate, one sentence each.
+        notes: How the method took the data and why, one sentence each.
         error: `mean_absolute`, `mean_percent_of_range` and `per_parameter`; None where the truth was not given.
         covariance: Covariance of the estimates in physical units, in the task's order; None where it is unknown.
         combinations: Sums and products of parameters that the log tells though it leaves each of them open.
@@ -92,6 +93,7 @@ class CalibrationResult:
     groups: list[list[str]]
     parameters: dict[str, ParameterEstimate]
     warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     error: dict[str, Any] | None = None
     covariance: list[list[float]] | None = None
     combinations: list[Combination] = field(default_factory=list)
@@ -230,6 +232,7 @@ class CalibrationResult:
                 f"{len(self.groups)} groups; adjusted Rand index with those found again {self.group_stability:.2f}"
             )
         lines += [f"told in combination: {told}" for told in self.combinations]
+        lines += [f"note: {note}" for note in self.notes]
         return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
 
     def __str__(self) -> str:

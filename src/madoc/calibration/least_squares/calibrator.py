@@ -204,11 +204,12 @@ class LeastSquares:
             std=np.sqrt(np.diag(covariance)),
             groups=(tuple(range(len(space))),),
             failures=sum(search.failures for search in searches),
+            notes=self._notes(problem, state),
             warnings=(
                 *identifiability(uncertainty, space.names),
                 *at_end_of_range(point, space),
                 *(() if found.settled else (sentences.NOT_SETTLED,)),
-                *self._about_states(problem, state),
+                *self._about_residuals(problem, state),
                 *((sentences.PREDICTS,) if progress == "better" else ()),
                 *((sentences.STILL_PREDICTING,) if progress == "under way" else ()),
             ),
@@ -370,15 +371,25 @@ class LeastSquares:
                 return longer
         return None
 
-    def _about_states(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
-        """Sentences on estimated initial states, unless the user asked for them."""
+    def _notes(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
+        """A sentence on estimated initial states, unless the user asked for them."""
         if state.stage == "filtering":
             assert state.filtered is not None
-            return sentences.about_filtered_states(problem, state.filtered)
+            return (sentences.about_filtered_states(problem, state.filtered),)
         if not state.estimates_starts or self.initial_states is not None:
             return ()
-        best, horizon = state.unknown[state.best], self._unknown(problem, state.best).horizon
-        about = (sentences.about_estimated_states(problem, best, horizon), *sentences.about_residuals(problem, best))
+        horizon = self._unknown(problem, state.best).horizon
+        return (sentences.about_estimated_states(problem, state.unknown[state.best], horizon),)
+
+    def _about_residuals(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
+        """Sentences on what estimated initial states leave, unless the user asked for them."""
+        if state.stage == "filtering":
+            assert state.filtered is not None
+            return sentences.about_surprises(state.filtered)
+        if not state.estimates_starts or self.initial_states is not None:
+            return ()
+        best = state.unknown[state.best]
+        about = sentences.about_residuals(problem, best)
         if float(best.deviation.max()) < sentences.EXACT:
             return about
         if state.stage == "lengthening" and not state.searched:

@@ -1,4 +1,4 @@
-"""The warnings that least squares adds to an estimate."""
+"""The warnings and notes that least squares adds to an estimate."""
 
 import numpy as np
 from jaxtyping import Float
@@ -46,17 +46,21 @@ def about_estimated_states(problem: CalibrationProblem, search: SearchState, hor
     return f"{sentence}; {_how_large(problem, search.deviation)}, and the intervals allow for it"
 
 
-def about_filtered_states(problem: CalibrationProblem, search: FilterState) -> tuple[str, ...]:
-    """Sentences that readings were predicted by an ensemble filter, why, how large the noise is and its tails."""
+def about_filtered_states(problem: CalibrationProblem, search: FilterState) -> str:
+    """A sentence that readings were predicted by an ensemble filter, why, and how large the noise is."""
     sentence = (
         f"every reading in windows of {horizon_of(problem)} control steps was predicted by an ensemble filter from "
         f"those before it, as {_why_states_are_not_known(problem)}, and bodies touch"
     )
     if not search.epochs:
-        return (sentence,)
+        return sentence
+    return f"{sentence}; {_how_large(problem, search.noise)}, and the intervals allow for it"
+
+
+def about_surprises(search: FilterState) -> tuple[str, ...]:
+    """Sentences on what prediction errors of an ensemble filter have that noise has not."""
     unlike = [TAILS] * (search.cost > LONG_TAILS) + [ALIKE.format(search.alike)] * (search.alike > WHITE)
-    left = unlike if search.found.unlike_noise else []
-    return (f"{sentence}; {_how_large(problem, search.noise)}, and the intervals allow for it", *left)
+    return tuple(unlike) if search.found.unlike_noise else ()
 
 
 def _why_states_are_not_known(problem: CalibrationProblem) -> str:
