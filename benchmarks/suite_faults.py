@@ -137,7 +137,7 @@ def compared(whole: Path, killed: Path) -> dict:
 def bits(folder: Path) -> tuple:
     """What a calibration found, without seconds: its result, its log, and the windows that show it."""
     result = json.loads((folder / "result.json").read_text())
-    del result["seconds"]
+    del result["seconds"], result["judging_seconds"]
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     with np.load(folder / "evidence.npz") as arrays:
         evidence = {name: arrays[name].tobytes() for name in arrays}

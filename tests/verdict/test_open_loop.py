@@ -67,6 +67,14 @@ def test_errors_are_those_of_stepping_on_from_the_log_in_the_signals_own_units()
     assert list(first.mid_range.values()) == pytest.approx(np.sqrt((np.square(errors)).mean((0, 1))))
 
 
+def test_noise_of_the_states_where_predictions_begin_counts_for_nothing_once_they_are_fitted():
+    bench = bench_of(Disturbance(noise=0.3))
+    logged, fitted = (open_loop(bench, at_truth(bench), fits_starts=fits)[-2] for fits in (False, True))
+    assert fitted.seconds == logged.seconds
+    assert all(fitted.estimate[name] < 0.9 * logged.estimate[name] for name in fitted.estimate)
+    assert fitted.estimate["observation[0]"] < 1.2 * bench.problem.noise_by_differences[0]
+
+
 def test_loose_rows_are_not_predicted_over_time():
     bench = bench_of(Disturbance(shuffled="rows"))
     assert open_loop(bench, at_truth(bench)) == ()
@@ -76,6 +84,6 @@ def test_a_simulation_that_fails_counts_as_the_worst_that_does_not(monkeypatch):
     bench = bench_of()
     residuals = np.full((3, 6, 4, 2), 0.1)
     residuals[0], residuals[2, :, 1:] = 40.0, np.nan  # the model as given drifts far, the estimate blows up
-    monkeypatch.setattr(module, "_exact", lambda *_: (residuals, np.arange(6) * 50))
+    monkeypatch.setattr(module, "_from_logged", lambda *_: (residuals, np.arange(6) * 50))
     first = open_loop(bench, at_truth(bench))[0]
     assert first.relative == pytest.approx(np.sqrt((3 * 40.0**2 + 0.1**2) / 4) / 40.0)

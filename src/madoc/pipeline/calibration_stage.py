@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from madoc.calibration import CalibrationResult, calibrate
+from madoc.calibration.holdout import Fitted
 from madoc.pipeline.folders import ENDED, working_folder
 from madoc.pipeline.keys import seed_key
 from madoc.pipeline.methods import choose, hyperparameters, methods_for
@@ -63,7 +64,8 @@ def calibrate_in(
                 bench = replace(prepared.bench, until=judged_by, rate=max(rate, 1.0), tell=tell)
                 result = assess(result, bench).result
                 tell("whole runs")
-                arrays = evidence(bench, result.mean, control_step=prepared.simulator.control_step)
+                fits_starts, step = isinstance(result.holdout, Fitted), prepared.simulator.control_step
+                arrays = evidence(bench, result.mean, control_step=step, fits_starts=fits_starts)
             result = replace(result, judging_seconds=time.monotonic() - began_judging)
             save_evidence(out / "evidence.npz", arrays)
         folder.write_json("result.json", result.to_json())

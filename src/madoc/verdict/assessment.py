@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration import CalibrationProblem, CalibrationResult
-from madoc.calibration.holdout import HoldOut, ToldApart, Verdict
+from madoc.calibration.holdout import Fitted, HoldOut, ToldApart, Verdict
 from madoc.data import Dataset
 from madoc.errors import MadocError
 from madoc.simulation.base import Simulator
@@ -76,7 +76,7 @@ def assess(
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
     holdout = measured(bench, result.mean, result.interval)
     if bench.begins("predictions over longer times"):
-        holdout = replace(holdout, open_loop=open_loop(bench, point))
+        holdout = replace(holdout, open_loop=open_loop(bench, point, fits_starts=isinstance(holdout, Fitted)))
     widened = with_widened_intervals(result, holdout)
     verdict = judge(
         holdout,

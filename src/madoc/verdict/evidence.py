@@ -29,7 +29,9 @@ Runs = tuple[Float[np.ndarray, "told state"], Int[np.ndarray, " runs"], Int[np.n
 """The state of each run at its first row, if the log tells states; that row, and the number of control steps."""
 
 
-def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float) -> dict[str, np.ndarray]:
+def evidence(
+    bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float, fits_starts: bool = False
+) -> dict[str, np.ndarray]:
     """Arrays of whole held-out runs by name, as many runs as there is time for; NaN behind the end of a run.
 
     There are always `signals` (names), `scale` (typical change in a stride, in each signal's unit), `time` (s) since
@@ -38,14 +40,15 @@ def evidence(bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float
     model as it was given and at the estimate under the logged actions, without another look at the log (NaN once a
     simulation has failed), `posture_measured`, `posture_before` and `posture_after` (runs, times, qpos); for replays
     with other parameters `start` (runs, state), at the estimate, and `actions` (runs, steps, action). Runs start at the
-    first logged state, or where velocities are hidden or noisy at one fitted to the first `fitted` rows. Where states
+    first logged state, or at one fitted to the first `fitted` rows where velocities are hidden, or readings so noisy
+    that the hold-out was judged from fitted states (`fits_starts`). Where states
     are known there are `residual_before` and `residual_after` (windows, signals), simulated minus measured observations
     after the shortest horizon.
     `mean` is the estimate in physical units, `control_step` the time between two rows in s.
     """
     held, simulator = bench.held_out, bench.simulator
     most = int(np.clip(SECONDS * bench.rate, *ROWS))
-    fitted = 0 if bench.states_known else FITTED * stride(bench.problem.dataset)
+    fitted = 0 if bench.states_known and not fits_starts else FITTED * stride(bench.problem.dataset)
     states, first, lengths = _runs(bench, fitted, most)
     steps = int(lengths.max())
     kept = np.minimum(np.arange(steps), lengths[:, None] - 1)  # the last row again, behind the end of a run

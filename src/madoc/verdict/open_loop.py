@@ -5,6 +5,7 @@ second and whole runs stand beside those of the user's own model as it was given
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -32,19 +33,22 @@ FAILED = 10.0
 """Least error, in typical changes of a stride, once a simulation has failed; it is the worst of any that has not."""
 
 
-def open_loop(bench: Bench, point: Float[np.ndarray, " d"]) -> tuple[OpenLoop, ...]:
+def open_loop(bench: Bench, point: Float[np.ndarray, " d"], *, fits_starts: bool = False) -> tuple[OpenLoop, ...]:
     """Errors of open-loop predictions of the hold-out at an estimate in [-1, 1], one record for each length of time.
 
+    Predictions begin at logged states, or at fitted ones where these are not known or `fits_starts`, as they are noisy.
     There are none where the log tells no states to begin at, and none of a length that no held-out stretch has.
     """
     if bench.states.kind == "unknown" or bench.held_out.disturbance.shuffled != "none":
         return ()
     given, held, step = as_given(bench.simulator), bench.held_out, bench.simulator.control_step
-    before = 0 if bench.states_known else FITTED * stride(bench.problem.dataset)
+    fits_starts = fits_starts or not bench.states_known
+    before = FITTED * stride(bench.problem.dataset) if fits_starts else 0
+    predicted = partial(_from_fitted if fits_starts else _from_logged, bench, given, point)
     whole = int(np.median(held.episode_ends - held.episode_starts)) - before
     lengths = {max(1, round(seconds / step)) for seconds in SECONDS} | {whole}
-    found = (_over(bench, given, point, steps, whole=steps == whole) for steps in sorted(lengths) if 0 < steps <= whole)
-    return tuple(each for each in found if each is not None)
+    found = ((steps, predicted(steps)) for steps in sorted(lengths) if 0 < steps <= whole)
+    return tuple(_record(bench, *errors, steps, whole=steps == whole) for steps, errors in found if errors is not None)
 
 
 def as_given(simulator: Simulator) -> Simulator:
@@ -66,14 +70,15 @@ def _own(parameter: Parameter, values: tuple[float, ...]) -> list[Parameter]:
     ]
 
 
-def _over(
-    bench: Bench, given: Simulator, point: Float[np.ndarray, " d"], steps: int, *, whole: bool
-) -> OpenLoop | None:
-    """The errors over windows of so many control steps; None where the hold-out has none as long."""
-    found = (_exact if bench.states_known else _from_fitted)(bench, given, point, steps)
-    if found is None:
-        return None
-    residuals, rows = found
+def _record(
+    bench: Bench,
+    residuals: Float[np.ndarray, "models windows steps channels"],
+    rows: Int[np.ndarray, " windows"],
+    steps: int,
+    *,
+    whole: bool,
+) -> OpenLoop:
+    """The errors over windows of so many control steps, which begin at the rows."""
     known = np.isfinite(residuals)
     worst = np.maximum(np.abs(np.where(known, residuals, 0.0)).max((0, 1, 2)), FAILED)
     size, units = np.where(known, residuals, worst), bench.change[: residuals.shape[-1]]
@@ -96,10 +101,13 @@ def _over(
     )
 
 
-def _exact(
+def _from_logged(
     bench: Bench, given: Simulator, point: Float[np.ndarray, " d"], steps: int
 ) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
-    """Residuals from logged states as given, at mid-range and at the estimate, and the rows where windows begin."""
+    """Residuals from logged states as given, at mid-range and at the estimate, and the rows where windows begin.
+
+    None where the hold-out has no run as long.
+    """
     held = bench.held_out
     states, rows = logged_states(held, bench.simulator.task)
     possible = rows_that_fit(held, rows, steps)
