@@ -23,7 +23,6 @@ from madoc.calibration.least_squares.instruments import (
     shares_of,
 )
 from madoc.data import Disturbance, disturb
-from madoc.identification import settling
 from madoc.identification.ensembles import (
     BEFORE,
     DRAWN,
@@ -40,7 +39,7 @@ from madoc.identification.ensembles import (
 )
 from madoc.identification.information import BOX_VARIANCE
 from madoc.identification.replay import Readings
-from madoc.identification.settling import ANEW, RESETTLING, settled
+from madoc.identification.settling import RESETTLING, settled, settled_to_noise
 from madoc.identification.windows import disjoint_windows
 from madoc.runs.checkpoint import load, save
 from own_robots import write_robot
@@ -189,7 +188,7 @@ def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_
     begun = int((rows - problem.dataset.episode_starts[problem.dataset.episode_of(rows)] >= BEFORE).sum())
     drawn = NOISE_ROUNDS * begun * DRAWN * BEFORE + len(rows) * (DRAWN + 1) * steps
     likely, of_draws = likely_states(*given, guesses)
-    after = settled(simulator, readings, point, likely, settling.WIDTHS, ANEW, until_noise=True)
+    after = settled_to_noise(simulator, readings, point, likely)
     assert of_draws == drawn and spent == drawn + after.simulations * steps
     aloft = np.add(guesses, [0.0, 1.0, 0.0, 0.0])
     untouched, nothing = with_contacts_settled(*given, aloft)

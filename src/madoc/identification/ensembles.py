@@ -18,14 +18,7 @@ from madoc.data.timescale import stride
 from madoc.identification.losses import Loss
 from madoc.identification.noise import difference_noise
 from madoc.identification.replay import Readings
-from madoc.identification.settling import (
-    ANEW,
-    FAILED_WINDOW,
-    WIDTHS,
-    settled,
-    window_costs,
-    with_bases_settled,
-)
+from madoc.identification.settling import FAILED_WINDOW, settled_to_noise, window_costs, with_bases_settled
 from madoc.identification.states import LoggedStates, states_of
 from madoc.simulation.attitudes import differences, moved
 from madoc.simulation.base import Simulator
@@ -327,13 +320,12 @@ def with_contacts_settled(
     """Initial states from near which those of single windows can be fitted, and the control steps that it took.
 
     Where windows begin in contact, the best of many states that are as likely as the readings before each window is
-    taken, and settles by differences of all `WIDTHS` until residuals of nearly all are noise, and anew where they are
-    not: what states in wrong minima leave would pass for what the model lacks.
+    taken, and settles (`settled_to_noise`): what states in wrong minima leave would pass for what the model lacks.
     """
     likely, spent = likely_states(dataset, logged, simulator, readings, rows, point, guesses)
     if readings.placed.any() or not _touch(simulator, point, guesses):
         return likely, spent
-    after = settled(simulator, readings, point, likely, WIDTHS, ANEW, until_noise=True)
+    after = settled_to_noise(simulator, readings, point, likely)
     return after.states, spent + after.simulations * readings.steps
 
 

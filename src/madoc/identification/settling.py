@@ -33,6 +33,8 @@ FARTHEST = 30.0
 """Largest error of a guess in standard errors of the state: that of a velocity that jumps between two positions."""
 BEYOND = 3.0
 """Standard deviations of a window's cost under noise alone, above its mean; a higher cost is more than noise."""
+WORTH_MORE = 0.1
+"""Share in [0, 1] of the windows whose residuals are more than noise, that a beginning explains if another follows."""
 FEW = 0.01
 """Share in [0, 1] of the windows whose residuals are more than noise, up to which no further steps are tried."""
 TRIALS = (1e-2, 1.0, 1e2)
@@ -126,21 +128,23 @@ def restart(
     guesses: Float[np.ndarray, "windows state"],
     before: Settled,
     loss: Loss,
-    random: np.random.Generator,
+    random: np.random.Generator | None,
 ) -> Settled:
     """Settle anew the windows whose residuals are more than noise, and keep what fits each of them better.
 
-    They begin at their guess and a normal error of the size of the states' standard errors or of up to `FARTHEST` times
-    that: where velocities jump, guesses may be far off. Where sensors show all but the place and speed of a base, they
-    begin at the guess with that place and speed as they have settled: these are better known by then, and what is
-    measured has gone astray to make up for what they were.
+    They begin at their guess, without `random` at that itself, and else with a normal error of the size of the states'
+    standard errors or of up to `FARTHEST` times that: where velocities jump, guesses may be far off. Where sensors show
+    all but the place and speed of a base, they begin at the guess with that place and speed as they have settled: these
+    are better known by then, and what is measured has gone astray to make up for what they were.
     """
     worse = np.flatnonzero(before.unexplained(readings.observed[0].size, loss))
     if not len(worse):
         return before
     part = readings.of(worse)
-    size = FARTHEST ** random.random((len(worse), 1)) * before.errors
-    error = np.minimum(size, 1.0) * random.standard_normal((len(worse), len(before.errors)))
+    error = np.zeros((len(worse), len(before.errors)))
+    if random is not None:
+        size = FARTHEST ** random.random((len(worse), 1)) * before.errors
+        error = np.minimum(size, 1.0) * random.standard_normal(error.shape)
     states, widths = guesses[worse] + readings.in_state_units(error, guesses.shape[1]), WIDTHS[1:]
     if readings.placed.any():
         columns = np.flatnonzero(readings.placed)
@@ -173,13 +177,8 @@ def settled(
     guesses: Float[np.ndarray, "windows state"],
     widths: tuple[float, ...],
     anew: int,
-    *,
-    until_noise: bool = False,
 ) -> Settled:
-    """Initial states after steps by differences of these widths, in standard errors, and so many new beginnings.
-
-    They end early once residuals of nearly all windows are noise, where that is asked for.
-    """
+    """Initial states after steps by differences of these widths, in standard errors, and so many new beginnings."""
     states, damping, errors = guesses, np.full(len(guesses), FIRST_DAMPING), np.zeros(len(readings.spread))
     simulations = 0
     for width in widths:
@@ -190,11 +189,33 @@ def settled(
             after.errors,
             simulations + after.simulations,
         )
-        after = replace(after, simulations=simulations)
-        if until_noise and after.unexplained(readings.observed[0].size, "cauchy").mean() <= FEW:
-            return after
+    after = replace(after, simulations=simulations)
     for again in range(anew):
         after = restart(simulator, readings, point, guesses, after, "cauchy", np.random.default_rng(again))
+    return after
+
+
+def settled_to_noise(
+    simulator: Simulator,
+    readings: Readings,
+    point: Float[np.ndarray, " d"],
+    guesses: Float[np.ndarray, "windows state"],
+) -> Settled:
+    """Initial states after a few steps and, of windows that are then more than noise, new beginnings.
+
+    These are at the guess, and then near it. They end once residuals of nearly all windows are noise, or one of them
+    explains few windows more: what is left then has another cause.
+    """
+    widths, values = (0.0, *RESETTLING), readings.observed[0].size
+    after = settled(simulator, readings, point, guesses, widths, 0)
+    left = after.unexplained(values, "cauchy").sum()
+    for random in (None, *map(np.random.default_rng, range(ANEW))):
+        if left <= FEW * len(readings):
+            break
+        after = restart(simulator, readings, point, guesses, after, "cauchy", random)
+        before, left = left, after.unexplained(values, "cauchy").sum()
+        if left > (1.0 - WORTH_MORE) * before:
+            break
     return after
 
 

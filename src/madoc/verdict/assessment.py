@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration import CalibrationProblem, CalibrationResult
-from madoc.calibration.holdout import Fitted, HoldOut, ToldApart, Verdict
+from madoc.calibration.holdout import HoldOut, OpenLoop, ToldApart, Verdict
 from madoc.data import Dataset
 from madoc.errors import MadocError
 from madoc.simulation.base import Simulator
@@ -74,9 +74,11 @@ def assess(
         )
     bench.left_out.clear()
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
-    holdout = measured(bench, result.mean, result.interval)
-    if bench.begins("predictions over longer times"):
-        holdout = replace(holdout, open_loop=open_loop(bench, point, fits_starts=isinstance(holdout, Fitted)))
+    fits_starts = _fits_starts(bench, point)
+    first = () if result.settled else _predictions(bench, point, fits_starts)  # all that may make it of use then
+    holdout = measured(bench, result.mean, result.interval, fits_starts=fits_starts)
+    later = _predictions(bench, point, fits_starts) if result.settled else first
+    holdout = replace(holdout, open_loop=later)
     widened = with_widened_intervals(result, holdout)
     verdict = judge(
         holdout,
@@ -94,19 +96,25 @@ def assess(
     return Assessment(verdict, holdout, widened)
 
 
-def measured(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None = None) -> HoldOut:
+def measured(
+    bench: Bench,
+    mean: Float[np.ndarray, " d"],
+    interval: Float[np.ndarray, "d 2"] | None = None,
+    *,
+    fits_starts: bool | None = None,
+) -> HoldOut:
     """The hold-out's numbers for an estimate and its 95 % intervals in physical units, by the measure its states allow.
 
     Where states can be rebuilt, but bodies touch and the sensors' noise is not small for them, or it hides what
-    parameters do, initial states are fitted too.
+    parameters do, initial states are fitted too. `fits_starts` is whether they are; None is to find that out.
 
     Raises:
         MadocError: No state of the hold-out can be rebuilt though the robot's observations determine it.
     """
     point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
     bench.tell("predictions of single steps and short windows")
-    noisy = bench.states_known and (noisy_contacts(bench, point) or noise_hides_gain(bench))
-    if bench.states_known and (not noisy or bench.fitted is None):
+    fits_starts = _fits_starts(bench, point) if fits_starts is None else fits_starts
+    if bench.states_known and not fits_starts:
         return predicted(bench, point, interval)
     if bench.fitted is not None:
         return fitted(bench, bench.fitted, point, interval)
@@ -114,6 +122,19 @@ def measured(bench: Bench, mean: Float[np.ndarray, " d"], interval: Float[np.nda
     areas = bench.area_at_mid_range, bench.area_of_rollouts(point)
     record = partial(ToldApart, area_at_mid_range=areas[0], area_at_estimate=areas[1])
     return judged(record, bench, point, interval, at=point, residual=noise, by_model=(), noise=noise, control_steps=0)
+
+
+def _fits_starts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
+    """Whether initial states of the hold-out are fitted, as they are not known or too noisy."""
+    noisy = not bench.states_known or noisy_contacts(bench, point) or noise_hides_gain(bench)
+    return noisy and bench.fitted is not None
+
+
+def _predictions(bench: Bench, point: Float[np.ndarray, " d"], fits_starts: bool) -> tuple[OpenLoop, ...]:
+    """Predictions over longer times, if there is time for them."""
+    if not bench.begins("predictions over longer times"):
+        return ()
+    return open_loop(bench, point, fits_starts=fits_starts)
 
 
 def _problem_of(result: CalibrationResult, training: Dataset | None, simulator: Simulator | None) -> CalibrationProblem:

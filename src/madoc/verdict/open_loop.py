@@ -38,6 +38,7 @@ def open_loop(bench: Bench, point: Float[np.ndarray, " d"], *, fits_starts: bool
 
     Predictions begin at logged states, or at fitted ones where these are not known or `fits_starts`, as they are noisy.
     There are none where the log tells no states to begin at, and none of a length that no held-out stretch has.
+    From fitted states those of shorter times are the beginnings of one prediction, so that starts are fitted once.
     """
     if bench.states.kind == "unknown" or bench.held_out.disturbance.shuffled != "none":
         return ()
@@ -46,9 +47,15 @@ def open_loop(bench: Bench, point: Float[np.ndarray, " d"], *, fits_starts: bool
     before = FITTED * stride(bench.problem.dataset) if fits_starts else 0
     predicted = partial(_from_fitted if fits_starts else _from_logged, bench, given, point)
     whole = int(np.median(held.episode_ends - held.episode_starts)) - before
-    lengths = {max(1, round(seconds / step)) for seconds in SECONDS} | {whole}
-    found = ((steps, predicted(steps)) for steps in sorted(lengths) if 0 < steps <= whole)
-    return tuple(_record(bench, *errors, steps, whole=steps == whole) for steps, errors in found if errors is not None)
+    shorter = [steps for steps in sorted({max(1, round(seconds / step)) for seconds in SECONDS}) if steps < whole]
+    parts = [shorter] if fits_starts and shorter else [[steps] for steps in shorter]
+    found: list[OpenLoop] = []
+    for lengths in [*parts, *([[whole]] if whole > 0 else [])]:
+        errors = predicted(lengths[-1])
+        if errors is not None:
+            residuals, rows = errors
+            found += [_record(bench, residuals[:, :, :steps], rows, steps, whole=steps == whole) for steps in lengths]
+    return tuple(found)
 
 
 def as_given(simulator: Simulator) -> Simulator:
