@@ -31,7 +31,7 @@ CLIP, OF_CLIPPED = 3.0, 0.9950
 """Standard deviations at which errors are clipped, and the mean square of a normal value that is."""
 BEFORE, MOST_BEFORE = 8, 30
 """Number of strides before a window, by whose readings a filter finds states at its first row; so many rows at most."""
-DRAWN = 32
+DRAWN = 16
 """Number of states that are tried at the first row of a window."""
 NOISE_ROUNDS = 2
 """Number of runs of a filter before a window; each tells the sensors' noise better."""

@@ -84,14 +84,15 @@ class FittedReplays:
     def starts(self, points: Float[np.ndarray, "systems d"]) -> tuple[Float[np.ndarray, "systems windows state"], int]:
         """The initial states from which each system comes nearest to the observations of the fitted steps.
 
-        Also the control steps that were simulated. Each step moves the windows that the one before gained on, under any
+        Also the control steps that were simulated. All begin at states that are likely under the last system, whose
+        parameters are the best known ones. Each step moves the windows that the one before gained on, under any
         system.
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
         log = self.held, self.logged, self.simulator, first, self.rows
-        begun = [likely_states(*log, point, self.near) for point in points]
-        states, spent = np.stack([each for each, _ in begun]), sum(count for _, count in begun)
+        begun, spent = likely_states(*log, points[-1], self.near)
+        states = np.repeat(begun[None], len(points), axis=0)
         gaining = np.arange(len(first))
         for _ in range(STEPS_OF_BASES if first.placed.any() else FIT_STEPS):
             part, around = first.of(gaining), states[:, gaining]
