@@ -139,7 +139,7 @@ def spring_log(**disturbance):
 def test_auto_takes_least_squares_where_it_can():
     name, why = choose(candidates_for({}), spring_log(), KEY)
     assert name == "least-squares"
-    assert why == "auto took least-squares: the log has the robot's states"
+    assert why == "auto took least-squares: the robot's states can be had from the log"
 
 
 def test_auto_takes_npe_where_least_squares_refuses_and_says_why():

@@ -64,6 +64,8 @@ def test_ranges_are_the_intervals_within_what_was_searched(tmp_path, name, low, 
     save_randomization(tmp_path / "r.yaml", found(), PROVENANCE, None)
     row = read_yaml((tmp_path / "r.yaml").read_text())["parameters"][name]
     assert (row["low"], row["high"]) == (low, high) and row["low"] <= row["mean"] <= row["high"]
+    stds = {"body_mass.cart": 0.7 / 1.959963984540054, "knees": 0.5, "action_delay": 0.0}  # of the wider half
+    assert row["std"] == pytest.approx(stds[name])
 
 
 def test_a_covariance_goes_along_with_its_order(tmp_path):

@@ -18,6 +18,7 @@ from madoc.identification.settling import (
     cost_of_noise,
     restart,
     settle,
+    settled_to_noise,
     window_costs,
     with_bases_settled,
 )
@@ -95,6 +96,22 @@ def test_wide_differences_and_restarts_find_states_at_contacts():
     drawn = replace(wide, costs=window_costs(residuals, "cauchy"))
     assert drawn.unexplained(values, "cauchy").sum() <= missed[1]
     assert spent > len(readings) * readings.steps
+
+
+def test_new_beginnings_end_once_one_explains_hardly_any_more_windows(monkeypatch):
+    simulator, readings, guesses = windows(spring(max_episode_steps=100), SPRING_TRUTH, 9, 0.1)
+    point, costs = np.zeros(len(simulator.parameters)), iter([1.0, 0.5, 0.49, 0.0])
+    high = cost_of_noise("cauchy")[0] * 10.0
+
+    def left(share):
+        many = np.where(np.arange(len(readings)) < share * len(readings), high, 0.0)
+        return Settled(guesses, np.ones(len(readings)), np.ones(2), np.ones(2), many, 0, 0)
+
+    monkeypatch.setattr(settling, "settled", lambda *_: left(next(costs)))
+    monkeypatch.setattr(settling, "restart", lambda *_: left(next(costs)))
+    after = settled_to_noise(simulator, readings, point, guesses)
+    assert after.unexplained(readings.observed[0].size, "cauchy").mean() == pytest.approx(0.49, abs=0.02)
+    assert next(costs) == 0.0  # the last beginning was not tried
 
 
 def test_contacts_of_a_window_are_those_of_its_simulated_states():

@@ -41,6 +41,21 @@ def test_a_result_and_rows_held_out_are_all_it_needs(result, split):
     assert found.holdout.split == "100 rows in 1 episode were held out"
 
 
+def test_what_a_search_that_had_not_settled_predicts_comes_before_tests(result, split):
+    problem, told = CalibrationProblem(split.kept, simulation.make(TASK, threads=1)), []
+    bench = Bench(problem, split.held, jax.random.key(0), tell=told.append)
+    orders = []
+    for settled in (True, False):
+        told.clear()
+        found = madoc.assess(replace(result, settled=settled), bench)
+        orders.append([told.index("predictions over longer times"), told.index("tests of what the model lacks")])
+        assert found.result.judging_seconds > 0.0
+    assert orders[0][0] > orders[0][1] and orders[1][0] < orders[1][1]
+    assert found.holdout.open_loop and found.verdict.word == "USABLE"
+    hurried = madoc.assess(replace(result, settled=False), replace(bench, until=time.monotonic()))
+    assert "nor was tested whether the model lacks anything" in hurried.verdict.sentence
+
+
 def test_without_time_nothing_is_said_to_be_tested(result, split):
     bench = Bench(CalibrationProblem(split.kept, simulation.make(TASK, threads=1)), split.held, jax.random.key(0))
     found = madoc.assess(result, replace(bench, until=time.monotonic()))

@@ -7,6 +7,7 @@ from planted_logs import ROBOTS, bench, log_of
 
 from madoc.data import Disturbance, disturb, hide_velocities
 from madoc.verdict.evidence import evidence, replay_errors, save_evidence
+from madoc.verdict.fitted_starts import FITTED
 
 STEP = 0.02
 
@@ -87,3 +88,13 @@ def test_a_replay_at_the_estimate_has_the_errors_of_the_runs_that_were_kept(hidd
     assert kept == pytest.approx(np.sqrt(np.nanmean(apart**2)), rel=1e-4)
     assert exact < (0.5 if hidden else 1e-4) * kept  # hidden, runs start where the middle of the ranges fits best
     assert replay_errors({"measured": arrays["measured"]}, judged.simulator, middle[None]) is None
+
+
+def test_noisy_runs_start_at_fitted_states_where_the_rest_is_judged_from_them():
+    task, truth = ROBOTS["spring"]
+    judged, values = bench(log_of("spring", noise=0.3), task), task.parameters.vector(truth)
+    logged, fitted = (evidence(judged, values, control_step=STEP, fits_starts=fits) for fits in (False, True))
+    assert (int(logged["fitted"]), int(fitted["fitted"]) % FITTED) == (0, 0) and fitted["fitted"] > 0
+    errors = [np.abs(each["after"] - each["measured"])[..., 0].mean() for each in (logged, fitted)]
+    assert errors[1] < 0.9 * errors[0]
+    assert "residual_after" in fitted

@@ -134,7 +134,9 @@ def test_what_predicts_much_better_than_the_model_as_given_is_usable_though_the_
     )
     others = replace(over[1], as_given={"q": 1.0, "qd": 1.0, "yaw": 1.0}, estimate={"q": 0.4, "qd": 1.05, "yaw": 1.2})
     worse = judge(replace(lacking, open_loop=(over[0], others))).sentence
-    assert "(95 % interval 30 % to 60 %), but yaw with more, so" in worse
+    assert "(95 % interval 30 % to 60 %; yaw is predicted worse than by that model), so" in worse
+    quiet = judge(replace(lacking, open_loop=(over[0], others), noise={"yaw": 1.3})).sentence
+    assert "(95 % interval 30 % to 60 %), so" in quiet
     verdict = judge(replace(lacking, open_loop=over))
     assert verdict.word == "USABLE"
     told = "over 1 s held-out motion is predicted with 40 % of the error of the model as given (95 % interval 30 % to "

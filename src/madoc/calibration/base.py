@@ -120,7 +120,7 @@ class Estimate:
         groups: Indices of the parameters that were calibrated together; empty means one group of all.
         failures: Number of simulated rows that diverged and were left out.
         warnings: Reasons to doubt the estimate, one sentence each.
-        notes: How the data was taken and why, one sentence each, of which nothing follows for the user.
+        notes: How the method had initial states from the log, and why, one sentence each.
         covariance: Covariance of the estimates, with `std` squared on its diagonal; None where it is unknown.
         interval: 95 % confidence intervals, columns low and high; None where they are unknown.
         quantile: Standard errors in half of such an interval, before an end of the range cuts it off.

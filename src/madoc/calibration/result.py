@@ -61,12 +61,12 @@ class CalibrationResult:
         sentence: The status in words.
         control_steps: Simulated control steps of any kind.
         seconds: Wall-clock time of the search.
-        judging_seconds: Wall-clock time of judging it on held-out rows; 0 where none were.
+        judging_seconds: Wall-clock time of judging it on held-out rows; 0 where it was not judged.
         seed: Seed of the random key.
         groups: Names of the parameters that were calibrated together.
         parameters: Estimates by name.
         warnings: Reasons to doubt the estimate, one sentence each.
-        notes: How the method took the data and why, one sentence each.
+        notes: How the method had initial states from the log, and why, one sentence each.
         error: `mean_absolute`, `mean_percent_of_range` and `per_parameter`; None where the truth was not given.
         covariance: Covariance of the estimates in physical units, in the task's order; None where it is unknown.
         combinations: Sums and products of parameters that the log tells though it leaves each of them open.
@@ -100,7 +100,7 @@ class CalibrationResult:
     settled: bool = True
     unlike_noise: bool = False
     effective: bool = False
-    judging_seconds: float = 0.0
+    judging_seconds: float = field(default=0.0, compare=False)
     group_stability: float | None = None
     chosen: str | None = None
     verdict: Verdict | None = None

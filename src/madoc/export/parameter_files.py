@@ -15,7 +15,7 @@ OF_PATCH = "What a calibration changed in the model, and how sure it is."
 """The first line of a patch."""
 OF_RANGES = (
     "Ranges to randomize in; each is a normal distribution cut off at low and high, whose std is that of its 95 % "
-    "interval."
+    "interval where it has one."
 )
 """The first line of a file of ranges; an interval is wider than a patch's std says where the model may lack a term."""
 

@@ -322,7 +322,7 @@ def with_contacts_settled(
     Where windows begin in contact, the best of many states that are as likely as the readings before each window is
     taken, and settles (`settled_to_noise`): what states in wrong minima leave would pass for what the model lacks.
     """
-    likely, spent = likely_states(dataset, logged, simulator, readings, rows, point, guesses)
+    (likely,), spent = likely_states(dataset, logged, simulator, readings, rows, point[None], guesses)
     if readings.placed.any() or not _touch(simulator, point, guesses):
         return likely, spent
     after = settled_to_noise(simulator, readings, point, likely)
@@ -347,20 +347,22 @@ def likely_states(
     simulator: Simulator,
     readings: Readings,
     rows: Int[np.ndarray, " windows"],
-    point: Float[np.ndarray, " d"],
+    points: Float[np.ndarray, "systems d"],
     guesses: Float[np.ndarray, "windows state"],
-) -> tuple[Float[np.ndarray, "windows state"], int]:
+) -> tuple[Float[np.ndarray, "systems windows state"], int]:
     """The guess of each window's first state, or that of an ensemble's states there which fits the window better.
 
-    The ensemble has followed the readings before the window, where its episode has as many. Bases that no sensor shows
-    settle instead. Guesses are left as they are where nothing touches, and where no states can be drawn. Also the
-    control steps.
+    Each system takes the states that fit best under its parameters, of one ensemble for all: it is the last system's,
+    and has followed the readings before the window, where its episode has as many. Bases that no sensor shows settle
+    instead. Guesses are left as they are where nothing touches, and where no states can be drawn. Also the control
+    steps.
     """
+    point = points[-1]
     if readings.placed.any():
-        states, simulations = with_bases_settled(simulator, readings, point, guesses)
-        return states, simulations * readings.steps
+        placed = [with_bases_settled(simulator, readings, each, guesses) for each in points]
+        return np.stack([states for states, _ in placed]), sum(count for _, count in placed) * readings.steps
     if not (logged.starts_known and can_be_drawn(logged, simulator) and _touch(simulator, point, guesses)):
-        return guesses, 0
+        return np.repeat(guesses[None], len(points), axis=0), 0
     before = min(BEFORE * stride(dataset), MOST_BEFORE)
     random, first = np.random.default_rng(0), rows - before
     noise = np.maximum(difference_noise(dataset)[: logged.measured] / readings.scale, LEAST_NOISE)
@@ -378,7 +380,7 @@ def likely_states(
         drawn = members_at(dataset, logged, simulator, rows[others], noise * readings.scale, DRAWN, random)
         tried[others, 1:] = system.unbiased(drawn)
     starts = np.swapaxes(tried, 0, 1).reshape(1, -1, guesses.shape[1])
-    residuals = readings.residuals(simulator, point[None], starts)[0] / np.tile(noise, readings.steps + 1)
-    best = window_costs(residuals, "cauchy").argmin(0)
-    spent = NOISE_ROUNDS * len(begun) * DRAWN * before + len(rows) * (1 + DRAWN) * readings.steps
+    residuals = readings.residuals(simulator, points, np.repeat(starts, len(points), axis=0))
+    best = window_costs(residuals / np.tile(noise, readings.steps + 1), "cauchy").argmin(1)
+    spent = NOISE_ROUNDS * len(begun) * DRAWN * before + len(points) * len(rows) * (1 + DRAWN) * readings.steps
     return tried[np.arange(len(rows)), best], spent

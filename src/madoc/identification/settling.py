@@ -22,21 +22,22 @@ from madoc.simulation.base import Simulator
 WIDTHS = (0.0, 3.0, 3.0, 1.5, 0.7, 0.3, 0.1, 0.0, 0.0)
 """Widths of the differences from step to step, in standard errors of the initial states; 0 is `DIFFERENCE`."""
 RESETTLING = (1.0, 0.3, 0.0)
-"""The same after a step of the parameters, by which initial states have moved little."""
+"""The same where initial states are nearly right: after a step of the parameters, or as drawn by an ensemble."""
 PLACED_ALONE = 3
 """Number of steps of places and speeds that no sensor shows, before all values of an initial state move."""
 RESTARTS = 5
 """Number of times that windows whose residuals are more than noise begin anew, near the guess of their state."""
 ANEW = 2
-"""The same in the fit for prediction and in tests of a model, of whose windows a few may stay where they are."""
+"""The same in the fit for prediction and, after one at the guess itself, in tests of a model."""
 FARTHEST = 30.0
 """Largest error of a guess in standard errors of the state: that of a velocity that jumps between two positions."""
 BEYOND = 3.0
 """Standard deviations of a window's cost under noise alone, above its mean; a higher cost is more than noise."""
 WORTH_MORE = 0.1
-"""Share in [0, 1] of the windows whose residuals are more than noise, that a beginning explains if another follows."""
+"""Smallest share in [0, 1] of the windows left with more than noise that a new beginning explains if another is to
+follow."""
 FEW = 0.01
-"""Share in [0, 1] of the windows whose residuals are more than noise, up to which no further steps are tried."""
+"""Share in [0, 1] of the windows whose residuals are more than noise, up to which nothing further is tried."""
 TRIALS = (1e-2, 1.0, 1e2)
 """Factors of the last damping that helped, tried at once; where none helps, it is multiplied by the last."""
 FIRST_DAMPING = 1e-2
@@ -201,10 +202,10 @@ def settled_to_noise(
     point: Float[np.ndarray, " d"],
     guesses: Float[np.ndarray, "windows state"],
 ) -> Settled:
-    """Initial states after a few steps and, of windows that are then more than noise, new beginnings.
+    """Initial states after a few steps and, of windows that are then left with more than noise, new beginnings.
 
-    These are at the guess, and then near it. They end once residuals of nearly all windows are noise, or one of them
-    explains few windows more: what is left then has another cause.
+    The first of these is at the guess, the others near it. They end once residuals of nearly all windows are noise, or
+    one of them explains hardly any more windows: what is left then has another cause.
     """
     widths, values = (0.0, *RESETTLING), readings.observed[0].size
     after = settled(simulator, readings, point, guesses, widths, 0)

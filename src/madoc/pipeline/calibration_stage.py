@@ -59,14 +59,13 @@ def calibrate_in(
         )
         result = replace(result, chosen=why)
         if prepared.holdout is not None and result.status in ENDED:
-            began_judging, rate = time.monotonic(), result.control_steps / max(result.seconds, 1e-3)
+            rate = result.control_steps / max(result.seconds, 1e-3)
             with waiting("judging the estimate on the rows held out", quiet=quiet) as tell:
                 bench = replace(prepared.bench, until=judged_by, rate=max(rate, 1.0), tell=tell)
                 result = assess(result, bench).result
                 tell("whole runs")
                 fits_starts, step = isinstance(result.holdout, Fitted), prepared.simulator.control_step
                 arrays = evidence(bench, result.mean, control_step=step, fits_starts=fits_starts)
-            result = replace(result, judging_seconds=time.monotonic() - began_judging)
             save_evidence(out / "evidence.npz", arrays)
         folder.write_json("result.json", result.to_json())
         return result

@@ -96,7 +96,7 @@ def choose(
             refusals.append(f"{name} refuses: {error}")
             continue
         had = problem.states.kind == "exact"
-        states = "the log has the robot's states" if had else "the robot's states can be fitted to the log"
+        states = f"the robot's states can be {'had from' if had else 'fitted to'} the log"
         why = "; ".join(refusals) or states
         return name, f"auto took {name}: {why}"
     raise MadocError("; ".join(refusals))

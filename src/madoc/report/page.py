@@ -135,7 +135,7 @@ def _facts(run: Run) -> list[tuple[str, str, str]]:
         facts.append(("off the truth", f"{number(run.error_percent, 3)} %", "of the range, on average"))
     if run.result is not None:
         facts.append(("control steps", count(run.result.control_steps), "simulated"))
-        facts.append(("time", duration(run.result.seconds), "wall clock"))
+        facts.append(("time", duration(run.result.seconds + run.result.judging_seconds), "search and judging"))
     if run.spec.data is not None:
         facts.append(("log", count(run.spec.data.rows), f"rows, checksum {run.spec.data.fingerprint}"))
     return facts

@@ -1,5 +1,6 @@
 """An estimate judged on rows that no method has seen, without any truth: `assess` does all of it."""
 
+import time
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -73,12 +74,15 @@ def assess(
             f"{', '.join(bench.simulator.parameters.names)}"
         )
     bench.left_out.clear()
+    began = time.monotonic()
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
+    bench.tell("predictions of single steps and short windows")
     fits_starts = _fits_starts(bench, point)
-    first = () if result.settled else _predictions(bench, point, fits_starts)  # all that may make it of use then
+    # Only predictions can make an estimate of use whose search has not settled.
+    predictions = None if result.settled else _predictions(bench, point, fits_starts)
     holdout = measured(bench, result.mean, result.interval, fits_starts=fits_starts)
-    later = _predictions(bench, point, fits_starts) if result.settled else first
-    holdout = replace(holdout, open_loop=later)
+    predictions = _predictions(bench, point, fits_starts) if predictions is None else predictions
+    holdout = replace(holdout, open_loop=predictions)
     widened = with_widened_intervals(result, holdout)
     verdict = judge(
         holdout,
@@ -93,6 +97,7 @@ def assess(
         warnings.append(f"the budget left no time for {', '.join(bench.left_out)}; a larger one judges in full")
     settled = result.settled and better
     widened = replace(widened, verdict=verdict, holdout=holdout, warnings=warnings, settled=settled)
+    widened = replace(widened, judging_seconds=round(time.monotonic() - began, 3))
     return Assessment(verdict, holdout, widened)
 
 
@@ -112,7 +117,6 @@ def measured(
         MadocError: No state of the hold-out can be rebuilt though the robot's observations determine it.
     """
     point = np.clip(bench.simulator.parameters.to_unit(mean), -1.0, 1.0)
-    bench.tell("predictions of single steps and short windows")
     fits_starts = _fits_starts(bench, point) if fits_starts is None else fits_starts
     if bench.states_known and not fits_starts:
         return predicted(bench, point, interval)
@@ -127,7 +131,7 @@ def measured(
 def _fits_starts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     """Whether initial states of the hold-out are fitted, as they are not known or too noisy."""
     noisy = not bench.states_known or noisy_contacts(bench, point) or noise_hides_gain(bench)
-    return noisy and bench.fitted is not None
+    return noisy and bench.fittable is not None
 
 
 def _predictions(bench: Bench, point: Float[np.ndarray, " d"], fits_starts: bool) -> tuple[OpenLoop, ...]:

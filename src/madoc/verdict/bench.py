@@ -19,7 +19,6 @@ from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
 from madoc.types import named_key
-from madoc.verdict.fitted_starts import MOST as MOST_FITTED
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of, replay_steps
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import better_than_chance
@@ -129,12 +128,19 @@ class Bench:
 
     @cached_property
     def fitted(self) -> FittedReplays | None:
-        """Windows of the hold-out whose initial states are to be fitted; None where they cannot be."""
+        """Windows of the hold-out whose initial states are fitted, as many as there is time for at the first use."""
+        if self.fittable is None:
+            return None
+        columns = replay_steps(self.states, stride(self.problem.dataset), len(self.simulator.parameters))
+        count = len(self.fittable.rows)
+        return self.fittable.of(evenly(np.arange(count), self.windows_in_time(columns, FITTING, count)))
+
+    @cached_property
+    def fittable(self) -> FittedReplays | None:
+        """Windows of the hold-out whose initial states can be fitted; None where none can be."""
         if self.states.kind == "unknown" or self.held_out.disturbance.shuffled != "none":
             return None
-        moving, space = stride(self.problem.dataset), self.simulator.parameters
-        most = self.windows_in_time(replay_steps(self.states, moving, len(space)), FITTING, MOST_FITTED)
-        return fitted_replays_of(self.held_out, self.simulator, self.change, moving, most=most)
+        return fitted_replays_of(self.held_out, self.simulator, self.change, stride(self.problem.dataset))
 
     @cached_property
     def clone(self) -> TanhGaussianPolicy:

@@ -41,10 +41,9 @@ def evidence(
     simulation has failed), `posture_measured`, `posture_before` and `posture_after` (runs, times, qpos); for replays
     with other parameters `start` (runs, state), at the estimate, and `actions` (runs, steps, action). Runs start at the
     first logged state, or at one fitted to the first `fitted` rows where velocities are hidden, or readings so noisy
-    that the hold-out was judged from fitted states (`fits_starts`). Where states
-    are known there are `residual_before` and `residual_after` (windows, signals), simulated minus measured observations
-    after the shortest horizon.
-    `mean` is the estimate in physical units, `control_step` the time between two rows in s.
+    that the hold-out was judged from fitted states (`fits_starts`). Where states are known there are `residual_before`
+    and `residual_after` (windows, signals), simulated minus measured observations after the shortest horizon. `mean` is
+    the estimate in physical units, `control_step` the time between two rows in s.
     """
     held, simulator = bench.held_out, bench.simulator
     most = int(np.clip(SECONDS * bench.rate, *ROWS))

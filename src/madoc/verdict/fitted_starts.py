@@ -63,6 +63,11 @@ class FittedReplays:
         """Number of control steps to whose observations an initial state is fitted."""
         return FITTED * self.stride
 
+    def of(self, kept: Int[np.ndarray, " some"]) -> "FittedReplays":
+        """These windows alone."""
+        parts = {"near": self.near[kept], "rows": self.rows[kept], "episodes": self.episodes[kept]}
+        return replace(self, readings=self.readings.of(kept), **parts)
+
     def at_horizons(
         self, residuals: Float[np.ndarray, "systems windows readings channels"]
     ) -> Float[np.ndarray, "systems windows horizons channels"]:
@@ -84,15 +89,13 @@ class FittedReplays:
     def starts(self, points: Float[np.ndarray, "systems d"]) -> tuple[Float[np.ndarray, "systems windows state"], int]:
         """The initial states from which each system comes nearest to the observations of the fitted steps.
 
-        Also the control steps that were simulated. All begin at states that are likely under the last system, whose
-        parameters are the best known ones. Each step moves the windows that the one before gained on, under any
+        Also the control steps that were simulated. Each step moves the windows that the one before gained on, under any
         system.
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
         log = self.held, self.logged, self.simulator, first, self.rows
-        begun, spent = likely_states(*log, points[-1], self.near)
-        states = np.repeat(begun[None], len(points), axis=0)
+        states, spent = likely_states(*log, points, self.near)
         gaining = np.arange(len(first))
         for _ in range(STEPS_OF_BASES if first.placed.any() else FIT_STEPS):
             part, around = first.of(gaining), states[:, gaining]

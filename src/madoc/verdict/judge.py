@@ -4,7 +4,7 @@ It answers two questions: does the simulator predict, and can the numbers be bel
 its model lacks something, or its search had not ended, is `USABLE`: its numbers serve in this simulator.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -35,7 +35,9 @@ MUCH_BETTER = 0.8
 """Error of open-loop predictions over that of the model as given, at or below which an estimate is of use though the
 model lacks something."""
 WORSE_SIGNAL = 1.1
-"""Error of one signal over that of the model as given, above which the sentence names the signal."""
+"""Error of one signal over that of the model as given, above which the sentence names it if it is beyond noise."""
+NAMED = 3
+"""Largest number of such signals that are named."""
 
 
 def judge(
@@ -96,8 +98,8 @@ def _usable(holdout: HoldOut, lacks: Verdict) -> Verdict | None:
     found = max(better, key=lambda each: (not each.whole, each.seconds))  # whole runs are often few
     return Verdict(
         "USABLE",
-        f"{_beside_given(found)}, so the estimates are of use in this simulator; they need not be the machine's "
-        f"own values, as {lacks.sentence}",
+        f"{_beside_given(found, holdout.noise)}, so the estimates are of use in this simulator; they need not be the "
+        f"machine's own values, as {lacks.sentence}",
         lacks.parameters,
     )
 
@@ -110,14 +112,16 @@ def _much_better(holdout: HoldOut) -> list[OpenLoop]:
     return [each for each in enough if each.relative <= MUCH_BETTER and each.relative_interval[1] < 1.0]
 
 
-def _beside_given(found: OpenLoop) -> str:
+def _beside_given(found: OpenLoop, noise: Mapping[str, float]) -> str:
     """How small open-loop errors are beside those of the model as given, and of which signals they are larger."""
     low, high = map(in_percent, found.relative_interval)
-    worse = [name for name, error in found.estimate.items() if error > WORSE_SIGNAL * found.as_given[name]]
-    but = f", but {', '.join(worse)} with more" if worse else ""
+    least = {name: max(WORSE_SIGNAL * found.as_given[name], noise.get(name, 0.0)) for name in found.estimate}
+    worse = [name for name, error in found.estimate.items() if error > least[name]]
+    named = ", ".join(worse[:NAMED]) + (f" and {len(worse) - NAMED} more" if len(worse) > NAMED else "")
+    but = f"; {named} {'is' if len(worse) == 1 else 'are'} predicted worse than by that model" if worse else ""
     return (
         f"over {found.seconds:.3g} s held-out motion is predicted with {in_percent(found.relative)} of the error of "
-        f"the model as given (95 % interval {low} to {high}){but}"
+        f"the model as given (95 % interval {low} to {high}{but})"
     )
 
 
@@ -184,8 +188,10 @@ def _with_an_assumed_base(holdout: HoldOut) -> Verdict | None:
 
 def _unsettled(holdout: HoldOut) -> Verdict:
     """A search that had not come to its end, and may still have come far enough to be of use."""
-    found = _usable(holdout, Verdict("NO_IMPROVEMENT", UNSETTLED))
-    return found or Verdict("NO_IMPROVEMENT", f"{_how_good(holdout)}, but {UNSETTLED}")
+    why = UNSETTLED if holdout.tested else f"{UNSETTLED}; nor was tested whether the model lacks anything"
+    return _usable(holdout, Verdict("NO_IMPROVEMENT", why)) or Verdict(
+        "NO_IMPROVEMENT", f"{_how_good(holdout)}, but {why}"
+    )
 
 
 def _not_certain(holdout: HoldOut, why: str) -> Verdict:
@@ -269,7 +275,7 @@ def _how_good(holdout: HoldOut) -> str:
     if not isinstance(holdout, ToldApart):
         confirmed = ", and mid-range is confirmed: every interval holds it" if _mid_range_was_right(holdout) else ""
         parts = [each for each in holdout.open_loop if not each.whole and each.relative <= 1.0]
-        told = _beside_given(parts[-1]) if parts else _how_small(holdout.errors)
+        told = _beside_given(parts[-1], holdout.noise) if parts else _how_small(holdout.errors)
         ahead = f", up to {in_rows(holdout.errors.estimate[-1].steps)} ahead as well as the sensors' noise allows"
         noise_alone = not beyond_noise(holdout.errors.estimate, holdout.errors.noise)
         return f"{told}{ahead if noise_alone else ''}{confirmed}"

@@ -28,7 +28,7 @@ SECONDS = (0.1, 0.3, 1.0)
 MOST = 60
 """Largest number of windows of one length."""
 SHARE = 0.3
-"""Share in (0, 1) of the time left that the starts of those of one length may take to fit."""
+"""Share in (0, 1) of the time left that predictions from starts which are fitted together may take."""
 FAILED = 10.0
 """Least error, in typical changes of a stride, once a simulation has failed; it is the worst of any that has not."""
 
@@ -38,7 +38,8 @@ def open_loop(bench: Bench, point: Float[np.ndarray, " d"], *, fits_starts: bool
 
     Predictions begin at logged states, or at fitted ones where these are not known or `fits_starts`, as they are noisy.
     There are none where the log tells no states to begin at, and none of a length that no held-out stretch has.
-    From fitted states those of shorter times are the beginnings of one prediction, so that starts are fitted once.
+    From fitted states those of shorter times are the beginnings of one prediction where runs are long enough, so that
+    starts are fitted once.
     """
     if bench.states.kind == "unknown" or bench.held_out.disturbance.shuffled != "none":
         return ()
@@ -48,7 +49,8 @@ def open_loop(bench: Bench, point: Float[np.ndarray, " d"], *, fits_starts: bool
     predicted = partial(_from_fitted if fits_starts else _from_logged, bench, given, point)
     whole = int(np.median(held.episode_ends - held.episode_starts)) - before
     shorter = [steps for steps in sorted({max(1, round(seconds / step)) for seconds in SECONDS}) if steps < whole]
-    parts = [shorter] if fits_starts and shorter else [[steps] for steps in shorter]
+    begin = (held.episode_ends - held.episode_starts - before - max(shorter, default=0)).clip(min=0).sum()
+    parts = [shorter] if fits_starts and shorter and begin >= MOST else [[steps] for steps in shorter]
     found: list[OpenLoop] = []
     for lengths in [*parts, *([[whole]] if whole > 0 else [])]:
         errors = predicted(lengths[-1])
@@ -136,7 +138,7 @@ def _from_fitted(
 ) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
     """The same from starts that are fitted under each model to the strides before."""
     moving, of_models, rows = stride(bench.problem.dataset), [], np.empty(0, np.int64)
-    most = bench.windows_in_time(replay_steps(bench.states, moving, 0) // 2, SHARE, MOST)
+    most = bench.windows_in_time(replay_steps(bench.states, moving, 0) // 2 + 3 * steps, SHARE, MOST)
     for simulator, points in _models(bench, given, point):
         replays = fitted_replays_of(
             bench.held_out, simulator, bench.change, moving, ahead=(steps,), fewest=1, most=most
