@@ -42,6 +42,8 @@ class Field:
 
 AT_END = 0.98
 """Position in [-1, 1] of its range; past it, to either side, a parameter is at the end of the range."""
+ROUNDED = 1e-9
+"""Distance in [-1, 1] from an end of a range, up to which an interval reaches it."""
 
 PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z", "payload_gyration")
 """Fields of a load on a body: its mass, where its centre is in the body's frame, its radius of gyration."""
@@ -270,15 +272,19 @@ class ParameterSpace:
         """Map physical units to [-1, 1]; shape (..., d), float64."""
         return 2.0 * (np.asarray(physical, dtype=np.float64) - self.low) / (self.high - self.low) - 1.0
 
-    def at_end(self, unit: Float[np.ndarray, " d"]) -> tuple[str, ...]:
+    def at_end(
+        self, unit: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None = None
+    ) -> tuple[str, ...]:
         """Names of the parameters that stand at an end of their range, where the true value may lie beyond it.
 
-        The physical minimum of a field, such as a damping of 0, is no such end.
+        The physical minimum of a field, such as a damping of 0, is no such end, nor is one that the 95 % interval, low
+        and high as the values in [-1, 1], does not reach.
         """
+        reached = np.ones(len(unit), bool) if interval is None else (np.abs(interval) > 1.0 - ROUNDED).any(1)
         return tuple(
             row.name
-            for row, value in zip(self.parameters, unit.tolist(), strict=True)
-            if abs(value) > AT_END and not (value < 0.0 and row.low <= row.kind.minimum)
+            for row, value, reaches in zip(self.parameters, unit.tolist(), reached.tolist(), strict=True)
+            if reaches and abs(value) > AT_END and not (value < 0.0 and row.low <= row.kind.minimum)
         )
 
     def select(self, names: Sequence[str]) -> "ParameterSpace":

@@ -164,7 +164,9 @@ class Calibrator(Method[CalibrationProblem, State], Protocol[State]):
         """The best estimate so far."""
 
 
-def at_end_of_range(scaled: Float[np.ndarray, " d"], space: ParameterSpace) -> tuple[str, ...]:
-    """Warn of estimates, scaled to [-1, 1], that are at an end of their range; see `ParameterSpace.at_end`."""
-    ends = space.at_end(scaled)
+def at_end_of_range(
+    scaled: Float[np.ndarray, " d"], space: ParameterSpace, interval: Float[np.ndarray, "d 2"] | None = None
+) -> tuple[str, ...]:
+    """Warn of estimates, scaled to [-1, 1] as the interval is, at an end of their range; see `ParameterSpace.at_end`."""
+    ends = space.at_end(scaled, interval)
     return (f"at the end of its range: {', '.join(ends)}; widen the range or doubt the model",) if ends else ()

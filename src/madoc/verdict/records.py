@@ -162,7 +162,9 @@ def judged(
         tested=doubts.tested and EXCHANGED not in bench.left_out,
         coarseness=coarse,
         finer=finer,
-        at_end=tuple(name for name in space.at_end(point) if of_range[name] < OPEN),  # an open one tells of no end
+        at_end=tuple(
+            name for name in space.at_end(point, ends) if of_range[name] < OPEN
+        ),  # an open one tells of no end
         base_from_contacts=bool(bench.states.placed.any()),
         concentration=doubts.concentration,
     )

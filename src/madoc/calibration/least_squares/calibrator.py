@@ -207,7 +207,7 @@ class LeastSquares:
             notes=self._notes(problem, state),
             warnings=(
                 *identifiability(uncertainty, space.names),
-                *at_end_of_range(point, space),
+                *at_end_of_range(point, space, space.to_unit(interval.T).T),
                 *(() if found.settled else (sentences.NOT_SETTLED,)),
                 *self._about_residuals(problem, state),
                 *((sentences.PREDICTS,) if progress == "better" else ()),
