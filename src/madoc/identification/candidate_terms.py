@@ -161,7 +161,8 @@ def _plausible(model: Any, parameter: Parameter, reference: float) -> tuple[floa
 def references_of(logged: LoggedStates, simulator: Simulator, joint: Any) -> dict[str, float]:
     """By field, the value with which a term would balance the torque that typically accelerates a joint.
 
-    All degrees of freedom of a free or a ball joint share one value, and it has no spring.
+    All degrees of freedom of a free or a ball joint share one value, and it has no spring. A free joint has nothing but
+    air about it: neither dry friction nor a rotor.
     """
     model = simulator.task.model
     dofs = slice(int(joint.dofadr[0]), int(joint.dofadr[0]) + len(joint.damping))
@@ -170,12 +171,10 @@ def references_of(logged: LoggedStates, simulator: Simulator, joint: Any) -> dic
     acceleration = np.sqrt((change**2).mean(0)) / simulator.control_step if len(change) else np.ones(speed.shape[1])
     inertia, fast = model.dof_M0[dofs], max(float(np.sqrt((speed**2).mean())), 1e-9)
     torque = max(float((inertia * acceleration).mean()), 1e-12)
-    references = {
-        "dof_frictionloss": torque,
-        "dof_drag": torque / fast**2,
-        "dof_damping": torque / fast,
-        "dof_armature": float(inertia.mean()),
-    }
+    of_air = {"dof_drag": torque / fast**2, "dof_damping": torque / fast}
+    if len(joint.damping) == 6:
+        return of_air
+    references = {"dof_frictionloss": torque, **of_air, "dof_armature": float(inertia.mean())}
     far = float(position[:, int(joint.qposadr[0])].std())
     return references | ({"jnt_stiffness": torque / far} if len(joint.damping) == 1 and far > _STILL else {})
 
