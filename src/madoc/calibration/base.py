@@ -167,6 +167,6 @@ class Calibrator(Method[CalibrationProblem, State], Protocol[State]):
 def at_end_of_range(
     scaled: Float[np.ndarray, " d"], space: ParameterSpace, interval: Float[np.ndarray, "d 2"] | None = None
 ) -> tuple[str, ...]:
-    """Warn of estimates, scaled to [-1, 1] as the interval is, at an end of their range; see `ParameterSpace.at_end`."""
+    """Warn of estimates, in [-1, 1] as the interval, at an end of their range; see `ParameterSpace.at_end`."""
     ends = space.at_end(scaled, interval)
     return (f"at the end of its range: {', '.join(ends)}; widen the range or doubt the model",) if ends else ()
