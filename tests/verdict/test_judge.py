@@ -223,6 +223,7 @@ def test_a_search_that_has_not_settled_is_of_use_where_it_predicts_much_better(g
     assert said.word == "USABLE" and "the search had not settled" in said.sentence
     open_ended = replace(good, open_loop=over, interval_shares=dict.fromkeys(good.interval_shares, 0.9))
     assert judge(open_ended).word == "NOT_IDENTIFIABLE" and judge(open_ended, settled=False) == said
+    assert judge(replace(good, open_loop=over, at_end=("mass",)), settled=False) == said
     worse = (*over, predicted_over(0.1, 1.5, (1.2, 1.8)))
     for open_loop in ((), worse):
         assert judge(replace(good, open_loop=open_loop), settled=False).word == "NO_IMPROVEMENT"

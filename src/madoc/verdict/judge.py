@@ -5,6 +5,7 @@ its model lacks something, or its search had not ended, is `USABLE`: its numbers
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -187,9 +188,12 @@ def _with_an_assumed_base(holdout: HoldOut) -> Verdict | None:
 
 
 def _unsettled(holdout: HoldOut) -> Verdict:
-    """A search that had not come to its end, and may still have come far enough to be of use."""
+    """A search that had not come to its end, and may still have come far enough to be of use.
+
+    An end of a range says nothing yet: the search may go on from there.
+    """
     why = UNSETTLED if holdout.tested else f"{UNSETTLED}; nor was tested whether the model lacks anything"
-    return _usable(holdout, Verdict("NO_IMPROVEMENT", why)) or Verdict(
+    return _usable(replace(holdout, at_end=()), Verdict("NO_IMPROVEMENT", why)) or Verdict(
         "NO_IMPROVEMENT", f"{_how_good(holdout)}, but {why}"
     )
 
