@@ -55,7 +55,7 @@ _DELAYED = "action_delay"
 BEFORE_OTHERS = 2.0
 """Time left over that of a test, from which it comes before what is to follow, as predictions over longer times."""
 TESTING = 0.7
-"""Share in (0, 1) of the time left that testing what the model lacks may take."""
+"""Share in (0, 1) of the time left that testing what the model lacks may take, if that is enough."""
 
 Measure = TypeVar("Measure", bound=Judged)
 
@@ -76,7 +76,7 @@ def _doubts(
     if not told or problem.dataset.disturbance.shuffled == "next_observations":
         return Suspicions(tested=False), False
     given, most = (problem.dataset, bench.states), _windows_in_time(bench)
-    enough = most is None or most >= 2 * (FEWEST + len(point))
+    enough = most is None or most >= _fewest(bench)
     part = "tests of what the model lacks" if shorter == 1 else "the same tests on shorter windows"
     if not bench.begins(part, 0.0 if enough else np.inf):
         return Suspicions(tested=False), False
@@ -106,12 +106,21 @@ def _doubts(
 
 
 def _windows_in_time(bench: Bench) -> int | None:
-    """How many windows the model can be tested on in the time left; None where that is not limited."""
+    """How many windows the model can be tested on in the time left; None where that is not limited.
+
+    As few as a test takes may use all of that time: without one nothing is certain, whatever else there is time for.
+    """
     if bench.until is None:
         return None
     values = len(bench.simulator.parameters) + bench.simulator.task.model.nv
     window = STRIDES * stride(bench.problem.dataset) * (COLUMNS + COLUMNS_OF_A_VALUE * values)
-    return int(TESTING * bench.rate * bench.seconds_left / window)
+    affordable = bench.rate * bench.seconds_left / window
+    return int(max(TESTING * affordable, min(affordable, _fewest(bench))))
+
+
+def _fewest(bench: Bench) -> int:
+    """Number of windows that a test takes at least."""
+    return 2 * (FEWEST + len(bench.simulator.parameters))
 
 
 def judged(
