@@ -160,3 +160,17 @@ def test_values_by_name_or_in_order_are_one_vector():
     assert (SPACE.vector(several) == several).all()
     with pytest.raises(MadocError, match=r"parameter values \(.*\), got an array of shape \(1,\)"):
         SPACE.vector([1.0])
+
+
+def test_an_estimate_is_at_an_end_where_it_stops_there_or_may_lie_beyond():
+    space = ParameterSpace((Parameter("dof_armature", "hip", 0.1, 1.1), Parameter("dof_damping", "hip", 0.0, 1.0)))
+
+    def ends(value, low, high):
+        return space.at_end(np.array([value, value]), np.array([[low, high], [low, high]]))
+
+    assert space.at_end(np.array([0.97, 0.99])) == ("dof_damping.hip",)
+    assert space.at_end(np.array([-0.99, -0.99])) == ("dof_armature.hip",)  # a damping of 0 is a physical bound
+    assert ends(1.0, 0.999, 1.0) == ("dof_armature.hip", "dof_damping.hip")  # it stops there
+    assert ends(0.99, 0.9, 1.0) == ("dof_armature.hip", "dof_damping.hip")  # not known so well
+    assert ends(0.99, 0.985, 1.0) == ()  # inside, and known to be
+    assert ends(0.99, 0.985, 0.995) == ()  # the interval does not reach the end

@@ -43,7 +43,7 @@ class Field:
 AT_END = 0.98
 """Position in [-1, 1] of its range; past it, to either side, a parameter is at the end of the range."""
 ROUNDED = 1e-9
-"""Distance in [-1, 1] from an end of a range, up to which an interval reaches it."""
+"""Distance in [-1, 1] from an end of a range, up to which an estimate stops at it, and an interval reaches it."""
 
 PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z", "payload_gyration")
 """Fields of a load on a body: its mass, where its centre is in the body's frame, its radius of gyration."""
@@ -277,10 +277,15 @@ class ParameterSpace:
     ) -> tuple[str, ...]:
         """Names of the parameters that stand at an end of their range, where the true value may lie beyond it.
 
-        The physical minimum of a field, such as a damping of 0, is no such end, nor is one that the 95 % interval, low
-        and high as the values in [-1, 1], does not reach.
+        The physical minimum of a field, such as a damping of 0, is no such end. Nor is one that the 95 % interval, low
+        and high as the values in [-1, 1], does not reach, nor one at which the estimate does not stop, if that is known
+        to be so near (`AT_END`).
         """
-        reached = np.ones(len(unit), bool) if interval is None else (np.abs(interval) > 1.0 - ROUNDED).any(1)
+        reached = np.ones(len(unit), bool)
+        if interval is not None:
+            stops = np.abs(unit) > 1.0 - ROUNDED
+            known = np.abs(interval - unit[:, None]).max(1) < 1.0 - AT_END
+            reached = (np.abs(interval) > 1.0 - ROUNDED).any(1) & (stops | ~known)
         return tuple(
             row.name
             for row, value, reaches in zip(self.parameters, unit.tolist(), reached.tolist(), strict=True)
