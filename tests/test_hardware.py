@@ -58,6 +58,7 @@ def servo():
     return benchmark_of("real_servo")
 
 
+@pytest.mark.timeout(600)  # five minutes with nothing beside it
 def test_the_arm_is_predicted_better_than_by_the_published_model_and_at_mid_range(arm):
     for motion, errors in arm["errors"].items():
         assert errors["madoc"] < 0.55 * errors["published"], motion
