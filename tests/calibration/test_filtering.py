@@ -192,8 +192,7 @@ def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_
     assert (of_two[1] == likely).all() and (of_two[0] != likely).any()  # of the same states, each its own choice
     after = settled_to_noise(simulator, readings, point, likely)
     assert of_draws == drawn and spent == drawn + after.simulations * steps
-    aloft = np.add(guesses, [0.0, 1.0, 0.0, 0.0])
-    untouched, nothing = with_contacts_settled(*given, aloft)
+    untouched, nothing = with_contacts_settled(*given, aloft := np.add(guesses, [0.0, 1.0, 0.0, 0.0]))
     assert nothing == 0 and (untouched == aloft).all()  # without contacts derivatives at the guesses serve
 
 

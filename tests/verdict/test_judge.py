@@ -137,13 +137,10 @@ def test_what_predicts_much_better_than_the_model_as_given_is_usable_though_the_
     assert "(95 % interval 30 % to 60 %; yaw is predicted worse than by that model), so" in worse
     quiet = judge(replace(lacking, open_loop=(over[0], others), noise={"yaw": 1.3})).sentence
     assert "(95 % interval 30 % to 60 %), so" in quiet
-    verdict = judge(replace(lacking, open_loop=over))
-    assert verdict.word == "USABLE"
+    word, sentence = (verdict := judge(replace(lacking, open_loop=over))).word, verdict.sentence
     told = "over 1 s held-out motion is predicted with 40 % of the error of the model as given (95 % interval 30 % to "
-    assert verdict.sentence.startswith(told)
-    assert (
-        "need not be the machine's own values, as the model cannot explain the data: after 20 rows" in verdict.sentence
-    )
+    assert word == "USABLE" and sentence.startswith(told)
+    assert "need not be the machine's own values, as the model cannot explain the data: after 20 rows" in sentence
 
 
 @EITHER
