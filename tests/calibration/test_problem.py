@@ -49,3 +49,8 @@ def test_what_method_and_check_both_say_is_without_repeats():
     own = ["the data does not identify mass, gain together; leave one out", "at the end of its range: damping"]
     doubts = [f"parameters: {own[0]}", "run.csv: the run is cut there"]
     assert without_repeats(own, doubts) == [*own, "run.csv: the run is cut there"]
+    told = "the data can hardly tell apart (correlation of the estimates): mass and gain (+0.97)"
+    before = told.replace("+0.97", "+0.91")
+    assert without_repeats([told], [f"parameters: {before}", "scale: no log can show it"])[1:] == [
+        "scale: no log can show it"
+    ]

@@ -134,6 +134,12 @@ def exploded(failures: int, control_steps: int) -> tuple[str, ...]:
 
 
 def without_repeats(warnings: Iterable[str], doubts: Iterable[str]) -> list[str]:
-    """The warnings of a method, then the doubts about the data that the method does not state already."""
+    """The warnings of a method, then the doubts about the data that the method does not state already.
+
+    It states one that says the same of other parameters before its colon, as that they can hardly be told apart: an
+    estimate knows better than a check before it.
+    """
     own = list(dict.fromkeys(warnings))
-    return [*own, *(doubt for doubt in doubts if not any(doubt.endswith(sentence) for sentence in own))]
+    heads = [f": {sentence.partition(': ')[0]}: " for sentence in own if ": " in sentence]
+    new = (doubt for doubt in doubts if not any(doubt.endswith(sentence) for sentence in own))
+    return [*own, *(doubt for doubt in new if not any(head in doubt for head in heads))]
