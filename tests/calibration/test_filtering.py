@@ -8,20 +8,10 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
-from madoc.calibration.least_squares import filtering
+from madoc.calibration.least_squares import filtering, instruments
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.least_squares.filtering import of_contacts
-from madoc.calibration.least_squares.instruments import (
-    AGREEING,
-    FEWER,
-    LARGEST_SHARE,
-    WIDTHS,
-    Side,
-    agreed,
-    axes_of,
-    products_of,
-    shares_of,
-)
+from madoc.calibration.least_squares.instruments import Side, agreed, axes_of, products_of, shares_of
 from madoc.data import Disturbance, disturb
 from madoc.identification.ensembles import (
     BEFORE,
@@ -209,7 +199,7 @@ def test_chance_biases_no_product_of_two_ensembles():
     assert products.mean() == pytest.approx(1.0, abs=0.15)
     assert squares.mean() == pytest.approx(5.0, rel=0.1)
     assert gradients.mean() == pytest.approx(0.3, abs=0.05)  # with its own slopes an ensemble's would be 0.7
-    np.testing.assert_allclose(agreed(np.array([[-1.0]]), np.array([[4.0]])), [[4.0 * AGREEING]])
+    np.testing.assert_allclose(agreed(np.array([[-1.0]]), np.array([[4.0]])), [[4.0 * instruments.AGREEING]])
 
 
 def test_what_both_ensembles_agree_on_is_kept_along_a_weak_direction_too():
@@ -217,7 +207,7 @@ def test_what_both_ensembles_agree_on_is_kept_along_a_weak_direction_too():
     alike = np.array([[1.0, 1.0, 0.0], [1.0, 1.000001, 0.0], [0.0, 0.0, -0.5]])
     squares = alike + np.diag([0.0, 0.0, 2.5])
     expected = alike.copy()
-    expected[2, 2] = 2.0 * AGREEING
+    expected[2, 2] = 2.0 * instruments.AGREEING
     np.testing.assert_allclose(agreed(alike, squares), expected, atol=1e-9)
 
 
@@ -231,7 +221,7 @@ def test_a_window_of_chance_alone_does_not_decide():
     np.testing.assert_allclose(shares.sum(0), np.eye(2), atol=1e-6)
     np.testing.assert_allclose(products, squares)  # one ensemble agrees with itself
     told = np.trace(shares, axis1=1, axis2=2) / 2.0
-    assert told[0] == told.max() <= 1.05 * LARGEST_SHARE
+    assert told[0] == told.max() <= 1.05 * instruments.LARGEST_SHARE
     less = gradients[0] / slopes[0].sum(0)
     assert less[0] == pytest.approx(less[1]) and less[0] < 1e-4
     np.testing.assert_allclose(gradients[1:], slopes[1:].sum(1))
@@ -324,7 +314,9 @@ def test_differences_lead_along_the_axes_of_the_covariance_and_not_out_of_a_rang
     axes = axes_of(np.array([[5e-4, 3e-4], [3e-4, 5e-4]]))
     expected = np.sqrt([[2e-4, 8e-4], [2e-4, 8e-4]])  # two of them, in each component 1 / sqrt(2) of the length
     np.testing.assert_allclose(np.abs(axes), expected)
-    np.testing.assert_allclose(np.linalg.norm(axes_of(np.diag([0.0, 9.0])), axis=0), WIDTHS)
+    np.testing.assert_allclose(np.linalg.norm(axes_of(np.diag([0.0, 9.0])), axis=0), instruments.WIDTHS)
+    wider = np.linalg.norm(axes_of(np.diag([8e-6, 8e-5])), axis=0)  # thrice, as far as that is small
+    np.testing.assert_allclose(wider, [3.0 * 4e-3, instruments.WIDE])
     steps, change = filtering.horizon_of(problem), problem.typical_change
     rows, point, spread = search.rows[search.block], np.array([0.0, 1.0]), np.array([[0.1, -0.1], [0.2, 0.1]])
     log = problem, Readings.at(problem.dataset, problem.states, rows, steps, change), rows
@@ -332,7 +324,7 @@ def test_differences_lead_along_the_axes_of_the_covariance_and_not_out_of_a_rang
     for side in sides:
         np.testing.assert_allclose(side.apart, [[0.2, 0.2], [-0.2, 0.1]])  # both ends of 1 +- 0.2 and of 1 +- 0.1
         np.testing.assert_allclose(side.aside, [0.0, -0.075])
-        assert side.few.shape[1] == 16 // FEWER
+        assert side.few.shape[1] == instruments.FEW
     assert (sides[0].few != sides[1].few).any()
 
 
@@ -365,6 +357,17 @@ def test_errors_are_the_mean_over_both_ends_and_lead_back_to_the_point(above, be
     np.testing.assert_allclose(side.found.counted(side.found.whitened[0]), [[2.0]])
 
 
+def test_steps_are_judged_by_what_chance_makes_of_as_many():
+    """By hand: half of all normal values are within 0.6745, and half of all pairs within 1.0518 = z((1 + √½) / 2)."""
+    assert filtering.moved_by(np.array([0.6745]), np.array([1.0])) == pytest.approx(1.0, rel=1e-4)
+    assert filtering.moved_by(np.array([0.1, -2.1036]), np.array([1.0, 2.0])) == pytest.approx(1.0, rel=1e-4)
+    scatter = np.diag([1.0, 4.0])
+    np.testing.assert_allclose(filtering.beyond_chance(np.array([1.0, 2.0]), scatter), 0.0, atol=1e-6)
+    np.testing.assert_allclose(
+        filtering.beyond_chance(np.array([0.0, 4.0]), scatter), [0.0, 4.0 * 0.5**0.5]
+    )  # 1 - 2 / 4
+
+
 def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tmp_path):
     problem = problem_of_foot(tmp_path)
     search = of_contacts(problem, jax.random.key(0))
@@ -375,13 +378,15 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     after, epoch = filtering.step(problem, rest, "cauchy")
     assert after.settled
     np.testing.assert_array_equal(after.point, rest.point)
-    assert not rest.apart.any() and after.apart.all()
-    known_well = replace(after, apart=np.array([1.0, 2.0]), products=1e3 * told, squares=1e3 * told)
+    assert not rest.apart.any() and after.apart.all() and after.chance.all()
+    known_well = replace(
+        after, apart=np.array([1.0, 2.0]), chance=np.zeros((2, 2)), products=1e3 * told, squares=1e3 * told
+    )
     covariance = known_well.found.uncertainty.covariance  # of one gradient alone, as there was no scatter before
     np.testing.assert_allclose(covariance, np.array([[1.0, 2.0], [2.0, 4.0]]) / (1e3 * len(told)) ** 2)
-    few = 2 * 2 * len(problem.simulator.parameters) // FEWER
-    systems = (2 + few) * filtering.MEMBERS // 2 + filtering.LARGE_ROUNDS * filtering.LARGE
-    assert epoch.control_steps == systems * len(search.rows) * filtering.horizon_of(problem)
+    systems = filtering.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
+    large = filtering.LARGE_ROUNDS * filtering.LARGE * search.size
+    assert epoch.control_steps == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
 
 def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
+from scipy.stats import norm
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.instruments import FEWER, Side, agreed, axes_of, products_of, shares_of
+from madoc.calibration.least_squares.instruments import FEW, Side, agreed, axes_of, products_of, shares_of
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
@@ -36,10 +37,10 @@ BLOCK, MOST_BLOCKS = 32, 8
 """Least number of windows of an epoch, of which the first ones, where steps are large, take half, and largest number of
 such blocks."""
 EARLY_EPOCHS = 8
-"""Largest number of the first epochs, which end once the noise is known and steps are below `SMALL`."""
+"""Largest number of the first epochs, which end once the noise is known and steps are below `NEAR`."""
 WIDTH = 0.1
 """Width of a difference in [-1, 1] to either side at first; later it is by what is known of parameters, `axes_of`."""
-MEMBERS = 16
+MEMBERS = 32
 """Number of states in an ensemble; the last epochs, with half as many, tell what a finite one errs."""
 LARGE, LARGE_ROUNDS = 64, 2
 """Number of states that tell at the end whether what is left is noise, as few leave errors that are alike, and how
@@ -52,11 +53,9 @@ WORSE = 2.0
 """Mean change of the windows' surprise in its standard errors; above it a step certainly makes it worse."""
 DAMPING = (1e-4, 1e2)
 """Smallest and largest damping of a step, relative to the columns' squared lengths."""
-NEAR, SMALL, LIKE_CHANCE = 2.5, 1.5, 1.0
-"""Steps in standard errors, below which epochs count together, below which the first epochs end, and below which the
-search does."""
-AGREES = 3.0
-"""What an epoch's windows alone ask for, in standard errors of their own, up to which they agree with those before."""
+NEAR, LIKE_CHANCE = 2.5, 1.0
+"""Steps in what chance usually makes (`moved_by`), below which the first epochs end and later ones count together, and
+below which the search ends."""
 TOGETHER = 3
 """Least number of epochs that count together in the end."""
 USUAL_EPOCHS = (6, 6)
@@ -67,7 +66,7 @@ FIRST_NOISE = 0.1
 NOISE_SETTLED = 0.4
 """Relative change of noise variances, root of the mean square, below which they are as good as known."""
 NOISE_ROUNDS = 3
-"""Number of runs of half an ensemble before each of the first epochs, which tell the noise better at little cost."""
+"""Number of runs of an ensemble before each of the first epochs, which tell the noise better at little cost."""
 TOUCHING = 0.05
 """Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts if they are enough."""
 FEW_TOUCH = (0.25, 0.5)
@@ -96,7 +95,8 @@ class FilterState:
         squares: Of each ensemble's own, which chance makes larger.
         meat: Scatter of the gradients before the last step, which counts as an error.
         apart: What gradients of half as many states differ from these, sum of the windows compared so far.
-        moved: The largest component of the last step in its standard errors.
+        chance: Scatter of those differences.
+        moved: The last step, by `moved_by`.
         damping: λ of the next step.
         cost: Mean loss of a whitened prediction error before it, in squared standard deviations.
         alike: The largest correlation of a channel's whitened error with that of the next reading, as noise has none;
@@ -120,6 +120,7 @@ class FilterState:
     squares: Float[np.ndarray, "windows d d"]
     meat: Float[np.ndarray, "d d"]
     apart: Float[np.ndarray, " d"]
+    chance: Float[np.ndarray, "d d"]
     moved: float
     damping: float
     cost: float
@@ -177,8 +178,7 @@ class FilterState:
         Not after one whose own windows disagree with those before it: of a step that they alone ask for, one part in
         `together` is taken, and their own standard error is larger by its root.
         """
-        agrees = self.moved * self.together**0.5 < AGREES
-        return self.wide > 1 and bool(self.quiet) and self.moved < NEAR and agrees
+        return self.wide > 1 and bool(self.quiet) and self.moved * max(1, self.together) ** 0.5 < NEAR
 
     @property
     def found(self) -> Found:
@@ -186,10 +186,11 @@ class FilterState:
         products, squares = self.products.sum(0), self.squares.sum(0)
         told = np.diag(squares) > 0.0
         bread = agreed(products, squares) * np.outer(told, told)
+        error = beyond_chance(self.apart, self.chance)
         unlike_noise = self.settled and (self.cost > LONG_TAILS or self.alike > WHITE)
         return Found(
             self.point,
-            sandwich(bread, self.meat + np.outer(self.apart, self.apart)),
+            sandwich(bread, self.meat + np.outer(error, error)),
             self.explained,
             self.settled,
             unlike_noise,
@@ -235,6 +236,7 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
         squares=np.zeros((len(rows), count, count)),
         meat=np.zeros((count, count)),
         apart=np.zeros(count),
+        chance=np.zeros((count, count)),
         moved=0.0,
         damping=FIRST_DAMPING,
         cost=0.0,
@@ -251,11 +253,12 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
 def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
     """Control steps of the next epoch; where the search is at rest no step is tried."""
     members, tried = state.members, 0 if state.at_rest else 1 + len(TRIALS)
-    few = (2 * 2 * len(problem.simulator.parameters) + tried) * (members // FEWER)
-    alone = 0 if state.wide else NOISE_ROUNDS * (members // 2)
+    few = (2 * 2 * len(problem.simulator.parameters) + tried) * FEW
+    alone = 0 if state.wide else NOISE_ROUNDS * members
     if state.at_rest and state.to_compare == 1:
         alone += LARGE_ROUNDS * LARGE
-    return (alone + 2 * members + few) * len(state.rows[state.block]) * horizon_of(problem)
+    windows = len(state.rows[state.block])
+    return (alone * min(windows, state.size) + (2 * members + few) * windows) * horizon_of(problem)
 
 
 def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
@@ -277,7 +280,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     random = [np.random.default_rng([state.seed, state.epochs, number]) for number in range(3)]
     log = problem.dataset, problem.states, problem.simulator, readings, rows
     if not state.wide:
-        how = rounding, count // 2, NOISE_ROUNDS, random[2]
+        how = rounding, count, NOISE_ROUNDS, random[2]
         state = replace(state, noise=with_noise(*log, state.point, state.noise, *how)[1])
     given = problem, readings, rows, state.point, state.spread, state.noise, count
     sides = [Side.of(*given, each) for each in random[:2]]
@@ -286,11 +289,20 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     if state.at_rest:
         # Errors of ensembles are in inverse proportion to their size: half errs by as much again.
         both = whole & state.squares[block].any((1, 2))
-        apart = state.apart + (fresh[0] - state.gradients[block])[both].sum(0)
+        differences = (fresh[0] - state.gradients[block])[both]
         failures = state.failures + int((~whole).sum())
-        following = replace(state, apart=apart, halved=state.halved + 1, epochs=state.epochs + 1, failures=failures)
+        following = replace(
+            state,
+            apart=state.apart + differences.sum(0),
+            chance=state.chance + differences.T @ differences,
+            halved=state.halved + 1,
+            epochs=state.epochs + 1,
+            failures=failures,
+        )
         if following.settled:
-            found, noise = with_noise(*log, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random[2])
+            some = np.arange(min(state.size, len(rows)))
+            fewer = problem.dataset, problem.states, problem.simulator, readings.of(some), rows[some]
+            found, noise = with_noise(*fewer, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random[2])
             following = replace(following, noise=noise, cost=_cost(found, loss), alike=found.alike())
         return following, Epoch({"moved": state.moved}, epoch_steps(problem, state))
     together = state.together + 1 if state.near else 0
@@ -311,7 +323,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     error = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
     ratio = np.mean([each.found.noise_ratio() for each in sides], axis=0)
     noise = next_noise(state.noise, ratio, rounding)
-    moved, pull = float((np.abs(undamped) / error).max()), bread @ undamped
+    moved, pull = moved_by(undamped, error), bread @ undamped
     quiet = bool((((noise / state.noise) ** 2 - 1.0) ** 2).mean() < NOISE_SETTLED**2)
     refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))
     following = replace(
@@ -326,7 +338,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         meat=meat + np.outer(pull, pull),
         moved=max(moved, LIKE_CHANCE) if refused else moved,
         cost=float(np.mean([_cost(each.found, loss) for each in sides])),
-        wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < SMALL)),
+        wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < NEAR)),
         quiet=int(quiet),
         together=together,
         epochs=state.epochs + 1,
@@ -334,6 +346,19 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     )
     metrics = {"residual": following.cost**0.5, "moved": following.moved, "noise": float(np.median(noise))}
     return following, Epoch(metrics, epoch_steps(problem, state))
+
+
+def moved_by(step: Float[np.ndarray, " d"], error: Float[np.ndarray, " d"]) -> float:
+    """The largest component of a step in its standard errors, over the median of that of as many normal values."""
+    usual = norm.ppf((1.0 + 0.5 ** (1.0 / len(step))) / 2.0)
+    return float((np.abs(step) / error).max() / usual)
+
+
+def beyond_chance(total: Float[np.ndarray, " d"], scatter: Float[np.ndarray, "d d"]) -> Float[np.ndarray, " d"]:
+    """A sum of values with this scatter, shortened by as much as chance alone makes it longer."""
+    least = np.diag(1e-9 * total**2 + np.finfo(float).tiny)
+    squared = float(total @ np.linalg.solve(scatter + least, total))
+    return total * (1.0 - len(total) / max(squared, len(total))) ** 0.5
 
 
 def _cost(found: Innovations, loss: Loss) -> float:

@@ -23,10 +23,13 @@ from madoc.identification.linearisation import LEAST_CURVATURE
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
 from madoc.identification.replay import Readings
 
-FEWER = 4
-"""Ratio of an ensemble to the number of states at the ends of differences and after steps that are tried."""
+FEW = 2
+"""Number of states at the ends of differences and after steps that are tried; time is better spent on more windows."""
 WIDTHS = (0.005, 0.4)
 """Smallest and largest width of a difference in [-1, 1] to either side."""
+WIDER, WIDE = 3.0, 0.02
+"""Factor by which differences are wider, up to the second, in [-1, 1]: so near the point predictions are as good as
+linear, and there is less of the ensembles' chance in wider ones."""
 LARGEST_SHARE = 0.1
 """Largest share in [0, 1] of the squares of all windows, mean over all directions, that a window counts with."""
 ROUNDS = 10  # of weighting windows of too large a share less
@@ -71,7 +74,7 @@ class Side:
         """
         states, simulator = problem.states, problem.simulator
         members = members_at(problem.dataset, states, simulator, rows, noise * readings.scale, count, random)
-        few = few_of(members, count // FEWER, states.physical_size)
+        few = few_of(members, FEW, states.physical_size)
         above, below = (np.clip(point + sign * spread.T, -1.0, 1.0) for sign in (1, -1))
         found = innovations(simulator, readings, point[None], members, noise, first=first_counted(states))
         ends = innovations(simulator, readings, np.concatenate([above, below]), few, noise, like=found)
@@ -146,4 +149,5 @@ def axes_of(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
     Means over the ends are those of cubic functions over its normal distribution (Arasaratnam and Haykin 2009).
     """
     variances, axes = np.linalg.eigh(covariance)
-    return axes * np.clip(np.sqrt(len(axes) * np.maximum(variances, 0.0)), *WIDTHS)
+    width = np.sqrt(len(axes) * np.maximum(variances, 0.0))
+    return axes * np.clip(np.maximum(width, np.minimum(WIDER * width, WIDE)), *WIDTHS)
