@@ -10,7 +10,7 @@ from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares import filtering, instruments
 from madoc.calibration.least_squares.calibrator import LeastSquares
-from madoc.calibration.least_squares.filtering import of_contacts
+from madoc.calibration.least_squares.filtering import beyond_chance, moved_by, of_contacts
 from madoc.calibration.least_squares.instruments import Side, agreed, axes_of, products_of, shares_of
 from madoc.data import Disturbance, disturb
 from madoc.identification.ensembles import (
@@ -335,8 +335,10 @@ def test_predictions_leave_errors_alike_only_where_windows_agree():
     errors[..., 1] += 1.5 * random.standard_normal((1, 40, 1))
     found = known(errors)
     clipped = np.clip(errors[0, ..., 1], -3.0, 3.0)
-    assert found.alike() == pytest.approx((clipped[:, 1:] * clipped[:, :-1]).mean() / (clipped**2).mean())
-    assert 0.5 < found.alike() < 0.75
+    pairs = (clipped[:, 1:] * clipped[:, :-1]).mean(1)
+    certain = pairs.mean() - 2.0 * pairs.std(ddof=1) / np.sqrt(40)
+    assert found.alike() == pytest.approx(certain / (clipped**2).mean())
+    assert 0.4 < found.alike() < 0.6
     errors[..., 1], errors[0, 0, :, 2] = errors[..., 0], 2.9
     assert replace(found).alike() < 0.1  # the third has a correlation of 0.2 that one window makes
 
@@ -359,13 +361,11 @@ def test_errors_are_the_mean_over_both_ends_and_lead_back_to_the_point(above, be
 
 def test_steps_are_judged_by_what_chance_makes_of_as_many():
     """By hand: half of all normal values are within 0.6745, and half of all pairs within 1.0518 = z((1 + √½) / 2)."""
-    assert filtering.moved_by(np.array([0.6745]), np.array([1.0])) == pytest.approx(1.0, rel=1e-4)
-    assert filtering.moved_by(np.array([0.1, -2.1036]), np.array([1.0, 2.0])) == pytest.approx(1.0, rel=1e-4)
-    scatter = np.diag([1.0, 4.0])
-    np.testing.assert_allclose(filtering.beyond_chance(np.array([1.0, 2.0]), scatter), 0.0, atol=1e-6)
-    np.testing.assert_allclose(
-        filtering.beyond_chance(np.array([0.0, 4.0]), scatter), [0.0, 4.0 * 0.5**0.5]
-    )  # 1 - 2 / 4
+    one, two, scatter = np.array([0.6745]), np.array([0.1, -2.1036]), np.diag([1.0, 4.0])
+    assert [moved_by(one, np.ones(1)), moved_by(two, np.array([1.0, 2.0]))] == pytest.approx([1.0, 1.0], rel=1e-4)
+    np.testing.assert_allclose(beyond_chance(np.array([1.0, 2.0]), scatter), 0.0, atol=1e-6)
+    half = beyond_chance(np.array([0.0, 4.0]), scatter)  # 1 - 2 / 4
+    np.testing.assert_allclose(half, [0.0, 4.0 * 0.5**0.5])
 
 
 def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tmp_path):

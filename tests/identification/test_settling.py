@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from madoc import robots, simulation, tasks
+from madoc import simulation, tasks
 from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb
 from madoc.identification import settling
@@ -20,9 +20,7 @@ from madoc.identification.settling import (
     settle,
     settled_to_noise,
     window_costs,
-    with_bases_settled,
 )
-from own_robots import SLED, SLED_SPEC, SLED_TRUTH, write_robot
 from robots import SPRING_TRUTH, recorded, spring
 
 
@@ -129,21 +127,3 @@ def test_contacts_of_a_window_are_those_of_its_simulated_states():
         np.testing.assert_array_equal(simulator.contacts(state[0]), expected)
         if step < readings.steps:
             state = system.step(state, readings.actions[None, :, step])
-
-
-def test_the_place_and_speed_of_a_base_move_before_what_sensors_show(tmp_path):
-    task = robots.load(write_robot(tmp_path, SLED_SPEC, sled=SLED)).task
-    problem = CalibrationProblem(recorded(task, SLED_TRUTH, 300, jax.random.key(0)), simulation.make(task, threads=1))
-    rows, point = np.arange(40, 280, 10), task.parameters.to_unit(task.parameters.vector(SLED_TRUTH))
-    readings = Readings.at(problem.dataset, problem.states, rows, 8, problem.typical_change)
-    guesses = problem.states.states[rows]
-    damping, width = np.full(len(rows), settling.FIRST_DAMPING), np.zeros(len(readings.spread))
-    after = settle(problem.simulator, readings, point, guesses, damping, width, "cauchy", placed_alone=True)
-    moved = np.abs(after.states - guesses).max(0)[: len(readings.placed)] > 1e-9
-    assert moved.any() and not (moved & ~readings.placed).any()
-    assert after.simulations == len(rows) * (1 + 6 + 3)
-    states, _ = with_bases_settled(problem.simulator, readings, point, guesses)
-    before, now = (
-        np.nanmean(readings.residuals(problem.simulator, point[None], each[None]) ** 2) for each in (guesses, states)
-    )
-    assert now < 0.3 * before

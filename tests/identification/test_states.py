@@ -8,6 +8,7 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.errors import MadocError
+from madoc.identification.ensembles import members_at
 from madoc.identification.states import probing_windows, states_observed_as, states_of
 from own_robots import CART_SPEC, GEARED, GEARED_SPEC, SLED, SLED_SPEC, SLED_TRUTH, write_robot
 from robots import SPRING_TRUTH, recorded, spring
@@ -83,6 +84,12 @@ def test_a_base_that_no_sensor_shows_stands_on_the_floor_and_is_followed(tmp_pat
     # Once it has fallen, it is 0.07 m above the ground, which is at 0.3 m; feet give way by less than a millimetre.
     np.testing.assert_allclose(logged.states[40:, 2], 0.37, atol=2e-3)
     np.testing.assert_allclose(logged.states[40:, 10], 0.0, atol=0.05)
+    simulator, noise = simulation.make(task, threads=1), np.full(9, 1e-6)
+    rows = np.arange(40, 90, 10)
+    drawn = members_at(log, logged, simulator, rows, noise, 400, np.random.default_rng(0)) - logged.states[rows, None]
+    np.testing.assert_allclose(drawn.std((0, 1))[[0, 1, 2]], 0.003, rtol=0.1)
+    np.testing.assert_allclose(drawn.std((0, 1))[[8, 9, 10]], 0.05, rtol=0.1)
+    assert np.abs(drawn[..., [7, 11, 12, 13, 14]]).max() < 1e-3
 
 
 @pytest.mark.parametrize("encoder", ["motor", "link"])

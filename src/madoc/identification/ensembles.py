@@ -15,11 +15,12 @@ from jaxtyping import Bool, Float, Int
 
 from madoc.data.dataset import Dataset
 from madoc.data.timescale import stride
+from madoc.data.velocities import moving_states
 from madoc.identification.losses import Loss
 from madoc.identification.noise import difference_noise
 from madoc.identification.replay import Readings
-from madoc.identification.settling import FAILED_WINDOW, settled_to_noise, window_costs, with_bases_settled
-from madoc.identification.states import LoggedStates, states_of
+from madoc.identification.settling import FAILED_WINDOW, settled_to_noise, window_costs
+from madoc.identification.states import LoggedStates, completed
 from madoc.simulation.attitudes import differences, moved
 from madoc.simulation.base import Simulator
 
@@ -29,6 +30,8 @@ NOISE_CHANGE = (0.1, 4.0)
 """Smallest and largest factor of a channel's noise variance from a run of the filter to the next."""
 CLIP, OF_CLIPPED = 3.0, 0.9950
 """Standard deviations at which errors are clipped, and the mean square of a normal value that is."""
+OF_BASES = (0.003, 0.05)
+"""Standard deviations in m and m/s of the places and speeds that contacts give bases which no sensor shows."""
 BEFORE, MOST_BEFORE = 8, 30
 """Number of strides before a window, by whose readings a filter finds states at its first row; so many rows at most."""
 DRAWN = 16
@@ -124,17 +127,17 @@ class Innovations:
         return errors[:, self.first :, kept].reshape(len(errors), -1)
 
     def alike(self) -> float:
-        """The largest certain correlation of a channel's whitened errors with the next ones, outliers clipped.
+        """The largest correlation of a channel's whitened errors with the next ones that is certain, outliers clipped.
 
-        It is that of the first system; 0 for right predictions, as these use every reading before them.
-        A correlation is certain where windows agree on it, by two standard errors.
+        It is that of the first system; 0 for right predictions, as these use every reading before them. What is certain
+        is what remains of a mean over windows less two standard errors.
         """
         errors = np.clip(self.whitened[0, self.whole[0], self.first :], -CLIP, CLIP)
         if len(errors) < 2:
             return 0.0
         pairs, squares = (errors[:, 1:] * errors[:, :-1]).mean(1), (errors**2).mean((0, 1))
-        certain = pairs.mean(0) > 2.0 * pairs.std(0, ddof=1) / np.sqrt(len(pairs))
-        return float((certain * pairs.mean(0) / np.maximum(squares, _SMALLEST)).max(initial=0.0))
+        certain = pairs.mean(0) - 2.0 * pairs.std(0, ddof=1) / np.sqrt(len(pairs))
+        return float((certain / np.maximum(squares, _SMALLEST)).max(initial=0.0))
 
     def noise_ratio(self) -> Float[np.ndarray, " channels"]:
         """Mean square of each channel's prediction errors over their variance, outliers clipped; 1 if they are all 0.
@@ -260,7 +263,7 @@ def members_at(
     """States that are as likely as those of the log at some rows: rebuilt from its readings with further noise.
 
     `noise` is the sensors', in the units of the channels. Where velocities are differences of positions, they are those
-    of the positions with noise.
+    of the positions with noise. Bases that no sensor shows are about where contacts have placed them (`OF_BASES`).
     """
     assert np.isin(rows, logged.rows).all()
     states = logged.states[np.searchsorted(logged.rows, rows)]
@@ -269,6 +272,9 @@ def members_at(
     drawn = [draw(dataset, simulator, rows, noise, random)[:, physical] for _ in range(count)]
     members = np.repeat(states[:, None], count, axis=1)
     members[..., physical] = np.stack(drawn, axis=1)
+    if (bases := np.flatnonzero(logged.placed)).size:
+        spread = np.where(bases < simulator.task.model.nq, *OF_BASES)
+        members[..., bases] = states[:, None, bases] + spread * random.standard_normal((*members.shape[:2], len(bases)))
     return members
 
 
@@ -293,19 +299,28 @@ def _rebuilt_from_neighbours(
     rows: Int[np.ndarray, " windows"],
     noise: Float[np.ndarray, " channels"],
     random: np.random.Generator,
-) -> Float[np.ndarray, "windows state"]:
-    """States whose velocities are differences of positions in the rows around."""
-    logged, attitudes = dataset.transitions, simulator.task.attitudes
-    here, there = (np.asarray(part, np.float64) for part in (logged.observation, logged.next_observation))
+) -> Float[np.ndarray, "windows physical"]:
+    """(qpos, qvel) whose velocities are differences of positions in the rows around."""
+    attitudes, episode = simulator.task.attitudes, dataset.episode_of(rows)
+    first = np.maximum(rows - 1, dataset.episode_starts[episode])
+    count = np.minimum(rows + 2, dataset.episode_ends[episode]) - first
+    starts = np.cumsum(count) - count
+    near = dataset.take(np.arange(count.sum()) + np.repeat(first - starts, count), starts)
+    here, there = (
+        np.asarray(part, np.float64) for part in (near.transitions.observation, near.transitions.next_observation)
+    )
     error = np.zeros((2, *here.shape))
     error[..., : len(noise)] = random.standard_normal((*error.shape[:2], len(noise))) * noise
-    last = np.isin(np.arange(len(dataset)), dataset.episode_ends - 1)
+    last = np.isin(np.arange(len(near)), near.episode_ends - 1)
     following = np.where(last[:, None], error[1], np.roll(error[0], -1, axis=0))
     noisy = replace(
-        logged, observation=moved(attitudes, here, error[0]), next_observation=moved(attitudes, there, following)
+        near.transitions,
+        observation=moved(attitudes, here, error[0]),
+        next_observation=moved(attitudes, there, following),
     )
-    states = states_of(replace(dataset, transitions=noisy), simulator)
-    return states.states[np.searchsorted(states.rows, rows)]
+    before, after = moving_states(replace(near, transitions=noisy), simulator.task)
+    place = starts + rows - first
+    return completed(simulator, before[place], (after - before)[place])[0]
 
 
 def with_contacts_settled(
@@ -323,7 +338,7 @@ def with_contacts_settled(
     taken, and settles (`settled_to_noise`): what states in wrong minima leave would pass for what the model lacks.
     """
     (likely,), spent = likely_states(dataset, logged, simulator, readings, rows, point[None], guesses)
-    if readings.placed.any() or not _touch(simulator, point, guesses):
+    if not _touch(simulator, point, guesses):
         return likely, spent
     after = settled_to_noise(simulator, readings, point, likely)
     return after.states, spent + after.simulations * readings.steps
@@ -358,9 +373,6 @@ def likely_states(
     steps.
     """
     point = points[-1]
-    if readings.placed.any():
-        placed = [with_bases_settled(simulator, readings, each, guesses) for each in points]
-        return np.stack([states for states, _ in placed]), sum(count for _, count in placed) * readings.steps
     if not (logged.starts_known and can_be_drawn(logged, simulator) and _touch(simulator, point, guesses)):
         return np.repeat(guesses[None], len(points), axis=0), 0
     before = min(BEFORE * stride(dataset), MOST_BEFORE)

@@ -53,7 +53,6 @@ def expected_half_widths(
             np.zeros((len(windows), windows.steps + 1, logged.measured)),  # derivatives do not depend on readings
             noise[: logged.measured],
             spread_of(windows.states[:, : logged.physical_size]),
-            logged.placed,
         )
         (around,) = slopes_at(simulator, readings, point[None], windows.states[None])
         damping = np.full(len(windows), _STATE_DAMPING)

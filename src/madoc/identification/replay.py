@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from madoc.data.dataset import Dataset, spread_of
 from madoc.identification.linearisation import (
@@ -51,14 +51,12 @@ class Readings:
         scale: Typical change of each channel in a step, of which residuals are multiples.
         spread: Standard deviation of each value of (qpos, qvel) over the log, of which steps of initial states are
             multiples. Pending actions are known.
-        placed: Which values of (qpos, qvel) no sensor shows, as of `LoggedStates`.
     """
 
     actions: Float[np.ndarray, "windows steps action"]
     observed: Float[np.ndarray, "windows readings channels"]
     scale: Float[np.ndarray, " channels"]
     spread: Float[np.ndarray, " physical"]
-    placed: Bool[np.ndarray, " physical"]
 
     @classmethod
     def at(
@@ -75,7 +73,6 @@ class Readings:
             observed=readings_at(dataset, rows, steps)[..., : logged.measured],
             scale=scale[: logged.measured],
             spread=spread_of(logged.states[:, : logged.physical_size]),
-            placed=logged.placed,
         )
 
     def __len__(self) -> int:
@@ -160,16 +157,14 @@ def slopes_at(
     initial_states: bool = True,
     central: bool = True,
     width: Float[np.ndarray, " physical"] | None = None,
-    placed_alone: bool = False,
 ) -> list[WindowSlopes]:
     """Residuals and their derivatives around every point's parameters and initial states, in two batches.
 
     Differences by parameters are central, which contacts need, or one-sided, which serves where motion is smooth; those
     by the many state values are one-sided. Without `parameters` there are only the latter, and d is 0; without
     `initial_states` only the former, and n is 0. Differences are `DIFFERENCE` wide, those by initial states `width`
-    where that is larger, in standard deviations of each value over the log. Derivatives by values of initial states
-    that sensors show are 0 where those that are `placed` count alone. It takes points · windows · (1 + 2 d + n) · steps
-    control steps, or (1 + d + n) of one-sided differences.
+    where that is larger, in standard deviations of each value over the log. It takes points · windows ·
+    (1 + 2 d + n) · steps control steps, or (1 + d + n) of one-sided differences.
     """
     count, windows, size = states.shape
     neighbours = difference_points if central else one_sided_points
@@ -178,13 +173,10 @@ def slopes_at(
     by_points = readings.residuals(simulator, around.reshape(-1, points.shape[1]), np.repeat(states, each, axis=0))
     by_points = by_points.reshape(count, each, windows, -1)
     by_shifts = np.zeros((count, 0, *by_points.shape[2:]))
-    moving = readings.placed if placed_alone else np.ones(len(readings.spread), bool)
     widths = np.maximum(DIFFERENCE, np.zeros(len(readings.spread)) if width is None else width)
     if initial_states:
-        shift = readings.in_state_units(np.diag(widths)[moving], size)
-        shifted = states[:, None] + shift[:, None]
-        by_shifts = np.repeat(by_points[:, :1], len(moving), axis=1)
-        by_shifts[:, moving] = readings.residuals(simulator, points, shifted.reshape(count, -1, size))
+        shifted = states[:, None] + readings.in_state_units(np.diag(widths), size)[:, None]
+        by_shifts = readings.residuals(simulator, points, shifted.reshape(count, -1, size))
     return [slopes_of_windows(*parts, widths) for parts in zip(around, by_points, by_shifts, strict=True)]
 
 

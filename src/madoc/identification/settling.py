@@ -23,8 +23,6 @@ WIDTHS = (0.0, 3.0, 3.0, 1.5, 0.7, 0.3, 0.1, 0.0, 0.0)
 """Widths of the differences from step to step, in standard errors of the initial states; 0 is `DIFFERENCE`."""
 RESETTLING = (1.0, 0.3, 0.0)
 """The same where initial states are nearly right: after a step of the parameters, or as drawn by an ensemble."""
-PLACED_ALONE = 3
-"""Number of steps of places and speeds that no sensor shows, before all values of an initial state move."""
 RESTARTS = 5
 """Number of times that windows whose residuals are more than noise begin anew, near the guess of their state."""
 ANEW = 2
@@ -89,17 +87,13 @@ def settle(
     damping: Float[np.ndarray, " windows"],
     width: Float[np.ndarray, " physical"],
     loss: Loss,
-    *,
-    placed_alone: bool = False,
 ) -> Settled:
     """One damped Gauss-Newton step of every window's initial state, of the damping of `TRIALS` that fits it best.
 
     `width` is that of the differences, in standard deviations of each value over the log, at least `DIFFERENCE`. It
-    takes 1 + n + 3 simulations of every window, for states of n values, or of n that are placed where these alone move.
+    takes 1 + n + 3 simulations of every window, for states of n values.
     """
-    (slopes,) = slopes_at(
-        simulator, readings, point[None], states[None], parameters=False, width=width, placed_alone=placed_alone
-    )
+    (slopes,) = slopes_at(simulator, readings, point[None], states[None], parameters=False, width=width)
     deviation, errors = _noise_and_errors(slopes, readings)
     scaled = slopes.over(np.tile(deviation, readings.steps + 1))
     weights = loss_slope((scaled.residuals / TUNING[loss]) ** 2, loss) * scaled.whole[:, None]
@@ -118,7 +112,7 @@ def settle(
         deviation=deviation,
         costs=costs.min(0),
         failures=int((~slopes.whole).sum()),
-        simulations=len(readings) * (1 + (int(readings.placed.sum()) if placed_alone else len(width)) + len(TRIALS)),
+        simulations=len(readings) * (1 + len(width) + len(TRIALS)),
     )
 
 
@@ -134,9 +128,7 @@ def restart(
     """Settle anew the windows whose residuals are more than noise, and keep what fits each of them better.
 
     They begin at their guess, without `random` at that itself, and else with a normal error of the size of the states'
-    standard errors or of up to `FARTHEST` times that: where velocities jump, guesses may be far off. Where sensors show
-    all but the place and speed of a base, they begin at the guess with that place and speed as they have settled: these
-    are better known by then, and what is measured has gone astray to make up for what they were.
+    standard errors or of up to `FARTHEST` times that: where velocities jump, guesses may be far off.
     """
     worse = np.flatnonzero(before.unexplained(readings.observed[0].size, loss))
     if not len(worse):
@@ -146,15 +138,10 @@ def restart(
     if random is not None:
         size = FARTHEST ** random.random((len(worse), 1)) * before.errors
         error = np.minimum(size, 1.0) * random.standard_normal(error.shape)
-    states, widths = guesses[worse] + readings.in_state_units(error, guesses.shape[1]), WIDTHS[1:]
-    if readings.placed.any():
-        columns = np.flatnonzero(readings.placed)
-        states, widths = guesses[worse], (*np.zeros(PLACED_ALONE), *RESETTLING)
-        states[:, columns] = before.states[np.ix_(worse, columns)]
+    states = guesses[worse] + readings.in_state_units(error, guesses.shape[1])
     damping, simulations = np.full(len(worse), FIRST_DAMPING), 0
-    for step, width in enumerate(widths):
-        alone = readings.placed.any() and step < PLACED_ALONE
-        after = settle(simulator, part, point, states, damping, width * before.errors, loss, placed_alone=bool(alone))
+    for width in WIDTHS[1:]:
+        after = settle(simulator, part, point, states, damping, width * before.errors, loss)
         states, damping, simulations = after.states, after.damping, simulations + after.simulations
     residuals = part.residuals(simulator, point[None], states[None])[0, 0]
     costs = window_costs(residuals / np.tile(before.deviation, readings.steps + 1), loss)
@@ -218,22 +205,6 @@ def settled_to_noise(
         if left > (1.0 - WORTH_MORE) * before:
             break
     return after
-
-
-def with_bases_settled(
-    simulator: Simulator,
-    readings: Readings,
-    point: Float[np.ndarray, " d"],
-    guesses: Float[np.ndarray, "windows state"],
-) -> tuple[Float[np.ndarray, "windows state"], int]:
-    """Initial states from near which those of single contacts can be fitted, and the simulations that it took.
-
-    They are the guesses, but where sensors do not show where a base is: its place and speed settle there first.
-    """
-    if not readings.placed.any():
-        return guesses, 0
-    after = settled(simulator, readings, point, guesses, (0.0,), 1)
-    return after.states, after.simulations
 
 
 @cache

@@ -103,11 +103,7 @@ def states_of(dataset: Dataset, simulator: Simulator) -> LoggedStates:
         return rebuilt
     here, there = moving_states(dataset, task)
     placed = on_the_floor(task, here)
-    guess = np.where(np.isnan(placed.states), simulator.initial_state[:physical], placed.states)
-    gears = deflection_values(task.model)[0]
-    gears = gears[np.isnan(here[:, gears]).all(0)]
-    if len(gears):
-        guess = _with_loaded_gears(simulator, guess, (there - here)[:, task.model.nq :] / simulator.control_step, gears)
+    guess, gears = completed(simulator, placed.states, there - here)
     try:
         states, rows = with_pending(dataset, task, guess, np.arange(len(dataset)))
     except MadocError as error:
@@ -119,6 +115,22 @@ def states_of(dataset: Dataset, simulator: Simulator) -> LoggedStates:
     unseen = (unseen_values(task) & ~guessed).any()
     kind: Kind = "unknown" if unseen else "approximate"
     return replace(rebuilt, kind=kind, states=states, rows=rows, placed=placed.found)
+
+
+def completed(
+    simulator: Simulator, states: Float[np.ndarray, "rows physical"], change: Float[np.ndarray, "rows physical"]
+) -> tuple[Float[np.ndarray, "rows physical"], Int[np.ndarray, " gears"]]:
+    """States with what is NaN in them as the model has it, and gears deflected by their load; also which gears are.
+
+    `change` is that of the states in a control step.
+    """
+    nq = simulator.task.model.nq
+    gears = deflection_values(simulator.task.model)[0]
+    gears = gears[np.isnan(states[:, gears]).all(0)]
+    filled = np.where(np.isnan(states), simulator.initial_state[: states.shape[1]], states)
+    if len(gears):
+        filled = _with_loaded_gears(simulator, filled, change[:, nq:] / simulator.control_step, gears)
+    return filled, gears
 
 
 def _with_loaded_gears(

@@ -17,8 +17,8 @@ from madoc.runs.progress import waiting
 from madoc.verdict import assess
 from madoc.verdict.evidence import evidence, save_evidence
 
-LEAST_OF_SEARCH = 0.2
-"""Least share of a time budget that the search gets."""
+OF_SEARCH, LEAST_OF_SEARCH = 2.0 / 3.0, 0.2
+"""Share of a time budget that the search may take, with what is spent before it, and the least one that it gets."""
 
 
 def calibrate_in(
@@ -72,11 +72,8 @@ def calibrate_in(
 
 
 def _for_search(budget: Seconds, spent: float) -> Seconds:
-    """What a search gets of a time that is for the whole command, of which some is spent: half, as judging takes it.
-
-    It gets a fifth at least.
-    """
-    return Seconds(max(budget.seconds * LEAST_OF_SEARCH, budget.seconds / 2.0 - spent))
+    """What a search gets of a time that is for the whole command, of which some is spent, as judging takes the rest."""
+    return Seconds(budget.seconds * max(LEAST_OF_SEARCH, OF_SEARCH - spent / budget.seconds))
 
 
 def default_folder(order: CalibrationOrder) -> Path:

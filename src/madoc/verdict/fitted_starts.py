@@ -29,8 +29,6 @@ FIT_STEPS = 10
 """Largest number of damped Gauss-Newton steps of an initial state, which begins at finite differences."""
 GAIN = 1e-3
 """Share in (0, 1] of a window's squared residuals; after a step that saves less its initial state is fitted."""
-STEPS_OF_BASES = 2
-"""The same where the place of a base, which no sensor shows, has settled with the state before."""
 FEW = 0.01
 """Share in [0, 1] of the windows, up to which no further step is taken for those that a step gained on."""
 _SHARES = np.array([1.0, 0.3, 0.1])
@@ -97,7 +95,7 @@ class FittedReplays:
         log = self.held, self.logged, self.simulator, first, self.rows
         states, spent = likely_states(*log, points, self.near)
         gaining = np.arange(len(first))
-        for _ in range(STEPS_OF_BASES if first.placed.any() else FIT_STEPS):
+        for _ in range(FIT_STEPS):
             part, around = first.of(gaining), states[:, gaining]
             slopes = slopes_at(self.simulator, part, points, around, parameters=False)
             damping = np.full(len(part), _DAMPING)

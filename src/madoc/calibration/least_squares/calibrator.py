@@ -12,7 +12,6 @@ from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.lengthening import (
     LENGTHS,
     LONGER,
-    OF_BASES,
     READINGS,
     LeastSquaresState,
     Stage,
@@ -253,15 +252,10 @@ class LeastSquares:
         return self._search(KnownStarts, "logged", horizon, self.searches)
 
     def _unknown(self, problem: CalibrationProblem, length: int = 0) -> Search:
-        """The search with unknown initial states; after one from logged states it needs to begin at one point only.
-
-        So does one in which nearly all of the states is measured, as where only the place of a base is not.
-        """
-        of_bases = bool(problem.states.placed.any())
-        searches = self.searches if self._first_stage(problem) == "estimated" and not of_bases else 1
+        """The search with unknown initial states; after one from logged states it needs to begin at one point only."""
+        searches = self.searches if self._first_stage(problem) == "estimated" else 1
         fewest = 2 * (FEWEST + len(problem.simulator.parameters))
-        scales = OF_BASES if of_bases else 1
-        horizon = self.horizon or LENGTHS[length] * horizon_of(problem.dataset, fewest, scales)
+        horizon = self.horizon or LENGTHS[length] * horizon_of(problem.dataset, fewest)
         return self._search(UnknownStarts, "estimated", horizon, searches)
 
     def _search(
@@ -273,13 +267,11 @@ class LeastSquares:
     def _all_lengths(self, problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[SearchState, ...]:
         """Searches on the shortest windows, and on every length that the episodes are long enough for.
 
-        If `horizon` is given, there is one length, and where sensors do not show where a base is: longer windows hold
-        more contacts that begin and end, and would tell little more.
+        If `horizon` is given, there is one length.
         """
         first = self._unknown(problem).init(problem, key)
         searches = [first]
-        one_length = self.horizon is not None or problem.states.placed.any()
-        for length in range(LONGER, LONGER if one_length else len(LENGTHS)):
+        for length in range(LONGER, LONGER if self.horizon is not None else len(LENGTHS)):
             most = READINGS * len(first.rows) // LENGTHS[length]
             longer = lengthened(problem, searches[-1], self._unknown(problem, length).horizon, most)
             if longer is None:

@@ -206,7 +206,7 @@ def horizon_of(problem: CalibrationProblem) -> int:
 def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState | None:
     """The search before it has begun; None where few windows show contacts, or sensors do not show all positions."""
     states, count = problem.states, len(problem.simulator.parameters)
-    if not states.starts_known or states.placed.any() or not can_be_drawn(states, problem.simulator):
+    if not states.starts_known or not can_be_drawn(states, problem.simulator):
         return None
     horizon = horizon_of(problem)
     if not len(rows_that_fit(problem.dataset, states.rows, horizon)):
@@ -269,9 +269,9 @@ def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
 def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[FilterState, Epoch]:
     """One step of the parameters, and the noise of every channel by how large its prediction errors were.
 
-    Once the noise is known and the end is near it is by all epochs since, each of which has other windows, or the same
-    ones once more where the log has no others, so that the chance of windows and of ensembles averages out. Gradients
-    of earlier windows follow the parameters by what those tell of them.
+    Once the noise is known and the end is near both are by all epochs since, each of which has other windows, or the
+    same ones once more where the log has no others, so that the chance of windows and of ensembles averages out.
+    Gradients of earlier windows follow the parameters by what those tell of them.
     """
     block, count = state.block, state.members
     rows = state.rows[block]
@@ -322,7 +322,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     covariance = sandwich(bread, meat).covariance
     error = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
     ratio = np.mean([each.found.noise_ratio() for each in sides], axis=0)
-    noise = next_noise(state.noise, ratio, rounding)
+    noise = next_noise(state.noise, 1.0 + (ratio - 1.0) / max(1, together), rounding)
     moved, pull = moved_by(undamped, error), bread @ undamped
     quiet = bool((((noise / state.noise) ** 2 - 1.0) ** 2).mean() < NOISE_SETTLED**2)
     refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))

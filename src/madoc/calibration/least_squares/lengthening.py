@@ -33,9 +33,6 @@ SHORTEST = 3
 state."""
 READINGS = 2
 """Largest number of readings in all longer windows, relative to the first search; more only for `FEWEST` windows."""
-OF_BASES = 3
-"""Length of the first windows relative to the time scale where these also tell where a base is, which no sensor does:
-the readings of several steps of the legs bear it out, those of one do not."""
 AS_WELL = 1.2
 """Ratio of a channel's noise to that of the first windows, at least 1; above it longer windows show model errors."""
 HOPELESS = 2.0
@@ -91,8 +88,8 @@ class LeastSquaresState:
         return bool(self.finished) or (self.prediction is not None and self.prediction.progress == "under way")
 
 
-def horizon_of(dataset: Dataset, fewest: int, scales: int = 1) -> int:
-    """Length in control steps of the first windows with unknown initial states: as many of the robot's time scales.
+def horizon_of(dataset: Dataset, fewest: int) -> int:
+    """Length in control steps of the first windows with unknown initial states: the robot's time scale.
 
     In shorter windows little moves; in longer ones small errors grow until simulated and logged motion are unrelated.
     The length is at least `SHORTEST`, no longer than the episode that the median row is in, and short enough for
@@ -100,7 +97,7 @@ def horizon_of(dataset: Dataset, fewest: int, scales: int = 1) -> int:
     """
     lengths = dataset.episode_ends - dataset.episode_starts
     longest = min(int(np.median(np.repeat(lengths, lengths))), len(dataset) // fewest - 1)
-    return max(min(SHORTEST, int(lengths.max())), min(scales * dataset.time_scale, longest))
+    return max(min(SHORTEST, int(lengths.max())), min(dataset.time_scale, longest))
 
 
 def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, most: int) -> SearchState | None:

@@ -33,9 +33,6 @@ FOUND = (0.5, 0.9)
 the size of all residuals, those windows lacked an initial state, not a better model."""
 FIRST_STEPS = 2
 """Number of steps of initial states at contacts with whose result those of the following steps are compared."""
-LEAST_STEP = 5e-3
-"""Step in [-1, 1], a quarter of a percent of a range; where sensors do not show where a base is, none smaller follows:
-a few of its windows end in another contact after each."""
 FAR = 3.0
 """Distance in standard errors; once parameters have moved farther, initial states are looked for anew."""
 SHORTER = 1.0 / TRIALS[0]
@@ -265,9 +262,7 @@ class Search:
             new["point"][0] = np.clip(plan.point + step, -1.0, 1.0)
             new["states"][0], new["state_damping"][0] = after.states, after.damping
         new["damping"][0] = np.clip(damping, *DAMPING_RANGE)
-        of_bases = bool(windows.readings.placed.any())
-        least = LEAST_STEP if of_bases else 0.0
-        new["cost"][0], new["moved"][0] = cost, self._relative_step(plan, step, ROUGHLY_SETTLED, least)
+        new["cost"][0], new["moved"][0] = cost, self._relative_step(plan, step, ROUGHLY_SETTLED)
         if not better and state.damping[0] <= self.starts.stuck:
             new["moved"][0] = max(new["moved"][0], 1.0)  # a damped step may be small far from the minimum too
         following = replace(
@@ -285,7 +280,7 @@ class Search:
         noise = float(np.median(plan.deviation))
         metrics = {"residual": float(np.sqrt(cost)) * noise, "moved": float(following.moved[0]), "noise": noise}
         far = self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0
-        if following.moved[0] < 1.0 and far and not of_bases:  # with these every step looks anew
+        if following.moved[0] < 1.0 and far:
             moved = np.maximum(following.moved, 1.0)
             following = replace(following, waiting=settling.RESTARTS, moved=moved)
         columns = 2 + 2 * len(step) + len(plan.spread)  # one for the contacts
@@ -359,10 +354,10 @@ class Search:
         relative = self._relative_step(plan, tried, share)
         return max(relative, 0.0 if plan.exact else outcome.saved(trial) / LITTLE)
 
-    def _relative_step(self, plan: Plan, step: Float[np.ndarray, " d"], share: float, least: float = 0.0) -> float:
-        """The largest component of a step relative to a share of its standard error, to the tolerance or the least."""
+    def _relative_step(self, plan: Plan, step: Float[np.ndarray, " d"], share: float) -> float:
+        """The largest component of a step relative to a share of its standard error, or to the tolerance."""
         error = np.sqrt(np.maximum(np.diag(sandwich(plan.bread, plan.meat).covariance), 0.0))
-        return float((np.abs(step) / np.maximum(max(2.0 * self.tolerance, least, _SMALLEST), share * error)).max())
+        return float((np.abs(step) / np.maximum(max(2.0 * self.tolerance, _SMALLEST), share * error)).max())
 
     def _refined(self, state: SearchState, leader: int) -> SearchState:
         """Put the best search first, which alone goes on, to all windows."""

@@ -68,15 +68,13 @@ def steady_cost(
     contacts: Int[np.ndarray, "windows readings"],
     least: Float[np.ndarray, " channels"],
     loss: Loss,
-    *,
-    steady_alone: bool = False,
 ) -> float:
     """Mean cost of the windows in which no contact begins or ends; 0 without windows.
 
     Where one does, residuals jump with the error of the initial state. Windows with the same number of `contacts` at
     every reading are of one kind, whose cost is in standard deviations of its own noise: a force that disturbs a flying
     body shows less where friction holds it. Kinds of fewer than `FEWEST_STEADY` windows say nothing; if all are, all
-    windows count as one kind, or none does where only steady ones may. A contact between two readings is not seen.
+    windows count as one kind. A contact between two readings is not seen.
     `spare` is 1 - leverage of each residual. No noise is below `least`: that of counts is their rounding, though most
     readings be of something at rest.
     """
@@ -85,8 +83,6 @@ def steady_cost(
     steady = (contacts == contacts[:, :1]).all(1)
     kinds = [steady & (contacts[:, 0] == count) for count in np.unique(contacts[steady, 0])]
     kinds = [kind for kind in kinds if kind.sum() >= FEWEST_STEADY]
-    if not kinds and steady_alone:
-        return 0.0
     kinds = kinds or [np.ones_like(steady)]
     noises = [np.maximum(channel_noise(residuals[kind], spare[kind]), least) for kind in kinds]
     costs = [

@@ -48,8 +48,6 @@ LIKE_NOISE = 1.5
 """Cost of a window, in squared standard deviations; noise alone rarely exceeds it, as its mean is 0.8."""
 UNLIKE_NOISE = 4.0
 """The same where the log shows no contact, so that nothing but what the model lacks, or false readings, make it."""
-PLACINGS = 2
-"""Number of epochs of initial states alone where these include places and speeds of bases that no sensor shows."""
 SECOND_CHANCES = 2
 """Number of times that windows which a step of the parameters leaves unexplained begin anew."""
 WORSE = 2.0
@@ -132,9 +130,7 @@ class UnknownStarts:
     @staticmethod
     def columns(problem: CalibrationProblem, *, smooth: bool, refining: bool) -> int:
         """Number of systems simulated for the derivatives of an epoch: differences by parameters and states."""
-        placed = int(problem.states.placed.sum())
-        values = placed if placed and not refining else problem.states.physical_size
-        return 1 + (1 if smooth else 2) * len(problem.simulator.parameters) + values
+        return 1 + (1 if smooth else 2) * len(problem.simulator.parameters) + problem.states.physical_size
 
     @staticmethod
     def trial_columns(*, smooth: bool) -> int:
@@ -159,8 +155,6 @@ class UnknownStarts:
         None are once residuals of nearly all windows are noise. Until there are as many to go as restarts, differences
         become narrower; then windows whose residuals are more than noise begin anew.
         """
-        if self.readings.placed.any():
-            waiting = min(waiting, PLACINGS)
         width = WIDTHS[self.waiting - waiting] if waiting > RESTARTS else 0.0
         after = settle(self.simulator, self.readings, point, states, damping, width * errors, self.loss)
         if waiting <= RESTARTS:
@@ -189,14 +183,14 @@ class UnknownStarts:
         point = np.clip(plan.point + plan.steps[0], -1.0, 1.0)
         states = states + self.readings.in_state_units(plan.state_steps[0], states.shape[1])
         damping, simulations = np.full(len(states), FIRST_DAMPING), 0
-        for width in RESETTLING[(of_bases := bool(self.readings.placed.any())) :]:
+        for width in RESETTLING:
             after = settle(self.simulator, self.readings, point, states, damping, width * errors, self.loss)
             states, damping, simulations = after.states, after.damping, simulations + after.simulations
         residuals = self.readings.residuals(self.simulator, point[None], states[None])[0, 0]
         costs = window_costs(residuals / np.tile(plan.deviation, self.readings.steps + 1), self.loss)
         simulations += len(states)
         after = replace(after, costs=costs, deviation=plan.deviation, errors=errors, simulations=simulations)
-        for again in range(second_chances - of_bases):
+        for again in range(second_chances):
             random = np.random.default_rng(RESTARTS + 1 + again)
             after = restart(self.simulator, self.readings, point, self.guesses, after, self.loss, random)
         if not plan.kept.any():
@@ -225,7 +219,6 @@ class UnknownStarts:
             points,
             states,
             central=bool(self.touching.any()),
-            placed_alone=bool(self.readings.placed.any()) and not refining,
         )
         searches = zip(slopes, points, damping.tolist(), state_damping, strict=True)
         return [
@@ -373,9 +366,9 @@ class UnknownStarts:
     ) -> float:
         if contacts is None:
             return 0.0
-        shape, of_bases = (-1, *self.readings.observed.shape[1:]), bool(self.readings.placed.any())
+        shape = (-1, *self.readings.observed.shape[1:])
         residuals, left = (part[kept].reshape(shape) for part in (slopes.residuals, spare))
-        return steady_cost(residuals, left, contacts[kept], self.rounding / deviation, self.loss, steady_alone=of_bases)
+        return steady_cost(residuals, left, contacts[kept], self.rounding / deviation, self.loss)
 
     def _trusted(self, slopes: WindowSlopes) -> Bool[np.ndarray, " windows"]:
         """Windows that an initial state explains; all of them if these hold too little information on a direction.
