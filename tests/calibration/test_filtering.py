@@ -10,7 +10,7 @@ from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares import filtering, instruments
 from madoc.calibration.least_squares.calibrator import LeastSquares
-from madoc.calibration.least_squares.filtering import beyond_chance, moved_by, of_contacts
+from madoc.calibration.least_squares.filtering import of_contacts
 from madoc.calibration.least_squares.instruments import Side, agreed, axes_of, products_of, shares_of
 from madoc.data import Disturbance, disturb
 from madoc.identification.ensembles import (
@@ -258,7 +258,7 @@ def test_a_foot_that_slides_under_noise(tmp_path):
     assert any("predicted by an ensemble filter" in note for note in estimate.notes)
     wrong = replace(state, filtered=replace(state.filtered, alike=0.3))
     doubtful = method.estimate(problem, wrong)
-    assert doubtful.unlike_noise and any("(correlation 0.30)" in warning for warning in doubtful.warnings)
+    assert doubtful.unlike_noise and any("(a correlation of at least 0.30)" in warning for warning in doubtful.warnings)
     resumed, _ = load(tmp_path / "checkpoint.npz", method.init(problem, jax.random.key(0)))
     again, _ = method.step(problem, resumed)
     for kept, other in zip(jax.tree.leaves(second), jax.tree.leaves(again), strict=True):
@@ -335,9 +335,8 @@ def test_predictions_leave_errors_alike_only_where_windows_agree():
     errors[..., 1] += 1.5 * random.standard_normal((1, 40, 1))
     found = known(errors)
     clipped = np.clip(errors[0, ..., 1], -3.0, 3.0)
-    pairs = (clipped[:, 1:] * clipped[:, :-1]).mean(1)
-    certain = pairs.mean() - 2.0 * pairs.std(ddof=1) / np.sqrt(40)
-    assert found.alike() == pytest.approx(certain / (clipped**2).mean())
+    pairs = (clipped[:, 1:] * clipped[:, :-1]).mean(1) / (clipped**2).mean()
+    assert found.alike() == pytest.approx(pairs.mean() - 2.0 * pairs.std(ddof=1) / np.sqrt(40))
     assert 0.4 < found.alike() < 0.6
     errors[..., 1], errors[0, 0, :, 2] = errors[..., 0], 2.9
     assert replace(found).alike() < 0.1  # the third has a correlation of 0.2 that one window makes
@@ -361,11 +360,14 @@ def test_errors_are_the_mean_over_both_ends_and_lead_back_to_the_point(above, be
 
 def test_steps_are_judged_by_what_chance_makes_of_as_many():
     """By hand: half of all normal values are within 0.6745, and half of all pairs within 1.0518 = z((1 + √½) / 2)."""
-    one, two, scatter = np.array([0.6745]), np.array([0.1, -2.1036]), np.diag([1.0, 4.0])
-    assert [moved_by(one, np.ones(1)), moved_by(two, np.array([1.0, 2.0]))] == pytest.approx([1.0, 1.0], rel=1e-4)
-    np.testing.assert_allclose(beyond_chance(np.array([1.0, 2.0]), scatter), 0.0, atol=1e-6)
-    half = beyond_chance(np.array([0.0, 4.0]), scatter)  # 1 - 2 / 4
-    np.testing.assert_allclose(half, [0.0, 4.0 * 0.5**0.5])
+    two = np.array([0.1, -2.1036])
+    assert instruments.moved_by(np.array([0.6745]), np.ones(1)) == pytest.approx(1.0, rel=1e-4)
+    assert instruments.moved_by(two, np.array([1.0, 2.0])) == pytest.approx(1.0, rel=1e-4)
+    np.testing.assert_allclose(instruments.beyond_chance(two, np.eye(2), 4), two)
+    values = np.array([[1.0, 0.0], [-1.0, 0.0], [1.0, 2.0], [-1.0, 2.0]] * 4)  # T² of (0, 16): 16² / (16 / 15 · 16)
+    shorter = instruments.beyond_chance(values.sum(0), values.T @ values, 16) / 16.0
+    np.testing.assert_allclose(shorter, [0.0, (1.0 - 2.0 * 15.0 / 12.0 / 15.0) ** 0.5])
+    assert not instruments.beyond_chance(np.array([0.1, -0.1]), np.eye(2), 16).any()
 
 
 def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tmp_path):
@@ -379,9 +381,7 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     assert after.settled
     np.testing.assert_array_equal(after.point, rest.point)
     assert not rest.apart.any() and after.apart.all() and after.chance.all()
-    known_well = replace(
-        after, apart=np.array([1.0, 2.0]), chance=np.zeros((2, 2)), products=1e3 * told, squares=1e3 * told
-    )
+    known_well = replace(after, apart=np.array([1.0, 2.0]), compared=0, products=1e3 * told, squares=1e3 * told)
     covariance = known_well.found.uncertainty.covariance  # of one gradient alone, as there was no scatter before
     np.testing.assert_allclose(covariance, np.array([[1.0, 2.0], [2.0, 4.0]]) / (1e3 * len(told)) ** 2)
     systems = filtering.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW

@@ -23,7 +23,7 @@ def found(errors, names=None):
     dataset = replace(dataset, run_names=names)
     rows = np.arange(100) * 5
     none, values, changes = np.zeros((100, 0)), STEPS * 3 + 3, np.ones(3)
-    readings = Readings(np.zeros((100, STEPS, 1)), np.zeros(errors.shape), changes, np.ones(2), np.zeros(2, bool))
+    readings = Readings(np.zeros((100, STEPS, 1)), np.zeros(errors.shape), changes, np.ones(2))
     windows = LoggedWindows(readings, none, none, none[:, None], dataset.episode_of(rows), rows)
     slopes = WindowSlopes(errors.reshape(100, values), *(np.zeros((100, values, 0)),) * 2, np.ones(100, bool))
     fit = Fit(np.zeros(0), none, slopes, np.zeros((100, values, 0)), slopes.whole, 0)
@@ -71,7 +71,7 @@ def test_a_signal_is_told_where_it_has_most():
 
 def test_what_is_left_is_alike_in_a_row_where_it_is_not_noise():
     """By hand, in 100 windows of 5 readings of 3 signals: 4 products of neighbours to 5 squares."""
-    readings = Readings(np.zeros((100, STEPS, 1)), np.zeros((100, 5, 3)), np.ones(3), np.ones(2), np.zeros(2, bool))
+    readings = Readings(np.zeros((100, STEPS, 1)), np.zeros((100, 5, 3)), np.ones(3), np.ones(2))
 
     def of(errors):
         slopes = WindowSlopes(errors.reshape(100, 15), *(np.zeros((100, 15, 0)),) * 2, np.ones(100, bool))

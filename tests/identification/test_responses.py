@@ -18,7 +18,7 @@ def of_windows(task, actions):
     simulator, size = simulation.make(task, threads=1), task.observation_size
     observed = np.zeros((len(actions), actions.shape[1] + 1, size))
     spread = np.ones(task.model.nq + task.model.nv)
-    return simulator, Readings(actions, observed, np.full(size, 0.5), spread, np.zeros(len(spread), bool))
+    return simulator, Readings(actions, observed, np.full(size, 0.5), spread)
 
 
 def test_a_force_on_a_free_body_adds_up_by_hand(tmp_path):

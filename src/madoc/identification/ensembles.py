@@ -368,9 +368,8 @@ def likely_states(
     """The guess of each window's first state, or that of an ensemble's states there which fits the window better.
 
     Each system takes the states that fit best under its parameters, of one ensemble for all: it is the last system's,
-    and has followed the readings before the window, where its episode has as many. Bases that no sensor shows settle
-    instead. Guesses are left as they are where nothing touches, and where no states can be drawn. Also the control
-    steps.
+    and has followed the readings before the window, where its episode has as many. Guesses are left as they are where
+    nothing touches, and where no states can be drawn. Also the control steps.
     """
     point = points[-1]
     if not (logged.starts_known and can_be_drawn(logged, simulator) and _touch(simulator, point, guesses)):

@@ -12,14 +12,22 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
-from scipy.stats import norm
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.instruments import FEW, Side, agreed, axes_of, products_of, shares_of
+from madoc.calibration.least_squares.instruments import (
+    FEW,
+    Side,
+    agreed,
+    axes_of,
+    beyond_chance,
+    moved_by,
+    products_of,
+    shares_of,
+)
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification.ensembles import Innovations, can_be_drawn, innovations, next_noise, with_noise
+from madoc.identification.ensembles import Innovations, can_be_drawn, first_counted, innovations, next_noise, with_noise
 from madoc.identification.gauss_newton import damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.losses import Loss
@@ -96,13 +104,14 @@ class FilterState:
         meat: Scatter of the gradients before the last step, which counts as an error.
         apart: What gradients of half as many states differ from these, sum of the windows compared so far.
         chance: Scatter of those differences.
+        compared: Number of these windows.
         moved: The last step, by `moved_by`.
         damping: λ of the next step.
         cost: Mean loss of a whitened prediction error before it, in squared standard deviations.
-        alike: The largest correlation of a channel's whitened error with that of the next reading, as noise has none;
-            0 until the end.
+        alike: The largest correlation that a channel's whitened error certainly has with that of the next reading, as
+            noise has none; 0 until the end.
         wide: 0 in the first epochs, then 1 and the number of epochs since.
-        quiet: 1 once noise has not changed much from one epoch to the next.
+        quiet: 1 once noise, its mean over epochs that count together, has not changed much from one epoch to the next.
         halved: Number of blocks of windows compared with what half as many states tell.
         together: Number of epochs near the end that the last step was by, 0 before these.
         epochs: Number of epochs.
@@ -121,6 +130,7 @@ class FilterState:
     meat: Float[np.ndarray, "d d"]
     apart: Float[np.ndarray, " d"]
     chance: Float[np.ndarray, "d d"]
+    compared: int
     moved: float
     damping: float
     cost: float
@@ -186,15 +196,10 @@ class FilterState:
         products, squares = self.products.sum(0), self.squares.sum(0)
         told = np.diag(squares) > 0.0
         bread = agreed(products, squares) * np.outer(told, told)
-        error = beyond_chance(self.apart, self.chance)
+        error = beyond_chance(self.apart, self.chance, self.compared)
+        uncertainty = sandwich(bread, self.meat + np.outer(error, error))
         unlike_noise = self.settled and (self.cost > LONG_TAILS or self.alike > WHITE)
-        return Found(
-            self.point,
-            sandwich(bread, self.meat + np.outer(error, error)),
-            self.explained,
-            self.settled,
-            unlike_noise,
-        )
+        return Found(self.point, uncertainty, self.explained, self.settled, unlike_noise)
 
 
 def horizon_of(problem: CalibrationProblem) -> int:
@@ -204,12 +209,12 @@ def horizon_of(problem: CalibrationProblem) -> int:
 
 
 def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState | None:
-    """The search before it has begun; None where few windows show contacts, or sensors do not show all positions."""
+    """The search before it has begun; None where few windows show contacts or are long, or states are unknown."""
     states, count = problem.states, len(problem.simulator.parameters)
     if not states.starts_known or not can_be_drawn(states, problem.simulator):
         return None
     horizon = horizon_of(problem)
-    if not len(rows_that_fit(problem.dataset, states.rows, horizon)):
+    if horizon < first_counted(states) + 2 or not len(rows_that_fit(problem.dataset, states.rows, horizon)):
         return None
     rows = states.rows[disjoint_windows(problem.dataset, states.rows, horizon)]
     if len(rows) < FEWEST + count:
@@ -237,6 +242,7 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
         meat=np.zeros((count, count)),
         apart=np.zeros(count),
         chance=np.zeros((count, count)),
+        compared=0,
         moved=0.0,
         damping=FIRST_DAMPING,
         cost=0.0,
@@ -295,6 +301,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
             state,
             apart=state.apart + differences.sum(0),
             chance=state.chance + differences.T @ differences,
+            compared=state.compared + len(differences),
             halved=state.halved + 1,
             epochs=state.epochs + 1,
             failures=failures,
@@ -346,19 +353,6 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     )
     metrics = {"residual": following.cost**0.5, "moved": following.moved, "noise": float(np.median(noise))}
     return following, Epoch(metrics, epoch_steps(problem, state))
-
-
-def moved_by(step: Float[np.ndarray, " d"], error: Float[np.ndarray, " d"]) -> float:
-    """The largest component of a step in its standard errors, over the median of that of as many normal values."""
-    usual = norm.ppf((1.0 + 0.5 ** (1.0 / len(step))) / 2.0)
-    return float((np.abs(step) / error).max() / usual)
-
-
-def beyond_chance(total: Float[np.ndarray, " d"], scatter: Float[np.ndarray, "d d"]) -> Float[np.ndarray, " d"]:
-    """A sum of values with this scatter, shortened by as much as chance alone makes it longer."""
-    least = np.diag(1e-9 * total**2 + np.finfo(float).tiny)
-    squared = float(total @ np.linalg.solve(scatter + least, total))
-    return total * (1.0 - len(total) / max(squared, len(total))) ** 0.5
 
 
 def _cost(found: Innovations, loss: Loss) -> float:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.stats import norm
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.identification.ensembles import Innovations, few_of, first_counted, innovations, members_at
@@ -146,8 +147,32 @@ def agreed(products: Float[np.ndarray, "d d"], squares: Float[np.ndarray, "d d"]
 def axes_of(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
     """√d standard errors along each axis of a covariance of d parameters, within `WIDTHS`, in columns.
 
-    Means over the ends are those of cubic functions over its normal distribution (Arasaratnam and Haykin 2009).
+    Means over the ends are those of cubic functions over its normal distribution (Arasaratnam and Haykin 2009). Where
+    that is less than `WIDE` they are `WIDER`.
     """
     variances, axes = np.linalg.eigh(covariance)
     width = np.sqrt(len(axes) * np.maximum(variances, 0.0))
     return axes * np.clip(np.maximum(width, np.minimum(WIDER * width, WIDE)), *WIDTHS)
+
+
+def moved_by(step: Float[np.ndarray, " d"], error: Float[np.ndarray, " d"]) -> float:
+    """The largest component of a step in its standard errors, over the median of that of as many normal values."""
+    usual = norm.ppf((1.0 + 0.5 ** (1.0 / len(step))) / 2.0)
+    return float((np.abs(step) / error).max() / usual)
+
+
+def beyond_chance(
+    total: Float[np.ndarray, " d"], squares: Float[np.ndarray, "d d"], count: int
+) -> Float[np.ndarray, " d"]:
+    """A sum of so many values with these squares, shortened by as much as chance alone makes it longer.
+
+    Its length is Hotelling's (1931) T², whose mean is d (n - 1) / (n - d - 2) if the values' is 0. As few values as
+    that do not tell chance; their sum is left as it is.
+    """
+    size = len(total)
+    if count <= size + 2:
+        return total
+    least = np.diag(1e-9 * total**2 + np.finfo(float).tiny)
+    covariance = count / (count - 1.0) * (squares - np.outer(total, total) / count) + least
+    usual = size * (count - 1.0) / (count - size - 2.0)
+    return total * (1.0 - usual / max(float(total @ np.linalg.solve(covariance, total)), usual)) ** 0.5

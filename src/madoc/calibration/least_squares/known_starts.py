@@ -85,7 +85,7 @@ class KnownStarts:
         return rows
 
     @staticmethod
-    def columns(problem: CalibrationProblem, *, smooth: bool, refining: bool) -> int:
+    def columns(problem: CalibrationProblem, *, smooth: bool) -> int:
         """Number of systems simulated for the derivatives of an epoch: central differences."""
         return 1 + 2 * len(problem.simulator.parameters)
 

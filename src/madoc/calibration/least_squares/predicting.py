@@ -109,7 +109,7 @@ def steps_of_a_second(problem: CalibrationProblem) -> int:
 
 
 def windows_for(problem: CalibrationProblem) -> Prediction | None:
-    """The fit before it has begun; None where the log has too few stretches of a second, ."""
+    """The fit before it has begun; None where the log has too few stretches of a second."""
     count, horizon = len(problem.simulator.parameters), steps_of_a_second(problem)
     states, rows = problem.states.guesses()
     size = max(problem.simulator.task.observation_size, states.shape[1])

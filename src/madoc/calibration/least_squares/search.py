@@ -325,7 +325,7 @@ class Search:
     def _columns(self, problem: CalibrationProblem, state: SearchState) -> int:
         """Number of systems simulated for the derivatives of an epoch in which parameters move."""
         smooth = not state.touching[: self.window_count(state)].any()
-        return self.starts.columns(problem, smooth=smooth, refining=bool(state.refining))
+        return self.starts.columns(problem, smooth=smooth)
 
     def _window_steps(self, state: SearchState) -> int:
         """Control steps of all windows of all searches under one system each."""

@@ -18,8 +18,8 @@ EXACT = 1e-6
 """Residual in typical changes of a stride; smaller ones mean that states were logged without noise."""
 TAILS = "residuals have longer tails than noise has: the intervals are too narrow, by how much is not known"
 ALIKE = (
-    "what the model leaves of a reading is like what it leaves of the next (correlation {:.2f}), as noise is not: the "
-    "intervals are too narrow, by how much is not known"
+    "what the model leaves of a reading is like what it leaves of the next (a correlation of at least {:.2f}), as "
+    "noise is not: the intervals are too narrow, by how much is not known"
 )
 NOT_SETTLED = (
     "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"

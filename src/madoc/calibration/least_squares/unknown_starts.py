@@ -128,7 +128,7 @@ class UnknownStarts:
         return rows
 
     @staticmethod
-    def columns(problem: CalibrationProblem, *, smooth: bool, refining: bool) -> int:
+    def columns(problem: CalibrationProblem, *, smooth: bool) -> int:
         """Number of systems simulated for the derivatives of an epoch: differences by parameters and states."""
         return 1 + (1 if smooth else 2) * len(problem.simulator.parameters) + problem.states.physical_size
 
