@@ -11,7 +11,18 @@ from test_madoc_recovers import quick
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
 from madoc.data import Disturbance, disturb
-from own_robots import ARM_SPEC, BOUNCER, BOUNCER_SPEC, GEARED, GEARED_SPEC, PENDULUM_SPEC, write_robot
+from own_robots import (
+    ARM_SPEC,
+    BOUNCER,
+    BOUNCER_SPEC,
+    GEARED,
+    GEARED_SPEC,
+    PENDULUM_SPEC,
+    SLED,
+    SLED_SPEC,
+    SLED_TRUTH,
+    write_robot,
+)
 from robots import ARM_TRUTH, recorded
 
 ARM = {"body_mass.fore": 0.4, "dof_damping.shoulder": 0.3, "dof_damping.elbow": 0.35}
@@ -103,6 +114,30 @@ def test_noise_at_contacts_misleads_neither_estimates_nor_intervals(bouncer):
 @pytest.mark.timeout(3600)
 def test_intervals_cover_at_contacts(bouncer):
     assert 0.9 < np.mean([covered(bouncer, seed) for seed in range(100, 140)]) < 0.995
+
+
+@pytest.fixture
+def sled(tmp_path):
+    """Its IMU shows its attitude, and nothing its place."""
+    return robots.load(write_robot(tmp_path, SLED_SPEC, sled=SLED)).task
+
+
+def test_a_base_that_no_sensor_shows_is_filtered(sled):
+    problem, method = problem_of(sled, SLED_TRUTH, rows=400, noise=0.02), LeastSquares()
+    state = method.init(problem, KEY)
+    assert problem.states.placed.any() and state.stage == "filtering" and not state.unknown
+    for _ in range(3):
+        state, _ = method.step(problem, state)
+    wrong = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(SLED_TRUTH))
+    assert (np.abs(state.filtered.point - wrong) < 0.3 * np.abs(wrong) + 0.05).all()
+
+
+@pytest.mark.slow
+def test_intervals_of_a_body_that_slips_on_an_unseen_base_hold(sled):
+    result = calibrate(LeastSquares(), problem_of(sled, SLED_TRUTH, rows=1500, noise=0.02), key=KEY, budget=2_000_000)
+    truth = sled.parameters.vector(SLED_TRUTH)
+    assert result.settled and ((result.interval[:, 0] <= truth) & (truth <= result.interval[:, 1])).all()
+    assert (np.diff(result.interval)[:, 0] < 0.1 * (sled.parameters.high - sled.parameters.low)).all()
 
 
 def test_a_search_that_the_budget_ends_says_so(arm):

@@ -25,3 +25,8 @@ def test_a_budget_is_a_count_or_a_time(written, budget):
 def test_what_is_no_budget_is_refused(written):
     with pytest.raises(MadocError, match="expected a budget"):
         read_budget(written)
+
+
+@pytest.mark.parametrize(("spent", "left"), [(0.0, 80.0), (10.0, 70.0), (100.0, 24.0)])
+def test_a_search_gets_two_thirds_of_a_time_with_what_is_spent_before_it(spent, left):
+    assert Seconds(120.0).for_search(spent).seconds == pytest.approx(left)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from planted_logs import ROBOTS, log_of
+from planted_logs import ROBOTS, bench, log_of
 
 from madoc import simulation
 from madoc.data import Disturbance, disturb, hide_velocities
@@ -31,9 +31,17 @@ def test_fits_end_where_steps_gain_little():
     of_a_step = (1 + 4 + 3) * replays.fitted * len(replays.readings)  # residuals, differences, shares of the step
     assert spent % (of_a_step // len(replays.readings)) == 0
     assert of_a_step < spent < 2.5 * of_a_step  # the second step moves the windows that the first one gained on
+    assert replace(replays, most_steps=1).starts(AT_TRUTH)[1] == of_a_step
     residuals, whole = replays.residuals(AT_TRUTH)
     assert whole == spent + len(replays.readings) * replays.readings.steps
     fitted, ahead = residuals[0, :, : replays.fitted + 1], residuals[0, :, replays.fitted + 1 :]
     assert (
         0.3 < fitted.std() / ahead.std() < 1.0
     )  # noise alone is left of the one, errors of the state grow in the other
+
+
+def test_starts_take_fewer_steps_where_time_is_short(monkeypatch):
+    judged = replace(bench(log_of("arm", rows=400), ROBOTS["arm"][0]), until=100.0, rate=50.0)
+    monkeypatch.setattr("madoc.verdict.bench.time.monotonic", lambda: 90.0)
+    assert [judged.steps_in_time(each) for each in (500, 1000, 10**6)] == [10, 5, 2]
+    assert replace(judged, until=None).steps_in_time(10**6) == 10

@@ -17,9 +17,6 @@ from madoc.runs.progress import waiting
 from madoc.verdict import assess
 from madoc.verdict.evidence import evidence, save_evidence
 
-OF_SEARCH, LEAST_OF_SEARCH = 2.0 / 3.0, 0.2
-"""Share of a time budget that the search may take, with what is spent before it, and the least one that it gets."""
-
 
 def calibrate_in(
     out: str | Path,
@@ -44,7 +41,7 @@ def calibrate_in(
     judged_by, budget = None, prepared.budget
     asked = order.search.budget is not None and prepared.holdout is not None
     if asked and isinstance(budget, Seconds):
-        judged_by, budget = began + budget.seconds, _for_search(budget, time.monotonic() - began)
+        judged_by, budget = began + budget.seconds, budget.for_search(time.monotonic() - began)
     spec = prepared.spec(out) | {"hyperparameters": hyperparameters(method)}
     with working_folder(out, spec, resume=resume) as folder:
         result = calibrate(
@@ -69,11 +66,6 @@ def calibrate_in(
             save_evidence(out / "evidence.npz", arrays)
         folder.write_json("result.json", result.to_json())
         return result
-
-
-def _for_search(budget: Seconds, spent: float) -> Seconds:
-    """What a search gets of a time that is for the whole command, of which some is spent, as judging takes the rest."""
-    return Seconds(budget.seconds * max(LEAST_OF_SEARCH, OF_SEARCH - spent / budget.seconds))
 
 
 def default_folder(order: CalibrationOrder) -> Path:

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from madoc.errors import MadocError
 from madoc.types import Unit
 
+OF_SEARCH, LEAST_OF_SEARCH = 2.0 / 3.0, 0.2
+"""Share of a time budget that a search may take, with what is spent before it, and the least one that it gets."""
+
 
 @dataclass(frozen=True)
 class Seconds:
@@ -15,6 +18,10 @@ class Seconds:
     """
 
     seconds: float
+
+    def for_search(self, spent: float) -> "Seconds":
+        """What a search gets of a time that is for a whole command, judging included, of which some is spent."""
+        return Seconds(self.seconds * max(LEAST_OF_SEARCH, OF_SEARCH - spent / self.seconds))
 
     def __str__(self) -> str:
         return f"{self.seconds:g} s"

@@ -19,7 +19,7 @@ from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
 from madoc.types import named_key
-from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of, replay_steps
+from madoc.verdict.fitted_starts import FIT_STEPS, FittedReplays, fitted_replays_of, replay_steps
 from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
 from madoc.verdict.statistics import better_than_chance
 from madoc.verdict.two_sample import WindowView, behaviour, classify, rolled
@@ -30,6 +30,8 @@ _NEIGHBOURS = 5000
 """Largest number of training rows among which the nearest neighbour of a row held out is searched."""
 FITTING = 0.4
 """Share in (0, 1) of the time left that fitting the starts of windows of the hold-out may take."""
+FEWEST_STEPS = 2
+"""Least number of steps of an initial state, however short the time: it begins at a likely one."""
 FEWEST_FITTED = 10
 """Smallest number of such windows, however little time is left."""
 _LONGEST_ROLLOUT = 1000
@@ -86,6 +88,11 @@ class Bench:
         affordable = int(share * self.rate * max(self.seconds_left, 0.0) / control_steps)
         return min(most, max(FEWEST_FITTED, affordable))
 
+    def steps_in_time(self, control_steps: int) -> int:
+        """How many steps of initial states there is time for, where `FIT_STEPS` simulate so many control steps."""
+        share = self.rate * self.seconds_left / max(1, control_steps)
+        return int(np.clip(FIT_STEPS * min(1.0, share), FEWEST_STEPS, FIT_STEPS))
+
     def begins(self, part: str, seconds: float = 0.0) -> bool:
         """Whether there is time for a part that takes so long: it is told of, or noted where there is none."""
         if self.seconds_left > seconds:
@@ -133,7 +140,8 @@ class Bench:
             return None
         columns = replay_steps(self.states, stride(self.problem.dataset), len(self.simulator.parameters))
         count = len(self.fittable.rows)
-        return self.fittable.of(evenly(np.arange(count), self.windows_in_time(columns, FITTING, count)))
+        most = self.windows_in_time(columns, FITTING, count)
+        return replace(self.fittable.of(evenly(np.arange(count), most)), most_steps=self.steps_in_time(most * columns))
 
     @cached_property
     def fittable(self) -> FittedReplays | None:

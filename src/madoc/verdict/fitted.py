@@ -100,7 +100,7 @@ def _nearby_best(replays: FittedReplays, point: Float[np.ndarray, " d"]) -> tupl
     simulator, readings = replays.simulator, replays.readings
     starts, spent = replays.starts(point[None])
     states, visited = starts[0], []
-    for _ in range(NEARBY_STEPS):
+    for _ in range(min(NEARBY_STEPS, replays.most_steps)):
         slopes = slopes_at(simulator, readings, point[None], states[None])[0]
         if not slopes.whole.any():
             break

@@ -43,7 +43,8 @@ _DAMPING = 1e-8
 class FittedReplays:
     """Windows of the hold-out whose initial states are unknown: `near` are first guesses of them, at their `rows`.
 
-    `ahead` are the numbers of control steps after the fitted ones at which errors are taken.
+    `ahead` are the numbers of control steps after the fitted ones at which errors are taken, and `most_steps` the
+    largest number of steps of an initial state.
     """
 
     held: Dataset
@@ -55,6 +56,7 @@ class FittedReplays:
     episodes: Int[np.ndarray, " windows"]
     stride: int
     ahead: tuple[int, ...]
+    most_steps: int = FIT_STEPS
 
     @property
     def fitted(self) -> int:
@@ -95,7 +97,7 @@ class FittedReplays:
         log = self.held, self.logged, self.simulator, first, self.rows
         states, spent = likely_states(*log, points, self.near)
         gaining = np.arange(len(first))
-        for _ in range(FIT_STEPS):
+        for _ in range(self.most_steps):
             part, around = first.of(gaining), states[:, gaining]
             slopes = slopes_at(self.simulator, part, points, around, parameters=False)
             damping = np.full(len(part), _DAMPING)

@@ -138,13 +138,16 @@ def _from_fitted(
 ) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
     """The same from starts that are fitted under each model to the strides before."""
     moving, of_models, rows = stride(bench.problem.dataset), [], np.empty(0, np.int64)
-    most = bench.windows_in_time(replay_steps(bench.states, moving, 0) // 2 + 3 * steps, SHARE, MOST)
+    of_window = replay_steps(bench.states, moving, 0) // 2 + 3 * steps
+    most = bench.windows_in_time(of_window, SHARE, MOST)
+    most_steps = bench.steps_in_time(most * of_window)
     for simulator, points in _models(bench, given, point):
         replays = fitted_replays_of(
             bench.held_out, simulator, bench.change, moving, ahead=(steps,), fewest=1, most=most
         )
         if replays is None:
             return None
+        replays = replace(replays, most_steps=most_steps)
         of_models.append(replays.residuals(points)[0][:, :, replays.fitted + 1 :])
         rows = replays.rows
     return np.concatenate(of_models), rows
