@@ -81,6 +81,7 @@ def test_a_base_that_no_sensor_shows_stands_on_the_floor_and_is_followed(tmp_pat
     logged = states_of(log, simulation.make(task, threads=1))
     assert (logged.kind, logged.measured) == ("approximate", 9)
     np.testing.assert_array_equal(np.flatnonzero(logged.placed), [0, 1, 2, 8, 9, 10])
+    np.testing.assert_array_equal(np.flatnonzero(logged.in_plane), [0, 1])
     # Once it has fallen, it is 0.07 m above the ground, which is at 0.3 m; feet give way by less than a millimetre.
     np.testing.assert_allclose(logged.states[40:, 2], 0.37, atol=2e-3)
     np.testing.assert_allclose(logged.states[40:, 10], 0.0, atol=0.05)

@@ -43,6 +43,7 @@ class LoggedStates:
         measured: Number of values of an observation, the first ones, that sensors measured; the others were derived
             from them by finite differences.
         placed: Which values of (qpos, qvel) are places and speeds of bases that no sensor shows, found from contacts.
+        in_plane: Which of these are places in the plane, on which nothing depends: they are the model's own.
     """
 
     kind: Kind
@@ -52,6 +53,7 @@ class LoggedStates:
     physical_size: int
     measured: int
     placed: Bool[np.ndarray, " physical"]
+    in_plane: Bool[np.ndarray, " physical"]
 
     @property
     def starts_known(self) -> bool:
@@ -93,6 +95,7 @@ def states_of(dataset: Dataset, simulator: Simulator) -> LoggedStates:
         physical_size=physical,
         measured=task.observation_size - derived,
         placed=np.zeros(physical, bool),
+        in_plane=np.zeros(physical, bool),
     )
     try:
         states, rows = logged_states(dataset, task)
@@ -114,7 +117,9 @@ def states_of(dataset: Dataset, simulator: Simulator) -> LoggedStates:
     guessed[gears] = True  # a gear gives little
     unseen = (unseen_values(task) & ~guessed).any()
     kind: Kind = "unknown" if unseen else "approximate"
-    return replace(rebuilt, kind=kind, states=states, rows=rows, placed=placed.found)
+    in_plane = placed.found & (np.arange(physical) < task.model.nq)
+    in_plane[placed.heights] = False
+    return replace(rebuilt, kind=kind, states=states, rows=rows, placed=placed.found, in_plane=in_plane)
 
 
 def completed(

@@ -102,7 +102,8 @@ class FittedReplays:
             slopes = slopes_at(self.simulator, part, points, around, parameters=False)
             damping = np.full(len(part), _DAMPING)
             fits = [eliminate(each, np.ones_like(each.residuals), damping) for each in slopes]
-            step = first.in_state_units(np.stack([fit.states_step(np.zeros(0)) for fit in fits]), states.shape[2])
+            steps = np.stack([fit.states_step(np.zeros(0)) for fit in fits]) * ~self.logged.in_plane
+            step = first.in_state_units(steps, states.shape[2])
             tried = around[:, None] + _SHARES[:, None, None] * step[:, None]
             residuals = part.residuals(self.simulator, points, tried.reshape(len(points), -1, states.shape[2]))
             spent += len(points) * len(part) * first.steps * (1 + len(first.spread) + len(_SHARES))

@@ -66,7 +66,7 @@ NEAR, LIKE_CHANCE = 2.5, 1.0
 below which the search ends."""
 TOGETHER = 3
 """Least number of epochs that count together in the end."""
-USUAL_EPOCHS = (6, 6)
+USUAL_EPOCHS = (2, 8)
 """Numbers of first and later epochs that most searches take, for the time that is told to be left; ensembles of half
 the size take about half an epoch."""
 FIRST_NOISE = 0.1
