@@ -24,7 +24,6 @@ from madoc.identification.ensembles import (
     innovations,
     likely_states,
     members_at,
-    next_noise,
     with_contacts_settled,
 )
 from madoc.identification.information import BOX_VARIANCE
@@ -122,19 +121,6 @@ def test_states_follow_a_reading_by_kalmans_gain():
     assert 3.0 - both[1].mean() == pytest.approx(0.5 * (3.0 - both[0].mean()), rel=0.01)  # the first system decides
     one = correction.follow(states[..., :1, :], apart[..., :1, :])  # a single state follows by the ensemble's gain
     assert one.item() == pytest.approx(4.0 - 3.0 * 2.0 / 3.0)
-
-
-def test_few_states_have_the_mean_of_all_and_noise_follows_the_size_of_errors():
-    members = np.arange(8.0).reshape(1, 4, 2) ** 2
-    few = few_of(members, 2, 1)
-    np.testing.assert_allclose(few[..., 0].mean(), members[..., 0].mean())
-    np.testing.assert_allclose(few[0, 1, 0] - few[0, 0, 0], 4.0 * np.sqrt(0.75 * 2.0))
-    many = np.random.default_rng(0).standard_normal((4000, 16, 1))
-    assert few_of(many, 4, 1).var() == pytest.approx(1.0, rel=0.05)
-    np.testing.assert_array_equal(few[..., 1], members[:, :2, 1])  # an action that is pending
-    noise, rounding = np.array([0.1, 0.1, 0.1, 1e-3, 1.0]), np.array([0.0, 0.04, 0.0, 0.0, 0.0])
-    ratio = np.array([9.0, 0.09, 1e-9, 0.5, 1.0])  # at most twice as large, at least the root of a tenth
-    np.testing.assert_allclose(next_noise(noise, ratio, rounding), [0.2, 0.04, 0.1 * np.sqrt(0.1), 1e-3, 1.0])
 
 
 def test_prediction_errors_of_the_right_model_are_white_and_of_variance_one():

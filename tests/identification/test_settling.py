@@ -10,7 +10,7 @@ from madoc import simulation, tasks
 from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb
 from madoc.identification import settling
-from madoc.identification.ensembles import with_contacts_settled
+from madoc.identification.ensembles import few_of, next_noise, with_contacts_settled
 from madoc.identification.replay import Readings
 from madoc.identification.settling import (
     FAILED_WINDOW,
@@ -127,3 +127,16 @@ def test_contacts_of_a_window_are_those_of_its_simulated_states():
         np.testing.assert_array_equal(simulator.contacts(state[0]), expected)
         if step < readings.steps:
             state = system.step(state, readings.actions[None, :, step])
+
+
+def test_few_states_have_the_mean_of_all_and_noise_follows_the_size_of_errors():
+    members = np.arange(8.0).reshape(1, 4, 2) ** 2
+    few = few_of(members, 2, 1)
+    np.testing.assert_allclose(few[..., 0].mean(), members[..., 0].mean())
+    np.testing.assert_allclose(few[0, 1, 0] - few[0, 0, 0], 4.0 * np.sqrt(0.75 * 2.0))
+    many = np.random.default_rng(0).standard_normal((4000, 16, 1))
+    assert few_of(many, 4, 1).var() == pytest.approx(1.0, rel=0.05)
+    np.testing.assert_array_equal(few[..., 1], members[:, :2, 1])  # an action that is pending
+    noise, rounding = np.array([0.1, 0.1, 0.1, 1e-3, 1.0]), np.array([0.0, 0.04, 0.0, 0.0, 0.0])
+    ratio = np.array([9.0, 0.09, 1e-9, 0.5, 1.0])  # at most twice as large, at least the root of a tenth
+    np.testing.assert_allclose(next_noise(noise, ratio, rounding), [0.2, 0.04, 0.1 * np.sqrt(0.1), 1e-3, 1.0])

@@ -128,8 +128,8 @@ def test_a_base_that_no_sensor_shows_is_filtered(sled):
     assert problem.states.placed.any() and state.stage == "filtering" and not state.unknown
     for _ in range(3):
         state, _ = method.step(problem, state)
-    wrong = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(SLED_TRUTH))
-    assert (np.abs(state.filtered.point - wrong) < 0.3 * np.abs(wrong) + 0.05).all()
+    truth = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(SLED_TRUTH))
+    assert (np.abs(state.filtered.point - truth) < 0.3 * np.abs(truth) + 0.05).all()
 
 
 @pytest.mark.slow

@@ -109,12 +109,12 @@ def steps_of_a_second(problem: CalibrationProblem) -> int:
 
 
 def windows_for(problem: CalibrationProblem) -> Prediction | None:
-    """The fit before it has begun; None where the log has too few stretches of a second."""
+    """The fit before it has begun; None where the log has too few stretches of a second, or where a base is unknown."""
     count, horizon = len(problem.simulator.parameters), steps_of_a_second(problem)
     states, rows = problem.states.guesses()
     size = max(problem.simulator.task.observation_size, states.shape[1])
     most = min(MOST, VALUES // (horizon * size * max(1 + 2 * count, FOLDS + 1)))
-    if not len(rows_that_fit(problem.dataset, rows, horizon)):
+    if problem.states.placed.any() or not len(rows_that_fit(problem.dataset, rows, horizon)):
         return None
     chosen = evenly(disjoint_windows(problem.dataset, rows, horizon), most)
     if len(chosen) < FEWEST + count:

@@ -213,13 +213,7 @@ class UnknownStarts:
         refining: bool,
     ) -> list[Plan]:
         """Differences around every search's point and initial states, in one batch each."""
-        slopes = slopes_at(
-            self.simulator,
-            self.readings,
-            points,
-            states,
-            central=bool(self.touching.any()),
-        )
+        slopes = slopes_at(self.simulator, self.readings, points, states, central=bool(self.touching.any()))
         searches = zip(slopes, points, damping.tolist(), state_damping, strict=True)
         return [
             self._plan(*each, contacts=self._contacts(each[1], state) if refining else None)
