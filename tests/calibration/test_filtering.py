@@ -226,7 +226,7 @@ def test_a_foot_that_slides_under_noise(tmp_path):
     problem = problem_of_foot(tmp_path)
     method, space = LeastSquares(), problem.simulator.parameters
     state = method.init(problem, jax.random.key(0))
-    assert state.filtered is not None and not state.unknown
+    assert state.filtered is not None and not state.unknown[0].epochs
     while not state.finished:
         before, (state, epoch) = state, method.step(problem, state)
         if state.stage == "filtering" and state.filtered.epochs == 2:
@@ -277,13 +277,16 @@ def test_windows_begin_at_rows_whose_states_are_known_and_episodes_may_be_short(
     assert (search.rows + filtering.horizon_of(problem) <= ends).all()
 
 
-def test_logs_without_contacts_or_with_a_horizon_of_the_users_fit_initial_states(tmp_path):
+def test_logs_without_contacts_fit_initial_states_and_a_horizon_of_the_users_is_the_filters(tmp_path):
     task = spring(max_episode_steps=100)
     log = recorded(task, SPRING_TRUTH, 600, jax.random.key(0))
     assert of_contacts(CalibrationProblem(log, simulation.make(task, threads=1)), jax.random.key(0)) is None
     problem = problem_of_foot(tmp_path)
-    for own in ({"horizon": 5}, {"windows": 20}, {"initial_states": "estimated"}):
-        assert LeastSquares(**own).init(problem, jax.random.key(0)).filtered is None
+    own = {"initial_states": "estimated", "horizon": 5, "windows": 20}
+    filtered = LeastSquares(**own).init(problem, jax.random.key(0)).filtered
+    assert (filtered.horizon, len(filtered.rows)) == (5, 20)
+    for without in ({"initial_states": "logged"}, own | {"windows": 6}, own | {"horizon": 1}):
+        assert LeastSquares(**without).init(problem, jax.random.key(0)).filtered is None
     assert of_contacts(problem, jax.random.key(0)).size == filtering.BLOCK
 
 

@@ -6,25 +6,22 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares
+from madoc.calibration.least_squares.plan import FEWEST
 from madoc.calibration.least_squares.sentences import LONG_TAILS, about_residuals, have_long_tails
 from madoc.calibration.least_squares.statistics import (
     autocorrelation,
     clipped_change,
     consecutive_residuals,
     outlier_limits,
-    steady_cost,
-    telling_first,
+    without_contacts,
 )
-from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE
+from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE, UnknownStarts
 from madoc.data import Disturbance, disturb
 from madoc.identification.noise import alternation
-from madoc.identification.settling import cost_of_noise
 from own_robots import BOUNCER, BOUNCER_SPEC, write_robot
 from robots import SPRING_TRUTH, recorded, spring
 
-NO_COUNTS = np.zeros(3)
 LEG_TRUTH = {"body_mass.trunk": 2.0, "body_mass.leg": 0.5, "dof_damping.knee": 5.0}
-CONTACT = "  - {field: contact_time, element: foot, low: 0.02, high: 0.1}\n"
 LIMITS = {"least": LIKE_NOISE, "failed": FAILED_WINDOW}
 
 
@@ -115,7 +112,7 @@ def test_tails_are_long_where_the_cost_is_above_that_of_noise():
     search = replace(begun, refining=1, epochs=3, deviation=np.full(2, 0.1), explained=len(begun.rows))
 
     def costing(cost, **changes):
-        return replace(search, cost=np.full(len(search.cost), cost), **{"steady_cost": cost} | changes)
+        return replace(search, cost=np.full(len(search.cost), cost), **{"tail_cost": cost} | changes)
 
     def long(search):
         return have_long_tails(problem, search)
@@ -127,69 +124,35 @@ def test_tails_are_long_where_the_cost_is_above_that_of_noise():
     )
     assert not long(costing(1.2, epochs=0))  # not all windows are known yet
     assert not long(costing(1.2, deviation=np.full(2, 1e-9)))  # rounding errors
-    at_contacts = costing(1.2, steady_cost=1.0)
-    assert not long(at_contacts)
-    (sentence,) = about_residuals(problem, at_contacts)
-    assert sentence.startswith("residuals have longer tails than noise has only where contacts begin or end")
+    assert not long(costing(1.2, tail_cost=1.0))
+    assert about_residuals(problem, costing(1.2, tail_cost=1.0)) == ()
 
     def leaving_out(count, **changes):
         return costing(1.0, explained=len(begun.rows) - count, **changes)
 
     assert not long(leaving_out(2))  # of 10
     assert long(leaving_out(3))
-    assert not long(leaving_out(3, touching=np.arange(len(begun.rows)) == 0))  # as where a contact begins
 
 
-def test_windows_with_and_without_contacts_have_their_own_noise_and_those_between_do_not_count():
-    readings, random = 4, np.random.default_rng(0)
-    resting, flying, landing = np.full((50, readings), 2), np.zeros((50, readings), int), np.zeros((50, readings), int)
-    landing[:, 2:] = 1
-    contacts = np.concatenate([resting, flying, landing])
-    sizes = np.repeat([0.1, 1.0, 30.0], 50)[:, None, None]
-    residuals, spare = sizes * random.standard_normal((150, readings, 3)), np.ones((150, readings, 3))
-    expected = cost_of_noise("cauchy")[0]
-    assert steady_cost(residuals, spare, contacts, NO_COUNTS, "cauchy") == pytest.approx(expected, rel=0.1)
-    residuals[:50:3] *= 30.0  # every third resting window is not explained
-    assert steady_cost(residuals, spare, contacts, NO_COUNTS, "cauchy") > LONG_TAILS
-    few = slice(41, 109)  # of nine windows that rest, and nine that land; those that fly decide
-    assert steady_cost(residuals[few], spare[few], contacts[few], NO_COUNTS, "cauchy") == pytest.approx(
-        expected, rel=0.1
-    )
-    fewer = slice(91, 150)  # nine that fly are too few, so that all count
-    residuals[100::3] *= 30.0
-    assert steady_cost(residuals[fewer], spare[fewer], contacts[fewer], NO_COUNTS, "cauchy") > LONG_TAILS
-    assert steady_cost(residuals[:0], spare[:0], contacts[:0], NO_COUNTS, "cauchy") == 0.0
+def test_rounding_of_counts_is_no_long_tail():
+    """Two of three readings are at rest, to a tenth of the rounding of counts with which the third is read."""
+    log = recorded(spring(), SPRING_TRUTH, 40, jax.random.key(0))
+    problem = CalibrationProblem(log, simulation.make(spring(), threads=1))
+    residuals = np.repeat([0.1, 0.1, 1.0], 30)[:, None] * np.random.default_rng(0).uniform(-1.7, 1.7, (90, 4))
+    counted = UnknownStarts.at(problem, np.array([0, 10]), np.zeros(2, bool), 1, "cauchy")
+    deviation = np.full(2, 0.1)
+    fine, coarse = (replace(counted, rounding=np.full(2, size))._tail_cost for size in (0.0, 1.0))
+    assert fine(residuals / deviation[0], deviation) > LONG_TAILS
+    assert coarse(residuals / deviation[0], deviation) < 0.5
+    assert fine(residuals[:0], deviation) == 0.0
 
 
-def test_readings_of_something_at_rest_do_not_make_the_rounding_of_others_a_long_tail():
-    """Two of three windows are at rest, to a tenth of the rounding of counts with which the third is read."""
-    random, contacts, spare = np.random.default_rng(0), np.zeros((90, 4), int), np.ones((90, 4, 3))
-    residuals = np.repeat([0.1, 0.1, 1.0], 30)[:, None, None] * random.uniform(-1.0, 1.0, (90, 4, 3)) * np.sqrt(3.0)
-    assert steady_cost(residuals, spare, contacts, NO_COUNTS, "cauchy") > LONG_TAILS
-    assert steady_cost(residuals, spare, contacts, np.ones(3), "cauchy") < 0.5
-
-
-def test_every_other_of_the_windows_searched_first_tells_much(tmp_path):
-    model = BOUNCER.replace('size=".05" pos', 'name="foot" size=".05" pos')
-    spec = BOUNCER_SPEC.replace("max_episode_steps", CONTACT + "max_episode_steps")
-    task = robots.load(write_robot(tmp_path, spec, bouncer=model)).task
-    problem = CalibrationProblem(
-        recorded(task, LEG_TRUTH | {"contact_time.foot": 0.03}, 1200, jax.random.key(0)),
-        simulation.make(task, threads=1),
-    )
-    rows = np.random.default_rng(0).permutation(np.arange(0, 1190, 10))
-    ordered = telling_first(problem, rows, 8, 40, 20)
-    np.testing.assert_array_equal(np.sort(ordered), np.sort(rows))
-    others = ordered[1:20:2]
-    np.testing.assert_array_equal(others, [row for row in rows if row not in ordered[:20:2]][:10])
-    counts = problem.simulator.contacts(problem.states.states)
-    changes = [[len(np.unique(counts[row : row + 9])) > 1 for row in part] for part in (ordered[:20:2], rows)]
-    assert np.mean(changes[0]) > np.mean(changes[1])  # landings and jumps tell of the contact's time constant
-    np.testing.assert_array_equal(telling_first(problem, rows, 8, len(rows), 20), rows)  # all are drawn anyway
-
-
-def test_nothing_changes_without_contacts():
-    task = spring(max_episode_steps=100)
-    problem = CalibrationProblem(recorded(task, SPRING_TRUTH, 400, jax.random.key(0)), simulation.make(task, threads=1))
-    rows = np.random.default_rng(0).permutation(np.arange(0, 390, 10))
-    np.testing.assert_array_equal(telling_first(problem, rows, 8, 20, 10), rows)
+def test_windows_in_which_bodies_touch_are_left_out_where_the_others_suffice(tmp_path):
+    task = robots.load(write_robot(tmp_path, BOUNCER_SPEC, bouncer=BOUNCER)).task
+    problem = CalibrationProblem(recorded(task, LEG_TRUTH, 1200, jax.random.key(0)), simulation.make(task, threads=1))
+    rows = np.arange(0, 1190, 10)
+    touching = (problem.simulator.contacts(problem.states.states) > 0)[rows[:, None] + np.arange(9)].any(1)
+    few = rows[np.flatnonzero(touching).tolist() + np.flatnonzero(~touching)[:7].tolist()]
+    assert len(LEG_TRUTH) + FEWEST == 8
+    np.testing.assert_array_equal(without_contacts(problem, rows, 8), rows[~touching])
+    np.testing.assert_array_equal(without_contacts(problem, few, 8), few)

@@ -112,23 +112,6 @@ def test_new_beginnings_end_once_one_explains_hardly_any_more_windows(monkeypatc
     assert next(costs) == 0.0  # the last beginning was not tried
 
 
-def test_contacts_of_a_window_are_those_of_its_simulated_states():
-    task = tasks.make("hopper", "legacy")
-    middle = dict(zip(task.parameters.names, task.parameters.middle.tolist(), strict=True))
-    simulator, readings, guesses = windows(task, middle, 5, 0.0)
-    states, point = guesses.copy(), np.zeros(len(middle))
-    states[:, 1] += 3.0
-    assert not readings.contacts(simulator, point, states).any()
-    states[:, 1] = simulator.initial_state[1]
-    counts = readings.contacts(simulator, point, states)
-    assert (counts != counts[:, :1]).any()
-    system, state = simulator.bind(task.parameters.middle[None]), states[None]
-    for step, expected in enumerate(counts.T):
-        np.testing.assert_array_equal(simulator.contacts(state[0]), expected)
-        if step < readings.steps:
-            state = system.step(state, readings.actions[None, :, step])
-
-
 def test_few_states_have_the_mean_of_all_and_noise_follows_the_size_of_errors():
     members = np.arange(8.0).reshape(1, 4, 2) ** 2
     few = few_of(members, 2, 1)

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from madoc import robots, simulation
+from madoc.data import Disturbance, disturb
+from madoc.data.disturbing import observed_task
 from madoc.errors import MadocError
 from madoc.identification.ensembles import members_at
 from madoc.identification.states import probing_windows, states_observed_as, states_of
@@ -91,6 +93,20 @@ def test_a_base_that_no_sensor_shows_stands_on_the_floor_and_is_followed(tmp_pat
     np.testing.assert_allclose(drawn.std((0, 1))[[0, 1, 2]], 0.003, rtol=0.1)
     np.testing.assert_allclose(drawn.std((0, 1))[[8, 9, 10]], 0.05, rtol=0.1)
     assert np.abs(drawn[..., [7, 11, 12, 13, 14]]).max() < 1e-3
+
+
+def test_states_with_derived_velocities_are_drawn_by_the_noise_of_positions():
+    wanted, task = Disturbance(hidden_velocities=True, velocities="differences"), replace(SPRING, velocities=1)
+    log = disturb(recorded(SPRING, SPRING_TRUTH, 50, jax.random.key(0)), wanted, task, jax.random.key(1))
+    simulator = simulation.make(observed_task(task, log), threads=1)
+    logged = states_of(log, simulator)
+    assert (logged.kind, logged.measured) == ("exact", 1)
+    rows = np.array([10, 20])
+    drawn = members_at(log, logged, simulator, rows, np.full(1, 0.01), 400, np.random.default_rng(0))
+    # A central difference has the noise of two positions over two control steps.
+    expected = [0.01, 0.01 * np.sqrt(2.0) / (2.0 * simulator.control_step)]
+    np.testing.assert_allclose((drawn - logged.states[rows, None]).std((0, 1)), expected, rtol=0.1)
+    np.testing.assert_allclose(drawn.mean(1), logged.states[rows], atol=0.2 * expected[1])
 
 
 @pytest.mark.parametrize("encoder", ["motor", "link"])

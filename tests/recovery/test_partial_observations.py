@@ -90,6 +90,15 @@ def bouncer(tmp_path):
     return robots.load(write_robot(tmp_path, BOUNCER_SPEC, bouncer=BOUNCER)).task
 
 
+def test_exact_encoders_at_contacts_lead_from_the_filter_to_exact_values(tmp_path):
+    spec = "\n".join(line for line in BOUNCER_SPEC.splitlines() if "_speed" not in line)
+    task = robots.load(write_robot(tmp_path, spec, bouncer=BOUNCER)).task
+    truth = {"body_mass.trunk": 2.8, "body_mass.leg": 0.47, "dof_damping.knee": 3.5}
+    result = calibrate(LeastSquares(), problem_of(task, truth, rows=1000), key=KEY, budget=1_000_000)
+    assert (off(result, task, truth) < EXACT).all(), off(result, task, truth)
+    assert result.status == "converged" and "initial state of each window" in result.notes[0]
+
+
 def covered(task, seed):
     """Which intervals hold a truth drawn with the seed, recorded with noise of 5 % of a step's change.
 
@@ -125,7 +134,7 @@ def sled(tmp_path):
 def test_a_base_that_no_sensor_shows_is_filtered(sled):
     problem, method = problem_of(sled, SLED_TRUTH, rows=400, noise=0.02), LeastSquares()
     state = method.init(problem, KEY)
-    assert problem.states.placed.any() and state.stage == "filtering" and not state.unknown
+    assert problem.states.placed.any() and state.stage == "filtering" and not state.unknown[0].epochs
     for _ in range(3):
         state, _ = method.step(problem, state)
     truth = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(SLED_TRUTH))

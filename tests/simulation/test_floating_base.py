@@ -12,17 +12,25 @@ WHEEL = """<mujoco><worldbody>
   <geom type="plane" size="5 5 0.1" pos="0 0 {floor}"/>
   <body pos="0 0 3"><freejoint name="base"/><geom size="0.1" pos="0 0 -0.2" {geom}/></body>
 </worldbody></mujoco>"""
+PLANAR = """<mujoco><worldbody>
+  <geom type="plane" size="5 5 0.1"/>
+  <body><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+    <joint name="pitch" axis="0 1 0"/><geom size="0.1" pos="0 0 -0.2"/></body>
+</worldbody></mujoco>"""
 HALF_TURN = (0.0, 1.0, 0.0, 0.0)  # about x: the ball is above the body's origin
 
 
 def placed(states, *, floor=0.0, geom=""):
     """States of a body with a ball of 0.1 m that is 0.2 m below its origin; all but attitude and turning is hidden."""
     hidden = np.array([np.nan] * 3 + [0.0] * 4 + [np.nan] * 3 + [0.0] * 3)
-    text = WHEEL.format(floor=floor, geom=geom)
-    task = replace(
-        spring(), spec=lambda: mujoco.MjSpec.from_string(text), observation_size=1, posture=lambda observation: hidden
+    return on_the_floor(seen(WHEEL.format(floor=floor, geom=geom), hidden), np.array(states, np.float64) + hidden)
+
+
+def seen(model, hidden):
+    """A robot of which the values that are NaN in `hidden` are not observed."""
+    return replace(
+        spring(), spec=lambda: mujoco.MjSpec.from_string(model), observation_size=1, posture=lambda observation: hidden
     )
-    return on_the_floor(task, np.array(states, np.float64) + hidden)
 
 
 def of(attitude, turning):
@@ -45,3 +53,14 @@ def test_what_stands_does_not_move():
 def test_what_cannot_touch_the_floor_is_not_placed():
     found = placed([of((1, 0, 0, 0), (0, 0, 0))], geom='contype="0" conaffinity="0"')
     assert not found.found.any() and np.isnan(found.states[0, 2])
+
+
+def test_a_planar_robot_is_placed_by_its_slides():
+    turning = np.array([[0.0, 0.0, np.pi, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 0.0, 0.0, 2.0]])
+    found = on_the_floor(seen(PLANAR, np.array([np.nan, np.nan, 0.0, np.nan, np.nan, 0.0])), turning)
+    np.testing.assert_allclose(found.states[:, 1], [-0.1, 0.3], atol=1e-9)  # the ball is above, then below its origin
+    np.testing.assert_allclose(found.states[:, 3:5], [[-0.2, 0.0], [0.6, 0.0]], atol=1e-9)
+    np.testing.assert_array_equal(np.flatnonzero(found.found), [0, 1, 3, 4])
+    np.testing.assert_array_equal(found.heights, [1])
+    flying = on_the_floor(seen(PLANAR, np.array([np.nan, 0.0, 0.0, np.nan, np.nan, 0.0])), turning)
+    np.testing.assert_array_equal(np.flatnonzero(flying.found), [0, 3])  # the change of its height tells its speed

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.data.dataset import Dataset
+from madoc.data.disturbing import hide_velocities
 from madoc.data.timescale import stride
 from madoc.data.velocities import moving_states
 from madoc.identification.losses import Loss
@@ -268,7 +269,8 @@ def members_at(
     assert np.isin(rows, logged.rows).all()
     states = logged.states[np.searchsorted(logged.rows, rows)]
     physical = slice(0, logged.physical_size)
-    draw = _rebuilt if logged.kind == "exact" else _rebuilt_from_neighbours
+    measures_all = logged.measured == simulator.task.observation_size
+    draw = _rebuilt if logged.kind == "exact" and measures_all else _rebuilt_from_neighbours
     drawn = [draw(dataset, simulator, rows, noise, random)[:, physical] for _ in range(count)]
     members = np.repeat(states[:, None], count, axis=1)
     members[..., physical] = np.stack(drawn, axis=1)
@@ -300,17 +302,18 @@ def _rebuilt_from_neighbours(
     noise: Float[np.ndarray, " channels"],
     random: np.random.Generator,
 ) -> Float[np.ndarray, "windows physical"]:
-    """(qpos, qvel) whose velocities are differences of positions in the rows around."""
-    attitudes, episode = simulator.task.attitudes, dataset.episode_of(rows)
+    """(qpos, qvel) whose velocities, but those that sensors measured, are differences of positions in rows around."""
+    task = simulator.task if len(noise) == simulator.task.observation_size else hide_velocities(simulator.task)
+    attitudes, episode = task.attitudes, dataset.episode_of(rows)
     first = np.maximum(rows - 1, dataset.episode_starts[episode])
     count = np.minimum(rows + 2, dataset.episode_ends[episode]) - first
     starts = np.cumsum(count) - count
     near = dataset.take(np.arange(count.sum()) + np.repeat(first - starts, count), starts)
     here, there = (
-        np.asarray(part, np.float64) for part in (near.transitions.observation, near.transitions.next_observation)
+        np.asarray(part, np.float64)[:, : len(noise)]
+        for part in (near.transitions.observation, near.transitions.next_observation)
     )
-    error = np.zeros((2, *here.shape))
-    error[..., : len(noise)] = random.standard_normal((*error.shape[:2], len(noise))) * noise
+    error = random.standard_normal((2, *here.shape)) * noise
     last = np.isin(np.arange(len(near)), near.episode_ends - 1)
     following = np.where(last[:, None], error[1], np.roll(error[0], -1, axis=0))
     noisy = replace(
@@ -318,7 +321,7 @@ def _rebuilt_from_neighbours(
         observation=moved(attitudes, here, error[0]),
         next_observation=moved(attitudes, there, following),
     )
-    before, after = moving_states(replace(near, transitions=noisy), simulator.task)
+    before, after = moving_states(replace(near, transitions=noisy), task)
     place = starts + rows - first
     return completed(simulator, before[place], (after - before)[place])[0]
 
@@ -351,11 +354,6 @@ def _touch(simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[n
     return bool(len(known) and simulator.contacts(known, values).any())
 
 
-def can_be_drawn(logged: LoggedStates, simulator: Simulator) -> bool:
-    """Whether `members_at` can draw states: not where a log has derived velocities that states are rebuilt from."""
-    return simulator.task.state_from_observation is None or logged.measured == simulator.task.observation_size
-
-
 def likely_states(
     dataset: Dataset,
     logged: LoggedStates,
@@ -369,10 +367,10 @@ def likely_states(
 
     Each system takes the states that fit best under its parameters, of one ensemble for all: it is the last system's,
     and has followed the readings before the window, where its episode has as many. Guesses are left as they are where
-    nothing touches, and where no states can be drawn. Also the control steps.
+    nothing touches, and where states are unknown. Also the control steps.
     """
     point = points[-1]
-    if not (logged.starts_known and can_be_drawn(logged, simulator) and _touch(simulator, point, guesses)):
+    if not (logged.starts_known and _touch(simulator, point, guesses)):
         return np.repeat(guesses[None], len(points), axis=0), 0
     before = min(BEFORE * stride(dataset), MOST_BEFORE)
     random, first = np.random.default_rng(0), rows - before

@@ -99,18 +99,6 @@ class Readings:
         differences[..., : len(self.spread)] = steps * self.spread
         return differences
 
-    def contacts(
-        self, simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
-    ) -> Int[np.ndarray, "windows readings"]:
-        """Number of pairs of geoms in contact at every reading of the simulated windows.
-
-        Spends windows · steps control steps.
-        """
-        values = simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))
-        system = simulator.bind(values[None])
-        visited = np.concatenate([states[:, None], system.roll_out(states[None], self.actions[None])[0]], axis=1)
-        return simulator.contacts(visited.reshape(-1, visited.shape[-1]), values).reshape(visited.shape[:2])
-
     def trajectories(
         self, simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
     ) -> tuple[Float[np.ndarray, "windows steps state"], Float[np.ndarray, "windows steps actuator dof"]]:

@@ -23,8 +23,6 @@ WIDTHS = (0.0, 3.0, 3.0, 1.5, 0.7, 0.3, 0.1, 0.0, 0.0)
 """Widths of the differences from step to step, in standard errors of the initial states; 0 is `DIFFERENCE`."""
 RESETTLING = (1.0, 0.3, 0.0)
 """The same where initial states are nearly right: after a step of the parameters, or as drawn by an ensemble."""
-RESTARTS = 5
-"""Number of times that windows whose residuals are more than noise begin anew, near the guess of their state."""
 ANEW = 2
 """The same in the fit for prediction and, after one at the guess itself, in tests of a model."""
 FARTHEST = 30.0

@@ -13,11 +13,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from madoc.simulation.velocities import hidden_values
+from madoc.simulation.velocities import hidden_values, unseen_values
 from madoc.tasks.base import Task
 
 STANDING = 0.01
 """Height of a point above the lowest one, relative to the base's own, up to which it counts as standing."""
+UPRIGHT = 0.99
+"""Smallest vertical part of the axis of a slide that is a base's height."""
 _Pairs = tuple[tuple[int, int], ...]
 _PLACINGS = 3
 """Number of times that a base is lowered by its distance; once is enough on a plane."""
@@ -39,27 +41,56 @@ class Placed:
 
 
 def on_the_floor(task: Task, states: Float[np.ndarray, "rows physical"]) -> Placed:
-    """Put each free base whose attitude is observed, and whose place is not, on the floor.
+    """Put each base whose attitude is observed, and whose place is not, on the floor.
 
     It is where the lowest of what can touch the world does, and its linear velocity is the one by which what stands
     there moves least. Bases that cannot touch the world are left. Positions that are NaN count as the model's own.
     """
-    model, hidden = task.model, hidden_values(task)
+    model, hidden, unseen = task.model, hidden_values(task), unseen_values(task)
     stood = np.where(np.isnan(states), np.append(model.qpos0, np.zeros(model.nv)), states)
     found, heights = np.zeros_like(hidden), []
-    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).tolist():
-        position, velocity = int(model.jnt_qposadr[joint]), model.nq + int(model.jnt_dofadr[joint])
-        place, speed = slice(position, position + 3), slice(velocity, velocity + 3)
-        pairs = tuple(_touching(model, int(model.jnt_bodyid[joint])))
-        if not pairs or not hidden[place].any() or hidden[position + 3 : position + 7].any():
+    for body in np.flatnonzero(model.body_parentid[1:] == 0).tolist():
+        base = _Base.of(model, body + 1)
+        place = np.array([each for each in base.place if unseen[each]], np.int64)
+        moves = [unseen[at] and hidden[speed] for at, speed in zip(base.place, base.speed, strict=True)]
+        speed, pairs = np.array(base.speed, np.int64)[moves], tuple(_touching(model, body + 1))
+        if not pairs or not len(place) or unseen[base.attitude].any():
             continue
-        data, height = mujoco.MjData(model), position + 2 if hidden[position + 2] else None
+        data, height = mujoco.MjData(model), next((each for each in base.heights if unseen[each]), None)
         for state in stood:
             _stand(model, data, state, pairs, height)
-            state[speed] = np.where(hidden[speed], _velocity(model, data, state, pairs, speed), state[speed])
-        found[place], found[speed] = hidden[place], hidden[speed]
+            state[speed] = _velocity(model, data, state, pairs, speed)
+        found[place] = found[speed] = True
         heights += [] if height is None else [height]
     return Placed(np.where(found, stood, states), found, np.array(heights, np.int64))
+
+
+@dataclass(frozen=True)
+class _Base:
+    """Indices in (qpos, qvel) of a base's place, its linear velocity and its attitude, and of places that are heights.
+
+    It has a free joint, or slides and hinges as a planar robot has.
+    """
+
+    place: list[int]
+    speed: list[int]
+    attitude: list[int]
+    heights: list[int]
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, body: int) -> "_Base":
+        base, first = cls([], [], [], []), model.body_jntadr[body]
+        for joint in range(first, first + model.body_jntnum[body]):
+            kind, at, speed = model.jnt_type[joint], int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+            free, slides = bool(kind == mujoco.mjtJoint.mjJNT_FREE), bool(kind == mujoco.mjtJoint.mjJNT_SLIDE)
+            places = 3 * free + slides
+            base.place.extend(range(at, at + places))
+            base.speed.extend(range(model.nq + speed, model.nq + speed + places))
+            turns = 0 if slides else 4 if free or kind == mujoco.mjtJoint.mjJNT_BALL else 1
+            base.attitude.extend(range(at + places, at + places + turns))
+            upright = slides and bool(model.jnt_axis[joint, 2] > UPRIGHT)
+            base.heights.extend([at + 2] * free + [at] * upright)
+        return base
 
 
 def _touching(model: mujoco.MjModel, base: int) -> Iterator[tuple[int, int]]:
@@ -99,22 +130,22 @@ def _velocity(
     data: mujoco.MjData,
     state: Float[np.ndarray, " physical"],
     pairs: _Pairs,
-    speed: slice,
-) -> Float[np.ndarray, " 3"]:
+    speed: Int[np.ndarray, " speeds"],
+) -> Float[np.ndarray, " speeds"]:
     """The linear velocity of the base by which the points that stand move least."""
     gaps = [_gap(model, data, pair) for pair in pairs]
     lowest = min(gaps, key=lambda gap: gap[0])
     body = int(model.geom_bodyid[pairs[0][0]])
     base = data.xpos[model.body_rootid[body]]
     near = STANDING * np.linalg.norm(base - lowest[1])
-    others, velocities = state[model.nq :].copy(), []
-    others[speed.start - model.nq : speed.stop - model.nq] = 0.0
-    jacobian = np.zeros((3, model.nv))
+    others, unknown, rows = state[model.nq :].copy(), speed - model.nq, []
+    others[unknown] = 0.0
     for (gap, point), pair in zip(gaps, pairs, strict=True):
         if gap <= lowest[0] + near:
-            mujoco.mj_jac(model, data, jacobian, None, point, model.geom_bodyid[pair[0]])
-            velocities.append(-jacobian @ others)
-    return np.mean(velocities, axis=0)
+            rows.append(np.zeros((3, model.nv)))
+            mujoco.mj_jac(model, data, rows[-1], None, point, model.geom_bodyid[pair[0]])
+    jacobian = np.concatenate(rows)
+    return np.linalg.lstsq(jacobian[:, unknown], -jacobian @ others)[0]
 
 
 def _gap(model: mujoco.MjModel, data: mujoco.MjData, pair: tuple[int, int]) -> tuple[float, Float[np.ndarray, " 3"]]:

@@ -15,6 +15,9 @@ from madoc.calibration.least_squares.lengthening import (
     READINGS,
     LeastSquaresState,
     Stage,
+    after_filter,
+    back_to_filter,
+    becomes_exact,
     begun,
     enough,
     failed,
@@ -23,7 +26,6 @@ from madoc.calibration.least_squares.lengthening import (
     hopeless,
     horizon_of,
     lengthened,
-    longest_first,
     noise_alone,
     tells_more,
     with_search,
@@ -33,6 +35,7 @@ from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.statistics import consecutive_residuals, noisy_rows
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import stride
+from madoc.errors import MadocError
 from madoc.identification.information import identifiability, quantile, sandwich
 from madoc.identification.losses import Loss
 from madoc.identification.noise import NOISY, alternation
@@ -56,19 +59,20 @@ class LeastSquares:
     Residuals are in typical changes of a channel in a stride. With `logged` initial states, which are assumed to be
     exact, noise in them biases the estimate. With `estimated` ones each window's initial state is a further unknown,
     its first reading is a reading like the others, and channels are weighted by their estimated noise. Once a search
-    has settled, windows become nine times as long, by way of three times where the longest show contacts or fail, while
-    that narrows the intervals and residuals remain noise: where motion is smooth, long windows hold more information,
-    and they show model errors. By default states are estimated where they cannot be rebuilt, where the data is declared
-    noisy, and where residuals of consecutive rows alternate as noise makes them: a reading that is too high makes the
-    step to it look too long and the step from it too short. Where windows show contacts and positions are
-    measured, an ensemble filter takes the place of estimated ones (`filtering`), unless a horizon or windows are given.
+    has settled, windows become nine times as long, or three times where these fail, while that narrows the intervals
+    and residuals remain noise: long windows hold more information, and they show model errors. By default states are
+    estimated where they cannot be rebuilt, where the data is declared noisy, and where residuals of consecutive rows
+    alternate as noise makes them: a reading that is too high makes the step to it look too long and the step from it
+    too short. Where windows show contacts and positions are measured, an ensemble filter takes their place
+    (`filtering`); what it leaves of data without noise is left to estimated ones.
 
     Attributes:
         initial_states: `logged`, `estimated`, or None to choose by the data.
         horizon: Length of a window in control steps; the observation after each of them counts. None is 1 from logged
-            states, and with estimated ones `horizon_of` the data, then 9 or 3 times as many.
+            states, and with estimated ones `horizon_of` the data, then 9 or 3 times as many; by the filter its own.
         loss: `linear`, or a robust one (`huber`, `soft-l1`, `cauchy`) whose scale follows the residuals.
-        windows: Largest number of windows. None is 1000 from logged states, and 100 with estimated ones.
+        windows: Largest number of windows. None is 1000 from logged states, 100 with estimated ones, and by the filter
+            `filtering.MOST_BLOCKS` times as many as an epoch has.
         searches: Number of points to search from: mid-range, then random ones. The best goes on.
         search_windows: Largest number of windows while searching. None is 64 from logged states, else 24.
         search_epochs: Largest number of epochs of searching, which ends once the best search has settled.
@@ -99,20 +103,18 @@ class LeastSquares:
         problem.require_pairs()
         stage = self._first_stage(problem)
         chosen = self.horizon is not None or self.initial_states is not None
-        filters = not chosen and self.windows is None
-        filtered = filtering.of_contacts(problem, named_key(key, "ensembles")) if filters else None
+        filtered = None
+        if stage != "logged":
+            filtered = filtering.of_contacts(problem, named_key(key, "ensembles"), self.horizon, self.windows)
         if stage == "estimated" and filtered is not None:
             stage = "filtering"
-        fits_starts = stage != "logged" and filtered is None
+        of_starts = named_key(key, "unknown starts")
         return LeastSquaresState(
             known=None if stage in ("estimated", "filtering") else self._known(problem).init(problem, key),
-            unknown=self._all_lengths(problem, named_key(key, "unknown starts")) if fits_starts else (),
+            unknown=() if stage == "logged" else self._all_lengths(problem, of_starts, filtered=filtered is not None),
             stage=stage,
-            length=0,
-            best=0,
             filtered=filtered,
             prediction=None if chosen or stage == "filtering" else predicting.windows_for(problem),
-            finished=0,
         )
 
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
@@ -123,11 +125,16 @@ class LeastSquares:
         elif state.stage == "filtering":
             assert state.filtered is not None
             by_filter, epoch = filtering.step(problem, state.filtered, self.loss)
-            state = replace(state, filtered=by_filter, finished=int(by_filter.settled))
+            state, spent = after_filter(problem, replace(state, filtered=by_filter), self._unknown(problem).horizon)
+            epoch = replace(epoch, control_steps=epoch.control_steps + spent)
         elif state.estimates_starts:
-            search, epoch = self._unknown(problem, state.length).step(problem, state.unknown[state.length])
-            state = self._after_unknown(problem, with_search(state, state.length, search))
-            state, epoch = self._then_predicting(problem, state, epoch)
+            before = state.unknown[state.length]
+            search, epoch = self._unknown(problem, state.length).step(problem, before)
+            if state.filtered is not None and not becomes_exact(search, before):
+                state = back_to_filter(state)
+            else:
+                state = self._after_unknown(problem, with_search(state, state.length, search))
+                state, epoch = self._then_predicting(problem, state, epoch)
         else:
             assert state.known is not None
             search, epoch = self._known(problem).step(problem, state.known)
@@ -228,10 +235,9 @@ class LeastSquares:
             steps += self._known(problem).whole_run(problem, state.known, epochs)
         if state.filtered is not None and state.stage in ("starting", "filtering"):
             steps += filtering.whole_run(problem, state.filtered)
-        if state.stage != "undecided":
+        elif state.stage != "undecided":
             for length, search in enumerate(state.unknown):
-                skipped = LONGER <= length < len(state.unknown) - 1 and longest_first(state.unknown)
-                if skipped and not search.epochs:
+                if LONGER <= length < len(state.unknown) - 1 and not search.epochs:
                     continue
                 steps += self._unknown(problem, length).whole_run(problem, search, refining_epochs)
         return steps
@@ -264,11 +270,19 @@ class LeastSquares:
         windows, search_windows = self.windows or WINDOWS[states], self.search_windows or SEARCH_WINDOWS[states]
         return Search(starts, self.loss, horizon, windows, searches, search_windows, self.search_epochs, self.tolerance)
 
-    def _all_lengths(self, problem: CalibrationProblem, key: PRNGKeyArray) -> tuple[SearchState, ...]:
+    def _all_lengths(
+        self, problem: CalibrationProblem, key: PRNGKeyArray, *, filtered: bool
+    ) -> tuple[SearchState, ...]:
         """Searches on the shortest windows, and on every length that the episodes are long enough for.
 
-        If `horizon` is given, there is one length.
+        If `horizon` is given, there is one length. After a filter there is one, in whose windows bodies may touch, or
+        none where these have more unknowns than readings.
         """
+        if filtered:
+            try:
+                return (replace(self._unknown(problem), searches=1, free=False).init(problem, key),)
+            except MadocError:
+                return ()
         first = self._unknown(problem).init(problem, key)
         searches = [first]
         for length in range(LONGER, LONGER if self.horizon is not None else len(LENGTHS)):
@@ -300,34 +314,29 @@ class LeastSquares:
     def _after_unknown(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
         """Go on to longer windows once a search has settled, while they narrow the intervals.
 
-        Where the log shows no contact in the longest, these come first: motion is smooth, and they mostly serve. Where
-        they do not, shorter ones have their turn, and then the longest again unless they have settled.
+        The longest come first, which mostly serve as motion is smooth. Where they do not, shorter ones have their turn,
+        and then the longest again unless they have settled.
 
         If longer windows show model errors, the estimate is that of windows three times as long as the first, with the
         wide intervals of the shortest: with a wrong model it predicts better, as the free initial states of short
-        windows explain much of what it gets wrong. At contacts longer windows may leave residuals because their initial
-        states were not found: there the estimate of the longest that were explained is kept, with the intervals of the
-        shortest.
+        windows explain much of what it gets wrong.
         """
         searches, length = state.unknown, state.length
         search = searches[length]
         if state.finished:
             return state
         if not self._unknown(problem).settled(search):
-            last = length == LONGER and not search.touching.any()
-            lost = not last and hopeless(search, searches[0], searches[state.best])
+            lost = length != LONGER and hopeless(search, searches[0], searches[state.best])
             lost = lost or search.epochs >= self.search_epochs
-            return failed(state) if length >= LONGER and lost and not search.waiting else state
+            return failed(state) if length >= LONGER and lost else state
         if length and not self._noise_alone(problem, state, length):
-            if search.touching.any():
-                return finished(state, state.best if search.rough else 0)
             return finished(state, LONGER) if length == LONGER else failed(state)
         if length and not tells_more(search, searches[state.best]):
             return failed(state)
         if float(search.deviation.max()) < sentences.EXACT:
             return finished(state, length)
         following = length + 1
-        if not length and longest_first(searches) and enough(searches[-1], search):
+        if not length and enough(searches[-1], search):
             following = len(searches) - 1
         if following == len(searches) or self._unknown(problem).settled(searches[following]):
             return finished(state, length)

@@ -27,7 +27,7 @@ from madoc.calibration.least_squares.instruments import (
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification.ensembles import Innovations, can_be_drawn, first_counted, innovations, next_noise, with_noise
+from madoc.identification.ensembles import Innovations, first_counted, innovations, next_noise, with_noise
 from madoc.identification.gauss_newton import damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.losses import Loss
@@ -76,7 +76,7 @@ NOISE_SETTLED = 0.4
 NOISE_ROUNDS = 3
 """Number of runs of an ensemble before each of the first epochs, which tell the noise better at little cost."""
 TOUCHING = 0.05
-"""Share in [0, 1] of the windows in which bodies touch, from which on the log is one of contacts if they are enough."""
+"""Share in [0, 1] of windows in which bodies touch, from which on the log is one of contacts."""
 FEW_TOUCH = (0.25, 0.5)
 """Shares in [0, 1] of windows in which bodies touch: below the first, others are left out; below the second, epochs
 have twice as many windows, so that enough of them touch."""
@@ -93,6 +93,7 @@ class FilterState:
 
     Attributes:
         point: The parameters, in [-1, 1].
+        horizon: Length of a window in control steps.
         rows: First rows of the windows, in random order, but that as many touch in every block of them.
         size: Number of windows of an epoch, a block of them.
         spread: Differences along each axis of the parameters' covariance, in [-1, 1], in columns.
@@ -119,6 +120,7 @@ class FilterState:
     """
 
     point: Float[np.ndarray, " d"]
+    horizon: int
     rows: Int[np.ndarray, " windows"]
     size: int
     spread: Float[np.ndarray, "d d"]
@@ -130,17 +132,17 @@ class FilterState:
     meat: Float[np.ndarray, "d d"]
     apart: Float[np.ndarray, " d"]
     chance: Float[np.ndarray, "d d"]
-    compared: int
-    moved: float
-    damping: float
-    cost: float
-    alike: float
-    wide: int
-    quiet: int
-    halved: int
-    together: int
-    epochs: int
-    failures: int
+    compared: int = 0
+    moved: float = 0.0
+    damping: float = FIRST_DAMPING
+    cost: float = 0.0
+    alike: float = 0.0
+    wide: int = 0
+    quiet: int = 0
+    halved: int = 0
+    together: int = 0
+    epochs: int = 0
+    failures: int = 0
 
     @property
     def blocks(self) -> int:
@@ -208,29 +210,36 @@ def horizon_of(problem: CalibrationProblem) -> int:
     return max(1, min(STRIDES * stride(problem.dataset), LONGEST_WINDOW, len(problem.dataset) // fewest - 1))
 
 
-def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState | None:
-    """The search before it has begun; None where few windows show contacts or are long, or states are unknown."""
+def of_contacts(
+    problem: CalibrationProblem, key: PRNGKeyArray, horizon: int | None = None, windows: int | None = None
+) -> FilterState | None:
+    """The search before it has begun; None where few windows show contacts or are long, or states are unknown.
+
+    `horizon` is the length of windows in control steps, `horizon_of` the problem by default, `windows` their largest
+    number.
+    """
     states, count = problem.states, len(problem.simulator.parameters)
-    if not states.starts_known or not can_be_drawn(states, problem.simulator):
-        return None
-    horizon = horizon_of(problem)
-    if horizon < first_counted(states) + 2 or not len(rows_that_fit(problem.dataset, states.rows, horizon)):
+    horizon, fewest = horizon or horizon_of(problem), FEWEST + count
+    short = horizon < first_counted(states) + 2 or not len(rows_that_fit(problem.dataset, states.rows, horizon))
+    if short or not states.starts_known:
         return None
     rows = states.rows[disjoint_windows(problem.dataset, states.rows, horizon)]
-    if len(rows) < FEWEST + count:
+    if min(len(rows), windows or len(rows)) < fewest:
         return None
     rows = generator(key).permutation(rows)[:MOST_SEEN]
     if not touched(problem, *states.guesses(), rows[:FIRST_SEEN], horizon).any():
         return None
     touching = touched(problem, *states.guesses(), rows, horizon)
-    if touching.sum() < max(TOUCHING * len(rows), FEWEST + count):
+    if touching.sum() < max(TOUCHING * len(rows), fewest):
         return None
-    size = max(BLOCK, 2 * (FEWEST + count)) * (1 if touching.mean() >= FEW_TOUCH[1] else 2)
+    size = max(BLOCK, 2 * fewest) * (1 if touching.mean() >= FEW_TOUCH[1] else 2)
     alone = max(size, int(touching.sum() / FEW_TOUCH[0] - touching.sum()))
-    rows = interleaved(rows[touching], rows[~touching][:alone])[: size * MOST_BLOCKS]
+    most = min(windows or len(rows), size * MOST_BLOCKS)
+    rows = interleaved(rows[touching], rows[~touching][:alone])[:most]
     by_differences = (problem.noise_by_differences / problem.typical_change)[: states.measured]
     return FilterState(
         point=np.zeros(count),
+        horizon=horizon,
         rows=rows,
         size=size,
         spread=WIDTH * np.eye(count),
@@ -242,17 +251,6 @@ def of_contacts(problem: CalibrationProblem, key: PRNGKeyArray) -> FilterState |
         meat=np.zeros((count, count)),
         apart=np.zeros(count),
         chance=np.zeros((count, count)),
-        compared=0,
-        moved=0.0,
-        damping=FIRST_DAMPING,
-        cost=0.0,
-        alike=0.0,
-        wide=0,
-        quiet=0,
-        halved=0,
-        together=0,
-        epochs=0,
-        failures=0,
     )
 
 
@@ -264,7 +262,7 @@ def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
     if state.at_rest and state.to_compare == 1:
         alone += LARGE_ROUNDS * LARGE
     windows = len(state.rows[state.block])
-    return (alone * min(windows, state.size) + (2 * members + few) * windows) * horizon_of(problem)
+    return (alone * min(windows, state.size) + (2 * members + few) * windows) * state.horizon
 
 
 def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
@@ -281,7 +279,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     """
     block, count = state.block, state.members
     rows = state.rows[block]
-    readings = Readings.at(problem.dataset, problem.states, rows, horizon_of(problem), problem.typical_change)
+    readings = Readings.at(problem.dataset, problem.states, rows, state.horizon, problem.typical_change)
     rounding = (problem.rounding / problem.typical_change)[: len(state.noise)]
     random = [np.random.default_rng([state.seed, state.epochs, number]) for number in range(3)]
     log = problem.dataset, problem.states, problem.simulator, readings, rows

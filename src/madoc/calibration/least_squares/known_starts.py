@@ -40,7 +40,6 @@ class KnownStarts:
     unknown: ClassVar[bool] = False
     failed_cost: ClassVar[float] = ALL_FAILED
     stuck: ClassVar[float] = 0.0
-    waiting: ClassVar[int] = 0
 
     @classmethod
     def at(
@@ -85,12 +84,12 @@ class KnownStarts:
         return rows
 
     @staticmethod
-    def columns(problem: CalibrationProblem, *, smooth: bool) -> int:
+    def columns(problem: CalibrationProblem) -> int:
         """Number of systems simulated for the derivatives of an epoch: central differences."""
         return 1 + 2 * len(problem.simulator.parameters)
 
     @staticmethod
-    def trial_columns(*, smooth: bool) -> int:
+    def trial_columns(*, refining: bool) -> int:
         """Number of systems simulated for the steps tried in an epoch."""
         return len(TRIALS)
 

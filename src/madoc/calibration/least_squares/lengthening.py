@@ -18,9 +18,12 @@ from madoc.calibration.least_squares.filtering import FilterState
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING
 from madoc.calibration.least_squares.predicting import Prediction
 from madoc.calibration.least_squares.search import SearchState
-from madoc.calibration.least_squares.unknown_starts import UnknownStarts
+from madoc.calibration.least_squares.statistics import touched
+from madoc.calibration.least_squares.unknown_starts import ROUNDING
 from madoc.data import Dataset
+from madoc.identification.ensembles import with_contacts_settled
 from madoc.identification.information import half_width, sandwich
+from madoc.identification.replay import Readings
 from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
 Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening", "filtering"]
@@ -42,6 +45,8 @@ FIRST_STEPS = 3
 inexact."""
 LEFT_OUT = 0.1
 """Share in [0, 1] of windows; longer windows are refused if more than this share of them is newly unexplained."""
+EXACTER = 0.5
+"""Share in [0, 1] of what a step left that the next one leaves at most where data has no noise."""
 CHANCE = 3.0
 """Autocorrelation in its standard errors under white noise; above it residuals are not white."""
 _SMALLEST = 1e-100
@@ -55,27 +60,27 @@ class LeastSquaresState:
     Attributes:
         known: The search from logged states; None where they cannot be rebuilt.
         unknown: Searches with unknown initial states: on the shortest windows, and on longer and longer
-            ones; none are needed with stage `logged`.
+            ones; none are needed with stage `logged`. After a filter one at most, for data without noise.
         stage: `logged`: from logged states, to the end. `undecided`: from logged states, until residuals show whether
             these are noisy. `starting`: from logged states, to find parameters for `estimated` to begin at.
             `estimated`: with unknown initial states on the shortest windows. `lengthening`: the same on longer ones.
             `filtering`: by an ensemble filter.
+        filtered: The search by an ensemble filter, which takes the place of those with unknown initial states where
+            windows show contacts; else None.
+        prediction: The fit for prediction, the last; None where the log does not serve for one.
         length: Index of the unknown search in progress.
         best: Index of the unknown search that has the estimate.
-        filtered: The search by an ensemble filter, which takes the place of those with unknown initial states where
-            most windows show contacts; else None.
-        prediction: The fit for prediction, the last; None where the log does not serve for one.
         finished: 1 once the next step would be too small to matter, else 0.
     """
 
     known: SearchState | None
     unknown: tuple[SearchState, ...]
     stage: Stage
-    length: int
-    best: int
     filtered: FilterState | None
     prediction: Prediction | None
-    finished: int
+    length: int = 0
+    best: int = 0
+    finished: int = 0
 
     @property
     def estimates_starts(self) -> bool:
@@ -103,12 +108,14 @@ def horizon_of(dataset: Dataset, fewest: int) -> int:
 def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, most: int) -> SearchState | None:
     """A search on at most `most` windows of `horizon` rows that share no reading, at rows where shorter ones begin.
 
-    It has not begun: its initial states are those of the shorter windows. None where too few windows fit.
+    Bodies touch in none of them. It has not begun: its initial states are those of the shorter windows. None where too
+    few windows fit.
     """
     rows, fewest = np.sort(shorter.rows), FEWEST + shorter.point.shape[1]
     if not len(rows_that_fit(problem.dataset, rows, horizon)):
         return None
-    chosen = rows[evenly(disjoint_windows(problem.dataset, rows, horizon), max(most, fewest))]
+    rows = rows[disjoint_windows(problem.dataset, rows, horizon)]
+    chosen = evenly(rows[~touched(problem, *problem.states.guesses(), rows, horizon)], max(most, fewest))
     if len(chosen) < fewest:
         return None
     return replace(
@@ -120,7 +127,7 @@ def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, 
         cost=shorter.cost[:1],
         moved=shorter.moved[:1],
         rows=chosen,
-        touching=UnknownStarts.touched(problem, chosen, horizon),
+        touching=np.zeros(len(chosen), bool),
         refining=1,
     )
 
@@ -131,10 +138,9 @@ def continued(longer: SearchState, shorter: SearchState) -> SearchState:
         longer,
         point=shorter.point[:1].copy(),
         states=_states_at(shorter, longer.rows),
-        state_errors=shorter.state_errors,
         damping=np.full_like(longer.damping, FIRST_DAMPING),
         state_damping=np.full_like(longer.state_damping, FIRST_DAMPING),
-        waiting=UnknownStarts.waiting,
+        waiting=1,
         epochs=0,
     )
 
@@ -188,9 +194,34 @@ def begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
     return replace(with_search(state, 0, first), stage="estimated")
 
 
-def longest_first(searches: tuple[SearchState, ...]) -> bool:
-    """Whether there are longer windows, and the log shows no contact in the longest."""
-    return len(searches) > LONGER and not searches[-1].touching.any()
+def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon: int) -> tuple[LeastSquaresState, int]:
+    """The state after an epoch of the filter: at its end, or with fitted starts where it left what is unlike noise.
+
+    What an ensemble leaves of data without noise is like what it leaves of the next reading. Windows of this horizon
+    with fitted starts go on from there to the exact values. Also the control steps that it took to find these starts.
+    """
+    filtered = state.filtered
+    assert filtered is not None
+    if not filtered.settled:
+        return state, 0
+    if not state.unknown or not filtered.found.unlike_noise:
+        return replace(state, finished=1), 0
+    first = state.unknown[0]
+    log = problem.dataset, problem.states, problem.simulator
+    readings = Readings.at(problem.dataset, problem.states, first.rows, horizon, problem.typical_change)
+    starts, spent = with_contacts_settled(*log, readings, first.rows, filtered.point, first.states[0])
+    first = replace(first, point=filtered.point[None].copy(), states=starts[None], refining=1)
+    return replace(state, unknown=(first,), stage="estimated"), spent
+
+
+def becomes_exact(search: SearchState, before: SearchState) -> bool:
+    """Whether a step left so much less of every channel that nothing but rounding errors are left, or may be soon."""
+    return bool((search.deviation <= np.maximum(EXACTER * before.deviation, ROUNDING)).all())
+
+
+def back_to_filter(state: LeastSquaresState) -> LeastSquaresState:
+    """The end of all with the filter's estimate: the data has noise, or the model lacks something."""
+    return replace(state, stage="filtering", finished=1)
 
 
 def failed(state: LeastSquaresState) -> LeastSquaresState:

@@ -37,7 +37,7 @@ class Plan:
         autocorrelation: Correlation of residuals of consecutive readings.
         exact: Whether residuals are rounding errors, so that their size cannot show whether initial states still move.
         left_out: Share of the windows that the cost does not count.
-        steady_cost: Cost of the windows in which no contact begins or ends; 0 while searching and for known states.
+        tail_cost: Cost with no noise below the rounding of counts; 0 while searching and for known states.
     """
 
     point: Float[np.ndarray, " d"]
@@ -55,7 +55,7 @@ class Plan:
     autocorrelation: float = 0.0
     exact: bool = True
     left_out: float = 0.0
-    steady_cost: float = 0.0
+    tail_cost: float = 0.0
 
     def comparable(self, cost: float) -> float:
         """A cost in typical changes, by which searches are compared; a window left out adds a whole change."""

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome, Plan
-from madoc.calibration.least_squares.statistics import telling_first
-from madoc.calibration.least_squares.unknown_starts import SECOND_CHANCES, UnknownStarts
+from madoc.calibration.least_squares.statistics import without_contacts
+from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.identification import settling
 from madoc.identification.information import SETTLED, sandwich
 from madoc.identification.losses import ALL_FAILED, Loss
@@ -26,18 +26,7 @@ DAMPING_RANGE = (1e-10, 1e10)
 LITTLE = 5e-3
 """Share in [0, 1] of the cost; after a step that saves less, unknown initial states count as settled too."""
 ROUGHLY_SETTLED = 0.5
-"""Ratio in [0, 1] of a step to the standard error at contacts, where some windows end in another minimum after each
-step, which moves the parameters by about as much."""
-FOUND = (0.5, 0.9)
-"""Shares in [0, 1]. If narrowing differences and restarts leave at most this share of the unexplained windows, or of
-the size of all residuals, those windows lacked an initial state, not a better model."""
-FIRST_STEPS = 2
-"""Number of steps of initial states at contacts with whose result those of the following steps are compared."""
-FAR = 3.0
-"""Distance in standard errors; once parameters have moved farther, initial states are looked for anew."""
-SHORTER = 1.0 / TRIALS[0]
-"""Smallest damping after a step that did not help at contacts: with less, the next would hardly be shorter. It is that
-of the least damped step, by which it is multiplied, of 1."""
+"""Ratio in [0, 1] of a step to the standard error that settles a search of many steps."""
 _SMALLEST = 1e-100
 """Smallest tolerance, so that the ratio of a step to a tolerance of 0 is finite."""
 
@@ -50,34 +39,27 @@ class SearchState:
     Attributes:
         point: The current point of each search, in [-1, 1].
         states: Initial state of every window there; without windows where they are known.
-        state_errors: Standard errors of an unknown initial state's values, by which differences are widened.
         damping: λ of each search's steps of the parameters.
         state_damping: λ of each unknown initial state's step.
         cost: Mean loss of a residual, `ALL_FAILED` before the first epoch. In squared typical changes of a stride; in
             squared standard deviations of the noise where initial states are unknown and the search refines.
         moved: The largest component of each search's last step, relative to one that matters; below 1 it has settled.
         rows: First rows of the windows.
-        touching: Whether a contact was seen in each window, as far as its states are known.
+        touching: Whether a contact was seen in each window from a known state.
         deviation: Noise of each channel in its typical changes; 1 where initial states are known.
         bread: Curvature of the best search's cost where it last linearised.
         meat: Scatter of the cost's gradient there, and the last step's where steps of half a standard error settle.
         explained: Number of windows from which these two were computed.
-        steady_cost: Mean loss of a residual in those in which no contact begins or ends, each kind in its own noise.
+        tail_cost: Mean loss of a residual in these, with no noise below the rounding of counts.
         autocorrelation: Correlation of these windows' residuals with the next reading's; 0 for known initial states.
         refining: 0 while searching on few windows, 1 on all of them.
-        settled_at: The point at which initial states last settled alone.
-        missed: Share of the windows that initial states did not explain after the first steps of that, and the size
-            of all windows' residuals in typical changes.
-        rough: 1 where wide differences and restarts have found initial states, as at contacts: each step of the
-            parameters is then followed by several of the states; else 0.
-        waiting: Number of epochs to come in which only initial states move.
+        waiting: 1 before an epoch in which only initial states move, as those of new windows are guesses; else 0.
         epochs: Number of epochs of this stage so far, those of waiting not counted.
         failures: Number of windows whose simulation failed.
     """
 
     point: Float[np.ndarray, "searches d"]
     states: Float[np.ndarray, "searches unknown state"]
-    state_errors: Float[np.ndarray, " physical"]
     damping: Float[np.ndarray, " searches"]
     state_damping: Float[np.ndarray, "searches unknown"]
     cost: Float[np.ndarray, " searches"]
@@ -88,12 +70,9 @@ class SearchState:
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
     explained: int
-    steady_cost: float
+    tail_cost: float
     autocorrelation: float
     refining: int
-    settled_at: Float[np.ndarray, " d"]
-    missed: tuple[float, float]
-    rough: int
     waiting: int
     epochs: int
     failures: int
@@ -104,7 +83,10 @@ _OF_EACH_SEARCH = ("point", "states", "damping", "state_damping", "cost", "moved
 
 @dataclass(frozen=True)
 class Search:
-    """Settings of a search: how its windows begin, and those that `LeastSquares` has under the same names."""
+    """Settings of a search: how its windows begin, and those that `LeastSquares` has under the same names.
+
+    Those with unknown initial states leave out windows in which bodies touch if `free` (`without_contacts`).
+    """
 
     starts: type[KnownStarts] | type[UnknownStarts]
     loss: Loss
@@ -114,6 +96,7 @@ class Search:
     search_windows: int
     search_epochs: int
     tolerance: float
+    free: bool = True
 
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> SearchState:
         """Draw the windows; put one search at mid-range, others at random places.
@@ -124,10 +107,9 @@ class Search:
         of_windows, of_starts = jax.random.split(key)
         count = len(problem.simulator.parameters)
         possible = self.starts.possible_rows(problem, self.horizon, self.windows)
-        rows = possible[generator(of_windows).permutation(len(possible))]
-        if self.starts.unknown:
-            rows = telling_first(problem, rows, self.horizon, self.windows, self.search_windows)
-        rows = rows[: self.windows]
+        if self.starts.unknown and self.free:
+            possible = without_contacts(problem, possible, self.horizon)
+        rows = possible[generator(of_windows).permutation(len(possible))][: self.windows]
         points = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
         points[0] = 0.0
         logged = problem.states
@@ -135,7 +117,6 @@ class Search:
         return SearchState(
             point=points,
             states=np.repeat(states[None], self.searches, axis=0),
-            state_errors=np.zeros(logged.physical_size if self.starts.unknown else 0),
             damping=np.full(self.searches, FIRST_DAMPING),
             state_damping=np.full((self.searches, len(states)), FIRST_DAMPING),
             cost=np.full(self.searches, ALL_FAILED),
@@ -146,12 +127,9 @@ class Search:
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),
             explained=0,
-            steady_cost=0.0,
+            tail_cost=0.0,
             autocorrelation=0.0,
             refining=0,
-            settled_at=np.zeros(count),
-            missed=(0.0, 0.0),
-            rough=0,
             waiting=0,
             epochs=0,
             failures=0,
@@ -163,8 +141,6 @@ class Search:
         windows = self.starts.at(problem, state.rows[:count], state.touching[:count], self.horizon, self.loss)
         if isinstance(windows, UnknownStarts) and state.waiting:
             return self._settled_states(windows, state)
-        if isinstance(windows, UnknownStarts) and state.rough:
-            return self._profiled(windows, state)
         points, states = state.point[:running], state.states[:running, :count]
         damping, state_damping = state.damping[:running], state.state_damping[:running, :count]
         plans = windows.plans(points, states, damping, state_damping, refining=bool(state.refining))
@@ -180,7 +156,7 @@ class Search:
             bread=best.bread,
             meat=best.meat + (_of_last_step(best) if roughly and new["moved"][leader] < 1.0 else 0.0),
             explained=int(best.kept.sum()),
-            steady_cost=best.steady_cost,
+            tail_cost=best.tail_cost,
             autocorrelation=best.autocorrelation,
             epochs=state.epochs + 1,
             failures=state.failures + sum(each.failures for each in plans) + sum(each.failures for each in outcomes),
@@ -220,72 +196,20 @@ class Search:
 
     def _settled_states(self, windows: UnknownStarts, state: SearchState) -> tuple[SearchState, Epoch]:
         """One step of initial states alone, which every search on new windows begins with."""
-        states, damping = state.states[0], state.state_damping[0]
-        after, waiting = windows.settle(state.point[0], states, damping, state.state_errors, state.waiting)
+        after = windows.settle(state.point[0], state.states[0], state.state_damping[0])
         new_states, new_damping = state.states.copy(), state.state_damping.copy()
         new_states[0], new_damping[0] = after.states, after.damping
-        first = state.waiting > self.starts.waiting - FIRST_STEPS
-        missed = windows.share_unexplained(after), float(np.sqrt(after.costs.mean()) * np.median(after.deviation))
-        before = missed if first else state.missed
-        smooth = not state.touching.any()
-        found = not first and not smooth and (missed[0] <= FOUND[0] * before[0] or missed[1] <= FOUND[1] * before[1])
         following = replace(
             state,
             states=new_states,
             state_damping=new_damping,
-            state_errors=after.errors,
             deviation=after.deviation,
-            settled_at=state.point[0].copy(),
-            missed=before,
-            rough=max(state.rough, int(found)),
-            waiting=0 if smooth else waiting,
+            waiting=0,
             failures=state.failures + after.failures,
         )
-        metrics = {"residual": missed[1], "noise": float(np.median(after.deviation))}
+        noise = float(np.median(after.deviation))
+        metrics = {"residual": float(np.sqrt(after.costs.mean())) * noise, "noise": noise}
         return following, Epoch(metrics, after.simulations * self.horizon, stage="calibrating")
-
-    def _profiled(self, windows: UnknownStarts, state: SearchState) -> tuple[SearchState, Epoch]:
-        """One step of the parameters after which initial states settle anew, kept unless that makes windows worse.
-
-        The cost is that of the best initial states for each parameter vector (variable projection, Golub and Pereyra
-        1973). A step with states that follow to first order alone would be refused at contacts. As states end in other
-        minima after each step, parameters do not come to rest: once settled, the covariance counts the last step as an
-        error.
-        """
-        states = state.states[:1]
-        undamped = np.full(states.shape[:2], settling.DAMPING_RANGE[0])
-        (plan,) = windows.plans(state.point[:1], states, state.damping[:1], undamped, refining=True)
-        after, better, cost = windows.profiled(plan, states[0], state.state_errors, SECOND_CHANCES)
-        damping = TRIALS[0] * state.damping[0] if better else max(1e3 * state.damping[0], SHORTER)
-        new, step = {name: getattr(state, name).copy() for name in _OF_EACH_SEARCH}, plan.steps[0]
-        if better:
-            new["point"][0] = np.clip(plan.point + step, -1.0, 1.0)
-            new["states"][0], new["state_damping"][0] = after.states, after.damping
-        new["damping"][0] = np.clip(damping, *DAMPING_RANGE)
-        new["cost"][0], new["moved"][0] = cost, self._relative_step(plan, step, ROUGHLY_SETTLED)
-        if not better and state.damping[0] <= self.starts.stuck:
-            new["moved"][0] = max(new["moved"][0], 1.0)  # a damped step may be small far from the minimum too
-        following = replace(
-            state,
-            **new,
-            deviation=plan.deviation,
-            bread=plan.bread,
-            meat=plan.meat + (_of_last_step(plan) if new["moved"][0] < 1.0 else 0.0),
-            explained=int(plan.kept.sum()),
-            steady_cost=plan.steady_cost,
-            autocorrelation=plan.autocorrelation,
-            epochs=state.epochs + 1,
-            failures=state.failures + plan.failures + after.failures,
-        )
-        noise = float(np.median(plan.deviation))
-        metrics = {"residual": float(np.sqrt(cost)) * noise, "moved": float(following.moved[0]), "noise": noise}
-        far = self._relative_step(plan, following.point[0] - state.settled_at, FAR) > 1.0
-        if following.moved[0] < 1.0 and far:
-            moved = np.maximum(following.moved, 1.0)
-            following = replace(following, waiting=settling.RESTARTS, moved=moved)
-        columns = 2 + 2 * len(step) + len(plan.spread)  # one for the contacts
-        spent = len(state.rows) * columns + after.simulations
-        return following, Epoch(metrics, spent * self.horizon, stage="calibrating")
 
     def settled(self, state: SearchState) -> bool:
         """Whether the last step on all windows was too small to matter; never while every window fails."""
@@ -297,15 +221,12 @@ class Search:
         return len(state.rows) if state.refining else min(self.search_windows, len(state.rows))
 
     def whole_run(self, problem: CalibrationProblem, state: SearchState, refining_epochs: int) -> int:
-        """Control steps of the longest search, unless it has ended, and of `refining_epochs` on all windows.
-
-        At contacts, where initial states settle for longer and more windows may follow, it takes more.
-        """
+        """Control steps of the longest search, unless it has ended, and of `refining_epochs` on all windows."""
         searching, refining, settling = (
             self._epoch_steps(problem, replace(state, refining=stage, waiting=waiting))
             for stage, waiting in ((0, 0), (1, 0), (1, 1))
         )
-        waiting = min(1, self.starts.waiting) if not state.rough else state.waiting
+        waiting = max(state.waiting, int(self.starts.unknown and not state.refining))
         return searching * self.search_epochs * (1 - state.refining) + refining * refining_epochs + settling * waiting
 
     def _running(self, state: SearchState) -> int:
@@ -313,19 +234,13 @@ class Search:
 
     def _epoch_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
         """About how many control steps an epoch simulates."""
-        trials = 0 if state.waiting else self.starts.trial_columns(smooth=self._smooth(state))
+        trials = 0 if state.waiting else self.starts.trial_columns(refining=bool(state.refining))
         return self._derivative_steps(problem, state) + self._window_steps(state) * trials
 
     def _derivative_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
-        """Control steps of an epoch's derivatives, and at contacts of counting these."""
-        columns = self.starts.settling_columns(problem) if state.waiting else self._columns(problem, state)
-        counted = self.starts.unknown and state.refining and not state.waiting and state.touching.any()
-        return self._window_steps(state) * (columns + int(counted))
-
-    def _columns(self, problem: CalibrationProblem, state: SearchState) -> int:
-        """Number of systems simulated for the derivatives of an epoch in which parameters move."""
-        smooth = not state.touching[: self.window_count(state)].any()
-        return self.starts.columns(problem, smooth=smooth)
+        """Control steps of an epoch's derivatives."""
+        columns = (self.starts.settling_columns if state.waiting else self.starts.columns)(problem)
+        return self._window_steps(state) * columns
 
     def _window_steps(self, state: SearchState) -> int:
         """Control steps of all windows of all searches under one system each."""
@@ -338,11 +253,6 @@ class Search:
         counts the last step as an error.
         """
         return self.starts.unknown and bool(state.refining) and state.epochs + 1 >= self.search_epochs
-
-    @staticmethod
-    def _smooth(state: SearchState) -> bool:
-        """Whether a search refines on windows without contacts."""
-        return bool(state.refining) and not state.touching.any()
 
     def _moved(self, plan: Plan, outcome: Outcome, trial: int, *, damping: float, share: float) -> float:
         """The largest component of a step relative to one that matters: a share of a standard error, or the tolerance.
@@ -363,11 +273,10 @@ class Search:
         """Put the best search first, which alone goes on, to all windows."""
         order = np.argsort(np.arange(self.searches) != leader, kind="stable")
         searches = {name: getattr(state, name)[order] for name in _OF_EACH_SEARCH}
-        if self.starts.waiting:
+        if self.starts.unknown:
             searches["damping"] = np.full(self.searches, FIRST_DAMPING)
             searches["state_damping"] = np.full_like(state.state_damping, FIRST_DAMPING)
-        waiting = self.starts.waiting
-        return replace(state, **searches, refining=1, waiting=waiting, epochs=0)
+        return replace(state, **searches, refining=1, waiting=int(self.starts.unknown), epochs=0)
 
 
 def _of_last_step(plan: Plan) -> Float[np.ndarray, "d d"]:

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.filtering import FilterState, horizon_of
+from madoc.calibration.least_squares.filtering import FilterState
 from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.statistics import LONG_TAILS
 from madoc.data import stride
@@ -49,7 +49,7 @@ def about_estimated_states(problem: CalibrationProblem, search: SearchState, hor
 def about_filtered_states(problem: CalibrationProblem, search: FilterState) -> str:
     """A sentence that readings were predicted by an ensemble filter, why, and how large the noise is."""
     sentence = (
-        f"every reading in windows of {horizon_of(problem)} control steps was predicted by an ensemble filter from "
+        f"every reading in windows of {search.horizon} control steps was predicted by an ensemble filter from "
         f"those before it, as {_why_states_are_not_known(problem)}, and bodies touch"
     )
     if not search.epochs:
@@ -84,15 +84,14 @@ def _how_large(problem: CalibrationProblem, noise: Float[np.ndarray, " channels"
 def have_long_tails(problem: CalibrationProblem, search: SearchState) -> bool:
     """Whether residuals have longer tails than noise has; not known before the first step on all windows.
 
-    Windows in which a contact begins or ends do not count where there are enough others, see `steady_cost`. Without any
-    contact, more than `MOST_LEFT_OUT` of the windows that no initial state explains are a long tail too: they are left
-    out of the cost.
+    More than `MOST_LEFT_OUT` of the windows that no initial state explains are a long tail too: they are left out of
+    the cost.
     """
     if not _noisy(search):
         return False
     left_out, windows = _left_out(search)
-    smooth = problem.states.starts_known and not search.touching.any()
-    return search.steady_cost > LONG_TAILS or (smooth and left_out >= max(FEWEST_LEFT_OUT, MOST_LEFT_OUT * windows))
+    many = left_out >= max(FEWEST_LEFT_OUT, MOST_LEFT_OUT * windows)
+    return search.tail_cost > LONG_TAILS or (problem.states.starts_known and many)
 
 
 def about_residuals(problem: CalibrationProblem, search: SearchState) -> tuple[str, ...]:
@@ -104,12 +103,7 @@ def about_residuals(problem: CalibrationProblem, search: SearchState) -> tuple[s
         f"{left_out} of {windows} windows count for nothing: no initial state found explains them as "
         "well as others, as where contacts begin, or their simulation failed"
     )
-    jumps = (
-        "residuals have longer tails than noise has only where contacts begin or end, or where windows of different "
-        "contacts are taken together; the verdict does not count that"
-    )
-    long = [TAILS] if have_long_tails(problem, search) else [jumps] if search.cost[0] > LONG_TAILS else []
-    return (*([sentence] if left_out else []), *long)
+    return (*([sentence] if left_out else []), *([TAILS] if have_long_tails(problem, search) else []))
 
 
 def about_model_errors(horizon: int) -> str:

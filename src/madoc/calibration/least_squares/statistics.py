@@ -4,24 +4,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.least_squares.plan import FEWEST
 from madoc.data import stride
-from madoc.identification.losses import NORMAL_MAD, Loss
-from madoc.identification.noise import NOISY_STRIDE, OUTLIER, channel_noise
-from madoc.identification.replay import Readings, window_residuals
-from madoc.identification.settling import window_costs
+from madoc.identification.losses import NORMAL_MAD
+from madoc.identification.noise import NOISY_STRIDE, OUTLIER
+from madoc.identification.replay import window_residuals
 from madoc.identification.windows import consecutive_rows, windows_at
 
 LONG_TAILS = 1.1
 """Cost of residuals, in squared standard deviations; above it they are not normal noise, whose cost is 0.8 with
 Cauchy's loss and 1 with squares."""
-FEWEST_STEADY = 10
-"""Smallest number of windows of a kind whose noise is estimated by itself."""
 _LARGEST = 3.0
 """Standard deviations of the noise at which residuals are clipped before they are correlated."""
-WIDE = 0.4
-"""Width in [-1, 1] of the differences by which windows are compared: these show beside the jumps of contacts."""
-COMPARED = 6
-"""Number of windows that are compared for each that is drawn; comparing all of a long log would take too long."""
 _SMALLEST = 1e-12
 """Residual in typical changes of a channel; smaller ones are rounding errors."""
 
@@ -62,34 +56,12 @@ def touched(
     return touching
 
 
-def steady_cost(
-    residuals: Float[np.ndarray, "windows readings channels"],
-    spare: Float[np.ndarray, "windows readings channels"],
-    contacts: Int[np.ndarray, "windows readings"],
-    least: Float[np.ndarray, " channels"],
-    loss: Loss,
-) -> float:
-    """Mean cost of the windows in which no contact begins or ends; 0 without windows.
-
-    Where one does, residuals jump with the error of the initial state. Windows with the same number of `contacts` at
-    every reading are of one kind, whose cost is in standard deviations of its own noise: a force that disturbs a flying
-    body shows less where friction holds it. Kinds of fewer than `FEWEST_STEADY` windows say nothing; if all are, all
-    windows count as one kind. A contact between two readings is not seen.
-    `spare` is 1 - leverage of each residual. No noise is below `least`: that of counts is their rounding, though most
-    readings be of something at rest.
-    """
-    if not len(residuals):
-        return 0.0
-    steady = (contacts == contacts[:, :1]).all(1)
-    kinds = [steady & (contacts[:, 0] == count) for count in np.unique(contacts[steady, 0])]
-    kinds = [kind for kind in kinds if kind.sum() >= FEWEST_STEADY]
-    kinds = kinds or [np.ones_like(steady)]
-    noises = [np.maximum(channel_noise(residuals[kind], spare[kind]), least) for kind in kinds]
-    costs = [
-        window_costs((residuals[kind] / noise).reshape(kind.sum(), -1), loss)
-        for kind, noise in zip(kinds, noises, strict=True)
-    ]
-    return float(np.concatenate(costs).mean())
+def without_contacts(
+    problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
+) -> Int[np.ndarray, " free"]:
+    """Rows of windows in which the log shows no contact, or all where too few do not."""
+    free = rows[~touched(problem, *problem.states.guesses(), rows, horizon)]
+    return free if len(free) >= FEWEST + len(problem.simulator.parameters) else rows
 
 
 def clipped_change(
@@ -161,46 +133,3 @@ def noisy_rows(problem: CalibrationProblem) -> bool:
     """
     loud = problem.noise_by_differences > NOISY_STRIDE * problem.typical_change
     return stride(problem.dataset) > 1 and bool(loud.any())
-
-
-def telling_first(
-    problem: CalibrationProblem,
-    rows: Int[np.ndarray, " windows"],
-    horizon: int,
-    drawn: int,
-    searched: int,
-) -> Int[np.ndarray, " windows"]:
-    """Rows of windows in random order, of which every other of those `searched` first is one that tells most.
-
-    A ball that bounces a few times and then lies still tells of its bounces in a few windows of hundreds. Of those
-    drawn by chance, too few are of these, and what they would tell passes for windows that no initial state explains.
-    The others remain random: windows that tell much are also those whose initial states are hardest to find. Nothing
-    changes where as many are `drawn` as there are, or where the log shows no contact.
-    """
-    compared = rows[: COMPARED * drawn]
-    if drawn >= len(rows) or not touched(problem, *problem.states.guesses(), compared, horizon).any():
-        return rows
-    telling = compared[np.argsort(-_shares(problem, compared, horizon), kind="stable")[: min(drawn, searched) // 2]]
-    others = rows[~np.isin(rows, telling)]
-    pairs = np.stack([telling, others[: len(telling)]], axis=1)
-    return np.concatenate([pairs.ravel(), others[len(telling) :]])
-
-
-def _shares(
-    problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
-) -> Float[np.ndarray, " windows"]:
-    """How much of all that the windows tell of the parameters each of them does, as the sum over all directions.
-
-    This is the leverage of a linear regression on differences from mid-range. It takes windows · (1 + d) · horizon
-    control steps.
-    """
-    readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
-    guesses = problem.states.states[np.searchsorted(problem.states.rows, rows)]
-    count = len(problem.simulator.parameters)
-    points = np.concatenate([np.zeros((1, count)), WIDE * np.eye(count)])
-    seen = readings.residuals(problem.simulator, points, np.repeat(guesses[None], len(points), axis=0))[:, 0]
-    with np.errstate(invalid="ignore"):
-        changes = np.moveaxis(seen[1:] - seen[0], 0, -1)
-    changes = np.where(np.isfinite(changes).all((1, 2), keepdims=True), changes, 0.0)
-    told = np.einsum("wvd,wve->wde", changes, changes)
-    return np.einsum("wde,ed->w", told, np.linalg.pinv(told.sum(0), hermitian=True))
