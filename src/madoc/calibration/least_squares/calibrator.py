@@ -32,7 +32,7 @@ from madoc.calibration.least_squares.lengthening import (
 )
 from madoc.calibration.least_squares.plan import FEWEST, Found
 from madoc.calibration.least_squares.search import Search, SearchState
-from madoc.calibration.least_squares.statistics import consecutive_residuals, noisy_rows
+from madoc.calibration.least_squares.statistics import EXACT, consecutive_residuals, noisy_rows
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import stride
 from madoc.errors import MadocError
@@ -170,7 +170,7 @@ class LeastSquares:
 
     def _found(self, problem: CalibrationProblem, state: LeastSquaresState) -> Found:
         """What the search in progress, or the best one, has found."""
-        if state.stage == "filtering":
+        if state.filters:
             assert state.filtered is not None
             return state.filtered.found
         best = self._fitted(state)
@@ -304,7 +304,7 @@ class LeastSquares:
         if state.stage == "starting" and known.refining:
             return begun(state, known), asking
         if state.stage == "undecided" and (settled or (known.refining and not known.epochs)):
-            if np.sqrt(known.cost[0]) >= sentences.EXACT:
+            if np.sqrt(known.cost[0]) >= EXACT:
                 pairs, asking = consecutive_residuals(problem, known.point[0], known.rows)
                 if alternation(*pairs) > NOISY:
                     return begun(state, known), asking
@@ -333,7 +333,7 @@ class LeastSquares:
             return finished(state, LONGER) if length == LONGER else failed(state)
         if length and not tells_more(search, searches[state.best]):
             return failed(state)
-        if float(search.deviation.max()) < sentences.EXACT:
+        if float(search.deviation.max()) < EXACT:
             return finished(state, length)
         following = length + 1
         if not length and enough(searches[-1], search):
@@ -356,7 +356,7 @@ class LeastSquares:
         """
         best = self._fitted(state)
         if not state.estimates_starts:
-            if float(np.sqrt(best.cost[0])) < sentences.EXACT:
+            if float(np.sqrt(best.cost[0])) < EXACT:
                 return False, 0
             (before, after), asking = consecutive_residuals(problem, best.point[0], best.rows)
             return alternation(before, -after) > 0.0, asking
@@ -374,7 +374,7 @@ class LeastSquares:
 
     def _notes(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
         """A sentence on estimated initial states, unless the user asked for them."""
-        if state.stage == "filtering":
+        if state.filters:
             assert state.filtered is not None
             return (sentences.about_filtered_states(problem, state.filtered),)
         if not state.estimates_starts or self.initial_states is not None:
@@ -384,14 +384,14 @@ class LeastSquares:
 
     def _about_residuals(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
         """Sentences on what estimated initial states leave, unless the user asked for them."""
-        if state.stage == "filtering":
+        if state.filters:
             assert state.filtered is not None
             return sentences.about_surprises(state.filtered)
         if not state.estimates_starts or self.initial_states is not None:
             return ()
         best = state.unknown[state.best]
         about = sentences.about_residuals(problem, best)
-        if float(best.deviation.max()) < sentences.EXACT:
+        if float(best.deviation.max()) < EXACT:
             return about
         if state.stage == "lengthening" and not state.searched:
             return (*about, sentences.STILL_LENGTHENING)

@@ -18,12 +18,13 @@ from madoc.calibration.least_squares.filtering import FilterState
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING
 from madoc.calibration.least_squares.predicting import Prediction
 from madoc.calibration.least_squares.search import SearchState
-from madoc.calibration.least_squares.statistics import touched
+from madoc.calibration.least_squares.statistics import EXACT, touched
 from madoc.calibration.least_squares.unknown_starts import ROUNDING
 from madoc.data import Dataset
-from madoc.identification.ensembles import with_contacts_settled
+from madoc.identification.ensembles import likely_states, with_contacts_settled
 from madoc.identification.information import half_width, sandwich
 from madoc.identification.replay import Readings
+from madoc.identification.settling import RESETTLING, settled
 from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
 Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening", "filtering"]
@@ -46,7 +47,8 @@ inexact."""
 LEFT_OUT = 0.1
 """Share in [0, 1] of windows; longer windows are refused if more than this share of them is newly unexplained."""
 EXACTER = 0.5
-"""Share in [0, 1] of what a step left that the next one leaves at most where data has no noise."""
+"""Share in [0, 1] of what the filter, or a step after it, left that the next step leaves at most of data without noise.
+"""
 CHANCE = 3.0
 """Autocorrelation in its standard errors under white noise; above it residuals are not white."""
 _SMALLEST = 1e-100
@@ -86,6 +88,12 @@ class LeastSquaresState:
     def estimates_starts(self) -> bool:
         """Whether the estimate is that of a search with unknown initial states."""
         return self.stage in ("estimated", "lengthening")
+
+    @property
+    def filters(self) -> bool:
+        """Whether the estimate is that of the filter, as long as a search that follows it has not become exact."""
+        follows = self.stage == "estimated" and bool(self.unknown[0].deviation.max() >= EXACT)
+        return self.filtered is not None and (self.stage == "filtering" or follows)
 
     @property
     def searched(self) -> bool:
@@ -197,8 +205,9 @@ def begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
 def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon: int) -> tuple[LeastSquaresState, int]:
     """The state after an epoch of the filter: at its end, or with fitted starts where it left what is unlike noise.
 
-    What an ensemble leaves of data without noise is like what it leaves of the next reading. Windows of this horizon
-    with fitted starts go on from there to the exact values. Also the control steps that it took to find these starts.
+    What an ensemble leaves of data without noise is like what it leaves of the next reading. Where fitted starts of a
+    few windows of this horizon leave much less, the search goes on with them to the exact values. Also the control
+    steps that it took to find these starts.
     """
     filtered = state.filtered
     assert filtered is not None
@@ -206,12 +215,18 @@ def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon:
         return state, 0
     if not state.unknown or not filtered.found.unlike_noise:
         return replace(state, finished=1), 0
-    first = state.unknown[0]
+    first, point, few = state.unknown[0], filtered.point, FEWEST + len(filtered.point)
     log = problem.dataset, problem.states, problem.simulator
     readings = Readings.at(problem.dataset, problem.states, first.rows, horizon, problem.typical_change)
-    starts, spent = with_contacts_settled(*log, readings, first.rows, filtered.point, first.states[0])
-    first = replace(first, point=filtered.point[None].copy(), states=starts[None], refining=1)
-    return replace(state, unknown=(first,), stage="estimated"), spent
+    some = readings.of(np.arange(len(readings))[:few])
+    (likely,), spent = likely_states(*log, some, first.rows[:few], point[None], first.states[0, :few])
+    tried = settled(problem.simulator, some, point, likely, (0.0, *RESETTLING), 0)
+    spent += tried.simulations * horizon
+    if (tried.deviation > EXACTER * filtered.noise).any():
+        return replace(state, finished=1), spent
+    starts, more = with_contacts_settled(*log, readings, first.rows, point, first.states[0])
+    first = replace(first, point=point[None].copy(), states=starts[None], refining=1)
+    return replace(state, unknown=(first,), stage="estimated"), spent + more
 
 
 def becomes_exact(search: SearchState, before: SearchState) -> bool:

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.filtering import FilterState
 from madoc.calibration.least_squares.search import SearchState
-from madoc.calibration.least_squares.statistics import LONG_TAILS
+from madoc.calibration.least_squares.statistics import EXACT, LONG_TAILS
 from madoc.data import stride
 from madoc.identification.noise import WHITE
 
@@ -14,8 +14,6 @@ MOST_LEFT_OUT = 0.05
 """Share in [0, 1] of windows that no initial state explains; without contacts, noise alone leaves out fewer."""
 FEWEST_LEFT_OUT = 3
 """Number of windows; fewer may be left out by chance, however few there are."""
-EXACT = 1e-6
-"""Residual in typical changes of a stride; smaller ones mean that states were logged without noise."""
 TAILS = "residuals have longer tails than noise has: the intervals are too narrow, by how much is not known"
 ALIKE = (
     "what the model leaves of a reading is like what it leaves of the next (a correlation of at least {:.2f}), as "

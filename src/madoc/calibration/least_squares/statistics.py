@@ -11,6 +11,8 @@ from madoc.identification.noise import NOISY_STRIDE, OUTLIER
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import consecutive_rows, windows_at
 
+EXACT = 1e-6
+"""Residual in typical changes of a stride; smaller ones mean that states were logged without noise."""
 LONG_TAILS = 1.1
 """Cost of residuals, in squared standard deviations; above it they are not normal noise, whose cost is 0.8 with
 Cauchy's loss and 1 with squares."""
