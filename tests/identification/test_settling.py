@@ -81,8 +81,8 @@ def test_wide_differences_and_restarts_find_states_at_contacts():
     truth = dict(zip(task.parameters.names, task.parameters.middle.tolist(), strict=True))
     simulator, readings, guesses, (problem, rows) = logged_windows(task, truth, 5, 0.1)
     point, values = np.zeros(len(truth)), readings.observed[0].size
-    narrow = descended(simulator, readings, guesses, point, np.zeros(len(settling.WIDTHS)))
-    wide = descended(simulator, readings, guesses, point, settling.WIDTHS)
+    narrow = descended(simulator, readings, guesses, point, np.zeros(1 + len(settling.WIDTHS)))
+    wide = descended(simulator, readings, guesses, point, (0.0, *settling.WIDTHS))
     again = restart(simulator, readings, point, guesses, wide, "cauchy", np.random.default_rng(0))
     missed = [int(each.unexplained(values, "cauchy").sum()) for each in (narrow, wide, again)]
     assert missed[0] > 1.5 * missed[1] > 0  # of 100 windows 22 and 7; with MuJoCo 3.8 19 and 11

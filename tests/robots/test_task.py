@@ -234,3 +234,25 @@ parameters:
     after = system.step(simulator.initial_state[None, None], np.full((1, 1, 1), 19.62 / 20.0 - 1.0))
     expected = 1e-4 * 19.62 * 0.1 / (0.004 + 2 * 0.1**2)
     np.testing.assert_allclose(system.observe(after)[0, 0, 0], expected, rtol=1e-5)
+
+
+def test_a_body_that_only_slides_takes_a_payload_off_its_centre(tmp_path):
+    slider = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
+    <geom size=".1" mass="1" type="sphere"/></body></worldbody>
+    <actuator><motor name="push" joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
+    spec = """\
+madoc: 1
+name: slider
+model: slider.xml
+control_step: 0.002
+signals:
+  - {name: speed, reads: velocity(x)}
+actions:
+  - {name: push, actuator: push}
+parameters:
+  - {field: payload_mass, element: cart, low: 0, high: 2}
+  - {field: payload_x, element: cart, low: -0.3, high: 0.3}
+"""
+    simulator = CpuSimulator(task_of(tmp_path, spec, slider=slider), threads=1)
+    after = simulator.bind(np.array([[1.0, 0.2]])).step(simulator.initial_state[None, None], np.ones((1, 1, 1)))
+    np.testing.assert_allclose(after[0, 0, 1], 0.002 / 2.0)  # 1 N on 2 kg

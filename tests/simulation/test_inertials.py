@@ -124,7 +124,7 @@ def test_a_body_without_extent_has_no_logarithm():
 
 def test_a_free_body_whose_mass_matrix_is_diagonal_takes_no_payload():
     text = """<mujoco><worldbody><body name="hand"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
-    with pytest.raises(MadocError, match=r"body 'hand' moves freely about its centre of mass, .* add an empty <body/>"):
+    with pytest.raises(MadocError, match=r"body 'hand' has its centre of mass at its origin, .* add an empty <body/>"):
         written(mujoco.MjModel.from_xml_string(text), {"payload_mass": 0.1})
     off = text.replace("<freejoint/>", '<freejoint/><inertial pos="0 0 1e-4" mass="1" diaginertia="1 1 1.5"/>')
     loaded = written(mujoco.MjModel.from_xml_string(off), {"payload_mass": 1.0, "payload_x": 0.2})

@@ -231,14 +231,19 @@ def with_noise(
     """
     for _ in range(rounds):
         members = members_at(dataset, logged, simulator, rows, noise * readings.scale, count, random)
-        found = innovations(simulator, readings, point[None], members, noise, first=first_counted(logged))
+        found = innovations(simulator, readings, point[None], members, noise, first=first_counted(logged, simulator))
         noise = next_noise(noise, found.noise_ratio(), rounding)
     return found, noise
 
 
-def first_counted(logged: LoggedStates) -> int:
+def first_counted(logged: LoggedStates, simulator: Simulator) -> int:
     """The first step whose errors count."""
-    return 0 if logged.kind == "exact" else SPOILT
+    return 0 if _of_one_row(logged, simulator) else SPOILT
+
+
+def _of_one_row(logged: LoggedStates, simulator: Simulator) -> bool:
+    """Whether what sensors measured in a row determines its state, so that no other row's noise is in it."""
+    return logged.kind == "exact" and logged.measured == simulator.task.observation_size
 
 
 def few_of(
@@ -269,8 +274,7 @@ def members_at(
     assert np.isin(rows, logged.rows).all()
     states = logged.states[np.searchsorted(logged.rows, rows)]
     physical = slice(0, logged.physical_size)
-    measures_all = logged.measured == simulator.task.observation_size
-    draw = _rebuilt if logged.kind == "exact" and measures_all else _rebuilt_from_neighbours
+    draw = _rebuilt if _of_one_row(logged, simulator) else _rebuilt_from_neighbours
     drawn = [draw(dataset, simulator, rows, noise, random)[:, physical] for _ in range(count)]
     members = np.repeat(states[:, None], count, axis=1)
     members[..., physical] = np.stack(drawn, axis=1)

@@ -19,12 +19,13 @@ from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
 from madoc.simulation.base import Simulator
 
-WIDTHS = (0.0, 3.0, 3.0, 1.5, 0.7, 0.3, 0.1, 0.0, 0.0)
+WIDTHS = (3.0, 3.0, 1.5, 0.7, 0.3, 0.1, 0.0, 0.0)
 """Widths of the differences from step to step, in standard errors of the initial states; 0 is `DIFFERENCE`."""
 RESETTLING = (1.0, 0.3, 0.0)
-"""The same where initial states are nearly right: after a step of the parameters, or as drawn by an ensemble."""
+"""The same where initial states are nearly right, as drawn by an ensemble."""
 ANEW = 2
-"""The same in the fit for prediction and, after one at the guess itself, in tests of a model."""
+"""Number of times that windows whose residuals are more than noise begin anew near the guess of their state, in the fit
+for prediction and, after once at the guess itself, in tests of a model."""
 FARTHEST = 30.0
 """Largest error of a guess in standard errors of the state: that of a velocity that jumps between two positions."""
 BEYOND = 3.0
@@ -138,7 +139,7 @@ def restart(
         error = np.minimum(size, 1.0) * random.standard_normal(error.shape)
     states = guesses[worse] + readings.in_state_units(error, guesses.shape[1])
     damping, simulations = np.full(len(worse), FIRST_DAMPING), 0
-    for width in WIDTHS[1:]:
+    for width in WIDTHS:
         after = settle(simulator, part, point, states, damping, width * before.errors, loss)
         states, damping, simulations = after.states, after.damping, simulations + after.simulations
     residuals = part.residuals(simulator, point[None], states[None])[0, 0]

@@ -18,8 +18,8 @@ from madoc.tasks.base import Task
 
 STANDING = 0.01
 """Height of a point above the lowest one, relative to the base's own, up to which it counts as standing."""
-UPRIGHT = 0.99
-"""Smallest vertical part of the axis of a slide that is a base's height."""
+LEVEL, UPRIGHT = 0.01, 0.99
+"""Largest vertical part of the axis of a base's slide in the plane, and smallest of one that is its height."""
 _Pairs = tuple[tuple[int, int], ...]
 _PLACINGS = 3
 """Number of times that a base is lowered by its distance; once is enough on a plane."""
@@ -69,7 +69,8 @@ def on_the_floor(task: Task, states: Float[np.ndarray, "rows physical"]) -> Plac
 class _Base:
     """Indices in (qpos, qvel) of a base's place, its linear velocity and its attitude, and of places that are heights.
 
-    It has a free joint, or slides and hinges as a planar robot has.
+    It has a free joint, or hinges and slides along or across the vertical that nothing drives or holds, as a planar
+    robot has; other slides are no base's.
     """
 
     place: list[int]
@@ -83,14 +84,29 @@ class _Base:
         for joint in range(first, first + model.body_jntnum[body]):
             kind, at, speed = model.jnt_type[joint], int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
             free, slides = bool(kind == mujoco.mjtJoint.mjJNT_FREE), bool(kind == mujoco.mjtJoint.mjJNT_SLIDE)
+            upright = _upright(model, body, joint) if slides else 0.0
+            if slides and (_held(model, joint) or LEVEL < abs(upright) < UPRIGHT or upright < -UPRIGHT):
+                return cls([], [], [], [])
             places = 3 * free + slides
             base.place.extend(range(at, at + places))
             base.speed.extend(range(model.nq + speed, model.nq + speed + places))
             turns = 0 if slides else 4 if free or kind == mujoco.mjtJoint.mjJNT_BALL else 1
             base.attitude.extend(range(at + places, at + places + turns))
-            upright = slides and bool(model.jnt_axis[joint, 2] > UPRIGHT)
-            base.heights.extend([at + 2] * free + [at] * upright)
+            base.heights.extend([at + 2] * free + [at] * (upright >= UPRIGHT))
         return base
+
+
+def _upright(model: mujoco.MjModel, body: int, joint: int) -> float:
+    """The vertical part, in [-1, 1], of the axis of a joint of a body on the world."""
+    axis = np.zeros(3)
+    mujoco.mju_rotVecQuat(axis, model.jnt_axis[joint], model.body_quat[body])
+    return float(axis[2])
+
+
+def _held(model: mujoco.MjModel, joint: int) -> bool:
+    """Whether an actuator, a spring or a limit acts on a joint."""
+    driven = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
+    return bool(driven.any() or model.jnt_stiffness[joint] or model.jnt_limited[joint])
 
 
 def _touching(model: mujoco.MjModel, base: int) -> Iterator[tuple[int, int]]:

@@ -21,8 +21,6 @@ LEAST = 1e-3
 CENTRED = 1e-6
 """Distance of a centre of mass from its body's origin, in radii of gyration, up to which rounding makes it."""
 
-DIAGONAL = 1
-"""What `body_simple` is where MuJoCo keeps only the diagonal of the mass matrix of a body that also turns."""
 _EXTENT = 1e-6
 """Share of its moments of inertia by which a body extends in each direction at least, or it has no Cholesky factor."""
 _INERTIAL_FRAMES = (mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA, mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT)
@@ -127,10 +125,10 @@ def write_deviations(model: mujoco.MjModel, body: int, values: Mapping[str, floa
         MadocError: The body has no extent in some direction, or MuJoCo keeps its mass matrix diagonal.
     """
     name = model.body(body).name
-    if model.body_simple[body] == DIAGONAL:
+    if model.body_simple[body]:
         raise MadocError(
-            f"body {name!r} moves freely about its centre of mass, and MuJoCo then has no place for a load off it or "
-            "for other axes; add an empty <body/> to it in the model"
+            f"body {name!r} has its centre of mass at its origin, which MuJoCo calls simple, and has no place for a "
+            "load off it or for other axes; add an empty <body/> to it in the model"
         )
     wanted = pseudo_inertia(model, body)
     if any(field in INERTIA for field in values):

@@ -13,7 +13,6 @@ from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.arrays import check_field, check_written, numbers_at, write_number
 from madoc.simulation.gears import backlash, deflections, gear_numbers, write_backlash
 from madoc.simulation.inertials import (
-    DIAGONAL,
     write_centre_of_mass,
     write_deviations,
     write_inertia,
@@ -118,7 +117,7 @@ def diagonal_bodies(model: mujoco.MjModel, parameter: Parameter) -> list[str]:
     if parameter.field not in (*PAYLOAD, *INERTIA):
         return []
     bodies = zip(parameter.elements, find_elements(model, parameter), strict=True)
-    return [name for name, body in bodies if model.body_simple[body] == DIAGONAL]
+    return [name for name, body in bodies if model.body_simple[body]]
 
 
 def check_elements(model: mujoco.MjModel, task: Task, parameter: Parameter) -> None:

@@ -17,7 +17,6 @@ from madoc.calibration.least_squares.lengthening import (
     Stage,
     after_filter,
     back_to_filter,
-    becomes_exact,
     begun,
     enough,
     failed,
@@ -25,6 +24,7 @@ from madoc.calibration.least_squares.lengthening import (
     gone_on,
     hopeless,
     horizon_of,
+    leaves_much_less,
     lengthened,
     noise_alone,
     tells_more,
@@ -77,8 +77,8 @@ class LeastSquares:
         search_windows: Largest number of windows while searching. None is 64 from logged states, else 24.
         search_epochs: Largest number of epochs of searching, which ends once the best search has settled.
         tolerance: Share of each range; the search ends with a step that moves no parameter by more than this, nor by a
-            tenth of its standard error (half of it at contacts, and where states are estimated from the step on that
-            is the last of `search_epochs`).
+            tenth of its standard error (half of it where states are estimated from the step on that is the last of
+            `search_epochs`).
     """
 
     initial_states: InitialStates | None = None
@@ -103,9 +103,8 @@ class LeastSquares:
         problem.require_pairs()
         stage = self._first_stage(problem)
         chosen = self.horizon is not None or self.initial_states is not None
-        filtered = None
-        if stage != "logged":
-            filtered = filtering.of_contacts(problem, named_key(key, "ensembles"), self.horizon, self.windows)
+        of_filter = problem, named_key(key, "ensembles"), self.horizon, self.windows
+        filtered = None if stage == "logged" else filtering.of_contacts(*of_filter)
         if stage == "estimated" and filtered is not None:
             stage = "filtering"
         of_starts = named_key(key, "unknown starts")
@@ -128,10 +127,9 @@ class LeastSquares:
             state, spent = after_filter(problem, replace(state, filtered=by_filter), self._unknown(problem).horizon)
             epoch = replace(epoch, control_steps=epoch.control_steps + spent)
         elif state.estimates_starts:
-            before = state.unknown[state.length]
-            search, epoch = self._unknown(problem, state.length).step(problem, before)
-            if state.filtered is not None and not becomes_exact(search, before):
-                state = back_to_filter(state)
+            search, epoch = self._unknown(problem, state.length).step(problem, state.unknown[state.length])
+            if state.filtered is not None and not leaves_much_less(search, state.filtered):
+                state = back_to_filter(with_search(state, 0, search))
             else:
                 state = self._after_unknown(problem, with_search(state, state.length, search))
                 state, epoch = self._then_predicting(problem, state, epoch)
@@ -280,7 +278,8 @@ class LeastSquares:
         """
         if filtered:
             try:
-                return (replace(self._unknown(problem), searches=1, free=False).init(problem, key),)
+                windows = 2 * (FEWEST + len(problem.simulator.parameters))
+                return (replace(self._unknown(problem), searches=1, windows=windows, free=False).init(problem, key),)
             except MadocError:
                 return ()
         first = self._unknown(problem).init(problem, key)
@@ -336,7 +335,7 @@ class LeastSquares:
         if float(search.deviation.max()) < EXACT:
             return finished(state, length)
         following = length + 1
-        if not length and enough(searches[-1], search):
+        if not length and len(searches) > LONGER and enough(searches[-1], search):
             following = len(searches) - 1
         if following == len(searches) or self._unknown(problem).settled(searches[following]):
             return finished(state, length)
@@ -376,7 +375,7 @@ class LeastSquares:
         """A sentence on estimated initial states, unless the user asked for them."""
         if state.filters:
             assert state.filtered is not None
-            return (sentences.about_filtered_states(problem, state.filtered),)
+            return (sentences.about_filtered_states(problem, state.filtered, asked=self.initial_states is not None),)
         if not state.estimates_starts or self.initial_states is not None:
             return ()
         horizon = self._unknown(problem, state.best).horizon

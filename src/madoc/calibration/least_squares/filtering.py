@@ -1,4 +1,4 @@
-"""The search where bodies touch and the log is noisy: prediction errors of an ensemble filter instead of fitted starts.
+"""The search where bodies touch: prediction errors of an ensemble filter instead of fitted starts.
 
 Every reading of a window is predicted from those before it (`identification.ensembles`), so nothing but the parameters
 is unknown, and each prediction error depends on no later noise: at the right parameters errors are uncorrelated with
@@ -220,7 +220,9 @@ def of_contacts(
     """
     states, count = problem.states, len(problem.simulator.parameters)
     horizon, fewest = horizon or horizon_of(problem), FEWEST + count
-    short = horizon < first_counted(states) + 2 or not len(rows_that_fit(problem.dataset, states.rows, horizon))
+    short = horizon < first_counted(states, problem.simulator) + 2 or not len(
+        rows_that_fit(problem.dataset, states.rows, horizon)
+    )
     if short or not states.starts_known:
         return None
     rows = states.rows[disjoint_windows(problem.dataset, states.rows, horizon)]

@@ -77,7 +77,7 @@ class Side:
         members = members_at(problem.dataset, states, simulator, rows, noise * readings.scale, count, random)
         few = few_of(members, FEW, states.physical_size)
         above, below = (np.clip(point + sign * spread.T, -1.0, 1.0) for sign in (1, -1))
-        found = innovations(simulator, readings, point[None], members, noise, first=first_counted(states))
+        found = innovations(simulator, readings, point[None], members, noise, first=first_counted(states, simulator))
         ends = innovations(simulator, readings, np.concatenate([above, below]), few, noise, like=found)
         return cls(few, found, ends, above - below, (above + below).mean(0) / 2.0 - point)
 

@@ -18,13 +18,12 @@ from madoc.calibration.least_squares.filtering import FilterState
 from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING
 from madoc.calibration.least_squares.predicting import Prediction
 from madoc.calibration.least_squares.search import SearchState
-from madoc.calibration.least_squares.statistics import EXACT, touched
-from madoc.calibration.least_squares.unknown_starts import ROUNDING
+from madoc.calibration.least_squares.statistics import touched
 from madoc.data import Dataset
-from madoc.identification.ensembles import likely_states, with_contacts_settled
+from madoc.identification.ensembles import likely_states
 from madoc.identification.information import half_width, sandwich
 from madoc.identification.replay import Readings
-from madoc.identification.settling import RESETTLING, settled
+from madoc.identification.settling import FAILED_WINDOW, RESETTLING, settled, settled_to_noise
 from madoc.identification.windows import disjoint_windows, evenly, rows_that_fit
 
 Stage = Literal["logged", "undecided", "starting", "estimated", "lengthening", "filtering"]
@@ -46,9 +45,9 @@ FIRST_STEPS = 3
 inexact."""
 LEFT_OUT = 0.1
 """Share in [0, 1] of windows; longer windows are refused if more than this share of them is newly unexplained."""
-EXACTER = 0.5
-"""Share in [0, 1] of what the filter, or a step after it, left that the next step leaves at most of data without noise.
-"""
+LESS, MUCH_LESS = 0.5, 0.1
+"""Shares in [0, 1] of the noise that the filter found: what fitted starts leave at most of data with much less, at
+the filter's estimate and after `FIRST_STEPS`."""
 CHANCE = 3.0
 """Autocorrelation in its standard errors under white noise; above it residuals are not white."""
 _SMALLEST = 1e-100
@@ -91,9 +90,12 @@ class LeastSquaresState:
 
     @property
     def filters(self) -> bool:
-        """Whether the estimate is that of the filter, as long as a search that follows it has not become exact."""
-        follows = self.stage == "estimated" and bool(self.unknown[0].deviation.max() >= EXACT)
-        return self.filtered is not None and (self.stage == "filtering" or follows)
+        """Whether the estimate is that of the filter, as long as a search after it does not explain much more."""
+        if self.filtered is None or self.stage not in ("filtering", "estimated"):
+            return False
+        first = self.unknown[0] if self.unknown else None
+        follows = first is not None and first.epochs >= FIRST_STEPS and leaves_much_less(first, self.filtered)
+        return self.stage == "filtering" or not follows
 
     @property
     def searched(self) -> bool:
@@ -120,10 +122,11 @@ def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, 
     few windows fit.
     """
     rows, fewest = np.sort(shorter.rows), FEWEST + shorter.point.shape[1]
-    if not len(rows_that_fit(problem.dataset, rows, horizon)):
+    rows = rows[rows_that_fit(problem.dataset, rows, horizon)]
+    if not len(rows):
         return None
-    rows = rows[disjoint_windows(problem.dataset, rows, horizon)]
-    chosen = evenly(rows[~touched(problem, *problem.states.guesses(), rows, horizon)], max(most, fewest))
+    free = rows[~touched(problem, *problem.states.guesses(), rows, horizon)]
+    chosen = evenly(free[disjoint_windows(problem.dataset, free, horizon)], max(most, fewest))
     if len(chosen) < fewest:
         return None
     return replace(
@@ -206,8 +209,8 @@ def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon:
     """The state after an epoch of the filter: at its end, or with fitted starts where it left what is unlike noise.
 
     What an ensemble leaves of data without noise is like what it leaves of the next reading. Where fitted starts of a
-    few windows of this horizon leave much less, the search goes on with them to the exact values. Also the control
-    steps that it took to find these starts.
+    few windows of this horizon leave less, the search goes on with them to the exact values. Also the control steps
+    that it took to fit them.
     """
     filtered = state.filtered
     assert filtered is not None
@@ -215,23 +218,26 @@ def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon:
         return state, 0
     if not state.unknown or not filtered.found.unlike_noise:
         return replace(state, finished=1), 0
-    first, point, few = state.unknown[0], filtered.point, FEWEST + len(filtered.point)
-    log = problem.dataset, problem.states, problem.simulator
+    first, point, log = state.unknown[0], filtered.point, (problem.dataset, problem.states, problem.simulator)
     readings = Readings.at(problem.dataset, problem.states, first.rows, horizon, problem.typical_change)
-    some = readings.of(np.arange(len(readings))[:few])
-    (likely,), spent = likely_states(*log, some, first.rows[:few], point[None], first.states[0, :few])
-    tried = settled(problem.simulator, some, point, likely, (0.0, *RESETTLING), 0)
+    (likely,), spent = likely_states(*log, readings, first.rows, point[None], first.states[0])
+    tried = settled(problem.simulator, readings, point, likely, (0.0, *RESETTLING), 0)
     spent += tried.simulations * horizon
-    if (tried.deviation > EXACTER * filtered.noise).any():
+    whole = (tried.costs < FAILED_WINDOW).sum() >= FEWEST + len(point)
+    if not whole or (tried.deviation > LESS * filtered.noise).any():
         return replace(state, finished=1), spent
-    starts, more = with_contacts_settled(*log, readings, first.rows, point, first.states[0])
-    first = replace(first, point=point[None].copy(), states=starts[None], refining=1)
-    return replace(state, unknown=(first,), stage="estimated"), spent + more
+    found = settled_to_noise(problem.simulator, readings, point, likely)
+    spent += found.simulations * horizon
+    first = replace(first, point=point[None].copy(), states=found.states[None], refining=1)
+    return replace(state, unknown=(first,), stage="estimated"), spent
 
 
-def becomes_exact(search: SearchState, before: SearchState) -> bool:
-    """Whether a step left so much less of every channel that nothing but rounding errors are left, or may be soon."""
-    return bool((search.deviation <= np.maximum(EXACTER * before.deviation, ROUNDING)).all())
+def leaves_much_less(search: SearchState, filtered: FilterState) -> bool:
+    """Whether fitted starts leave much less of every channel than the filter did, or have had too few steps yet."""
+    if search.epochs < FIRST_STEPS:
+        return True
+    much = bool((search.deviation <= MUCH_LESS * filtered.noise).all())
+    return much and search.explained >= FEWEST + len(filtered.point)
 
 
 def back_to_filter(state: LeastSquaresState) -> LeastSquaresState:

@@ -45,7 +45,8 @@ class SearchState:
             squared standard deviations of the noise where initial states are unknown and the search refines.
         moved: The largest component of each search's last step, relative to one that matters; below 1 it has settled.
         rows: First rows of the windows.
-        touching: Whether a contact was seen in each window from a known state.
+        touching: Whether a contact was seen in each window, as far as its states are known.
+        without: Number of windows in which bodies touch that were left out.
         deviation: Noise of each channel in its typical changes; 1 where initial states are known.
         bread: Curvature of the best search's cost where it last linearised.
         meat: Scatter of the cost's gradient there, and the last step's where steps of half a standard error settle.
@@ -66,6 +67,7 @@ class SearchState:
     moved: Float[np.ndarray, " searches"]
     rows: Int[np.ndarray, " windows"]
     touching: Bool[np.ndarray, " windows"]
+    without: int
     deviation: Float[np.ndarray, " channels"]
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
@@ -107,6 +109,7 @@ class Search:
         of_windows, of_starts = jax.random.split(key)
         count = len(problem.simulator.parameters)
         possible = self.starts.possible_rows(problem, self.horizon, self.windows)
+        every = len(possible)
         if self.starts.unknown and self.free:
             possible = without_contacts(problem, possible, self.horizon)
         rows = possible[generator(of_windows).permutation(len(possible))][: self.windows]
@@ -123,6 +126,7 @@ class Search:
             moved=np.full(self.searches, 1.0 / _SMALLEST),
             rows=rows,
             touching=self.starts.touched(problem, rows, self.horizon),
+            without=every - len(possible),
             deviation=np.ones(problem.states.measured),
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),

@@ -34,21 +34,30 @@ STILL_PREDICTING = (
 
 
 def about_estimated_states(problem: CalibrationProblem, search: SearchState, horizon: int) -> str:
-    """A sentence that initial states were estimated, why the data needed it, and how large the noise is."""
+    """A sentence that initial states were estimated, why the data needed it, and how large the noise is.
+
+    It also says how many windows were left out because bodies touch in them.
+    """
     sentence = (
         f"the initial state of each window of {horizon} control steps was estimated with the parameters, as "
         f"{_why_states_are_not_known(problem)}"
     )
+    if search.without:
+        sentence += f", and {search.without} windows in which bodies touch were left out"
     if not search.refining:
         return sentence
     return f"{sentence}; {_how_large(problem, search.deviation)}, and the intervals allow for it"
 
 
-def about_filtered_states(problem: CalibrationProblem, search: FilterState) -> str:
-    """A sentence that readings were predicted by an ensemble filter, why, and how large the noise is."""
+def about_filtered_states(problem: CalibrationProblem, search: FilterState, *, asked: bool) -> str:
+    """A sentence that readings were predicted by an ensemble filter, why, and how large the noise is.
+
+    `asked` is whether the user asked for estimated initial states.
+    """
+    why = "initial_states=estimated asks for it" if asked else _why_states_are_not_known(problem)
     sentence = (
         f"every reading in windows of {search.horizon} control steps was predicted by an ensemble filter from "
-        f"those before it, as {_why_states_are_not_known(problem)}, and bodies touch"
+        f"those before it, as {why}, and bodies touch"
     )
     if not search.epochs:
         return sentence
@@ -82,14 +91,15 @@ def _how_large(problem: CalibrationProblem, noise: Float[np.ndarray, " channels"
 def have_long_tails(problem: CalibrationProblem, search: SearchState) -> bool:
     """Whether residuals have longer tails than noise has; not known before the first step on all windows.
 
-    More than `MOST_LEFT_OUT` of the windows that no initial state explains are a long tail too: they are left out of
-    the cost.
+    Where nothing touches, more than `MOST_LEFT_OUT` of the windows that no initial state explains are a long tail too:
+    they are left out of the cost.
     """
     if not _noisy(search):
         return False
     left_out, windows = _left_out(search)
     many = left_out >= max(FEWEST_LEFT_OUT, MOST_LEFT_OUT * windows)
-    return search.tail_cost > LONG_TAILS or (problem.states.starts_known and many)
+    smooth = problem.states.starts_known and not search.touching.any()
+    return search.tail_cost > LONG_TAILS or (smooth and many)
 
 
 def about_residuals(problem: CalibrationProblem, search: SearchState) -> tuple[str, ...]:

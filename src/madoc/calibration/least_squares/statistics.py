@@ -61,9 +61,9 @@ def touched(
 def without_contacts(
     problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
 ) -> Int[np.ndarray, " free"]:
-    """Rows of windows in which the log shows no contact, or all where too few do not."""
+    """Rows of windows in which the log shows no contact, or all where these are too few or fewer than the others."""
     free = rows[~touched(problem, *problem.states.guesses(), rows, horizon)]
-    return free if len(free) >= FEWEST + len(problem.simulator.parameters) else rows
+    return free if len(free) >= max(FEWEST + len(problem.simulator.parameters), len(rows) / 2) else rows
 
 
 def clipped_change(

@@ -16,6 +16,7 @@ from madoc.calibration.least_squares.statistics import (
     clipped_change,
     noise_ratio,
     outlier_limits,
+    touched,
 )
 from madoc.errors import MadocError
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
@@ -80,8 +81,8 @@ class UnknownStarts:
     def touched(
         problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
     ) -> Bool[np.ndarray, " windows"]:
-        """None: windows with contacts count like others, where they are not left out (`without_contacts`)."""
-        return np.zeros(len(rows), bool)
+        """Whether bodies were in contact at any state of a window, as far as the log tells."""
+        return touched(problem, *problem.states.guesses(), rows, horizon)
 
     @staticmethod
     def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
