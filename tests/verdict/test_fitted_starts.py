@@ -8,7 +8,8 @@ from planted_logs import ROBOTS, bench, log_of
 
 from madoc import simulation
 from madoc.data import Disturbance, disturb, hide_velocities
-from madoc.verdict.fitted_starts import fitted_replays_of
+from madoc.verdict.bench import FEWEST_FITTED
+from madoc.verdict.fitted_starts import fitted_replays_of, replay_steps
 
 ARM, TRUTH = replace(ROBOTS["arm"][0], velocities=2), ROBOTS["arm"][1]
 AT_TRUTH = ARM.parameters.to_unit(ARM.parameters.vector(TRUTH))[None]
@@ -45,3 +46,14 @@ def test_starts_take_fewer_steps_where_time_is_short(monkeypatch):
     monkeypatch.setattr("madoc.verdict.bench.time.monotonic", lambda: 90.0)
     assert [judged.steps_in_time(each) for each in (500, 1000, 10**6)] == [10, 5, 2]
     assert replace(judged, until=None).steps_in_time(10**6) == 10
+
+
+def test_the_hold_out_leaves_time_for_tests_of_the_model(monkeypatch):
+    judged = replace(bench(log_of("arm", rows=400), ROBOTS["arm"][0]), until=100.0)
+    monkeypatch.setattr("madoc.verdict.bench.time.monotonic", lambda: 90.0)
+    to_test = judged.windows_to_test * replace(judged, rate=1.0).window_seconds  # control steps
+    columns = replay_steps(judged.states, 1, len(ARM.parameters))
+    for share, fitted in ((0.3, 0.4), (0.65, 0.35), (1.5, 0.1)):  # of the time left for tests, and then for the hold-out
+        timed = replace(judged, rate=to_test / share / 10.0)
+        affordable = int(fitted * timed.rate * 10.0 / columns)
+        assert len(timed.fitted.rows) == min(len(judged.fittable.rows), max(FEWEST_FITTED, affordable))

@@ -13,7 +13,9 @@ from madoc.calibration import CalibrationProblem
 from madoc.calibration.holdout import AgainstChance, Area
 from madoc.data import Dataset, stride
 from madoc.errors import MadocError
+from madoc.identification.fitted_windows import STRIDES
 from madoc.identification.states import LoggedStates, logged_states
+from madoc.identification.term_tests import FEWEST
 from madoc.identification.windows import consecutive_rows, evenly, horizons
 from madoc.learning.features import Scaling
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
@@ -28,8 +30,12 @@ FEWEST_HELD = 10
 """Smallest number of rows held out, at least 1. With fewer, even perfect predictions could be chance."""
 _NEIGHBOURS = 5000
 """Largest number of training rows among which the nearest neighbour of a row held out is searched."""
-FITTING = 0.4
-"""Share in (0, 1) of the time left that fitting the starts of windows of the hold-out may take."""
+FITTING, LEAST_FITTING = 0.4, 0.1
+"""Largest and least share in (0, 1) of the time left that fitting the starts of windows of the hold-out may take, which
+leaves time for tests of what the model lacks if it can."""
+COLUMNS, COLUMNS_OF_A_VALUE = 60, 20
+"""Simulations of a window that testing a model takes about, and how many more for each parameter and each degree of
+freedom."""
 FEWEST_STEPS = 2
 """Least number of steps of an initial state, however short the time: it begins at a likely one."""
 FEWEST_FITTED = 10
@@ -88,6 +94,18 @@ class Bench:
         affordable = int(share * self.rate * max(self.seconds_left, 0.0) / control_steps)
         return min(most, max(FEWEST_FITTED, affordable))
 
+    @property
+    def windows_to_test(self) -> int:
+        """Number of windows that a test of what the model lacks takes at least."""
+        return 2 * (FEWEST + len(self.simulator.parameters))
+
+    @property
+    def window_seconds(self) -> float:
+        """About how long testing the model on a window takes, in s."""
+        values = len(self.simulator.parameters) + self.simulator.task.model.nv
+        steps = STRIDES * stride(self.problem.dataset) * (COLUMNS + COLUMNS_OF_A_VALUE * values)
+        return steps / self.rate
+
     def steps_in_time(self, control_steps: int) -> int:
         """How many steps of initial states there is time for, where `FIT_STEPS` simulate so many control steps."""
         share = self.rate * self.seconds_left / max(1, control_steps)
@@ -140,7 +158,8 @@ class Bench:
             return None
         columns = replay_steps(self.states, stride(self.problem.dataset), len(self.simulator.parameters))
         count = len(self.fittable.rows)
-        most = self.windows_in_time(columns, FITTING, count)
+        room = 1.0 - self.windows_to_test * self.window_seconds / max(self.seconds_left, 1e-9)
+        most = self.windows_in_time(columns, float(np.clip(room, LEAST_FITTING, FITTING)), count)
         return replace(self.fittable.of(evenly(np.arange(count), most)), most_steps=self.steps_in_time(most * columns))
 
     @cached_property

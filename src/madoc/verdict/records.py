@@ -11,17 +11,16 @@ from jaxtyping import Float
 
 from madoc import simulation
 from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
-from madoc.data import stride
 from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.diagnosis.scales import coarseness
 from madoc.identification.candidate_effects import FINER
 from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
 from madoc.identification.excitation import expected_half_widths
-from madoc.identification.fitted_windows import SHORTER, STRIDES, WINDOWS
+from madoc.identification.fitted_windows import SHORTER, WINDOWS
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
-from madoc.identification.term_tests import FEWEST, MissingTerm
+from madoc.identification.term_tests import MissingTerm
 from madoc.identification.windows import horizons
 from madoc.parameters import ParameterSpace
 from madoc.verdict.adequacy import (
@@ -44,9 +43,6 @@ from madoc.verdict.statistics import NEGLIGIBLE
 _MOST_TERMS = 5
 """Number of missing terms that a report keeps, the most significant ones; besides them the integration step's and all
 that are certain are kept, as a verdict rests on them."""
-COLUMNS, COLUMNS_OF_A_VALUE = 60, 20
-"""Simulations of a window that testing a model takes about, and how many more for each parameter and each degree of
-freedom."""
 EXCHANGED = "exchanged columns"
 """A part of judging without which nothing is tested."""
 NO_DELAY = "look for a limit of speed or a filter of the drives or of the log before you add a delay to the spec"
@@ -76,7 +72,7 @@ def _doubts(
     if not told or problem.dataset.disturbance.shuffled == "next_observations":
         return Suspicions(tested=False), False
     given, most = (problem.dataset, bench.states), _windows_in_time(bench)
-    enough = most is None or most >= _fewest(bench)
+    enough = most is None or most >= bench.windows_to_test
     part = "tests of what the model lacks" if shorter == 1 else "the same tests on shorter windows"
     if not bench.begins(part, 0.0 if enough else np.inf):
         return Suspicions(tested=False), False
@@ -112,15 +108,8 @@ def _windows_in_time(bench: Bench) -> int | None:
     """
     if bench.until is None:
         return None
-    values = len(bench.simulator.parameters) + bench.simulator.task.model.nv
-    window = STRIDES * stride(bench.problem.dataset) * (COLUMNS + COLUMNS_OF_A_VALUE * values)
-    affordable = bench.rate * bench.seconds_left / window
-    return int(max(TESTING * affordable, min(affordable, _fewest(bench))))
-
-
-def _fewest(bench: Bench) -> int:
-    """Number of windows that a test takes at least."""
-    return 2 * (FEWEST + len(bench.simulator.parameters))
+    affordable = bench.seconds_left / bench.window_seconds
+    return int(max(TESTING * affordable, min(affordable, bench.windows_to_test)))
 
 
 def judged(
