@@ -95,6 +95,18 @@ def test_a_base_that_no_sensor_shows_stands_on_the_floor_and_is_followed(tmp_pat
     assert np.abs(drawn[..., [7, 11, 12, 13, 14]]).max() < 1e-3
 
 
+def test_a_base_is_followed_alike_in_stretches(tmp_path, monkeypatch):
+    task = robots.load(write_robot(tmp_path, SLED_SPEC, sled=SLED)).task
+    log, simulator = recorded(task, SLED_TRUTH, 300, jax.random.key(0)), simulation.make(task, threads=1)
+    whole = []
+    for stretch in (30, 1000):
+        monkeypatch.setattr("madoc.identification.states.STRETCH", stretch)
+        whole.append(states_of(log, simulator).states)
+    np.testing.assert_array_equal(whole[0][:30], whole[1][:30])
+    np.testing.assert_allclose(whole[0][:, 2], whole[1][:, 2], atol=1e-3)
+    assert (whole[0] - whole[1])[:, 8:11].std() < 0.01  # a body that slips keeps its speed for long
+
+
 def test_states_with_derived_velocities_are_drawn_by_the_noise_of_positions():
     wanted, task = Disturbance(hidden_velocities=True, velocities="differences"), replace(SPRING, velocities=1)
     log = disturb(recorded(SPRING, SPRING_TRUTH, 50, jax.random.key(0)), wanted, task, jax.random.key(1))

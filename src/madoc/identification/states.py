@@ -25,6 +25,8 @@ damping, friction and the like have an effect."""
 Kind = Literal["exact", "approximate", "unknown"]
 SINKING = 0.01
 """Depth in m below the floor that a base is followed to; contacts of robots give way by less."""
+STRETCH, BEFORE = 100, 100
+"""Number of rows of a stretch in which a base is followed, and of those before it from where on it is."""
 
 
 @dataclass(frozen=True)
@@ -175,17 +177,32 @@ def _followed(
 
     All other values are the log's at every row, so that an error of these does not last: in a few steps contacts give
     way as much as what they carry weighs (an observer of reduced order, Luenberger 1971). A step that fails, or leads
-    farther into the floor than contacts give way, begins anew on it.
+    farther into the floor than contacts give way, begins anew on it. Stretches of `STRETCH` rows are followed side by
+    side, each from `BEFORE` rows before it.
     """
     system, model = simulator.bind(simulator.parameters.middle[None]), simulator.task.model
     action = np.asarray(dataset.transitions.action, np.float64)
     speeds = np.flatnonzero(placed.found[model.nq :]) + model.nq
     columns, followed = np.concatenate([placed.heights, speeds]), states.copy()
-    for position in consecutive_rows(dataset, rows).tolist():
-        after = system.step(followed[None, position, None], action[None, rows[position], None])[0, 0]
-        sunk = states[position + 1, placed.heights] - after[placed.heights]
-        if np.isfinite(after).all() and (sunk <= SINKING).all():
-            followed[position + 1, columns] = after[columns]
+    follows = np.zeros(len(rows), bool)
+    follows[consecutive_rows(dataset, rows) + 1] = True  # the row before is the one before in the log too
+    first = np.maximum.accumulate(np.where(follows, 0, np.arange(len(rows))))
+    begins = np.flatnonzero((np.arange(len(rows)) - first) % STRETCH == 0)
+    ends, at = np.append(begins[1:], len(rows)), np.maximum(begins - BEFORE, first[begins])
+    state = states[at]
+    for _ in range(STRETCH + BEFORE):
+        going = np.flatnonzero(at + 1 < ends)
+        if not len(going):
+            break
+        after = system.step(state[None, going], action[None, rows[at[going]]])[0]
+        at[going] += 1
+        now = states[at[going]]
+        sunk = (now[:, placed.heights] - after[:, placed.heights] <= SINKING).all(1)
+        good = np.isfinite(after).all(1) & sunk
+        now[np.ix_(good, columns)] = after[np.ix_(good, columns)]
+        state[going] = now
+        own = at[going] >= begins[going]
+        followed[at[going][own]] = now[own]
     return followed
 
 
