@@ -53,7 +53,8 @@ def test_the_hold_out_leaves_time_for_tests_of_the_model(monkeypatch):
     monkeypatch.setattr("madoc.verdict.bench.time.monotonic", lambda: 90.0)
     to_test = judged.windows_to_test * replace(judged, rate=1.0).window_seconds  # control steps
     columns = replay_steps(judged.states, 1, len(ARM.parameters))
-    for share, fitted in ((0.3, 0.4), (0.65, 0.35), (1.5, 0.1)):  # of the time left for tests, and then for the hold-out
+    shares = ((0.3, 0.4), (0.65, 0.35), (1.5, 0.1))  # of the time left for tests, and then for the hold-out
+    for share, fitted in shares:
         timed = replace(judged, rate=to_test / share / 10.0)
         affordable = int(fitted * timed.rate * 10.0 / columns)
         assert len(timed.fitted.rows) == min(len(judged.fittable.rows), max(FEWEST_FITTED, affordable))
