@@ -124,6 +124,17 @@ def predicted_over(seconds, relative, interval, *, whole=False, windows=60):
     return OpenLoop(seconds, whole, windows, given, given, estimate, relative, interval)
 
 
+def test_predictions_that_noise_and_uncertainty_do_not_explain_are_never_calibrated():
+    over = (predicted_over(0.1, 0.4, (0.3, 0.6)), predicted_over(1.0, 0.4, (0.3, 0.6)))
+    for ratio, word in ((1.9, "CALIBRATED"), (2.1, "USABLE")):
+        later = replace(over[1], beside_noise={"q": 1.0, "qd": ratio})
+        verdict = judge(replace(PREDICTED, open_loop=(over[0], later)))
+        assert verdict.word == word
+    assert "over 1 s it predicts qd with 2.1 times the error, at least, that" in verdict.sentence
+    few = replace(later, windows=3)
+    assert judge(replace(PREDICTED, open_loop=(over[0], few))).word == "CALIBRATED"
+
+
 @EITHER
 def test_what_predicts_much_better_than_the_model_as_given_is_usable_though_the_model_lacks_something(good):
     lacking = changed(good, LEFT_OVER, explained=0.6)

@@ -17,6 +17,7 @@ from madoc.simulation.write import nominal_values
 from madoc.verdict import Bench
 from madoc.verdict import open_loop as module
 from madoc.verdict.open_loop import MOST, as_given, open_loop
+from madoc.verdict.statistics import ABOVE_NOISE
 
 TASK, TRUTH = ROBOTS["spring"]
 TASK = replace(TASK, velocities=1)
@@ -73,6 +74,20 @@ def test_noise_of_the_states_where_predictions_begin_counts_for_nothing_once_the
     assert fitted.seconds == logged.seconds
     assert all(fitted.estimate[name] < 0.9 * logged.estimate[name] for name in fitted.estimate)
     assert fitted.estimate["observation[0]"] < 1.2 * bench.problem.noise_by_differences[0]
+
+
+def test_fitted_predictions_are_as_good_as_those_of_an_imitated_hold_out_where_the_model_is_right():
+    bench = bench_of(Disturbance(noise=0.3))
+    point, covariance = at_truth(bench), 1e-6 * np.eye(len(TASK.parameters))
+    right = open_loop(bench, point, fits_starts=True, covariance=covariance)
+    assert all(set(each.beside_noise) == set(each.estimate) for each in right)
+    assert max(max(each.beside_noise.values()) for each in right) < 1.3
+    # An estimate 5 % of a range off is 20 times as far off as it is said to be, and as far as it is said to be.
+    wrong = open_loop(bench, point + 0.1, fits_starts=True, covariance=25.0 * covariance)
+    assert max(wrong[-1].beside_noise.values()) > ABOVE_NOISE
+    unsure = open_loop(bench, point + 0.1, fits_starts=True, covariance=1e-2 * np.eye(len(point)))
+    assert max(unsure[-1].beside_noise.values()) < ABOVE_NOISE
+    assert not open_loop(bench, point, covariance=covariance)[0].beside_noise  # from logged states
 
 
 def test_loose_rows_are_not_predicted_over_time():

@@ -79,9 +79,12 @@ def assess(
     bench.tell("predictions of single steps and short windows")
     fits_starts = _fits_starts(bench, point)
     # Only predictions can make an estimate of use whose search has not settled.
-    predictions = None if result.settled else _predictions(bench, point, fits_starts)
+    half = (bench.simulator.parameters.high - bench.simulator.parameters.low) / 2.0
+    covariance = None if result.covariance is None else result.covariance / np.outer(half, half)
+    predict = partial(_predictions, bench, point, fits_starts, covariance)
+    predictions = None if result.settled else predict()
     holdout = measured(bench, result.mean, result.interval, fits_starts=fits_starts)
-    predictions = _predictions(bench, point, fits_starts) if predictions is None else predictions
+    predictions = predict() if predictions is None else predictions
     holdout = replace(holdout, open_loop=predictions)
     widened = with_widened_intervals(result, holdout)
     verdict = judge(
@@ -134,11 +137,13 @@ def _fits_starts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     return noisy and bench.fittable is not None
 
 
-def _predictions(bench: Bench, point: Float[np.ndarray, " d"], fits_starts: bool) -> tuple[OpenLoop, ...]:
+def _predictions(
+    bench: Bench, point: Float[np.ndarray, " d"], fits_starts: bool, covariance: Float[np.ndarray, "d d"] | None
+) -> tuple[OpenLoop, ...]:
     """Predictions over longer times, if there is time for them."""
     if not bench.begins("predictions over longer times"):
         return ()
-    return open_loop(bench, point, fits_starts=fits_starts)
+    return open_loop(bench, point, fits_starts=fits_starts, covariance=covariance)
 
 
 def _problem_of(result: CalibrationResult, training: Dataset | None, simulator: Simulator | None) -> CalibrationProblem:

@@ -82,9 +82,15 @@ class FittedReplays:
         They are in typical changes of a stride; NaN in a window whose simulation failed.
         """
         states, spent = self.starts(points)
-        flat = self.readings.residuals(self.simulator, points, states)[:, 0]
         spent += len(points) * len(self.readings) * self.readings.steps
-        return flat.reshape(*flat.shape[:2], *self.readings.observed.shape[1:]), spent
+        return self.residuals_from(points, states), spent
+
+    def residuals_from(
+        self, points: Float[np.ndarray, "systems d"], states: Float[np.ndarray, "systems windows state"]
+    ) -> Float[np.ndarray, "systems windows readings channels"]:
+        """The residuals from given initial states."""
+        flat = self.readings.residuals(self.simulator, points, states)[:, 0]
+        return flat.reshape(*flat.shape[:2], *self.readings.observed.shape[1:])
 
     def starts(self, points: Float[np.ndarray, "systems d"]) -> tuple[Float[np.ndarray, "systems windows state"], int]:
         """The initial states from which each system comes nearest to the observations of the fitted steps.

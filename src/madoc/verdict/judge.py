@@ -15,7 +15,7 @@ from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.verdict.adequacy import numerical
 from madoc.verdict.mismatch import SEPARABLE, at_most, change_of, contradicted, in_percent, in_rows, lacking, of_area
-from madoc.verdict.statistics import FEWEST_GROUPS, WORTH_GAINING, beyond_noise
+from madoc.verdict.statistics import ABOVE_NOISE, FEWEST_GROUPS, WORTH_GAINING, beyond_noise
 
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
 ASSUMED_BASE = (
@@ -76,6 +76,7 @@ def judge(
         or _no_improvement(holdout)
         or _untested(holdout)
         or _with_an_assumed_base(holdout)
+        or _beyond_noise_later(holdout)
         or (_not_certain(holdout, EFFECTIVE) if effective and numerical(holdout) is None else None)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and {_how_sure(holdout)}")
     )
@@ -185,6 +186,21 @@ def _with_an_assumed_base(holdout: HoldOut) -> Verdict | None:
     if not holdout.base_from_contacts:
         return None
     return _not_certain(holdout, ASSUMED_BASE)
+
+
+def _beyond_noise_later(holdout: HoldOut) -> Verdict | None:
+    """What no test of single terms finds, and yet is in predictions over a longer time."""
+    enough = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
+    beside = [(ratio, name, each.seconds) for each in enough for name, ratio in each.beside_noise.items()]
+    ratio, name, seconds = max(beside, default=(0.0, "", 0.0))
+    if ratio <= ABOVE_NOISE or numerical(holdout) is not None:
+        return None
+    return _not_certain(
+        holdout,
+        f"the model lacks something that no test finds: over {seconds:.3g} s it predicts {name} with {ratio:.2g} times "
+        "the error, at least, that the sensors' noise and the estimates' uncertainty make; look for what acts slowly, "
+        "or for what couples drives, as a supply that they share",
+    )
 
 
 def _unsettled(holdout: HoldOut) -> Verdict:

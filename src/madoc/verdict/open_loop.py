@@ -1,7 +1,8 @@
 """How far the simulator can be believed, in the user's units: held-out motion predicted without a look at it.
 
 The simulator starts where the log does, gets the logged actions, and runs on. Its errors after a tenth of a second, a
-second and whole runs stand beside those of the user's own model as it was given, and of mid-range.
+second and whole runs stand beside those of the user's own model as it was given, and of mid-range. From fitted starts
+they also stand beside those that the sensors' noise and the estimate's uncertainty alone would make.
 """
 
 from dataclasses import replace
@@ -13,15 +14,17 @@ from jaxtyping import Float, Int
 from madoc import simulation
 from madoc.calibration.holdout import OpenLoop
 from madoc.data import stride
+from madoc.identification.noise import residual_noise
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, rows_that_fit, windows_at
 from madoc.parameters import Parameter, ParameterSpace
+from madoc.simulation.attitudes import moved
 from madoc.simulation.base import Simulator
 from madoc.simulation.write import nominal_values
 from madoc.verdict.bench import Bench
-from madoc.verdict.fitted_starts import FITTED, fitted_replays_of, replay_steps
-from madoc.verdict.statistics import independent_groups, interval_of, resampled
+from madoc.verdict.fitted_starts import FITTED, FittedReplays, fitted_replays_of, replay_steps
+from madoc.verdict.statistics import beside_random, independent_groups, interval_of, resampled
 
 SECONDS = (0.1, 0.3, 1.0)
 """Times in s over which motion is predicted, besides whole runs."""
@@ -29,24 +32,35 @@ MOST = 60
 """Largest number of windows of one length."""
 SHARE = 0.3
 """Share in (0, 1) of the time left that predictions from starts which are fitted together may take."""
+IMITATED = 4
+"""Number of parameter vectors by which the hold-out is imitated."""
 FAILED = 10.0
 """Least error, in typical changes of a stride, once a simulation has failed; it is the worst of any that has not."""
 
 
-def open_loop(bench: Bench, point: Float[np.ndarray, " d"], *, fits_starts: bool = False) -> tuple[OpenLoop, ...]:
+def open_loop(
+    bench: Bench,
+    point: Float[np.ndarray, " d"],
+    *,
+    fits_starts: bool = False,
+    covariance: Float[np.ndarray, "d d"] | None = None,
+) -> tuple[OpenLoop, ...]:
     """Errors of open-loop predictions of the hold-out at an estimate in [-1, 1], one record for each length of time.
 
     Predictions begin at logged states, or at fitted ones where these are not known or `fits_starts`, as they are noisy.
     There are none where the log tells no states to begin at, and none of a length that no held-out stretch has.
     From fitted states those of shorter times are the beginnings of one prediction where runs are long enough, so that
-    starts are fitted once.
+    starts are fitted once. With the estimate's `covariance`, in [-1, 1], it is also said how many times as large errors
+    from fitted states are as those of an imitated hold-out (`_imitated`).
     """
     if bench.states.kind == "unknown" or bench.held_out.disturbance.shuffled != "none":
         return ()
     given, held, step = as_given(bench.simulator), bench.held_out, bench.simulator.control_step
     fits_starts = fits_starts or not bench.states_known
     before = FITTED * stride(bench.problem.dataset) if fits_starts else 0
-    predicted = partial(_from_fitted if fits_starts else _from_logged, bench, given, point)
+    predicted = partial(_from_logged, bench, given, point)
+    if fits_starts:
+        predicted = partial(_from_fitted, bench, given, point, covariance)
     whole = int(np.median(held.episode_ends - held.episode_starts)) - before
     shorter = [steps for steps in sorted({max(1, round(seconds / step)) for seconds in SECONDS}) if steps < whole]
     begin = (held.episode_ends - held.episode_starts - before - max(shorter, default=0)).clip(min=0).sum()
@@ -87,14 +101,23 @@ def _record(
     *,
     whole: bool,
 ) -> OpenLoop:
-    """The errors over windows of so many control steps, which begin at the rows."""
+    """The errors over windows of so many control steps, which begin at the rows.
+
+    Residuals are those of the model as given, of mid-range, of the estimate and, where there are some, of the imitated
+    hold-out.
+    """
     known = np.isfinite(residuals)
     worst = np.maximum(np.abs(np.where(known, residuals, 0.0)).max((0, 1, 2)), FAILED)
     size, units = np.where(known, residuals, worst), bench.change[: residuals.shape[-1]]
     of_signals = np.sqrt((size**2).mean((1, 2))) * units
     of_windows = np.sqrt((size**2).mean((2, 3)))  # of which means are taken, as a few windows may run away
     groups = independent_groups(bench.held_out.episode_of(rows), rows, steps)
-    before, _, after = of_windows.mean(1)
+    before, _, after = of_windows[:3].mean(1)
+    beside = {}
+    if len(residuals) > 3:
+        found, imitated = np.sqrt((size[2:] ** 2).mean(2))
+        ratios = beside_random(found, imitated, groups)
+        beside = dict(zip(bench.simulator.task.signal_names, ratios.tolist(), strict=False))
     draws = resampled(of_windows.T, groups)
     low, high = interval_of(draws[:, 2] / np.maximum(draws[:, 0], np.finfo(float).tiny))
     named = [dict(zip(bench.simulator.task.signal_names, row, strict=False)) for row in of_signals.tolist()]
@@ -107,6 +130,7 @@ def _record(
         estimate=named[2],
         relative=float(after / max(before, np.finfo(float).tiny)),
         relative_interval=(float(low), float(high)),
+        beside_noise=beside,
     )
 
 
@@ -134,11 +158,15 @@ def _from_logged(
 
 
 def _from_fitted(
-    bench: Bench, given: Simulator, point: Float[np.ndarray, " d"], steps: int
+    bench: Bench,
+    given: Simulator,
+    point: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"] | None,
+    steps: int,
 ) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
-    """The same from starts that are fitted under each model to the strides before."""
+    """The same from starts that are fitted under each model to the strides before, and of the imitated hold-out."""
     moving, of_models, rows = stride(bench.problem.dataset), [], np.empty(0, np.int64)
-    of_window = replay_steps(bench.states, moving, 0) // 2 + 3 * steps
+    of_window = replay_steps(bench.states, moving, 0) * 2 // 3 + (4 + IMITATED) * steps
     most = bench.windows_in_time(of_window, SHARE, MOST)
     most_steps = bench.steps_in_time(most * of_window)
     for simulator, points in _models(bench, given, point):
@@ -148,9 +176,36 @@ def _from_fitted(
         if replays is None:
             return None
         replays = replace(replays, most_steps=most_steps)
-        of_models.append(replays.residuals(points)[0][:, :, replays.fitted + 1 :])
+        states, _ = replays.starts(points)
+        parts = [replays.residuals_from(points, states)]
+        if simulator is bench.simulator and covariance is not None:
+            parts.append(_imitated(bench, replays, point, covariance, states[-1], parts[0][-1]))
+        of_models += [part[:, :, replays.fitted + 1 :] for part in parts]
         rows = replays.rows
     return np.concatenate(of_models), rows
+
+
+def _imitated(
+    bench: Bench,
+    replays: FittedReplays,
+    point: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    states: Float[np.ndarray, "windows state"],
+    residuals: Float[np.ndarray, "windows readings channels"],
+) -> Float[np.ndarray, "1 windows readings channels"]:
+    """Residuals at the estimate of a hold-out as the model itself would make it (a posterior predictive check).
+
+    Its windows begin where the log's do, at `states`. Its parameters are drawn from the estimate's normal distribution,
+    a few for all windows, and its sensors have the noise that the estimate's `residuals` of fitted readings have. What
+    is missing in the model then shows in errors of the log that are larger than these (Gelman, Meng and Stern 1996).
+    """
+    random, readings, windows = np.random.default_rng(0), replays.readings, np.arange(len(replays.readings))
+    drawn = np.clip(random.multivariate_normal(point, covariance, size=IMITATED, method="eigh"), -1.0, 1.0)
+    made = replays.residuals_from(drawn, np.repeat(states[None], IMITATED, axis=0))[windows % IMITATED, windows]
+    noise = residual_noise(residuals[:, : replays.fitted + 1], made.shape[-1])
+    made = np.where(np.isfinite(made), made, 0.0) + noise * random.standard_normal(made.shape)
+    observed = moved(bench.simulator.task.attitudes, readings.observed, made * readings.scale)
+    return replace(replays, readings=replace(readings, observed=observed)).residuals(point[None])[0]
 
 
 def _models(
