@@ -177,14 +177,6 @@ def test_an_estimate_that_makes_up_for_what_the_model_lacks_is_never_calibrated(
     assert judge(PREDICTED, effective=True).word == "NOT_IDENTIFIABLE"
 
 
-def test_a_base_that_only_contacts_show_is_never_calibrated():
-    assert judge(PREDICTED).word == "CALIBRATED"
-    over = (predicted_over(1.0, 0.4, (0.3, 0.6)),)
-    verdict = judge(replace(PREDICTED, base_from_contacts=True, open_loop=over))
-    assert verdict.word == "USABLE" and "no sensor shows where the base is" in verdict.sentence
-    assert judge(replace(PREDICTED, base_from_contacts=True)).word == "NOT_IDENTIFIABLE"
-
-
 def test_what_predicts_certainly_worse_over_another_time_stays_a_mismatch():
     over = (predicted_over(0.1, 0.4, (0.3, 0.6)), predicted_over(1.0, 1.5, (1.2, 1.8)))
     assert judge(changed(PREDICTED, LEFT_OVER, explained=0.6, open_loop=over)).word == "MODEL_MISMATCH"

@@ -171,8 +171,6 @@ class Judged:
         finer: Whether other terms than the error of the integration step were tested with steps of a quarter of the
             length, as that error explains much and would hide them.
         open_loop: Errors of open-loop predictions in the signals' units, the shortest first; none without states.
-        base_from_contacts: Whether no sensor shows where a free base is or how fast it moves, and both were taken from
-            contacts that stand still.
         concentration: Where in the log that was calibrated to most of what the model leaves unexplained is; None where
             that was not looked for or no place stands out.
     """
@@ -195,7 +193,6 @@ class Judged:
     coarseness: float = 0.0
     finer: bool = False
     open_loop: tuple[OpenLoop, ...] = ()
-    base_from_contacts: bool = False
     concentration: Concentration | None = None
 
     @property

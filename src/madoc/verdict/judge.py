@@ -18,10 +18,6 @@ from madoc.verdict.mismatch import SEPARABLE, at_most, change_of, contradicted, 
 from madoc.verdict.statistics import ABOVE_NOISE, FEWEST_GROUPS, WORTH_GAINING, beyond_noise
 
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
-ASSUMED_BASE = (
-    "no sensor shows where the base is and how fast it moves: both were taken from contacts that stand still, "
-    "which was not tested; log the base by motion capture, for a while at least, to be sure of the values"
-)
 EFFECTIVE = (
     "the model leaves more than noise, and other values predict better than those that explain short windows best: it "
     "seems to lack something, whose effect the estimates make up for"
@@ -75,7 +71,6 @@ def judge(
         _open(holdout, combinations)
         or _no_improvement(holdout)
         or _untested(holdout)
-        or _with_an_assumed_base(holdout)
         or _beyond_noise_later(holdout)
         or (_not_certain(holdout, EFFECTIVE) if effective and numerical(holdout) is None else None)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and {_how_sure(holdout)}")
@@ -179,13 +174,6 @@ def _untested(holdout: HoldOut) -> Verdict | None:
             "or the budget was too short; log more, or in longer runs, or give it more time"
         )
     return Verdict("NOT_IDENTIFIABLE", f"{_how_good(holdout)}, but {why}")
-
-
-def _with_an_assumed_base(holdout: HoldOut) -> Verdict | None:
-    """What would be `CALIBRATED`, if contacts that stand still were not all that tells where a base is."""
-    if not holdout.base_from_contacts:
-        return None
-    return _not_certain(holdout, ASSUMED_BASE)
 
 
 def _beyond_noise_later(holdout: HoldOut) -> Verdict | None:

@@ -163,7 +163,6 @@ def judged(
         at_end=tuple(
             name for name in space.at_end(point, ends) if of_range[name] < OPEN
         ),  # an open one tells of no end
-        base_from_contacts=bool(bench.states.placed.any()),
         concentration=doubts.concentration,
     )
     shorter = SHORTER if far_beyond_noise(found) and missing_term(found) is None else 1
