@@ -200,7 +200,9 @@ def _imitated(
     is missing in the model then shows in errors of the log that are larger than these (Gelman, Meng and Stern 1996).
     """
     random, readings, windows = np.random.default_rng(0), replays.readings, np.arange(len(replays.readings))
-    drawn = np.clip(random.multivariate_normal(point, covariance, size=IMITATED, method="eigh"), -1.0, 1.0)
+    drawn = np.clip(
+        random.multivariate_normal(point, covariance, size=IMITATED, check_valid="ignore", method="eigh"), -1.0, 1.0
+    )
     made = replays.residuals_from(drawn, np.repeat(states[None], IMITATED, axis=0))[windows % IMITATED, windows]
     noise = residual_noise(residuals[:, : replays.fitted + 1], made.shape[-1])
     made = np.where(np.isfinite(made), made, 0.0) + noise * random.standard_normal(made.shape)
