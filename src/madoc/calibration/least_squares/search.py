@@ -23,6 +23,8 @@ from madoc.types import Epoch, generator
 
 DAMPING_RANGE = (1e-10, 1e10)
 """Smallest and largest relative damping of the parameters' step; it is clipped to them."""
+SEEN = 4
+"""Number of windows of which it is asked whether bodies touch in them, for each that is taken at most."""
 LITTLE = 5e-3
 """Share in [0, 1] of the cost; after a step that saves less, unknown initial states count as settled too."""
 ROUGHLY_SETTLED = 0.5
@@ -46,7 +48,7 @@ class SearchState:
         moved: The largest component of each search's last step, relative to one that matters; below 1 it has settled.
         rows: First rows of the windows.
         touching: Whether a contact was seen in each window, as far as its states are known.
-        without: Number of windows in which bodies touch that were left out.
+        without: Number of windows in which bodies touch that were left out, of those that were looked at.
         deviation: Noise of each channel in its typical changes; 1 where initial states are known.
         bread: Curvature of the best search's cost where it last linearised.
         meat: Scatter of the cost's gradient there, and the last step's where steps of half a standard error settle.
@@ -109,10 +111,9 @@ class Search:
         of_windows, of_starts = jax.random.split(key)
         count = len(problem.simulator.parameters)
         possible = self.starts.possible_rows(problem, self.horizon, self.windows)
-        every = len(possible)
-        if self.starts.unknown and self.free:
-            possible = without_contacts(problem, possible, self.horizon)
-        rows = possible[generator(of_windows).permutation(len(possible))][: self.windows]
+        seen = possible[generator(of_windows).permutation(len(possible))][: SEEN * self.windows]
+        free = without_contacts(problem, seen, self.horizon) if self.starts.unknown and self.free else seen
+        rows = free[: self.windows]
         points = np.array(jax.random.uniform(of_starts, (self.searches, count), minval=-1.0, maxval=1.0), np.float64)
         points[0] = 0.0
         logged = problem.states
@@ -126,7 +127,7 @@ class Search:
             moved=np.full(self.searches, 1.0 / _SMALLEST),
             rows=rows,
             touching=self.starts.touched(problem, rows, self.horizon),
-            without=every - len(possible),
+            without=len(seen) - len(free),
             deviation=np.ones(problem.states.measured),
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),
