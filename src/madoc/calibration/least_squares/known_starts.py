@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.plan import TRIALS, Outcome, Plan
-from madoc.calibration.least_squares.statistics import touched
 from madoc.errors import MadocError
 from madoc.identification.gauss_newton import damped_step, triangular_factors
 from madoc.identification.information import bread, meat
@@ -53,13 +52,6 @@ class KnownStarts:
         """The windows that begin at the given rows, and whether a contact was seen in each."""
         states = problem.states.states[np.searchsorted(problem.states.rows, rows)]
         return cls(problem, windows_at(problem.dataset, states, rows, horizon), touching, loss)
-
-    @staticmethod
-    def touched(
-        problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
-    ) -> Bool[np.ndarray, " windows"]:
-        """Whether bodies were in contact at any logged state of a window, from its first to its last."""
-        return touched(problem, *problem.states.exact(), rows, horizon)
 
     @staticmethod
     def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome, Plan
-from madoc.calibration.least_squares.statistics import without_contacts
+from madoc.calibration.least_squares.statistics import touched, without_contacts
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.identification import settling
 from madoc.identification.information import SETTLED, sandwich
@@ -126,7 +126,7 @@ class Search:
             cost=np.full(self.searches, ALL_FAILED),
             moved=np.full(self.searches, 1.0 / _SMALLEST),
             rows=rows,
-            touching=self.starts.touched(problem, rows, self.horizon),
+            touching=touched(problem, *problem.states.guesses(), rows, self.horizon),
             without=len(seen) - len(free),
             deviation=np.ones(problem.states.measured),
             bread=np.zeros((count, count)),

@@ -16,7 +16,6 @@ from madoc.calibration.least_squares.statistics import (
     clipped_change,
     noise_ratio,
     outlier_limits,
-    touched,
 )
 from madoc.errors import MadocError
 from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
@@ -76,13 +75,6 @@ class UnknownStarts:
         readings = Readings.at(problem.dataset, problem.states, rows, horizon, problem.typical_change)
         rounding = (problem.rounding / problem.typical_change)[: problem.states.measured]
         return cls(problem.simulator, readings, rounding, loss)
-
-    @staticmethod
-    def touched(
-        problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
-    ) -> Bool[np.ndarray, " windows"]:
-        """Whether bodies were in contact at any state of a window, as far as the log tells."""
-        return touched(problem, *problem.states.guesses(), rows, horizon)
 
     @staticmethod
     def possible_rows(problem: CalibrationProblem, horizon: int, most: int) -> Int[np.ndarray, " windows"]:
