@@ -39,8 +39,7 @@ def calibrate_in(
     name, why = choose(methods, prepared.problem, key)
     prepared, method = prepared.by(name), methods[name]
     judged_by, budget = None, prepared.budget
-    asked = order.search.budget is not None and prepared.holdout is not None
-    if asked and isinstance(budget, Seconds):
+    if prepared.holdout is not None and isinstance(budget, Seconds):
         judged_by, budget = began + budget.seconds, budget.for_search(time.monotonic() - began)
     spec = prepared.spec(out) | {"hyperparameters": hyperparameters(method)}
     with working_folder(out, spec, resume=resume) as folder:

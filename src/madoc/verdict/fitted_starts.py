@@ -95,30 +95,36 @@ class FittedReplays:
     def starts(self, points: Float[np.ndarray, "systems d"]) -> tuple[Float[np.ndarray, "systems windows state"], int]:
         """The initial states from which each system comes nearest to the observations of the fitted steps.
 
-        Also the control steps that were simulated. Each step moves the windows that the one before gained on, under any
-        system.
+        Also the control steps that were simulated.
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
         log = self.held, self.logged, self.simulator, first, self.rows
-        states, spent = likely_states(*log, points, self.near)
-        gaining = np.arange(len(first))
+        likely, spent = likely_states(*log, points, self.near)
+        found = [self._fitted(first, point, states) for point, states in zip(points, likely, strict=True)]
+        return np.stack([states for states, _ in found]), spent + sum(steps for _, steps in found)
+
+    def _fitted(
+        self, first: Readings, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
+    ) -> tuple[Float[np.ndarray, "windows state"], int]:
+        """States from which one system comes nearest to the first readings: each step moves those the last gained on.
+
+        Also the control steps that were simulated.
+        """
+        states, gaining, spent = states.copy(), np.arange(len(first)), 0
         for _ in range(self.most_steps):
-            part, around = first.of(gaining), states[:, gaining]
-            slopes = slopes_at(self.simulator, part, points, around, parameters=False)
-            damping = np.full(len(part), _DAMPING)
-            fits = [eliminate(each, np.ones_like(each.residuals), damping) for each in slopes]
-            steps = np.stack([fit.states_step(np.zeros(0)) for fit in fits]) * ~self.logged.in_plane
-            step = first.in_state_units(steps, states.shape[2])
-            tried = around[:, None] + _SHARES[:, None, None] * step[:, None]
-            residuals = part.residuals(self.simulator, points, tried.reshape(len(points), -1, states.shape[2]))
-            spent += len(points) * len(part) * first.steps * (1 + len(first.spread) + len(_SHARES))
-            before = np.stack([np.where(each.whole, (each.residuals**2).sum(-1), np.inf) for each in slopes])
-            costs = np.concatenate([_squares(residuals), before[:, None]], axis=1)
-            best = costs.argmin(1)[:, None, :, None]
-            every = np.concatenate([tried, around[:, None]], axis=1)
-            states[:, gaining] = np.take_along_axis(every, best, axis=1)[:, 0]
-            gaining = gaining[(costs.min(1) < (1.0 - GAIN) * before).any(0)]
+            part, around = first.of(gaining), states[gaining]
+            (slopes,) = slopes_at(self.simulator, part, point[None], around[None], parameters=False)
+            fit = eliminate(slopes, np.ones_like(slopes.residuals), np.full(len(part), _DAMPING))
+            step = first.in_state_units(fit.states_step(np.zeros(0)) * ~self.logged.in_plane, states.shape[1])
+            tried = around + _SHARES[:, None, None] * step
+            residuals = part.residuals(self.simulator, point[None], tried.reshape(1, -1, states.shape[1]))[0]
+            spent += len(part) * first.steps * (1 + len(first.spread) + len(_SHARES))
+            before = np.where(slopes.whole, (slopes.residuals**2).sum(-1), np.inf)
+            costs = np.concatenate([_squares(residuals), before[None]])
+            best = costs.argmin(0)
+            states[gaining] = np.concatenate([tried, around[None]])[best, np.arange(len(part))]
+            gaining = gaining[costs.min(0) < (1.0 - GAIN) * before]
             if len(gaining) <= FEW * len(first):
                 break
         return states, spent
