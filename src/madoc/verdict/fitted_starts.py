@@ -25,6 +25,8 @@ AHEAD = (1, 5, 10)
 """Numbers of strides after the fitted ones at which errors are taken."""
 MOST = 150
 """Largest number of windows."""
+OVERLAPPING = 2
+"""Largest number of windows that share a row, on average: what more of them tell is what these tell."""
 FIT_STEPS = 10
 """Largest number of damped Gauss-Newton steps of an initial state, which begins at finite differences."""
 GAIN = 1e-3
@@ -152,9 +154,11 @@ def fitted_replays_of(
     *,
     ahead: tuple[int, ...] = (),
     fewest: int = FEWEST_WINDOWS,
-    most: int = MOST,
+    most: int | None = None,
 ) -> FittedReplays | None:
     """Windows spread evenly over the hold-out; None where fewer than `fewest` are long enough.
+
+    They are at most `most`; without that `MOST`, which overlap no more than `OVERLAPPING` says but for the fewest.
 
     `stride` is the number of control steps between readings at which the robot has moved, `data.timescale.stride`.
     `ahead` are control steps after the fitted ones, `AHEAD` strides where none are given.
@@ -166,6 +170,7 @@ def fitted_replays_of(
     possible = rows_that_fit(held, rows, steps)
     if len(possible) < fewest:
         return None
+    most = most or min(MOST, max(fewest, OVERLAPPING * len(possible) // steps))
     chosen = evenly(possible, most)
     readings = Readings.at(held, logged, rows[chosen], steps, scale)
     episodes = held.episode_of(rows[chosen])
