@@ -299,20 +299,51 @@ def _eliminated(slopes: WindowSlopes, weights: Float[np.ndarray, "windows values
     return eliminate(slopes, weights, np.full(len(slopes.residuals), _STATE_DAMPING))
 
 
-def products_of(slopes: WindowSlopes, readings: Readings, count: int) -> Products | None:
-    """Products of residuals and derivatives that no initial state explains; None if there is nothing to explain.
+@dataclass(frozen=True)
+class Reduced:
+    """Residuals of windows and their derivatives in units of the noise, without what initial states explain of them.
 
-    They are in units of the noise, and residuals far beyond it, as where a contact begins, count little.
+    Residuals far beyond the noise, as where a contact begins, count little.
+
+    Attributes:
+        eliminated: The residuals and derivatives, those by the parameters first.
+        noise: Standard deviation of each value's noise.
+        finite: The windows that count.
+        count: Number of parameters.
     """
+
+    eliminated: Eliminated
+    noise: Float[np.ndarray, " values"]
+    finite: Bool[np.ndarray, " all"]
+    count: int
+
+    def products(self, others: Float[np.ndarray, "all values others"] | None = None) -> Products:
+        """Products of all columns, and of those of other terms, whose derivatives are given for all windows."""
+        reduced = self.eliminated.reduced
+        by_parameters, terms = reduced.jacobian[..., : self.count], reduced.jacobian[..., self.count :]
+        if others is not None:
+            further = self.eliminated.projected(others[self.finite] / self.noise[:, None])
+            terms = np.concatenate([terms, further], axis=-1)
+        return Products.of(reduced.residuals, by_parameters, terms)
+
+
+def reduced_of(slopes: WindowSlopes, readings: Readings, count: int) -> Reduced | None:
+    """What no initial state explains of residuals and derivatives; None if there is nothing to explain."""
     finite = slopes.finite
     if not finite.any() or negligible(slopes):
         return None
     kept = WindowSlopes(
         slopes.residuals[finite], slopes.by_parameters[finite], slopes.by_states[finite], slopes.whole[finite]
     )
-    scaled = kept.over(_noise(kept, readings))
-    left = _eliminated(scaled, _weights(scaled)).reduced
-    return Products.of(left.residuals, left.jacobian[..., :count], left.jacobian[..., count:])
+    noise = _noise(kept, readings)
+    scaled = kept.over(noise)
+    return Reduced(_eliminated(scaled, _weights(scaled)), noise, finite, count)
+
+
+def products_of(slopes: WindowSlopes, readings: Readings, count: int) -> Products | None:
+    """Products of residuals and derivatives, those by so many parameters first; None if there is nothing to explain."""
+    reduced = reduced_of(slopes, readings, count)
+    return None if reduced is None else reduced.products()
 
 
 def negligible(slopes: WindowSlopes) -> bool:

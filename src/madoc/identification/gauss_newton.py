@@ -149,15 +149,26 @@ class Eliminated:
         reduced: Weighted residuals and derivatives, projected on what no initial state of their window can explain.
         spare: 1 - leverage of each value: the share of its noise that its window's initial state does not absorb.
         response: R⁻¹ Qᵀ (r, Jθ), from which `states_step` is computed.
+        basis: Q, with the rows of the damping below.
+        root: Square roots of the weights.
     """
 
     reduced: Linearisation
     spare: Float[np.ndarray, "windows values"]
     response: Float[np.ndarray, "windows n columns"]
+    basis: Float[np.ndarray, "windows rows n"]
+    root: Float[np.ndarray, "windows values 1"]
 
     def states_step(self, step: Float[np.ndarray, " d"]) -> Float[np.ndarray, "windows n"]:
         """The states' step that goes with a step of the parameters: -C⁻¹ (Jsᵀ r + Bᵀ p)."""
         return -(self.response[..., 0] + self.response[..., 1:] @ step)
+
+    def projected(
+        self, columns: Float[np.ndarray, "windows values columns"]
+    ) -> Float[np.ndarray, "windows rows columns"]:
+        """Other columns, weighted and projected as the reduced ones are."""
+        padded = _weighted(self.root, columns, self.basis.shape[2])
+        return padded - self.basis @ (np.swapaxes(self.basis, 1, 2) @ padded)
 
 
 def states_basis(
@@ -185,13 +196,22 @@ def eliminate(
     """
     root = np.sqrt(weights)[..., None]
     basis, factor = states_basis(root * slopes.by_states, damping)
-    windows, values, states = slopes.by_states.shape
-    others = root * np.concatenate([slopes.residuals[..., None], slopes.by_parameters], axis=-1)
-    padded = np.concatenate([others, np.zeros((windows, states, others.shape[-1]))], axis=1)
+    columns = np.concatenate([slopes.residuals[..., None], slopes.by_parameters], axis=-1)
+    padded = _weighted(root, columns, slopes.by_states.shape[2])
     within = np.swapaxes(basis, 1, 2) @ padded
     left = padded - basis @ within
     return Eliminated(
         reduced=Linearisation(left[..., 0], left[..., 1:]),
-        spare=1.0 - (basis[:, :values] ** 2).sum(-1),
+        spare=1.0 - (basis[:, : slopes.residuals.shape[1]] ** 2).sum(-1),
         response=np.linalg.solve(factor, within),
+        basis=basis,
+        root=root,
     )
+
+
+def _weighted(
+    root: Float[np.ndarray, "windows values 1"], columns: Float[np.ndarray, "windows values columns"], below: int
+) -> Float[np.ndarray, "windows rows columns"]:
+    """The weighted columns with so many rows of zeros below."""
+    windows, _, count = columns.shape
+    return np.concatenate([root * columns, np.zeros((windows, below, count))], axis=1)

@@ -21,7 +21,7 @@ from madoc.identification.body_forces import (
     of_all_drives,
 )
 from madoc.identification.candidate_terms import INTEGRATION, UNLISTED
-from madoc.identification.fitted_windows import Fit, products_of
+from madoc.identification.fitted_windows import Fit, reduced_of
 from madoc.identification.information import NORMAL_95
 from madoc.identification.replay import Readings
 from madoc.identification.responses import Responses
@@ -118,15 +118,16 @@ def unlisted_forces(
     """
     steps = [index for index, each in enumerate(tests.tried) if each.cause == INTEGRATION]
     steps = [index for index in steps if (step := tests.score(index)) is not None and abs(step.t) >= SUSPICIOUS]
-    first, terms, others, every = 1 + tests.products.count, list[MissingTerm](), list[Alternative](), list(families)
+    terms, others, every = list[MissingTerm](), list[Alternative](), list(families)
+    first, beside = 1 + tests.products.count, by_terms[..., steps]
+    listed = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, beside], axis=-1))
+    reduced = reduced_of(listed, readings, tests.products.count)
+    if reduced is None:
+        return terms, others
     for family in every:
-        added = np.concatenate([by_terms[..., steps], responses.effects(family.forces)], axis=-1)
-        both = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, added], axis=-1))
-        products, own = (
-            products_of(both, readings, tests.products.count),
-            range(first + len(steps), first + added.shape[-1]),
-        )
-        found = None if products is None else family_score(products, own, range(first, own.start))
+        products = reduced.products(responses.effects(family.forces))
+        own = range(first + len(steps), products.each.shape[1])
+        found = family_score(products, own, range(first, own.start))
         t = 0.0 if found is None else shared_deviate(found.t, len(every))
         if found is None or t < SUSPICIOUS:
             continue
