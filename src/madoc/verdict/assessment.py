@@ -78,11 +78,11 @@ def assess(
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
     bench.tell("predictions of single steps and short windows")
     fits_starts = _fits_starts(bench, point)
-    # Only predictions can make an estimate of use whose search has not settled.
+    # Only predictions can make an estimate of use whose search has not settled, and of fitted starts a certain one.
     half = (bench.simulator.parameters.high - bench.simulator.parameters.low) / 2.0
     covariance = None if result.covariance is None else result.covariance / np.outer(half, half)
     predict = partial(_predictions, bench, point, fits_starts, covariance)
-    predictions = None if result.settled else predict()
+    predictions = None if result.settled and not fits_starts else predict()
     holdout = measured(bench, result.mean, result.interval, fits_starts=fits_starts)
     predictions = predict() if predictions is None else predictions
     holdout = replace(holdout, open_loop=predictions)

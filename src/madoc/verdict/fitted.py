@@ -23,8 +23,8 @@ from madoc.verdict.systematic import explained_at_end
 
 NEARBY_STEPS = 6
 """Largest number of Gauss-Newton steps from an estimate, at least 1: enough to reach the nearest local minimum."""
-SHORTEST = 1e-5
-"""Distance in [-1, 1]; after a step that moves no parameter by more the search ends."""
+GAIN = 0.01
+"""Share in (0, 1) by which a step has to change the residuals' scale for another one to follow."""
 _CANDIDATES = 2
 """Number of last points whose predictions are compared: an earlier one may be better where the last went too far."""
 _DAMPING = 1e-6
@@ -99,12 +99,15 @@ def _nearby_best(replays: FittedReplays, point: Float[np.ndarray, " d"]) -> tupl
     """
     simulator, readings = replays.simulator, replays.readings
     starts, spent = replays.starts(point[None])
-    states, visited = starts[0], []
+    states, visited, before = starts[0], list[Float[np.ndarray, " d"]](), 0.0
     for _ in range(min(NEARBY_STEPS, replays.most_steps)):
         slopes = slopes_at(simulator, readings, point[None], states[None])[0]
         if not slopes.whole.any():
             break
         scale = scale_of(slopes.residuals[slopes.whole], "cauchy")
+        if abs(scale - before) < GAIN * before:
+            break
+        before = scale
         z = (slopes.residuals / scale) ** 2
         newton = slopes.curved(curvature_share(z[slopes.whole], "cauchy"))
         eliminated = eliminate(newton, loss_slope(z, "cauchy"), np.full(len(readings), _DAMPING))
@@ -112,10 +115,8 @@ def _nearby_best(replays: FittedReplays, point: Float[np.ndarray, " d"]) -> tupl
         states = states + readings.in_state_units(eliminated.states_step(step), states.shape[1])
         point = point + step
         visited.append(point)
-        if np.abs(step).max() < SHORTEST:
-            break
     columns = 1 + 2 * len(point) + len(readings.spread)
-    spent += len(visited) * columns * len(readings) * readings.steps
+    spent += min(len(visited) + 1, NEARBY_STEPS) * columns * len(readings) * readings.steps
     return np.array(visited[-_CANDIDATES:]).reshape(-1, len(point)), spent
 
 

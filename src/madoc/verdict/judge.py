@@ -13,7 +13,8 @@ from madoc.calibration.holdout import Area, Fitted, HoldOut, OpenLoop, Predicted
 from madoc.identification.combinations import Combination
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS
-from madoc.verdict.adequacy import numerical
+from madoc.identification.term_tests import named
+from madoc.verdict.adequacy import is_certain, numerical
 from madoc.verdict.mismatch import SEPARABLE, at_most, change_of, contradicted, in_percent, in_rows, lacking, of_area
 from madoc.verdict.statistics import ABOVE_NOISE, FEWEST_GROUPS, WORTH_GAINING, beyond_noise
 
@@ -72,6 +73,7 @@ def judge(
         or _no_improvement(holdout)
         or _untested(holdout)
         or _beyond_noise_later(holdout)
+        or _small_but_certain(holdout)
         or (_not_certain(holdout, EFFECTIVE) if effective and numerical(holdout) is None else None)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and {_how_sure(holdout)}")
     )
@@ -188,6 +190,24 @@ def _beyond_noise_later(holdout: HoldOut) -> Verdict | None:
         f"the model lacks something that no test finds: over {seconds:.3g} s it predicts {name} with {ratio:.2g} times "
         "the error, at least, that the sensors' noise and the estimates' uncertainty make; look for what acts slowly, "
         "or for what couples drives, as a supply that they share",
+    )
+
+
+def _small_but_certain(holdout: HoldOut) -> Verdict | None:
+    """What is certainly missing, though it explains too little of the residuals to be named as the cause.
+
+    Parameters may have made up for more of it than is left. With a finer timestep a certain term may be what is left of
+    the numerical error, and intervals cover it.
+    """
+    small = [] if holdout.finer or numerical(holdout) is not None else list(filter(is_certain, holdout.missing_terms))
+    if not small:
+        return None
+    clearest = max(small, key=lambda term: abs(term.t))
+    return _not_certain(
+        holdout,
+        f"the model certainly lacks something: {named(clearest)} explains but {100 * clearest.explained:.2g} % of "
+        f"the squared residuals, and not by chance (t = {abs(clearest.t):.1f}); parameters may make up for more of "
+        "it than is left, and which term it is the log does not tell",
     )
 
 
