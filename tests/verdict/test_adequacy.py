@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_judge import PREDICTED
 
-from madoc.calibration.holdout import AgainstChance, Area, ToldApart
+from madoc.calibration.holdout import AgainstChance, Area, OpenLoop, ToldApart
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.identification.body_forces import WEAKENING_ALL
 from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, LATE_DRIVE, TILTS, UNLISTED
@@ -120,6 +121,17 @@ def test_small_terms_are_covered_by_intervals_and_not_named():
     step, friction = term(INTEGRATION, t=20.0, explained=0.3, parameter=""), term(explained=0.05)
     assert missing_term(replace(held(step, friction), finer=True)) is None
     assert missing_term(replace(held(replace(step, explained=0.2), friction), finer=True)) is friction
+
+
+def test_a_certain_term_however_small_is_never_calibrated_unless_a_finer_step_may_have_left_it():
+    least = replace(term(t=5.1, explained=0.004), cause="another centre of mass", parameter="body_com.leg")
+    sure = judge(replace(PREDICTED, missing_terms=(least,)))
+    assert sure.word == "NOT_IDENTIFIABLE"
+    assert "another centre of mass (body_com.leg) explains but 0.4 % of the squared residuals, and not" in sure.sentence
+    ahead = OpenLoop(1.0, False, 60, {"q": 1.0}, {"q": 1.0}, {"q": 0.4}, 0.4, (0.3, 0.6))
+    assert judge(replace(PREDICTED, missing_terms=(least,), open_loop=(ahead,))).word == "USABLE"
+    assert judge(replace(PREDICTED, missing_terms=(replace(least, t=4.9),))).word == "CALIBRATED"
+    assert judge(replace(PREDICTED, missing_terms=(least,), finer=True)).word == "CALIBRATED"
 
 
 def test_what_is_usual_is_named_before_a_tilted_base():
