@@ -84,7 +84,9 @@ def assess(
     predict = partial(_predictions, bench, point, fits_starts, covariance)
     predictions = None if result.settled and not fits_starts else predict()
     holdout = measured(bench, result.mean, result.interval, fits_starts=fits_starts)
-    predictions = predict() if predictions is None else predictions
+    if predictions is None:
+        noise = np.array(list(holdout.noise.values())) / bench.change[: len(holdout.noise)]
+        predictions = predict(noise)
     holdout = replace(holdout, open_loop=predictions)
     widened = with_widened_intervals(result, holdout)
     verdict = judge(
@@ -138,12 +140,16 @@ def _fits_starts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
 
 
 def _predictions(
-    bench: Bench, point: Float[np.ndarray, " d"], fits_starts: bool, covariance: Float[np.ndarray, "d d"] | None
+    bench: Bench,
+    point: Float[np.ndarray, " d"],
+    fits_starts: bool,
+    covariance: Float[np.ndarray, "d d"] | None,
+    noise: Float[np.ndarray, " observation"] | None = None,
 ) -> tuple[OpenLoop, ...]:
     """Predictions over longer times, if there is time for them."""
     if not bench.begins("predictions over longer times"):
         return ()
-    return open_loop(bench, point, fits_starts=fits_starts, covariance=covariance)
+    return open_loop(bench, point, fits_starts=fits_starts, covariance=covariance, noise=noise)
 
 
 def _problem_of(result: CalibrationResult, training: Dataset | None, simulator: Simulator | None) -> CalibrationProblem:

@@ -36,6 +36,9 @@ WORSE_SIGNAL = 1.1
 """Error of one signal over that of the model as given, above which the sentence names it if it is beyond noise."""
 NAMED = 3
 """Largest number of such signals that are named."""
+BY_CHANCE = 1.3
+"""Error of predictions from logged starts over that of noise, random forces and the estimate's uncertainty, by the lower
+end of a 95 % interval; more is no chance, but for what the estimate of the noise errs by."""
 
 
 def judge(
@@ -183,7 +186,7 @@ def _beyond_noise_later(holdout: HoldOut) -> Verdict | None:
     enough = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
     beside = [(ratio, name, each.seconds) for each in enough for name, ratio in each.beside_noise.items()]
     ratio, name, seconds = max(beside, default=(0.0, "", 0.0))
-    if ratio <= ABOVE_NOISE or numerical(holdout) is not None:
+    if ratio <= (BY_CHANCE if isinstance(holdout, Predicted) else ABOVE_NOISE) or numerical(holdout) is not None:
         return None
     return _not_certain(
         holdout,

@@ -24,6 +24,8 @@ from madoc.simulation.base import Simulator
 from madoc.simulation.write import nominal_values
 from madoc.verdict.bench import Bench
 from madoc.verdict.fitted_starts import FITTED, FittedReplays, fitted_replays_of, replay_steps
+from madoc.verdict.predicted import by_chance
+from madoc.verdict.prediction import Replays
 from madoc.verdict.statistics import beside_random, independent_groups, interval_of, resampled
 
 SECONDS = (0.1, 0.3, 1.0)
@@ -44,6 +46,7 @@ def open_loop(
     *,
     fits_starts: bool = False,
     covariance: Float[np.ndarray, "d d"] | None = None,
+    noise: Float[np.ndarray, " observation"] | None = None,
 ) -> tuple[OpenLoop, ...]:
     """Errors of open-loop predictions of the hold-out at an estimate in [-1, 1], one record for each length of time.
 
@@ -51,14 +54,15 @@ def open_loop(
     There are none where the log tells no states to begin at, and none of a length that no held-out stretch has.
     From fitted states those of shorter times are the beginnings of one prediction where runs are long enough, so that
     starts are fitted once. With the estimate's `covariance`, in [-1, 1], it is also said how many times as large errors
-    from fitted states are as those of an imitated hold-out (`_imitated`).
+    are as those of an imitated hold-out (`_imitated`), from logged states with the sensors' `noise`, in typical changes
+    of a stride.
     """
     if bench.states.kind == "unknown" or bench.held_out.disturbance.shuffled != "none":
         return ()
     given, held, step = as_given(bench.simulator), bench.held_out, bench.simulator.control_step
     fits_starts = fits_starts or not bench.states_known
     before = FITTED * stride(bench.problem.dataset) if fits_starts else 0
-    predicted = partial(_from_logged, bench, given, point)
+    predicted = partial(_from_logged, bench, given, point, covariance, noise)
     if fits_starts:
         predicted = partial(_from_fitted, bench, given, point, covariance)
     whole = int(np.median(held.episode_ends - held.episode_starts)) - before
@@ -135,11 +139,16 @@ def _record(
 
 
 def _from_logged(
-    bench: Bench, given: Simulator, point: Float[np.ndarray, " d"], steps: int
+    bench: Bench,
+    given: Simulator,
+    point: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"] | None,
+    noise: Float[np.ndarray, " observation"] | None,
+    steps: int,
 ) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
     """Residuals from logged states as given, at mid-range and at the estimate, and the rows where windows begin.
 
-    None where the hold-out has no run as long.
+    Those of the imitated hold-out follow, over the times in `SECONDS`. None where the hold-out has no run as long.
     """
     held = bench.held_out
     states, rows = logged_states(held, bench.simulator.task)
@@ -154,7 +163,15 @@ def _from_logged(
             for simulator, points in _models(bench, given, point)
         ]
     )
-    return flat.reshape(*flat.shape[:2], steps, -1), rows[chosen]
+    residuals, rows = flat.reshape(*flat.shape[:2], steps, -1), rows[chosen]
+    if covariance is None or noise is None or steps > max(SECONDS) / bench.simulator.control_step + 1:
+        return residuals, rows
+    observation, episodes = np.asarray(held.transitions.observation)[rows], held.episode_of(rows)
+    replays = Replays(bench.simulator, windows, observation, rows, episodes, (steps,), bench.change)
+    chance, _ = by_chance(bench, replays, point, replays.noise_floor(held, point, noise))
+    drawn = replays.residuals(_drawn(point, covariance))
+    of_parameters = drawn[np.arange(len(rows)) % IMITATED, np.arange(len(rows))] - residuals[-1]
+    return np.concatenate([residuals, chance + of_parameters]), rows
 
 
 def _from_fitted(
@@ -199,15 +216,20 @@ def _imitated(
     a few for all windows, and its sensors have the noise that the estimate's `residuals` of fitted readings have. What
     is missing in the model then shows in errors of the log that are larger than these (Gelman, Meng and Stern 1996).
     """
-    random, readings, windows = np.random.default_rng(0), replays.readings, np.arange(len(replays.readings))
-    drawn = np.clip(
-        random.multivariate_normal(point, covariance, size=IMITATED, check_valid="ignore", method="eigh"), -1.0, 1.0
-    )
+    random, readings, windows = np.random.default_rng(1), replays.readings, np.arange(len(replays.readings))
+    drawn = _drawn(point, covariance)
     made = replays.residuals_from(drawn, np.repeat(states[None], IMITATED, axis=0))[windows % IMITATED, windows]
     noise = residual_noise(residuals[:, : replays.fitted + 1], made.shape[-1])
     made = np.where(np.isfinite(made), made, 0.0) + noise * random.standard_normal(made.shape)
     observed = moved(bench.simulator.task.attitudes, readings.observed, made * readings.scale)
     return replace(replays, readings=replace(readings, observed=observed)).residuals(point[None])[0]
+
+
+def _drawn(point: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "systems d"]:
+    """A few parameter vectors in [-1, 1] from an estimate's normal distribution."""
+    random = np.random.default_rng(0)
+    drawn = random.multivariate_normal(point, covariance, size=IMITATED, check_valid="ignore", method="eigh")
+    return np.clip(drawn, -1.0, 1.0)
 
 
 def _models(

@@ -14,7 +14,7 @@ from madoc.identification.states import logged_states
 from madoc.identification.windows import consecutive_rows, evenly
 from madoc.simulation.attitudes import differences
 from madoc.verdict.bench import Bench
-from madoc.verdict.prediction import nearby_best
+from madoc.verdict.prediction import Replays, nearby_best
 from madoc.verdict.records import judged
 from madoc.verdict.statistics import (
     NEGLIGIBLE,
@@ -158,22 +158,35 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
 def _beside_random(bench: Bench, found: _Replayed) -> tuple[Float[np.ndarray, " observation"], int]:
     """The errors of each signal after the longest horizon over those of chance, and the control steps simulated."""
     replays = bench.replays
-    pushes, rows = _pushes(bench, found.best, np.nan_to_num(np.nanmean(found.noisy[:, 0] ** 2, axis=0)))
-    random = replays.random_floor(found.best, found.noisy[None], pushes)
-    left, by_chance = (replays.magnitudes(each)[:, 0, -1] for each in (found.at_best[None], random))
+    random, rows = by_chance(bench, replays, found.best, found.noisy[None])
+    left, chance = (replays.magnitudes(each)[:, 0, -1] for each in (found.at_best[None], random))
     groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
-    return beside_random(left, by_chance, groups), rows + 2 * random[..., 0].size
+    return beside_random(left, chance, groups), rows + 2 * random[..., 0].size
+
+
+def by_chance(
+    bench: Bench,
+    replays: Replays,
+    point: Float[np.ndarray, " d"],
+    noisy: Float[np.ndarray, "1 windows steps observation"],
+) -> tuple[Float[np.ndarray, "1 windows steps observation"], int]:
+    """Residuals of windows that sensor noise, which makes `noisy` ones, and random forces would cause together.
+
+    Also the control steps simulated to tell how large these are.
+    """
+    pushes, rows = _pushes(bench, replays, point, np.nan_to_num(np.nanmean(noisy[0, :, 0] ** 2, axis=0)))
+    return replays.random_floor(point, noisy, pushes), rows
 
 
 def _pushes(
-    bench: Bench, point: Float[np.ndarray, " d"], by_noise: Float[np.ndarray, " observation"]
+    bench: Bench, replays: Replays, point: Float[np.ndarray, " d"], by_noise: Float[np.ndarray, " observation"]
 ) -> tuple[Float[np.ndarray, "windows steps observation"], int]:
     """What random forces may have changed in each row of the windows, and the control steps simulated.
 
     That is the row's residual, less the share of all their mean square that sensor noise makes (`by_noise`). Rows whose
     state cannot be rebuilt have the residual of another one.
     """
-    wanted = bench.replays.rows[:, None] + np.arange(bench.replays.windows.steps)
+    wanted = replays.rows[:, None] + np.arange(replays.windows.steps)
     rows = evenly(np.intersect1d(logged_states(bench.held_out, bench.simulator.task)[1], wanted), MOST_ROWS)
     residuals = np.nan_to_num(_residuals(bench, point, rows))
     square = np.maximum((residuals**2).mean(0), np.finfo(float).tiny)
