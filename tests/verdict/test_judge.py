@@ -123,12 +123,13 @@ def predicted_over(seconds, relative, interval, *, whole=False, windows=60):
     return OpenLoop(seconds, whole, windows, {"q": 1.0}, {"q": 1.0}, {"q": relative}, relative, interval)
 
 
-def test_predictions_that_noise_and_uncertainty_do_not_explain_are_never_calibrated():
-    far = replace(predicted_over(1.0, 0.4, (0.3, 0.6)), beside_noise={"q": 1.0, "qd": 2.1})
-    verdict = judge(replace(PREDICTED, open_loop=(far,)))
-    assert verdict.word == "USABLE" and "1 s it predicts qd with 2.1 times the error, at least" in verdict.sentence
-    less = replace(far, beside_noise={"qd": 1.9}), replace(far, windows=3)
-    assert judge(replace(PREDICTED, open_loop=less)).word == "CALIBRATED"
+@pytest.mark.parametrize(("good", "ratio", "less"), [(FITTED, 2.1, 1.9), (PREDICTED, 1.4, 1.2)])
+def test_predictions_that_noise_and_uncertainty_do_not_explain_are_never_calibrated(good, ratio, less):
+    far = replace(predicted_over(1.0, 0.4, (0.3, 0.6)), beside_noise={"q": 1.0, "qd": ratio})
+    verdict = judge(replace(good, open_loop=(far,)))
+    assert verdict.word == "USABLE" and f"1 s it predicts qd with {ratio} times the error, at least" in verdict.sentence
+    near = replace(far, beside_noise={"qd": less}), replace(far, windows=3)
+    assert judge(replace(good, open_loop=near)).word == "CALIBRATED"
 
 
 @EITHER

@@ -37,8 +37,8 @@ WORSE_SIGNAL = 1.1
 NAMED = 3
 """Largest number of such signals that are named."""
 BY_CHANCE = 1.3
-"""Error of predictions from logged starts over that of noise, random forces and the estimate's uncertainty, by the lower
-end of a 95 % interval; more is no chance, but for what the estimate of the noise errs by."""
+"""Error of predictions from logged starts over that of noise, random forces and the estimate's uncertainty, at the low
+end of a 95 % interval; a larger one is no chance, but for what the estimate of the noise errs by."""
 
 
 def judge(
