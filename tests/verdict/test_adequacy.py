@@ -123,14 +123,15 @@ def test_small_terms_are_covered_by_intervals_and_not_named():
     assert missing_term(replace(held(replace(step, explained=0.2), friction), finer=True)) is friction
 
 
-def test_a_certain_term_however_small_is_never_calibrated_unless_a_finer_step_may_have_left_it():
+def test_a_certain_term_of_a_thousandth_is_never_calibrated_unless_a_finer_step_may_have_left_it():
     least = replace(term(t=5.1, explained=0.004), cause="another centre of mass", parameter="body_com.leg")
     sure = judge(replace(PREDICTED, missing_terms=(least,)))
     assert sure.word == "NOT_IDENTIFIABLE"
     assert "another centre of mass (body_com.leg) explains but 0.4 % of the squared residuals, and not" in sure.sentence
     ahead = OpenLoop(1.0, False, 60, {"q": 1.0}, {"q": 1.0}, {"q": 0.4}, 0.4, (0.3, 0.6))
     assert judge(replace(PREDICTED, missing_terms=(least,), open_loop=(ahead,))).word == "USABLE"
-    assert judge(replace(PREDICTED, missing_terms=(replace(least, t=4.9),))).word == "CALIBRATED"
+    for other in (replace(least, t=4.9), replace(least, explained=9e-4)):
+        assert judge(replace(PREDICTED, missing_terms=(other,))).word == "CALIBRATED"
     assert judge(replace(PREDICTED, missing_terms=(least,), finer=True)).word == "CALIBRATED"
 
 

@@ -36,6 +36,9 @@ WORSE_SIGNAL = 1.1
 """Error of one signal over that of the model as given, above which the sentence names it if it is beyond noise."""
 NAMED = 3
 """Largest number of such signals that are named."""
+LEAST_EXPLAINED = 1e-3
+"""Share in [0, 1] of the squared residuals below which a term that is certain may stand for what the noise of initial
+states does at contacts."""
 BY_CHANCE = 1.3
 """Error of predictions from logged starts over that of noise, random forces and the estimate's uncertainty, at the low
 end of a 95 % interval; a larger one is no chance, but for what the estimate of the noise errs by."""
@@ -202,8 +205,8 @@ def _small_but_certain(holdout: HoldOut) -> Verdict | None:
     Parameters may have made up for more of it than is left. With a finer timestep a certain term may be what is left of
     the numerical error, and intervals cover it.
     """
-    small = [] if holdout.finer or numerical(holdout) is not None else list(filter(is_certain, holdout.missing_terms))
-    if not small:
+    small = [term for term in holdout.missing_terms if is_certain(term) and term.explained >= LEAST_EXPLAINED]
+    if not small or holdout.finer or numerical(holdout) is not None:
         return None
     clearest = max(small, key=lambda term: abs(term.t))
     return _not_certain(
