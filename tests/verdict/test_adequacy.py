@@ -127,7 +127,7 @@ def test_a_certain_term_of_a_thousandth_is_never_calibrated_unless_a_finer_step_
     least = replace(term(t=5.1, explained=0.004), cause="another centre of mass", parameter="body_com.leg")
     sure = judge(replace(PREDICTED, missing_terms=(least,)))
     assert sure.word == "NOT_IDENTIFIABLE"
-    assert "another centre of mass (body_com.leg) explains but 0.4 % of the squared residuals, and not" in sure.sentence
+    assert "another centre of mass (body_com.leg) explains only 0.4 % of the squared residuals, but" in sure.sentence
     ahead = OpenLoop(1.0, False, 60, {"q": 1.0}, {"q": 1.0}, {"q": 0.4}, 0.4, (0.3, 0.6))
     assert judge(replace(PREDICTED, missing_terms=(least,), open_loop=(ahead,))).word == "USABLE"
     for other in (replace(least, t=4.9), replace(least, explained=9e-4)):

@@ -66,6 +66,7 @@ def test_without_time_nothing_is_said_to_be_tested(result, split):
         "a larger one judges in full"
     )
     in_full = madoc.assess(result, replace(bench, until=time.monotonic() + 1000.0, rate=1e5))
+    assert max(in_full.holdout.open_loop[0].beside_noise.values()) < 1.3
     assert in_full.verdict.word == "CALIBRATED" and in_full.holdout == madoc.assess(result, bench).holdout
 
 

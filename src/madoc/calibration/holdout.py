@@ -88,9 +88,9 @@ class OpenLoop:
         relative: Error at the estimate over that of the model as given: the mean over stretches of the root mean square
             over all signals, each in units of its change.
         relative_interval: 95 % confidence interval of that, by resampling episodes, or stretches where these are few.
-        beside_noise: How many times as large the error at the estimate is, at least, as that which the sensors' noise
-            and the estimate's uncertainty make; for each signal, the lower end of a 95 % interval. None are known
-            where predictions begin at logged states.
+        beside_noise: How many times as large the error at the estimate is, at least, as that which the sensors' noise,
+            random forces where predictions begin at logged states, and the estimate's uncertainty make; for each
+            signal, the lower end of a 95 % interval.
     """
 
     seconds: float

@@ -69,7 +69,7 @@ _ENTRIES = (
         "damped Gauss-Newton, robust, with intervals",
         "Levenberg; Marquardt",
         1963,
-        usual_budget="450s",  # it settles by itself, mostly within seconds
+        usual_budget="300s",  # it settles by itself, mostly within seconds
     ),
     _entry("oted", Oted, "matches (s, a) by a bandit's policy gradient", "Gur et al. (from its abstract)", 2021),
     _entry("dropo", Dropo, "distribution that makes next states likely", "Tiboni et al., DROPO", 2022),

@@ -40,7 +40,9 @@ def calibrate_in(
     prepared, method = prepared.by(name), methods[name]
     judged_by, budget = None, prepared.budget
     if prepared.holdout is not None and isinstance(budget, Seconds):
-        judged_by, budget = began + budget.seconds, budget.for_search(time.monotonic() - began)
+        whole = budget if order.search.budget is not None else budget.with_judging
+        judged_by = began + whole.seconds
+        budget = budget if whole is not budget else budget.for_search(time.monotonic() - began)
     spec = prepared.spec(out) | {"hyperparameters": hyperparameters(method)}
     with working_folder(out, spec, resume=resume) as folder:
         result = calibrate(

@@ -91,8 +91,9 @@ class Search:
     set: Settings = ()
     """Hyperparameters of the method as name=value; of a method that auto may take as least-squares.name=value."""
     budget: int | str | None = None
-    """Simulated control steps, or the time of the whole command, judging included, as 300s or 15min. Default: 450s for
-    least-squares, which settles by itself and mostly much sooner, 300000 control steps for the others."""
+    """Simulated control steps, or the time of the whole command, judging included, as 300s or 15min. Default: 300s of
+    searching for least-squares, which settles by itself and mostly much sooner, and 450s with judging; 300000 control
+    steps for the others."""
     seed: int = 0
     """Seed of all random numbers."""
 

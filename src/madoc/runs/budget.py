@@ -23,6 +23,11 @@ class Seconds:
         """What a search gets of a time that is for a whole command, judging included, of which some is spent."""
         return Seconds(self.seconds * max(LEAST_OF_SEARCH, OF_SEARCH - spent / self.seconds))
 
+    @property
+    def with_judging(self) -> "Seconds":
+        """The time for a whole command whose search gets this one."""
+        return Seconds(self.seconds / OF_SEARCH)
+
     def __str__(self) -> str:
         return f"{self.seconds:g} s"
 

@@ -21,6 +21,8 @@ from madoc.verdict.open_loop import open_loop
 from madoc.verdict.predicted import noise_hides_gain, noisy_contacts, predicted
 from madoc.verdict.records import judged
 
+LATER = "predictions over longer times"
+"""A part of judging without which nothing is tested."""
 NO_BETTER = "the estimate predicts the rows held out no better than mid-range does, so it is not settled"
 
 
@@ -78,7 +80,8 @@ def assess(
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
     bench.tell("predictions of single steps and short windows")
     fits_starts = _fits_starts(bench, point)
-    # Only predictions can make an estimate of use whose search has not settled, and of fitted starts a certain one.
+    # Predictions come first where all depends on them: an unsettled search is of use by them alone, and from fitted
+    # starts they take much of the time.
     half = (bench.simulator.parameters.high - bench.simulator.parameters.low) / 2.0
     covariance = None if result.covariance is None else result.covariance / np.outer(half, half)
     predict = partial(_predictions, bench, point, fits_starts, covariance)
@@ -87,7 +90,7 @@ def assess(
     if predictions is None:
         noise = np.array(list(holdout.noise.values())) / bench.change[: len(holdout.noise)]
         predictions = predict(noise)
-    holdout = replace(holdout, open_loop=predictions)
+    holdout = replace(holdout, open_loop=predictions, tested=holdout.tested and LATER not in bench.left_out)
     widened = with_widened_intervals(result, holdout)
     verdict = judge(
         holdout,
@@ -147,7 +150,7 @@ def _predictions(
     noise: Float[np.ndarray, " observation"] | None = None,
 ) -> tuple[OpenLoop, ...]:
     """Predictions over longer times, if there is time for them."""
-    if not bench.begins("predictions over longer times"):
+    if not bench.begins(LATER):
         return ()
     return open_loop(bench, point, fits_starts=fits_starts, covariance=covariance, noise=noise)
 

@@ -15,7 +15,17 @@ from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import named
 from madoc.verdict.adequacy import is_certain, numerical
-from madoc.verdict.mismatch import SEPARABLE, at_most, change_of, contradicted, in_percent, in_rows, lacking, of_area
+from madoc.verdict.mismatch import (
+    BEYOND_RANDOM,
+    SEPARABLE,
+    at_most,
+    change_of,
+    contradicted,
+    in_percent,
+    in_rows,
+    lacking,
+    of_area,
+)
 from madoc.verdict.statistics import ABOVE_NOISE, FEWEST_GROUPS, WORTH_GAINING, beyond_noise
 
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
@@ -37,11 +47,8 @@ WORSE_SIGNAL = 1.1
 NAMED = 3
 """Largest number of such signals that are named."""
 LEAST_EXPLAINED = 1e-3
-"""Share in [0, 1] of the squared residuals below which a term that is certain may stand for what the noise of initial
-states does at contacts."""
-BY_CHANCE = 1.3
-"""Error of predictions from logged starts over that of noise, random forces and the estimate's uncertainty, at the low
-end of a 95 % interval; a larger one is no chance, but for what the estimate of the noise errs by."""
+"""Share in [0, 1] of the squared residuals; a term that is certain and explains less may stand for what the noise of
+initial states does at contacts, as in an honest log of a puck (0.013 %)."""
 
 
 def judge(
@@ -189,12 +196,12 @@ def _beyond_noise_later(holdout: HoldOut) -> Verdict | None:
     enough = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
     beside = [(ratio, name, each.seconds) for each in enough for name, ratio in each.beside_noise.items()]
     ratio, name, seconds = max(beside, default=(0.0, "", 0.0))
-    if ratio <= (BY_CHANCE if isinstance(holdout, Predicted) else ABOVE_NOISE) or numerical(holdout) is not None:
+    if ratio <= (BEYOND_RANDOM if isinstance(holdout, Predicted) else ABOVE_NOISE) or numerical(holdout) is not None:
         return None
     return _not_certain(
         holdout,
         f"the model lacks something that no test finds: over {seconds:.3g} s it predicts {name} with {ratio:.2g} times "
-        "the error, at least, that the sensors' noise and the estimates' uncertainty make; look for what acts slowly, "
+        "the error, at least, that noise and the estimates' uncertainty make; look for what acts slowly, "
         "or for what couples drives, as a supply that they share",
     )
 
@@ -211,9 +218,9 @@ def _small_but_certain(holdout: HoldOut) -> Verdict | None:
     clearest = max(small, key=lambda term: abs(term.t))
     return _not_certain(
         holdout,
-        f"the model certainly lacks something: {named(clearest)} explains but {100 * clearest.explained:.2g} % of "
-        f"the squared residuals, and not by chance (t = {abs(clearest.t):.1f}); parameters may make up for more of "
-        "it than is left, and which term it is the log does not tell",
+        f"the model certainly lacks something: {named(clearest)} explains only {100 * clearest.explained:.2g} % of "
+        f"the squared residuals, but not by chance (t = {abs(clearest.t):.1f}), and the parameters may have absorbed "
+        "most of its effect; which term it is the log does not tell, so look for what acts alike",
     )
 
 

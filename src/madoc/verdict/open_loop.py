@@ -1,8 +1,9 @@
 """How far the simulator can be believed, in the user's units: held-out motion predicted without a look at it.
 
 The simulator starts where the log does, gets the logged actions, and runs on. Its errors after a tenth of a second, a
-second and whole runs stand beside those of the user's own model as it was given, and of mid-range. From fitted starts
-they also stand beside those that the sensors' noise and the estimate's uncertainty alone would make.
+second and whole runs stand beside those of the user's own model as it was given, and of mid-range. They also stand
+beside those that chance would make: the sensors' noise, random forces where starts are logged, and the estimate's
+uncertainty.
 """
 
 from dataclasses import replace
@@ -36,6 +37,8 @@ SHARE = 0.3
 """Share in (0, 1) of the time left that predictions from starts which are fitted together may take."""
 IMITATED = 4
 """Number of parameter vectors by which the hold-out is imitated."""
+UNSURE = 2.0
+"""Errors of these, root of the mean square along each axis, in standard errors: about what 95 % of estimates have."""
 FAILED = 10.0
 """Least error, in typical changes of a stride, once a simulation has failed; it is the worst of any that has not."""
 
@@ -54,8 +57,8 @@ def open_loop(
     There are none where the log tells no states to begin at, and none of a length that no held-out stretch has.
     From fitted states those of shorter times are the beginnings of one prediction where runs are long enough, so that
     starts are fitted once. With the estimate's `covariance`, in [-1, 1], it is also said how many times as large errors
-    are as those of an imitated hold-out (`_imitated`), from logged states with the sensors' `noise`, in typical changes
-    of a stride.
+    are as those of a hold-out that the model itself would make: from fitted states an imitated one (`_imitated`), and
+    from logged states what the sensors' `noise`, in typical changes of a stride, and random forces make.
     """
     if bench.states.kind == "unknown" or bench.held_out.disturbance.shuffled != "none":
         return ()
@@ -148,7 +151,8 @@ def _from_logged(
 ) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
     """Residuals from logged states as given, at mid-range and at the estimate, and the rows where windows begin.
 
-    Those of the imitated hold-out follow, over the times in `SECONDS`. None where the hold-out has no run as long.
+    Those that chance would make follow, over the times in `SECONDS` and where noise is known. None where the hold-out
+    has no run as long.
     """
     held = bench.held_out
     states, rows = logged_states(held, bench.simulator.task)
@@ -171,6 +175,7 @@ def _from_logged(
     chance, _ = by_chance(bench, replays, point, replays.noise_floor(held, point, noise))
     drawn = replays.residuals(_drawn(point, covariance))
     of_parameters = drawn[np.arange(len(rows)) % IMITATED, np.arange(len(rows))] - residuals[-1]
+    of_parameters = np.where(np.isfinite(of_parameters), of_parameters, 0.0)
     return np.concatenate([residuals, chance + of_parameters]), rows
 
 
@@ -212,11 +217,11 @@ def _imitated(
 ) -> Float[np.ndarray, "1 windows readings channels"]:
     """Residuals at the estimate of a hold-out as the model itself would make it (a posterior predictive check).
 
-    Its windows begin where the log's do, at `states`. Its parameters are drawn from the estimate's normal distribution,
-    a few for all windows, and its sensors have the noise that the estimate's `residuals` of fitted readings have. What
-    is missing in the model then shows in errors of the log that are larger than these (Gelman, Meng and Stern 1996).
+    Its windows begin where the log's do, at `states`. Its parameters are a few for all windows (`_drawn`), and its
+    sensors have the noise that the estimate's `residuals` of fitted readings have. What is missing in the model then
+    shows in errors of the log that are larger than these (Gelman, Meng and Stern 1996).
     """
-    random, readings, windows = np.random.default_rng(1), replays.readings, np.arange(len(replays.readings))
+    random, readings, windows = np.random.default_rng(0), replays.readings, np.arange(len(replays.readings))
     drawn = _drawn(point, covariance)
     made = replays.residuals_from(drawn, np.repeat(states[None], IMITATED, axis=0))[windows % IMITATED, windows]
     noise = residual_noise(residuals[:, : replays.fitted + 1], made.shape[-1])
@@ -226,10 +231,11 @@ def _imitated(
 
 
 def _drawn(point: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "systems d"]:
-    """A few parameter vectors in [-1, 1] from an estimate's normal distribution."""
-    random = np.random.default_rng(0)
-    drawn = random.multivariate_normal(point, covariance, size=IMITATED, check_valid="ignore", method="eigh")
-    return np.clip(drawn, -1.0, 1.0)
+    """A few parameter vectors in [-1, 1] around an estimate, whose errors are `UNSURE`."""
+    variances, axes = np.linalg.eigh(covariance)
+    errors = np.random.default_rng(2).standard_normal((IMITATED, len(point)))
+    errors *= UNSURE / np.sqrt((errors**2).mean(0))
+    return np.clip(point + errors * np.sqrt(np.maximum(variances, 0.0)) @ axes.T, -1.0, 1.0)
 
 
 def _models(
