@@ -1,11 +1,14 @@
 """The records of what a hold-out shows of an estimate."""
 
+from dataclasses import replace
+
 import pytest
 
 from madoc.calibration.holdout import (
     AgainstChance,
     Area,
     Fitted,
+    OpenLoop,
     Predicted,
     PredictionError,
     PredictionErrors,
@@ -42,3 +45,15 @@ def test_the_clearest_prediction_pays_for_the_others_that_were_tried():
 def test_less_is_better_by_every_measure(report, score):
     assert report.score == score
     assert report.score_interval[0] < report.score < report.score_interval[1]
+
+
+def test_what_is_told_is_the_longest_time_over_which_the_model_as_given_is_beaten_for_certain():
+    def over(seconds, relative, high, *, whole=False):
+        errors = {"q": 1.0}
+        return OpenLoop(seconds, whole, 60, errors, errors, errors, relative, (relative, high))
+
+    short, middle, long = over(0.1, 0.1, 0.2), over(0.3, 0.15, 0.3), over(1.0, 0.92, 1.3)
+    given = replace(REPORTS[1], open_loop=(short, middle, long, over(9.0, 0.1, 0.2, whole=True)))
+    assert given.ahead == middle
+    assert replace(given, open_loop=(over(0.3, 0.9, 1.1), long)).ahead == long
+    assert replace(given, open_loop=(over(1.0, 1.1, 1.3),)).ahead is None

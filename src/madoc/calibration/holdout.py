@@ -196,6 +196,15 @@ class Judged:
     concentration: Concentration | None = None
 
     @property
+    def ahead(self) -> OpenLoop | None:
+        """The longest predictions, but for whole runs, that are better than those of the model as given; None of none.
+
+        Those that are certainly better come first.
+        """
+        better = [each for each in self.open_loop if not each.whole and each.relative <= 1.0]
+        return max(better, key=lambda each: (each.relative_interval[1] < 1.0, each.seconds), default=None)
+
+    @property
     def clearest(self) -> AgainstChance:
         """The test with the smallest p-value."""
         return min(self.against_chance, key=lambda each: (each.p_value, -each.skill))

@@ -147,10 +147,9 @@ def _on_holdout(held: HoldOut) -> tuple[str, str, str]:
         low, high = (number(end, 2) for end in held.area_at_estimate.interval)
         note = f"area of a classifier, {low} to {high}; 0.5 is chance"
         return "classifier, simulated or logged", number(held.area_at_estimate.area, 2), note
-    parts = [each for each in held.open_loop if not each.whole and each.relative <= 1.0]
-    if parts:
-        value, low, high = map(percent, (parts[-1].relative, *parts[-1].relative_interval))
-        note = f"of your model's as given, over {number(parts[-1].seconds, 3)} s and all signals; {low} to {high}"
+    if held.ahead is not None:
+        value, low, high = map(percent, (held.ahead.relative, *held.ahead.relative_interval))
+        note = f"of your model's as given, over {number(held.ahead.seconds, 3)} s and all signals; {low} to {high}"
         return "error on the hold-out", value, note
     value, low, high = map(percent, (held.score, *held.score_interval))
     return "error on the hold-out", value, f"of that at mid-range, over all times and signals; {low} to {high}"

@@ -315,8 +315,7 @@ def _no_better_areas(before: Area, after: Area) -> str:
 def _how_good(holdout: HoldOut) -> str:
     if not isinstance(holdout, ToldApart):
         confirmed = ", and mid-range is confirmed: every interval holds it" if _mid_range_was_right(holdout) else ""
-        parts = [each for each in holdout.open_loop if not each.whole and each.relative <= 1.0]
-        told = _beside_given(parts[-1], holdout.noise) if parts else _how_small(holdout.errors)
+        told = _how_small(holdout.errors) if holdout.ahead is None else _beside_given(holdout.ahead, holdout.noise)
         ahead = f", up to {in_rows(holdout.errors.estimate[-1].steps)} ahead as well as the sensors' noise allows"
         noise_alone = not beyond_noise(holdout.errors.estimate, holdout.errors.noise)
         return f"{told}{ahead if noise_alone else ''}{confirmed}"
