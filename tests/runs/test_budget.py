@@ -30,3 +30,4 @@ def test_what_is_no_budget_is_refused(written):
 @pytest.mark.parametrize(("spent", "left"), [(0.0, 80.0), (10.0, 70.0), (100.0, 24.0)])
 def test_a_search_gets_two_thirds_of_a_time_with_what_is_spent_before_it(spent, left):
     assert Seconds(120.0).for_search(spent).seconds == pytest.approx(left)
+    assert Seconds(80.0).with_judging.seconds == pytest.approx(120.0)  # what a command takes whose search gets 80 s

@@ -40,9 +40,10 @@ def calibrate_in(
     prepared, method = prepared.by(name), methods[name]
     judged_by, budget = None, prepared.budget
     if prepared.holdout is not None and isinstance(budget, Seconds):
-        whole = budget if order.search.budget is not None else budget.with_judging
-        judged_by = began + whole.seconds
-        budget = budget if whole is not budget else budget.for_search(time.monotonic() - began)
+        if order.search.budget is None:  # the usual time is that of a search
+            judged_by = began + budget.with_judging.seconds
+        else:
+            judged_by, budget = began + budget.seconds, budget.for_search(time.monotonic() - began)
     spec = prepared.spec(out) | {"hyperparameters": hyperparameters(method)}
     with working_folder(out, spec, resume=resume) as folder:
         result = calibrate(
