@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from madoc.runs import machine
 from madoc.suites import process
@@ -138,3 +139,17 @@ def test_a_local_cluster_listens_to_this_machine_alone_in_a_folder_that_is_close
     assert len(done.stdout.split()) > 4
     assert addresses <= {"127.0.0.1", "[::ffff:127.0.0.1]", "[::1]", "0o700"}
     assert "0o700" in addresses
+
+
+def test_products_of_matrices_do_not_wait_for_cores_that_others_use():
+    import scipy.linalg  # noqa: F401  its BLAS is another than NumPy's
+
+    def threads() -> list[int]:
+        return [each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"]
+
+    with threadpool_limits(2):
+        before = threads()
+        with machine.one_blas_thread():
+            assert threads() == [1] * len(before)
+        assert threads() == before == [2] * len(before)
+    assert before

@@ -15,6 +15,7 @@ from madoc.parameters import Parameter, ParameterSpace
 from madoc.runs import loop
 from madoc.runs.budget import Budget
 from madoc.runs.files import replacing
+from madoc.runs.machine import one_blas_thread
 from madoc.runs.run_folder import RunFolder
 from madoc.simulation.sensitivity import refuse_insensitive
 from madoc.simulation.write import nominal_values
@@ -25,6 +26,7 @@ DIVERGED = "the run diverged: the estimate is that of its last checkpoint, which
 """A warning that comes before those of the method."""
 
 
+@one_blas_thread()
 def calibrate(
     method: Calibrator[State],
     problem: CalibrationProblem,

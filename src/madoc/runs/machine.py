@@ -7,6 +7,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 
 def usable_cores() -> int:
     """Number of cores that this process may use; all of the machine where the system knows no affinity."""
@@ -22,6 +24,19 @@ def keep_to_core(core: int) -> None:
     """Keep this process to one of the cores that it can choose."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {core})
+
+
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Products of matrices on one thread: the same bits on any number of cores.
+
+    Those of windows are small. A second thread saves little of their time, and costs several times as much where it
+    has to wait for a core. It is a decorator too.
+    """
+    import scipy.linalg  # noqa: F401  its BLAS is another than NumPy's, and is limited only once it is loaded
+
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 def own_folder(*parts: str) -> Path | None:

@@ -12,6 +12,7 @@ from madoc.calibration import CalibrationProblem, CalibrationResult
 from madoc.calibration.holdout import HoldOut, OpenLoop, ToldApart, Verdict
 from madoc.data import Dataset
 from madoc.errors import MadocError
+from madoc.runs.machine import one_blas_thread
 from madoc.simulation.base import Simulator
 from madoc.verdict.adequacy import about_imitated, with_widened_intervals
 from madoc.verdict.bench import Bench
@@ -44,6 +45,7 @@ class Assessment:
         return str(self.verdict)
 
 
+@one_blas_thread()
 def assess(
     result: CalibrationResult,
     held_out: Dataset | Bench,

@@ -12,6 +12,7 @@ from madoc.identification.replay import Readings
 from madoc.identification.states import logged_states, states_of
 from madoc.identification.windows import evenly
 from madoc.runs.files import replacing
+from madoc.runs.machine import one_blas_thread
 from madoc.simulation.attitudes import differences, moved
 from madoc.simulation.base import Simulator
 from madoc.verdict.bench import Bench
@@ -29,6 +30,7 @@ Runs = tuple[Float[np.ndarray, "told state"], Int[np.ndarray, " runs"], Int[np.n
 """The state of each run at its first row, if the log tells states; that row, and the number of control steps."""
 
 
+@one_blas_thread()
 def evidence(
     bench: Bench, mean: Float[np.ndarray, " d"], *, control_step: float, fits_starts: bool = False
 ) -> dict[str, np.ndarray]:
